@@ -1,0 +1,89 @@
+"""What a cluster's constraints say about its coordinates: `q = gamma(y)` and its derivatives `G` and `g`.
+
+Each cluster has spanning coordinates `q` (one per body, eliminated rotors included) and independent coordinates `y`,
+a subset of them. All that the recursions need is
+
+    q = gamma(y),   qd = G yd,   qdd = G ydd + g        (constraint-embedding paper, eq. explicit_constraints)
+
+`G` and `g` are derived from `gamma` by automatic differentiation, never by hand. May know descriptions and CasADi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.model.clusters import Cluster
+from ce_gym.model.description import LinearConstraint
+from ce_gym.model.errors import RobotError
+
+SX = ca.SX
+
+
+@dataclass(frozen=True)
+class ClusterCoordinates:
+    """The coordinates of one cluster at one state.
+
+    Attributes:
+        index: Row of each body in the spanning quantities, by name.
+        q: Spanning positions, shape (n,).
+        qd: Spanning velocities, shape (n,).
+        G: Constraint Jacobian, shape (n, d).
+        g: Velocity-product acceleration of the constraint, shape (n,).
+    """
+
+    index: dict[str, int]
+    q: SX
+    qd: SX
+    G: SX
+    g: SX
+
+
+def cluster_coordinates(cluster: Cluster, y: SX, yd: SX) -> ClusterCoordinates:
+    """Evaluate a cluster's constraint at independent positions `y` (d,) and velocities `yd` (d,)."""
+    symbol, rate = SX.sym("y", y.shape[0]), SX.sym("yd", y.shape[0])
+    gamma = explicit_constraint(cluster, symbol)
+    G = ca.jacobian(gamma, symbol)
+    g = ca.jtimes(G @ rate, symbol, rate)
+    evaluate = ca.Function("constraint", [symbol, rate], [gamma, ca.densify(G), ca.densify(g)])
+    q, G_at, g_at = evaluate(y, yd)
+    G_at, g_at = ca.sparsify(G_at), ca.sparsify(g_at)
+    return ClusterCoordinates({name: i for i, name in enumerate(cluster.bodies)}, q, G_at @ yd, G_at, g_at)
+
+
+def explicit_constraint(cluster: Cluster, y: SX) -> SX:
+    """Return `gamma(y)`, the spanning coordinates of a cluster, shape (n,)."""
+    G, offset = linear_solution(cluster)
+    return ca.sparsify(SX(G)) @ y + offset
+
+
+def linear_solution(cluster: Cluster) -> tuple[np.ndarray, np.ndarray]:
+    """Solve the linear constraints of a cluster, `K q = b`, for `q = G y + q0`.
+
+    Returns:
+        G, shape (n, d), and q0, shape (n,).
+
+    Raises:
+        RobotError: If the independent coordinates do not determine the others.
+    """
+    rows = {name: i for i, name in enumerate(cluster.bodies)}
+    constraints = [c for c in cluster.constraints if isinstance(c, LinearConstraint)]
+    K, b = np.zeros((len(constraints), len(rows))), np.zeros(len(constraints))
+    for row, constraint in enumerate(constraints):
+        b[row] = constraint.offset
+        for body, coefficient in constraint.coefficients:
+            K[row, rows[body]] += coefficient
+    independent = [rows[name] for name in cluster.independent]
+    dependent = [i for i in range(len(rows)) if i not in independent]
+    G, q0 = np.zeros((len(rows), len(independent))), np.zeros(len(rows))
+    G[independent, range(len(independent))] = 1.0
+    if dependent:
+        K_d = K[:, dependent]
+        if K_d.shape[0] != K_d.shape[1] or np.linalg.matrix_rank(K_d) < len(dependent):
+            tied = ", ".join(cluster.bodies[i] for i in dependent)
+            raise RobotError(f"cluster of {cluster.bodies[0]!r}: its constraints do not determine {tied}")
+        G[dependent] = np.linalg.solve(K_d, -K[:, independent])
+        q0[dependent] = np.linalg.solve(K_d, b)
+    return np.where(np.abs(G) < 1e-14, 0.0, G), q0

@@ -1,0 +1,219 @@
+"""`Model`: one robot at one transmission level, and its dynamics on numpy arrays.
+
+Every quantity is traced once, on first use, into a CasADi function; the methods evaluate that function on arrays with
+any leading batch shape. Thousands of states at a time, or steps in time, are the business of `ce_gym.Simulator`.
+May know the algorithms of this room and descriptions; no compilation.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ce_gym.dynamics.functions import FUNCTIONS
+from ce_gym.model import Robot, load_robot
+from ce_gym.model.clusters import ClusterTree
+from ce_gym.model.mechanism import build_mechanism
+
+Array = NDArray[np.float64]
+
+
+class Model:
+    """The dynamics of one robot at one transmission level.
+
+    `q = [base position (3) [m], base quaternion wxyz (4), independent joint positions]`,
+    `v = [base angular (3) [rad/s], base linear (3) [m/s], joint velocities]`, both base velocities in the base frame;
+    a fixed base has only the joints. `vdot` is the time derivative of `v`, component by component.
+
+    Args:
+        robot: A description, the name of a robot that ships with the package, or a path to a robot file.
+        transmission: "exact", "coupled", "armature" or "none".
+        locked_rotors: Whether approximated rotors leave their mass and inertia at rest with their carrier (so that total
+            mass is the same at every level). False deletes them, as the constraint-embedding paper does in its figures.
+        eliminate_rotors: Whether symmetric rotors are eliminated at the exact level. False runs the general algorithm,
+            with every rotor a body: the same result, for more work.
+
+    Raises:
+        RobotError: If the robot file or the level is not valid.
+    """
+
+    def __init__(
+        self,
+        robot: Robot | str | Path,
+        transmission: str = "exact",
+        *,
+        locked_rotors: bool = True,
+        eliminate_rotors: bool = True,
+    ) -> None:
+        self.robot = robot if isinstance(robot, Robot) else load_robot(robot)
+        self.transmission = transmission
+        self.mechanism = build_mechanism(
+            self.robot, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors
+        )
+        self._functions: dict[str, ca.Function] = {}
+
+    def __repr__(self) -> str:
+        return f"Model({self.robot.name!r}, transmission={self.transmission!r}, nq={self.nq}, nv={self.nv})"
+
+    @property
+    def nv(self) -> int:
+        """Number of independent velocities, six for a floating base included."""
+        return len(self.robot.independent) + (6 if self.robot.floating else 0)
+
+    @property
+    def nq(self) -> int:
+        """Number of position coordinates, seven for a floating base included."""
+        return len(self.robot.independent) + (7 if self.robot.floating else 0)
+
+    @property
+    def joint_links(self) -> tuple[str, ...]:
+        """The link that each independent joint moves, in the order of the joint coordinates."""
+        return self.robot.independent
+
+    @property
+    def cluster_tree(self) -> ClusterTree:
+        """The clusters of the robot, parents first."""
+        return self.mechanism.tree
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of all bodies that take part, locked rotors included [kg]."""
+        return float(sum(body.inertia[3, 3] for body in self.mechanism.bodies.values()))
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """All bodies, rotors included, in the order of `body_poses`."""
+        return tuple(body.name for body in self.robot.bodies)
+
+    @property
+    def spanning_names(self) -> tuple[str, ...]:
+        """The body that each spanning joint moves, in the order of `spanning`, the floating base not included."""
+        return tuple(body.name for body in self.robot.bodies if body.joint.type != "free")
+
+    @property
+    def contact_names(self) -> tuple[str, ...]:
+        """The contact spheres, in the order of contact outputs."""
+        return tuple(contact.name for contact in self.robot.contacts)
+
+    @cached_property
+    def standing_q(self) -> Array:
+        """The standing pose, upright at the origin, shape (nq,)."""
+        angles = dict(self.robot.pose.joints)
+        joints = [angles.get(name, 0.0) for name in self.joint_links]
+        base = [0.0, 0.0, self.robot.pose.height, 1.0, 0.0, 0.0, 0.0] if self.robot.floating else []
+        return np.array(base + joints)
+
+    def casadi_function(self, name: str) -> ca.Function:
+        """Return a quantity as a CasADi SX function of column vectors.
+
+        Args:
+            name: "forward_dynamics" (q, v, tau) -> vdot; "inverse_dynamics" (q, v, vdot) -> tau; "mass_matrix" q -> M;
+                "bias_force" (q, v) -> tau at vdot = 0; "spanning" (q, v) -> (q_span, v_span); "body_poses" q -> positions
+                (3, n), rotations (3, 3 n); "contact_points" (q, v) -> positions (3, n), velocities (3, n);
+                "energy" (q, v) -> kinetic, potential.
+
+        Raises:
+            KeyError: If there is no such quantity.
+        """
+        if name not in self._functions:
+            if name not in FUNCTIONS:
+                raise KeyError(f"no function {name!r}; expected one of {', '.join(FUNCTIONS)}")
+            self._functions[name] = FUNCTIONS[name](self.mechanism)
+        return self._functions[name]
+
+    def n_instructions(self, name: str) -> int:
+        """Return the number of instructions of a traced quantity, the cost measure of the constraint-embedding paper."""
+        return self.casadi_function(name).n_instructions()
+
+    def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
+        """Return the acceleration `vdot`, shape (..., nv), that forces produce.
+
+        Args:
+            q: Positions, shape (..., nq).
+            v: Velocities, shape (..., nv).
+            tau: Generalised forces [N m or N], base wrench [moment; force] in the base frame first, shape (..., nv).
+
+        Source: CE-ABA, Chignoli et al., "Recursive rigid-body dynamics algorithms for systems with kinematic loops".
+        """
+        return self._evaluate("forward_dynamics", q, v, tau)[0][..., 0]
+
+    def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
+        """Return the generalised force, shape (..., nv) [N m or N], that produces the acceleration `vdot` (..., nv)."""
+        return self._evaluate("inverse_dynamics", q, v, vdot)[0][..., 0]
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """Return the mass matrix of the independent coordinates, shape (..., nv, nv)."""
+        return self._evaluate("mass_matrix", q)[0]
+
+    def bias_force(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return Coriolis, centrifugal, gyroscopic and gravity forces, `M vdot + bias = tau`, shape (..., nv)."""
+        return self._evaluate("bias_force", q, v)[0][..., 0]
+
+    def spanning(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+        """Return positions and velocities of every joint, rotors included, in the order of `robot.bodies`.
+
+        A floating base comes first, with 7 positions and 6 velocities: shapes (..., nq_span) and (..., nv_span).
+        """
+        q_span, v_span = self._evaluate("spanning", q, v)
+        return q_span[..., 0], v_span[..., 0]
+
+    def body_poses(self, q: ArrayLike) -> tuple[Array, Array]:
+        """Return where all bodies are, in the order of `body_names`.
+
+        Returns:
+            Origins in the world [m], shape (..., n, 3), and rotations body to world, shape (..., n, 3, 3).
+        """
+        positions, rotations = self._evaluate("body_poses", q)
+        n = positions.shape[-1]
+        stacked = rotations.reshape(*rotations.shape[:-1], n, 3)  # (..., row, body, column)
+        return np.swapaxes(positions, -1, -2), np.moveaxis(stacked, -2, -3)
+
+    def contact_points(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+        """Return centres [m] and velocities [m/s] of the contact spheres in the world, each shape (..., n, 3)."""
+        position, velocity = self._evaluate("contact_points", q, v)
+        return np.swapaxes(position, -1, -2), np.swapaxes(velocity, -1, -2)
+
+    def energy(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+        """Return kinetic and potential energy [J], each shape (...)."""
+        kinetic, potential = self._evaluate("energy", q, v)
+        return kinetic[..., 0, 0], potential[..., 0, 0]
+
+    def describe(self) -> str:
+        """Return a readable account of the robot: figures, and its cluster tree as text."""
+        rotors = sum(1 for _ in self.robot.rotors())
+        eliminated = sum(len(spins) for spins in self.mechanism.spins)
+        lines = [
+            f"{self.robot.name}: {'floating' if self.robot.floating else 'fixed'} base, {len(self.joint_links)} joints, "
+            f"{len(self.body_names)} bodies of which {rotors} rotors, {len(self.cluster_tree.clusters)} clusters, "
+            f"{self.total_mass:.3f} kg",
+            f"transmission {self.transmission}: {eliminated} rotors need no body of their own",
+            "",
+            self.cluster_tree.as_text(),
+        ]
+        return "\n".join(lines)
+
+    def _evaluate(self, name: str, *arguments: ArrayLike) -> list[Array]:
+        """Evaluate a traced function on arrays that share leading batch dimensions; outputs (..., rows, columns)."""
+        function = self.casadi_function(name)
+        arrays = [np.asarray(a, dtype=float) for a in arguments]
+        for i, a in enumerate(arrays):
+            if a.ndim == 0 or a.shape[-1] != function.size1_in(i):
+                raise ValueError(
+                    f"{name}: {function.name_in(i)} has shape {a.shape}; expected (..., {function.size1_in(i)})"
+                )
+        batch = np.broadcast_shapes(*[a.shape[:-1] for a in arrays])
+        count = int(np.prod(batch))
+        flat = [np.broadcast_to(a, (*batch, a.shape[-1])).reshape(count, a.shape[-1]).T for a in arrays]
+        if count == 0:
+            return [np.zeros((*batch, *function.size_out(i))) for i in range(function.n_out())]
+        outputs = function.call([ca.DM(a) for a in flat]) if count == 1 else function.map(count).call(flat)
+        results = []
+        for i, output in enumerate(outputs):
+            rows, columns = function.size_out(i)
+            value = np.asarray(ca.DM(output).full()).reshape(rows, count, columns)
+            results.append(np.moveaxis(value, 1, 0).reshape(*batch, rows, columns))
+        return results

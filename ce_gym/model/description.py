@@ -1,0 +1,264 @@
+"""What a robot is: frozen data, nothing computed.
+
+Every loader ends in a `Robot`; every other part of the package starts from one. A robot is a spanning tree of
+bodies, each moved by one joint against its parent, plus the constraints that tie joint coordinates together
+(gears, belts, differentials, closed loops). A joint has the name of the body it moves, so one name space is
+enough: "the angle of FL_hip_link" is the coordinate of the joint between FL_hip_link and its parent.
+
+Numbers are plain floats in tuples, so that two robots are equal if and only if their figures are, and a robot
+can be hashed into a cache key. Units are SI and radians. Knows nothing about algorithms, arrays or files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+Vec3 = tuple[float, float, float]
+Mat3 = tuple[Vec3, Vec3, Vec3]
+
+IDENTITY: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+ZERO: Vec3 = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Pose of a frame in its parent frame: `x_parent = rotation @ x + position`.
+
+    Attributes:
+        position: Origin of the frame in the parent frame [m].
+        rotation: Columns are the axes of the frame in the parent frame.
+    """
+
+    position: Vec3 = ZERO
+    rotation: Mat3 = IDENTITY
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Mass properties of a body in its own frame.
+
+    Attributes:
+        mass: [kg]; zero is allowed for rotors whose mass is already counted in the body that carries them.
+        com: Centre of mass [m].
+        inertia: Rotational inertia about the centre of mass, body axes [kg m^2].
+    """
+
+    mass: float
+    com: Vec3
+    inertia: Mat3
+
+
+@dataclass(frozen=True)
+class Joint:
+    """The tree joint between a body and its parent.
+
+    Attributes:
+        type: "free" (six degrees of freedom, only against the world), "revolute" or "prismatic".
+        axis: Unit axis in the body frame; for "revolute" positive is right-handed. Ignored by "free".
+        position: Lower and upper limit [rad or m]; infinite where there is none.
+        torque: Largest actuator effort at the joint [N m or N].
+        velocity: Largest speed the actuator reaches [rad/s or m/s].
+        damping: Viscous friction at the joint [N m s/rad or N s/m].
+    """
+
+    type: Literal["free", "revolute", "prismatic"]
+    axis: Vec3 = (0.0, 0.0, 1.0)
+    position: tuple[float, float] = (-float("inf"), float("inf"))
+    torque: float = float("inf")
+    velocity: float = float("inf")
+    damping: float = 0.0
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A primitive to draw.
+
+    Attributes:
+        type: "box", "cylinder", "capsule" or "sphere".
+        size: box: full edge lengths x, y, z; cylinder and capsule: radius, length along z (a capsule's length is
+            that of its cylindrical part); sphere: radius [m].
+        placement: Pose of the shape's centre in the body frame.
+        color: Red, green, blue, alpha in 0..1.
+    """
+
+    type: Literal["box", "cylinder", "capsule", "sphere"]
+    size: tuple[float, ...]
+    placement: Placement = Placement()
+    color: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body and the joint that moves it.
+
+    Attributes:
+        name: Unique among all bodies.
+        kind: "link", or "rotor" for a body that spins inside a transmission. The transmission levels differ only in
+            what they keep of rotors.
+        parent: Name of the parent body; None is the world.
+        placement: Pose of the body frame in the parent frame when the joint coordinate is zero.
+    """
+
+    name: str
+    kind: Literal["link", "rotor"]
+    parent: str | None
+    placement: Placement
+    joint: Joint
+    inertial: Inertial
+    shapes: tuple[Shape, ...] = ()
+
+
+@dataclass(frozen=True)
+class LinearConstraint:
+    """`sum(coefficient * angle of body) = offset`: gears, belts, planetary stages, averaging differentials.
+
+    A gear of ratio N between a rotor and a link is `{rotor: 1, link: -N}`.
+
+    Attributes:
+        name: For messages.
+        coefficients: Pairs (body, coefficient), at least two, none zero.
+        offset: Right-hand side [rad or m].
+    """
+
+    name: str
+    coefficients: tuple[tuple[str, float], ...]
+    offset: float = 0.0
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies whose joint coordinates the constraint ties together."""
+        return tuple(body for body, _ in self.coefficients)
+
+
+Constraint = LinearConstraint
+
+
+@dataclass(frozen=True)
+class ContactSphere:
+    """A sphere fixed to a body that may touch the ground.
+
+    Attributes:
+        name: Unique among contacts.
+        body: Name of the body that carries it.
+        position: Centre in the body frame [m].
+        radius: [m]; zero is a point.
+        group: Free label, such as "foot", "knee" or "torso", by which tasks choose contacts.
+    """
+
+    name: str
+    body: str
+    position: Vec3
+    radius: float
+    group: str = "foot"
+
+
+@dataclass(frozen=True)
+class ContactMaterial:
+    """Compliance and friction of a robot's contacts with the ground.
+
+    Attributes:
+        stiffness: Normal stiffness of each contact sphere [N/m].
+        damping: Normal damping of each contact sphere [N s/m].
+        friction: Coulomb coefficient [-].
+    """
+
+    stiffness: float = 5e4
+    damping: float = 500.0
+    friction: float = 0.8
+
+
+@dataclass(frozen=True)
+class Motor:
+    """An electric motor that turns a rotor.
+
+    Attributes:
+        rotor: Name of the rotor body.
+        torque: Largest torque at the rotor [N m].
+        velocity: No-load speed of the rotor [rad/s].
+    """
+
+    rotor: str
+    torque: float = float("inf")
+    velocity: float = float("inf")
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A named configuration.
+
+    Attributes:
+        height: Height of the base origin above flat ground [m]; ignored by a fixed base.
+        joints: Pairs (body, angle) for independent joints; those not named are zero [rad or m].
+    """
+
+    height: float = 0.0
+    joints: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Joint-space PD gains, pairs (body, value) for every independent joint.
+
+    Attributes:
+        kp: Position gains [N m/rad or N/m].
+        kd: Velocity gains [N m s/rad or N s/m].
+    """
+
+    kp: tuple[tuple[str, float], ...] = ()
+    kd: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A complete description of one robot.
+
+    Attributes:
+        name: Short name, such as "mini_cheetah".
+        bodies: Parents before children. A floating base is a body with a "free" joint on the world, listed first.
+        constraints: What ties joint coordinates together.
+        independent: Bodies whose joint coordinates are the independent coordinates `y`, in the order of `y`.
+        contacts: Spheres that may touch the ground.
+        material: Compliance and friction of the contacts.
+        motors: One for each driven rotor.
+        pose: The standing pose.
+        gains: PD gains for position control of the independent joints.
+        gravity: Acceleration of free fall in the world frame [m/s^2].
+        source: The file it was read from, for messages.
+        notes: Facts a user should know, such as repaired figures.
+    """
+
+    name: str
+    bodies: tuple[Body, ...]
+    constraints: tuple[Constraint, ...] = ()
+    independent: tuple[str, ...] = ()
+    contacts: tuple[ContactSphere, ...] = ()
+    material: ContactMaterial = ContactMaterial()
+    motors: tuple[Motor, ...] = ()
+    pose: Pose = Pose()
+    gains: Gains = Gains()
+    gravity: Vec3 = (0.0, 0.0, -9.81)
+    source: str = field(default="", compare=False)
+    notes: tuple[str, ...] = field(default=(), compare=False)
+
+    def body(self, name: str) -> Body:
+        """Return the body called `name`; KeyError if there is none."""
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        raise KeyError(f"{self.name} has no body {name!r}; it has {', '.join(b.name for b in self.bodies)}")
+
+    def rotors(self) -> Iterator[Body]:
+        """Iterate over the bodies that spin inside transmissions."""
+        return (body for body in self.bodies if body.kind == "rotor")
+
+    @property
+    def floating(self) -> bool:
+        """Whether the first body is free to move in the world."""
+        return bool(self.bodies) and self.bodies[0].joint.type == "free"
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of all bodies [kg]."""
+        return sum(body.inertial.mass for body in self.bodies)

@@ -1,0 +1,201 @@
+"""From a robot description to the figures the dynamics needs, at one transmission level.
+
+The four levels differ only in what they keep of a *spinning* rotor; its mass and its inertia at rest always stay with
+the body that carries it, so total mass, coordinates and limits are the same at every level:
+
+| level      | what is kept of the spin                                                                     |
+|------------|----------------------------------------------------------------------------------------------|
+| `exact`    | everything: kinetic energy, coupling to the carrier, gyroscopic torque                       |
+| `coupled`  | the reflected inertia `G_r^T J G_r` of each cluster, with its off-diagonal terms             |
+| `armature` | the diagonal of that matrix                                                                  |
+| `none`     | nothing                                                                                      |
+
+At `exact`, a rotor that is symmetric about its spin axis never has to become a body of the recursion: its inertia is
+constant in its carrier's frame and its spin enters as a `Spin`. Any other rotor stays a body of its cluster. That is
+decided here, rotor by rotor. May know descriptions and numpy, nothing symbolic.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
+from ce_gym.model.description import Body, Robot
+from ce_gym.model.errors import RobotError
+
+Level = Literal["exact", "coupled", "armature", "none"]
+LEVELS: tuple[Level, ...] = get_args(Level)
+Array = NDArray[np.float64]
+
+AXISYMMETRY_TOLERANCE = 1e-9
+"""Largest relative asymmetry of a rotor that still counts as symmetric about its spin axis."""
+
+
+@dataclass(frozen=True)
+class Spin:
+    """The spin of a rotor whose inertia at rest has been merged into its carrier.
+
+    Attributes:
+        rotor: Name of the rotor.
+        carrier: Name of the body it is mounted on; None is the world.
+        axis: Unit spin axis in the carrier's frame, shape (3,).
+        inertia: Moment of inertia about the axis [kg m^2].
+    """
+
+    rotor: str
+    carrier: str | None
+    axis: Array
+    inertia: float
+
+
+@dataclass(frozen=True)
+class MovingBody:
+    """A body that takes part in the recursion.
+
+    Attributes:
+        name: Its name.
+        parent: Its parent body; None is the world.
+        rotation: Columns are its axes in the parent frame at joint coordinate zero, shape (3, 3).
+        position: Its origin in the parent frame at joint coordinate zero [m], shape (3,).
+        joint_type: "free", "revolute" or "prismatic".
+        axis: Unit joint axis in its own frame, shape (3,).
+        inertia: Spatial inertia about its own origin, angular part first, shape (6, 6).
+    """
+
+    name: str
+    parent: str | None
+    rotation: Array
+    position: Array
+    joint_type: str
+    axis: Array
+    inertia: Array
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """A robot at one transmission level, ready for the recursions.
+
+    Attributes:
+        robot: The description it was made from.
+        level: Transmission level.
+        tree: Clusters of the robot, including eliminated rotors.
+        bodies: The bodies that take part in the recursion, by name, parents first.
+        spins: Spins of eliminated or approximated rotors, in each cluster.
+    """
+
+    robot: Robot
+    level: Level
+    tree: ClusterTree
+    bodies: dict[str, MovingBody]
+    spins: tuple[tuple[Spin, ...], ...]
+
+    def moving(self, cluster: Cluster) -> list[MovingBody]:
+        """Return the bodies of a cluster that take part in the recursion, parents first."""
+        return [self.bodies[name] for name in cluster.bodies if name in self.bodies]
+
+
+def build_mechanism(
+    robot: Robot, level: str = "exact", *, locked_rotors: bool = True, eliminate: bool = True
+) -> Mechanism:
+    """Prepare a robot for the recursions at a transmission level.
+
+    Args:
+        robot: The description.
+        level: "exact", "coupled", "armature" or "none".
+        locked_rotors: Whether the mass and inertia at rest of an approximated rotor stay with its carrier. False deletes
+            them, as in the "unconstrained" and "approximate" systems of the constraint-embedding paper's figures.
+        eliminate: Whether symmetric rotors are eliminated at the exact level; False keeps every rotor as a body, the
+            general algorithm that the elimination is tested against.
+
+    Raises:
+        RobotError: If the level does not exist.
+    """
+    if level not in LEVELS:
+        raise RobotError(f"{robot.name}: transmission {level!r} does not exist; expected one of {', '.join(LEVELS)}")
+    tree = cluster_tree(robot)
+    kept = {
+        body.name
+        for body in robot.bodies
+        if body.kind == "link" or (level == "exact" and not (eliminate and is_axisymmetric(body)))
+    }
+    carriers = {body.parent for body in robot.bodies}
+    for body in robot.bodies:
+        if body.name not in kept and body.name in carriers:
+            raise RobotError(f"{robot.name}: rotor {body.name!r} carries another body; only links can")
+    inertias = {name: spatial_inertia(robot.body(name)) for name in kept}
+    for body in robot.bodies:
+        if body.name not in kept and body.parent is not None and (locked_rotors or level == "exact"):
+            inertias[body.parent] = inertias[body.parent] + _seen_from_parent(body)
+    bodies = {b.name: _moving_body(b, inertias[b.name]) for b in robot.bodies if b.name in kept}
+    spins = tuple(
+        tuple(_spin(robot.body(name)) for name in cluster.bodies if name not in kept) for cluster in tree.clusters
+    )
+    return Mechanism(robot, level, tree, bodies, spins)  # type: ignore[arg-type]
+
+
+def is_axisymmetric(rotor: Body) -> bool:
+    """Whether a rotor's inertia is symmetric about its spin axis and its centre of mass lies on it."""
+    u = np.array(rotor.joint.axis)
+    com = np.array(rotor.inertial.com)
+    inertia = np.array(rotor.inertial.inertia)
+    spin = skew(u)
+    asymmetry = float(np.abs(spin @ inertia - inertia @ spin).max())
+    offset = rotor.inertial.mass * float(np.linalg.norm(np.cross(u, com))) ** 2
+    scale = float(np.abs(inertia).max())
+    revolute = rotor.joint.type == "revolute"
+    return revolute and asymmetry <= AXISYMMETRY_TOLERANCE * scale and offset <= AXISYMMETRY_TOLERANCE * scale
+
+
+def skew(x: Array) -> Array:
+    """Return the matrix of the cross product, `skew(x) @ y = cross(x, y)`."""
+    return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
+
+
+def spatial_inertia(body: Body) -> Array:
+    """Return the spatial inertia of a body about its own origin, shape (6, 6). Featherstone 2008, eq. 2.63."""
+    m, c = body.inertial.mass, skew(np.array(body.inertial.com))
+    inertia = np.array(body.inertial.inertia)
+    return np.block([[inertia + m * c @ c.T, m * c], [m * c.T, m * np.eye(3)]])
+
+
+def snapped(x: Array) -> Array:
+    """Round entries that differ from an integer by rounding only, so that symbolic code can drop them."""
+    nearest = np.round(x)
+    return np.where(np.abs(x - nearest) < 1e-12, nearest, x)
+
+
+def _seen_from_parent(body: Body) -> Array:
+    """Spatial inertia of a body at joint coordinate zero, about its parent's origin, in its parent's axes."""
+    rotation, position = np.array(body.placement.rotation), np.array(body.placement.position)
+    to_body = np.block([[rotation.T, np.zeros((3, 3))], [-rotation.T @ skew(position), rotation.T]])
+    inertia = to_body.T @ spatial_inertia(body) @ to_body
+    return np.where(np.abs(inertia) < 1e-15 * np.abs(inertia).max(), 0.0, inertia)
+
+
+def _moving_body(body: Body, inertia: Array) -> MovingBody:
+    return MovingBody(
+        name=body.name,
+        parent=body.parent,
+        rotation=snapped(np.array(body.placement.rotation)),
+        position=np.array(body.placement.position),
+        joint_type=body.joint.type,
+        axis=snapped(np.array(body.joint.axis)),
+        inertia=inertia,
+    )
+
+
+def _spin(rotor: Body) -> Spin:
+    axis = np.array(rotor.joint.axis)
+    moment = float(axis @ np.array(rotor.inertial.inertia) @ axis)
+    com_offset = math.fsum(np.cross(axis, np.array(rotor.inertial.com)) ** 2)
+    return Spin(
+        rotor=rotor.name,
+        carrier=rotor.parent,
+        axis=snapped(np.array(rotor.placement.rotation) @ axis),
+        inertia=moment + rotor.inertial.mass * com_offset,
+    )
