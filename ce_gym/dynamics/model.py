@@ -51,6 +51,8 @@ class Model:
     ) -> None:
         self.robot = robot if isinstance(robot, Robot) else load_robot(robot)
         self.transmission = transmission
+        self.locked_rotors = locked_rotors
+        self.eliminated = eliminate_rotors
         self.mechanism = build_mechanism(
             self.robot, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors
         )
@@ -81,8 +83,9 @@ class Model:
 
     @property
     def total_mass(self) -> float:
-        """Mass of all bodies that take part, locked rotors included [kg]."""
-        return float(sum(body.inertia[3, 3] for body in self.mechanism.bodies.values()))
+        """Mass of all bodies, the same at every level unless locked rotors are deleted [kg]."""
+        deleted = not self.locked_rotors and self.transmission != "exact"
+        return self.robot.total_mass - (sum(r.inertial.mass for r in self.robot.rotors()) if deleted else 0.0)
 
     @property
     def body_names(self) -> tuple[str, ...]:

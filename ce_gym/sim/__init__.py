@@ -1,0 +1,5 @@
+"""Many robots stepped together: state arrays and compiled kernels."""
+
+from ce_gym.sim.simulator import Simulator
+
+__all__ = ["Simulator"]

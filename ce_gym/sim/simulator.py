@@ -1,0 +1,209 @@
+"""`Simulator`: many copies of one robot, stepped together by one compiled kernel.
+
+Holds state arrays and knows when to call the kernel; the physics is `ce_gym.dynamics.step`, the machine code comes from
+`ce_gym.compile`. May know models, dynamics and compile; no tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ce_gym.compile import Buffer, Call, Kernel, Program, load_kernel
+from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.step import StepOptions, step_function
+from ce_gym.model import ContactMaterial, Robot
+from ce_gym.sim.tiles import read_rows, tiles, write_rows
+
+OUTPUTS = ("torque", "contact_forces")
+
+
+class Simulator:
+    """Steps `num_envs` copies of a robot in time.
+
+    Args:
+        model: The robot at a transmission level.
+        num_envs: Number of robots.
+        dt: Length of a sub-step [s]; the step is linearly implicit and stable to 10 ms and more.
+        dtype: "float64" or "float32" for state and arithmetic.
+        num_threads: Threads the robots are split over; results do not depend on it.
+        control: What `target` means: "position" for joint positions [rad] through the robot's PD gains, "torque" for
+            joint torques [N m].
+        contacts: Which contact spheres can touch the ground: "all", the name of a group such as "foot", or names.
+        material: Compliance and friction of the contacts; the robot's own if None.
+        outputs: Which of "torque" and "contact_forces" to compute; those left out cost nothing and read as errors.
+
+    Raises:
+        ValueError: If an argument is not one of the choices.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        num_envs: int = 1,
+        dt: float = 0.005,
+        dtype: str = "float64",
+        num_threads: int = 1,
+        *,
+        control: str = "position",
+        contacts: str | Sequence[str] = "all",
+        material: ContactMaterial | None = None,
+        outputs: Sequence[str] = OUTPUTS,
+    ) -> None:
+        _check("num_envs", num_envs, num_envs >= 1, "at least 1")
+        _check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
+        _check("dtype", dtype, dtype in ("float64", "float32"), "'float64' or 'float32'")
+        _check("num_threads", num_threads, num_threads >= 1, "at least 1")
+        _check("control", control, control in ("position", "torque"), "'position' or 'torque'")
+        for name in outputs:
+            _check("outputs", name, name in OUTPUTS, f"any of {', '.join(OUTPUTS)}")
+        self.model, self.num_envs, self.dt = model, num_envs, dt
+        self.dtype, self.num_threads = dtype, num_threads
+        self.contact_names = select_contacts(model.robot, contacts)
+        self.options = StepOptions(dt, control, self.contact_names, material or model.robot.material)  # type: ignore[arg-type]
+        sizes = {"torque": len(model.joint_links), "contact_forces": 3 * len(self.contact_names)}
+        self._outputs = {name: sizes[name] for name in OUTPUTS if name in outputs and sizes[name] > 0}
+        self._kernel = load_step_kernel(model, self.options, self._outputs, dtype)
+        self._arrays = {
+            name: tiles(num_envs, buffer.size, dtype)
+            for name, buffer in self._kernel.buffers.items()
+            if buffer.kind == "tiles"
+        }
+        self.reset()
+
+    def reset(self, mask: ArrayLike | None = None) -> None:
+        """Put robots at rest into the standing pose.
+
+        Args:
+            mask: Which robots, bool, shape (num_envs,); all of them if None.
+        """
+        self.set_state(self.model.standing_q, np.zeros(self.model.nv), mask)
+
+    def set_state(self, q: ArrayLike, v: ArrayLike, mask: ArrayLike | None = None) -> None:
+        """Set positions and velocities, and clear divergence.
+
+        Args:
+            q: Positions, shape (num_envs, nq) or (nq,).
+            v: Velocities, shape (num_envs, nv) or (nv,).
+            mask: Which robots, bool, shape (num_envs,); all of them if None.
+
+        Raises:
+            ValueError: If a shape is wrong or a number is not finite.
+        """
+        chosen = None if mask is None else np.asarray(mask, dtype=bool)
+        if chosen is not None and chosen.shape != (self.num_envs,):
+            raise ValueError(f"mask has shape {chosen.shape}; expected ({self.num_envs},)")
+        for name, value, size in (("q", q, self.model.nq), ("v", v, self.model.nv)):
+            value = np.asarray(value, dtype=float)
+            if value.shape not in ((size,), (self.num_envs, size)):
+                raise ValueError(f"{name} has shape {value.shape}; expected ({size},) or ({self.num_envs}, {size})")
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} holds a number that is not finite")
+            write_rows(self._arrays[name], np.broadcast_to(value, (self.num_envs, size)), chosen)
+        write_rows(self._arrays["diverged"], np.zeros((self.num_envs, 1)), chosen)
+
+    def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
+        """Advance all robots by `n_substeps` sub-steps.
+
+        Args:
+            target: Joint positions [rad] or torques [N m], shape (num_envs, nj) or (nj,), in the order of
+                `model.joint_links`.
+            n_substeps: Number of sub-steps of length `dt`.
+
+        Raises:
+            ValueError: If the shape is wrong.
+        """
+        n = len(self.model.joint_links)
+        rows = np.asarray(target, dtype=self.dtype)
+        if rows.shape not in ((n,), (self.num_envs, n)):
+            raise ValueError(f"target has shape {rows.shape}; expected ({n},) or ({self.num_envs}, {n})")
+        rows = np.ascontiguousarray(np.broadcast_to(rows, (self.num_envs, n)))
+        self._kernel(
+            self._arrays | {"target": rows},
+            self.num_envs,
+            repeats={"n_substeps": n_substeps},
+            num_threads=self.num_threads,
+        )
+
+    @property
+    def q(self) -> NDArray:
+        """Positions, a copy, shape (num_envs, nq)."""
+        return self._read("q")
+
+    @property
+    def v(self) -> NDArray:
+        """Velocities, a copy, shape (num_envs, nv)."""
+        return self._read("v")
+
+    @property
+    def diverged(self) -> NDArray[np.bool_]:
+        """Robots whose state went out of bounds; they stay frozen at their last good state, shape (num_envs,)."""
+        return self._read("diverged")[:, 0] > 0.5
+
+    @property
+    def torque(self) -> NDArray:
+        """Motor torques at the joints, mean of the last sub-step [N m], shape (num_envs, nj)."""
+        return self._read("torque")
+
+    @property
+    def contact_forces(self) -> NDArray:
+        """Forces on the contact spheres, mean of the last sub-step, world axes [N], shape (num_envs, n_contacts, 3)."""
+        if not self.contact_names:
+            return np.zeros((self.num_envs, 0, 3), self.dtype)
+        return self._read("contact_forces").reshape(self.num_envs, -1, 3)
+
+    def _read(self, name: str) -> NDArray:
+        if name not in self._arrays:
+            raise ValueError(f"{name} is not computed; ask for it with Simulator(..., outputs=({name!r},))")
+        return read_rows(self._arrays[name], self.num_envs)
+
+
+def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, ...]:
+    """Return names of contact spheres: all of them, those of a group, or those named.
+
+    Raises:
+        ValueError: If a name or group does not exist.
+    """
+    names = tuple(contact.name for contact in robot.contacts)
+    if isinstance(contacts, str):
+        groups = sorted({contact.group for contact in robot.contacts})
+        chosen = names if contacts == "all" else tuple(c.name for c in robot.contacts if c.group == contacts)
+        _check("contacts", contacts, contacts == "all" or bool(chosen), f"'all', a group ({', '.join(groups)}) or names")
+        return chosen
+    for name in contacts:
+        _check("contacts", name, name in names, f"names among {', '.join(names)}")
+    return tuple(contacts)
+
+
+def model_key(model: Model) -> str:
+    """Return a text that is equal for equal models, for cache keys; where a robot was read from does not matter."""
+    return f"{replace(model.robot, source='', notes=())!r} {model.mechanism.level} {model.locked_rotors} {model.eliminated}"
+
+
+def load_step_kernel(model: Model, options: StepOptions, outputs: dict[str, int], dtype: str) -> Kernel:
+    """Compile, or load from the cache, the kernel that repeats a sub-step.
+
+    Args:
+        model: The robot at a transmission level.
+        options: The scene.
+        outputs: Sizes of the optional outputs to compute, by name.
+        dtype: "float64" or "float32".
+    """
+
+    def build() -> Program:
+        nj = len(model.joint_links)
+        sizes = {"q": model.nq, "v": model.nv, "diverged": 1} | outputs
+        buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()] + [Buffer("target", nj, "rows_in")]
+        function = step_function(model.mechanism, options, tuple(outputs))
+        call = Call(function, ("q", "v", "diverged", "target"), tuple(sizes), repeat="n_substeps")
+        return Program(f"{model.robot.name} {model.transmission} step", tuple(buffers), (call,))
+
+    return load_kernel(f"step {model_key(model)} {options!r} {outputs!r}", build, dtype)
+
+
+def _check(argument: str, value: object, valid: bool, expected: str) -> None:
+    if not valid:
+        raise ValueError(f"{argument}={value!r}; expected {expected}")
