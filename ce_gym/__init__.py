@@ -1,0 +1,18 @@
+"""Gymnasium environments for legged robots whose physics keeps rotors, gears and belts.
+
+    import gymnasium, ce_gym
+    env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0")
+
+`load_robot` reads a robot, `Model` is its dynamics at a transmission level, `Simulator` steps thousands of copies.
+"""
+
+from ce_gym.dynamics.model import Model
+from ce_gym.envs.registration import environment_ids, register_environments
+from ce_gym.model import Robot, RobotError, load_robot, robots
+from ce_gym.sim.simulator import Simulator
+
+__version__ = "0.1.0"
+
+__all__ = ["Model", "Robot", "RobotError", "Simulator", "environment_ids", "load_robot", "robots"]
+
+register_environments()

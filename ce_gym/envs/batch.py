@@ -1,0 +1,114 @@
+"""A batch of environments without Gymnasium: state arrays, two kernels and random streams.
+
+Both the single environment and the vector environment are thin shells over this, so that one lane of a batch and an
+environment of its own are the same numbers, bit for bit. May know programs, compile and sim; no Gymnasium.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.compile import Kernel, load_kernel
+from ce_gym.envs.program import TaskProgram
+from ce_gym.sim.simulator import model_key
+from ce_gym.sim.tiles import read_rows, tiles, write_rows
+
+
+@dataclass
+class Outcome:
+    """What a control step leaves behind, fresh arrays.
+
+    Attributes:
+        observation: float32, shape (num_envs, n_obs).
+        reward: float64, shape (num_envs,).
+        terminated: Failed, shape (num_envs,).
+        diverged: Numerically diverged and frozen at the last good state, shape (num_envs,).
+    """
+
+    observation: NDArray[np.float32]
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    diverged: NDArray[np.bool_]
+
+
+class Batch:
+    """Many copies of one task on one robot.
+
+    Args:
+        program: The task on the robot.
+        num_envs: Number of copies.
+        dtype: "float64" or "float32" for state and arithmetic.
+        num_threads: Threads the copies are split over.
+    """
+
+    def __init__(self, program: TaskProgram, num_envs: int, dtype: str, num_threads: int) -> None:
+        self.program, self.num_envs, self.dtype, self.num_threads = program, num_envs, dtype, num_threads
+        self._step, self._reset = _kernels(program, dtype)
+        self.observation_size = self._step.buffers["observation"].size
+        self._arrays = {name: tiles(num_envs, size, dtype) for name, size in program.state_sizes.items()}
+        self._arrays["chosen"] = tiles(num_envs, 1, dtype)
+        self.keys = np.zeros(num_envs, np.uint64)
+        self._counters = np.zeros(num_envs, np.int64)
+
+    def seed(self, keys: NDArray[np.uint64]) -> None:
+        """Start the random streams of all copies anew, one key for each, shape (num_envs,)."""
+        self.keys[:] = keys
+        self._counters[:] = 0
+
+    def reset(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Start new episodes where `mask` is true.
+
+        Returns:
+            Observations, shape (num_envs, n_obs); rows outside the mask are undefined.
+        """
+        observation = np.empty((self.num_envs, self.observation_size), np.float32)
+        write_rows(self._arrays["chosen"], mask[:, None].astype(self.dtype))
+        arrays = self._arrays | {"observation": observation}
+        self._reset(arrays, self.num_envs, keys=self.keys, counters=self._counters, num_threads=self.num_threads)
+        self._counters += mask
+        return observation
+
+    def step(self, action: NDArray[np.float32], ignored: NDArray[np.bool_] | None = None) -> Outcome:
+        """Carry out one control step.
+
+        Args:
+            action: Shape (num_envs, n_joints), finite; clipped to [-1, 1].
+            ignored: Copies about to be reset, whose step must not use up random numbers, shape (num_envs,).
+        """
+        observation = np.empty((self.num_envs, self.observation_size), np.float32)
+        outcome = np.empty((self.num_envs, 3))
+        self._step(
+            self._arrays | {"action_in": action, "observation": observation, "outcome": outcome},
+            self.num_envs,
+            repeats={"n_substeps": self.program.task.n_substeps},
+            keys=self.keys,
+            counters=self._counters,
+            num_threads=self.num_threads,
+        )
+        self._counters += 1 if ignored is None else ~ignored
+        return Outcome(observation, outcome[:, 0].copy(), outcome[:, 1] > 0.5, outcome[:, 2] > 0.5)
+
+    def rows(self, name: str) -> NDArray:
+        """Return a copy of a state buffer, shape (num_envs, size); KeyError if there is none."""
+        return read_rows(self._arrays[name], self.num_envs)
+
+    def write(self, name: str, rows: NDArray, mask: NDArray[np.bool_] | None = None) -> None:
+        """Overwrite a state buffer, for tests, evaluation and curricula; shape (num_envs, size)."""
+        write_rows(self._arrays[name], rows, mask)
+
+    def episode_sums(self, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+        """Return sums over the current episodes, zero outside the mask, each shape (num_envs,)."""
+        lanes = self._arrays["sums"].shape[2]
+        index = np.flatnonzero(mask)
+        sums = np.zeros((self.num_envs, len(self.program.sum_names)))
+        sums[index] = self._arrays["sums"][index // lanes, :, index % lanes]
+        return dict(zip(self.program.sum_names, sums.T, strict=True))
+
+
+def _kernels(program: TaskProgram, dtype: str) -> tuple[Kernel, Kernel]:
+    key = f"{model_key(program.model)} {program.task!r} {program.contact_forces}"
+    step = load_kernel(f"environment {key}", program.step_program, dtype)
+    return step, load_kernel(f"reset {key}", program.reset_program, dtype)

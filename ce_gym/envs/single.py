@@ -1,0 +1,101 @@
+"""`LeggedEnv`: one robot as a Gymnasium `Env`, a batch of one. May know batches and Gymnasium."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.utils import EzPickle
+from numpy.typing import NDArray
+
+from ce_gym.envs.program import OBSERVATION_BOUND
+from ce_gym.envs.setup import make_batch
+
+
+class LeggedEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]], EzPickle):
+    """One robot and one task.
+
+    Observations and actions are float32 vectors; `observation_structure` names the blocks of the observation. `info`
+    holds `diverged`, whether the simulation failed numerically: the episode is then truncated, at the last good state.
+
+    Args:
+        robot: Name of a robot that ships with the package, or a path to a robot file.
+        task: Name of a task.
+        **kwargs: See `ce_gym.envs.setup.make_batch`.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own declaration)
+
+    def __init__(self, robot: str = "mini_cheetah", task: str = "velocity", **kwargs: Any) -> None:
+        EzPickle.__init__(self, robot, task, **kwargs)
+        self.batch = make_batch(robot, task, num_envs=1, **kwargs)
+        self.model = self.batch.program.model
+        self.observation_space, self.action_space = spaces(self.batch.observation_size, self.batch.program.n_joints)
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
+        self.render_mode = None
+        self._seeded = False
+
+    @property
+    def dt(self) -> float:
+        """Length of a control step [s]."""
+        return self.batch.program.control_dt
+
+    @property
+    def observation_structure(self) -> dict[str, int]:
+        """Length of each observation block, in order."""
+        return self.batch.program.observation_sizes
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start a new episode; see `gymnasium.Env.reset`. The same seed gives the same episodes, step by step."""
+        super().reset(seed=seed)
+        if seed is not None or not self._seeded:
+            key = seed if seed is not None else self.np_random.integers(2**63)
+            self.batch.seed(np.array([key], np.uint64))
+            self._seeded = True
+        return self.batch.reset(np.ones(1, bool))[0], {"diverged": False}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Carry out one control step; see `gymnasium.Env.step`.
+
+        Raises:
+            ValueError: If the action has the wrong shape or is not finite.
+        """
+        outcome = self.batch.step(checked_action(action, (1, self.batch.program.n_joints)))
+        diverged = bool(outcome.diverged[0])
+        return outcome.observation[0], float(outcome.reward[0]), bool(outcome.terminated[0]), diverged, {"diverged": diverged}
+
+    def state(self) -> dict[str, NDArray]:
+        """Return what a recorder needs: q, v, command and, if computed, contact_forces (n_contacts, 3)."""
+        return {name: rows[0] for name, rows in recorded_state(self.batch).items()}
+
+
+def spaces(n_observations: int, n_actions: int) -> tuple[Box, Box]:
+    """Return observation and action space of one robot."""
+    bound = OBSERVATION_BOUND
+    return Box(-bound, bound, (n_observations,), np.float32), Box(-1.0, 1.0, (n_actions,), np.float32)
+
+
+def checked_action(action: Any, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return an action as contiguous float32 rows.
+
+    Raises:
+        ValueError: If its shape is wrong or it is not finite.
+    """
+    rows = np.ascontiguousarray(action, dtype=np.float32)
+    if rows.shape != shape and rows.shape != (shape[1],) * (shape[0] == 1):
+        raise ValueError(f"action has shape {np.shape(action)}; expected {shape if shape[0] > 1 else shape[1:]}")
+    if not np.isfinite(rows).all():
+        raise ValueError("action holds a number that is not finite")
+    return rows.reshape(shape)
+
+
+def recorded_state(batch: Any) -> dict[str, NDArray]:
+    """Return copies of q (n, nq), v (n, nv), command (n, 3) and, if computed, contact_forces (n, n_contacts, 3)."""
+    state = {name: batch.rows(name) for name in ("q", "v", "command")}
+    if batch.program.contact_forces:
+        state["contact_forces"] = batch.rows("contact_forces").reshape(batch.num_envs, -1, 3)
+    return state

@@ -1,0 +1,182 @@
+"""`LeggedVectorEnv`: many robots as a native Gymnasium `VectorEnv`. May know batches and Gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from ce_gym.envs.setup import make_batch
+from ce_gym.envs.single import checked_action, recorded_state, spaces
+
+Observations = NDArray[np.float32]
+
+
+class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
+    """Many copies of one robot and one task, stepped by one kernel.
+
+    Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit, whatever
+    the size of the batch and the number of threads. `infos` holds `diverged`, bool (num_envs,): environments whose
+    simulation failed numerically; they are truncated at their last good state and reset alone. Where an episode has
+    ended, `infos["episode_terms"]` has its length, its return and every reward term and metric (see `Task`).
+
+    Args:
+        num_envs: Number of environments.
+        max_episode_steps: Control steps until time is up; the task's own if None.
+        autoreset_mode: When a finished environment starts again: "NextStep" (Gymnasium's default), "SameStep" or
+            "Disabled", see `gymnasium.vector.AutoresetMode`.
+        robot: Name of a robot that ships with the package, or a path to a robot file.
+        task: Name of a task.
+        **kwargs: See `ce_gym.envs.setup.make_batch`.
+
+    Raises:
+        ValueError: If an argument is not one of the choices.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        robot: str = "mini_cheetah",
+        task: str = "velocity",
+        **kwargs: Any,
+    ) -> None:
+        self.autoreset_mode = as_autoreset_mode(autoreset_mode)
+        self.num_envs = num_envs
+        self.batch = make_batch(robot, task, num_envs=num_envs, **kwargs)
+        program = self.batch.program
+        self.model = program.model
+        self.max_episode_steps = max_episode_steps or program.task.episode_length
+        self.metadata = {
+            **self.metadata,
+            "autoreset_mode": self.autoreset_mode,
+            "render_fps": round(1 / program.control_dt),
+        }
+        self.single_observation_space, self.single_action_space = spaces(self.batch.observation_size, program.n_joints)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.render_mode = None
+        self._elapsed = np.zeros(num_envs, np.int64)
+        self._finished = np.zeros(num_envs, bool)
+        self._observation = np.zeros((num_envs, self.batch.observation_size), np.float32)
+        self._seeded = False
+
+    @property
+    def dt(self) -> float:
+        """Length of a control step [s]."""
+        return self.batch.program.control_dt
+
+    @property
+    def observation_structure(self) -> dict[str, int]:
+        """Length of each observation block, in order."""
+        return self.batch.program.observation_sizes
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start new episodes; see `gymnasium.vector.VectorEnv.reset`.
+
+        Args:
+            seed: One number `s`, giving seeds s, s + 1, ..., or one for each environment.
+            options: `reset_mask`, bool (num_envs,), resets only some environments.
+
+        Raises:
+            ValueError: If the mask or the list of seeds has the wrong shape.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        mask = self._reset_mask(options)
+        self._seed(seed)
+        fresh = self.batch.reset(mask)
+        self._observation = np.where(mask[:, None], fresh, self._observation)
+        self._elapsed[mask] = 0
+        self._finished[mask] = False
+        return self._observation.copy(), {"diverged": np.zeros(self.num_envs, bool)}
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[Observations, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Carry out one control step; see `gymnasium.vector.VectorEnv.step`.
+
+        Raises:
+            ValueError: If the actions have the wrong shape or are not finite.
+            gymnasium.error.ResetNeeded: In "Disabled" mode, if a finished environment has not been reset.
+        """
+        rows = checked_action(actions, (self.num_envs, self.batch.program.n_joints))
+        resetting = self._finished
+        some_reset = bool(resetting.any())
+        if some_reset and self.autoreset_mode == AutoresetMode.DISABLED:
+            raise gymnasium.error.ResetNeeded(
+                f"{int(resetting.sum())} environments are finished; reset them with options={{'reset_mask': ...}}"
+            )
+        outcome = self.batch.step(rows, resetting if some_reset else None)
+        self._elapsed += 1
+        truncated = (self._elapsed >= self.max_episode_steps) | outcome.diverged
+        terminated, reward, observation = outcome.terminated, outcome.reward, outcome.observation
+        infos: dict[str, Any] = {"diverged": outcome.diverged}
+        if some_reset:  # next-step mode: these environments ignore the action and show the first observation instead
+            fresh = self.batch.reset(resetting)
+            observation[resetting] = fresh[resetting]
+            reward[resetting] = 0.0
+            for flags in (terminated, truncated, outcome.diverged):
+                flags[resetting] = False
+            self._elapsed[resetting] = 0
+        done = terminated | truncated
+        if done.any():
+            infos["episode_terms"] = {"length": self._elapsed * done, **self.batch.episode_sums(done)}
+            infos["_episode_terms"] = done
+            if self.autoreset_mode == AutoresetMode.SAME_STEP:
+                infos["final_obs"], infos["_final_obs"] = observation.copy(), done.copy()
+                infos["final_info"], infos["_final_info"] = {"diverged": outcome.diverged.copy()}, done.copy()
+                fresh = self.batch.reset(done)
+                observation[done] = fresh[done]
+                self._elapsed[done] = 0
+                done = np.zeros(self.num_envs, bool)
+        self._finished = done
+        self._observation = observation
+        return observation.copy(), reward, terminated, truncated, infos
+
+    def state(self) -> dict[str, NDArray]:
+        """Return what a recorder needs: q, v, command and, if computed, contact_forces (num_envs, n_contacts, 3)."""
+        return recorded_state(self.batch)
+
+    def _reset_mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
+        """Read, but do not take away, the mask: wrappers outside look at it too."""
+        if not options or "reset_mask" not in options:
+            return np.ones(self.num_envs, bool)
+        mask = options["reset_mask"]
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(f"reset_mask={mask!r}; expected a bool array of shape ({self.num_envs},) with a true entry")
+        return mask
+
+    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
+        if seed is None:
+            if not self._seeded:
+                self.batch.seed(self.np_random.integers(2**63, size=self.num_envs).astype(np.uint64))
+        elif isinstance(seed, int | np.integer):
+            self.batch.seed(np.arange(seed, seed + self.num_envs).astype(np.uint64))
+        else:
+            if len(seed) != self.num_envs or any(s is None for s in seed):
+                raise ValueError(f"seed has {len(seed)} entries; expected {self.num_envs} whole numbers")
+            self.batch.seed(np.array(seed, np.uint64))
+        self._seeded = True
+
+
+def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    """Return an autoreset mode given as itself, by name ("SAME_STEP") or by value ("SameStep").
+
+    Raises:
+        ValueError: If there is no such mode.
+    """
+    for known in AutoresetMode:
+        if mode in (known, known.name, known.value):
+            return known
+    raise ValueError(f"autoreset_mode={mode!r}; expected one of {', '.join(str(m.value) for m in AutoresetMode)}")
