@@ -1,0 +1,205 @@
+"""The implicit step against a dense solve, analytic motions and rest states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ce_gym.dynamics import Model
+from ce_gym.dynamics.contact import SLIP_SPEED
+from ce_gym.dynamics.step import StepOptions, step_function
+from ce_gym.model import ContactMaterial, ContactSphere, Robot
+from ce_gym.model.mechanism import LEVELS
+
+ALL = "all"
+
+
+def stepper(model: Model, dt: float = 0.005, **options):
+    contacts = options.pop("contacts", ALL)
+    names = model.contact_names if contacts == ALL else contacts
+    material = options.pop("material", model.robot.material)
+    scene = StepOptions(dt, contacts=names, material=material, **options)
+    function = step_function(model.mechanism, scene, ("torque", "contact_forces"))
+
+    def step(q, v, target, diverged=0.0):
+        return [np.array(x.full()).ravel() for x in function(q, v, diverged, target)]
+
+    return step
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_step_equals_a_dense_solve(level: str, random_state):
+    """(M + dt J^T C J + slope) vdot = tau - bias + J^T (f0 - dt C Jdot v), assembled in numpy from its parts."""
+    model, dt, material = Model("mini_cheetah", level), 0.004, ContactMaterial(3e4, 200.0, 0.7)
+    rng = np.random.default_rng(5)
+    q, v = model.standing_q.copy(), rng.normal(0, 0.3, model.nv)
+    q[2] -= 0.003
+    q[7:] += rng.normal(0, 0.02, 12)
+    target = q[7:] + rng.normal(0, 0.05, 12)
+    _, v_next, _, torque, forces = stepper(model, dt, material=material)(q, v, target)
+
+    robot = model.robot
+    A, b = model.mass_matrix(q), -model.bias_force(q, v)
+    joints = np.arange(6, model.nv)
+    kp, kd = (np.array([dict(g)[n] for n in robot.independent]) for g in (robot.gains.kp, robot.gains.kd))
+    damping = np.array([robot.body(n).joint.damping for n in robot.independent])
+    b[joints] += kp * (target - q[7:]) - (kd + dt * kp) * v[6:] - damping * v[6:]
+    A[joints, joints] += dt * (kd + dt * kp + damping)
+    expected_forces = []
+    parts = [contact_parts(model, sphere, q, v, dt, material) for sphere in robot.contacts]
+    for J, Jdot_v, f0, C in parts:
+        A += dt * J.T @ C @ J
+        b += J.T @ (f0 - dt * C @ Jdot_v)
+    vdot = np.linalg.solve(A, b)
+    for J, Jdot_v, f0, C in parts:
+        expected_forces.append(f0 - dt * C @ (J @ vdot + Jdot_v))
+    assert sum(np.linalg.norm(f) > 1 for f in expected_forces) == 4  # the four feet are loaded
+    np.testing.assert_allclose(forces.reshape(-1, 3), expected_forces, atol=1e-9)
+    np.testing.assert_allclose(v_next[6:], v[6:] + dt * vdot[6:], atol=1e-10)
+    np.testing.assert_allclose(v_next[:3], v[:3] + dt * vdot[:3], atol=1e-10)
+    np.testing.assert_allclose(torque, kp * (target - q[7:]) - (kd + dt * kp) * (v[6:] + dt * vdot[6:]), atol=1e-9)
+
+
+def contact_parts(model: Model, sphere: ContactSphere, q, v, dt: float, material: ContactMaterial):
+    """World-frame J, Jdot v, force at zero acceleration and effective damping of one sphere, by numpy."""
+    lowest = sphere_bottom(model, sphere, q)
+    world_point, J = point_jacobian(model, sphere.body, lowest, q)
+    Jdot_v = point_bias(model, sphere.body, lowest, q, v)
+    velocity, n = J @ v, np.array([0.0, 0.0, 1.0])
+    depth, normal_slope = -world_point[2], material.damping + dt * material.stiffness
+    push = material.stiffness * depth - normal_slope * velocity[2]
+    if depth - dt * velocity[2] <= 0 or push <= 0:
+        return J, Jdot_v, np.zeros(3), np.zeros((3, 3))
+    slip = velocity - velocity[2] * n
+    tangent_slope = material.friction * push / np.sqrt(slip @ slip + SLIP_SPEED**2)
+    C = normal_slope * np.outer(n, n) + tangent_slope * (np.eye(3) - np.outer(n, n))
+    return J, Jdot_v, push * n - tangent_slope * slip, C
+
+
+def sphere_bottom(model: Model, sphere: ContactSphere, q) -> np.ndarray:
+    _, rotations = model.body_poses(q)
+    R = rotations[model.body_names.index(sphere.body)]
+    return np.array(sphere.position) - sphere.radius * R.T @ [0.0, 0.0, 1.0]
+
+
+def point_on(model: Model, body: str, point) -> ca.Function:
+    """Position and velocity of a body-fixed point as a function of (q, v), through our kinematics."""
+    robot = replace(model.robot, contacts=(ContactSphere("point", body, tuple(map(float, point)), 0.0),))
+    return Model(robot, model.transmission).casadi_function("contact_points")
+
+
+def point_jacobian(model: Model, body: str, point, q) -> tuple[np.ndarray, np.ndarray]:
+    f = point_on(model, body, point)
+    columns = [f(q, unit)[1].full().ravel() for unit in np.eye(model.nv)]
+    return f(q, np.zeros(model.nv))[0].full().ravel(), np.array(columns).T
+
+
+def point_bias(model: Model, body: str, point, q, v) -> np.ndarray:
+    """Jdot v by a central difference of J(q) v along v, plus the turning of the base-fixed velocity components."""
+    f, h = point_on(model, body, point), 1e-5
+
+    def moved(sign: float) -> np.ndarray:
+        from ce_gym.dynamics.integration import advance
+
+        q_s, v_s = ca.SX.sym("q", model.nq), ca.SX.sym("v", model.nv)
+        q_next, _ = advance(q_s, v_s, ca.SX(model.nv, 1), sign * h, True)
+        # the linear base velocity turns with the body while its components stay: vdot = 0 as in the definition of J
+        return f(ca.Function("move", [q_s, v_s], [q_next])(q, v), v)[1].full().ravel()
+
+    return (moved(1.0) - moved(-1.0)) / (2 * h)
+
+
+def test_free_flight_is_a_straight_line():
+    """Without gravity and joint forces the centre of mass moves uniformly, however the robot tumbles."""
+    robot = replace(Model("mini_cheetah").robot, gravity=(0.0, 0.0, 0.0), contacts=())
+    model = Model(robot)
+    step = stepper(model, 0.001, control="torque", contacts=())
+    q, v = model.standing_q.copy(), np.zeros(model.nv)
+    v[:6] = [2.0, -1.0, 3.0, 0.4, 0.2, -0.3]
+    for _ in range(200):
+        q, v, *_ = step(q, v, np.zeros(12))
+        assert abs(np.linalg.norm(q[3:7]) - 1) < 1e-12
+
+
+def test_rest_depth_is_weight_over_stiffness():
+    """A contact has no bias: the robot rests where the springs carry its weight."""
+    model = Model("mini_cheetah")
+    step = stepper(model, 0.005)
+    q, v, target = model.standing_q.copy(), np.zeros(model.nv), model.standing_q[7:]
+    for _ in range(4000):
+        q, v, _, _, forces = step(q, v, target)
+    forces = forces.reshape(-1, 3)
+    assert forces[:, 2].sum() == pytest.approx(model.total_mass * 9.81, rel=1e-3)
+    centres, _ = model.contact_points(q, v)
+    for sphere, centre, force in zip(model.robot.contacts, centres, forces, strict=True):
+        depth = max(sphere.radius - centre[2], 0.0)
+        assert force[2] == pytest.approx(model.robot.material.stiffness * depth, abs=0.5)
+
+
+@pytest.mark.parametrize("dt", [0.0005, 0.002, 0.01])
+@pytest.mark.parametrize("stiffness", [1e4, 1e5, 1e6])
+def test_drop_settles_without_chatter(dt: float, stiffness: float):
+    model = Model("mini_cheetah")
+    step = stepper(model, dt, material=ContactMaterial(stiffness, 500.0, 0.8))
+    q, v, target = model.standing_q.copy(), np.zeros(model.nv), model.standing_q[7:]
+    q[2] += 0.1
+    for _ in range(round(3.0 / dt)):
+        q, v, diverged, *_ = step(q, v, target)
+    assert np.isfinite(v).all()
+    assert diverged[0] == 0
+    assert np.abs(v[:6]).max() < 0.1
+    speeds = []
+    for _ in range(20):
+        before = v
+        q, v, *_ = step(q, v, target)
+        speeds.append(np.abs(v - before).max())
+    assert max(speeds) < 2e-2
+
+
+def test_motors_saturate():
+    model = Model("mini_cheetah")
+    step = stepper(model)
+    *_, torque, _ = step(model.standing_q, np.zeros(model.nv), model.standing_q[7:] + 10.0)
+    limits = [model.robot.body(name).joint.torque for name in model.joint_links]
+    np.testing.assert_allclose(torque, limits)
+
+
+def test_joint_stops_hold():
+    """Full torque against a stop gets no further than the stop's compliance allows."""
+    model = Model(replace(Model("mini_cheetah").robot, gravity=(0.0, 0.0, 0.0)))
+    step = stepper(model, contacts=())
+    q, v = model.standing_q.copy(), np.zeros(model.nv)
+    for _ in range(400):
+        q, v, *_ = step(q, v, np.full(12, 20.0))
+    upper = np.array([model.robot.body(name).joint.position[1] for name in model.joint_links])
+    assert (q[7:] < upper + 0.1).all()
+    assert np.isfinite(q).all()
+
+
+def test_a_bad_number_freezes_the_robot():
+    model = Model("mini_cheetah")
+    step = stepper(model)
+    v = np.zeros(model.nv)
+    v[8] = np.nan
+    q_next, v_next, diverged, *_ = step(model.standing_q, v, model.standing_q[7:])
+    assert diverged[0] == 1
+    np.testing.assert_array_equal(q_next, model.standing_q)
+    np.testing.assert_array_equal(v_next, v)
+    *_, again, _, _ = step(model.standing_q, np.zeros(model.nv), model.standing_q[7:], diverged=1.0)
+    assert again[0] == 1
+
+
+def test_what_is_not_asked_for_costs_nothing():
+    model = Model("mini_cheetah")
+    bare = step_function(model.mechanism, StepOptions(0.005))
+    feet = StepOptions(0.005, contacts=("FL_foot",))
+    assert step_function(model.mechanism, feet).n_instructions() > bare.n_instructions() + 50
+    with_forces = step_function(model.mechanism, feet, ("contact_forces",))
+    assert with_forces.n_instructions() > step_function(model.mechanism, feet).n_instructions()
+
+
+def test_robot_type(robot: Robot):
+    assert step_function(Model(robot).mechanism, StepOptions(0.001, control="torque")).n_out() == 3
