@@ -1,0 +1,69 @@
+"""Is this body possible? Checks of mass properties, placement and joint of one body.
+
+Knows only the robot description. Each check raises a `RobotError` of one line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from ce_gym.model.description import Body, Joint
+from ce_gym.model.errors import bad
+
+RELATIVE_TOLERANCE = 1e-9
+
+
+def check_body(body: Body, file: str) -> None:
+    """Check the figures of one body."""
+    where = f"{body.kind} {body.name!r}"
+    mass = body.inertial.mass
+    if not math.isfinite(mass) or mass < 0.0 or (mass == 0.0 and body.kind == "link"):
+        raise bad(file, f"{where} mass", mass, "a mass above 0 [kg]" if body.kind == "link" else "a mass of 0 or more")
+    check_finite(file, f"{where} centre of mass", body.inertial.com)
+    _check_inertia(file, f"{where} inertia", np.array(body.inertial.inertia))
+    check_finite(file, f"{where} position", body.placement.position)
+    rotation = np.array(body.placement.rotation)
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0.0:
+        raise bad(file, f"{where} rotation", body.placement.rotation, "a rotation matrix")
+    if body.joint.type != "free":
+        _check_joint(file, where, body.joint)
+
+
+def _check_joint(file: str, where: str, joint: Joint) -> None:
+    if joint.type not in ("revolute", "prismatic"):
+        raise bad(file, f"{where} joint type", joint.type, "free, revolute or prismatic")
+    if not math.isclose(math.hypot(*joint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
+        raise bad(file, f"{where} joint axis", joint.axis, "a unit axis")
+    lower, upper = joint.position
+    if not lower <= upper:
+        raise bad(file, f"{where} joint limits", joint.position, "a lower limit that is not above the upper")
+    for name, value in (("torque", joint.torque), ("velocity", joint.velocity)):
+        if not value >= 0.0:
+            raise bad(file, f"{where} joint {name}", value, "0 or more")
+    if not 0.0 <= joint.damping < math.inf:
+        raise bad(file, f"{where} joint damping", joint.damping, "0 or more, finite")
+
+
+def check_finite(file: str, key: str, values: Iterable[float]) -> None:
+    """Check that all values are finite numbers."""
+    if not all(map(math.isfinite, values)):
+        raise bad(file, key, tuple(values), "finite numbers")
+
+
+def _check_inertia(file: str, key: str, inertia: np.ndarray) -> None:
+    if inertia.shape != (3, 3) or not np.isfinite(inertia).all():
+        raise bad(file, key, inertia.tolist(), "3 x 3 finite numbers")
+    scale = np.abs(inertia).max()
+    if np.abs(inertia - inertia.T).max() > RELATIVE_TOLERANCE * scale:
+        raise bad(file, key, inertia.tolist(), "a symmetric matrix")
+    if scale > 0.0 and np.linalg.eigvalsh(inertia / scale)[0] < -RELATIVE_TOLERANCE:
+        raise bad(file, key, inertia.tolist(), "a positive semidefinite matrix")
+
+
+def violates_triangle_inequality(body: Body) -> bool:
+    """Whether one principal moment exceeds the sum of the others, which no distribution of mass can do."""
+    small, middle, large = np.linalg.eigvalsh(np.array(body.inertial.inertia))
+    return bool(large > (small + middle) * (1.0 + RELATIVE_TOLERANCE))

@@ -1,0 +1,148 @@
+"""The cluster tree: which bodies must be treated together because constraints tie their joints.
+
+Found by analysis of the graph, for any robot. Knows only the robot description.
+
+A constraint over the joints of some bodies makes one cluster of those bodies and of everything between them: take the
+nearest common ancestor of their *parents*; every body on the way from there (exclusive) to each of them (inclusive)
+belongs to the cluster. Clusters that share a body are merged. So, in the terms of the paper's figure 3:
+
+- a link and its rotor on the same parent form one cluster;
+- a belt (knee, ankle on the knee, both rotors on the thigh) forms one cluster of four;
+- a tie between a body and its grandchild takes in the body between them.
+
+All base bodies of a cluster hang on one output body, as the recursive algorithms need: that is so for one constraint
+by construction, and if two clusters share a body then both output bodies are ancestors of it, so one of the two lies
+on the path from the other and is a member of the other's cluster, whose output body the union keeps. Because output
+bodies lie strictly nearer to the root than their clusters, clusters form a tree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from ce_gym.model.description import Constraint, Robot
+from ce_gym.model.errors import bad
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Bodies whose joints are tied together, or one body that is free of ties.
+
+    Attributes:
+        bodies: Names, parents before children.
+        constraints: The ties among them.
+        independent: Those of the bodies whose joint coordinates are independent, in the robot's order; empty for the
+            cluster of a floating base.
+        parent: Index of the parent cluster; None is the world.
+        output_body: Body of the parent cluster that all base bodies of this cluster are attached to; None is the world.
+    """
+
+    bodies: tuple[str, ...]
+    constraints: tuple[Constraint, ...]
+    independent: tuple[str, ...]
+    parent: int | None
+    output_body: str | None
+
+
+@dataclass(frozen=True)
+class ClusterTree:
+    """The clusters of a robot, parents before children, otherwise in the order of their first bodies."""
+
+    clusters: tuple[Cluster, ...]
+
+    def base_to_tip(self) -> Iterable[int]:
+        """Indices of the clusters, parents before children."""
+        return range(len(self.clusters))
+
+    def tip_to_base(self) -> Iterable[int]:
+        """Indices of the clusters, children before parents."""
+        return reversed(range(len(self.clusters)))
+
+    def cluster_of(self, body: str) -> int:
+        """Return the index of the cluster that holds `body`; KeyError if there is none."""
+        for index, cluster in enumerate(self.clusters):
+            if body in cluster.bodies:
+                return index
+        raise KeyError(f"no cluster holds a body called {body!r}")
+
+    def as_text(self) -> str:
+        """Return a drawing of the tree, one cluster a line; `*` marks independent joints."""
+        return "\n".join(["world", *self._lines(None, "")])
+
+    def _lines(self, parent: int | None, indent: str) -> Iterator[str]:
+        children = [i for i, cluster in enumerate(self.clusters) if cluster.parent == parent]
+        for i in children:
+            last = i == children[-1]
+            yield f"{indent}{'└── ' if last else '├── '}{_label(self.clusters[i])}"
+            yield from self._lines(i, indent + ("    " if last else "│   "))
+
+
+def _label(cluster: Cluster) -> str:
+    return " + ".join(f"{body}*" if body in cluster.independent else body for body in cluster.bodies)
+
+
+def cluster_tree(robot: Robot) -> ClusterTree:
+    """Group the bodies of `robot` into clusters.
+
+    Raises:
+        RobotError: A constraint reaches across a free joint.
+    """
+    parents = {body.name: body.parent for body in robot.bodies}
+    groups = _merged([[name] for name in parents] + [_span(c.bodies, parents) for c in robot.constraints])
+    order = {name: i for i, name in enumerate(parents)}
+    # Bodies are listed parents before children, so this order puts a cluster behind the one that carries it.
+    members = sorted((sorted(group, key=order.__getitem__) for group in groups), key=lambda group: order[group[0]])
+    index_of = {body: i for i, group in enumerate(members) for body in group}
+    return ClusterTree(tuple(_cluster(robot, group, parents, index_of) for group in members))
+
+
+def _ancestors(body: str | None, parents: dict[str, str | None]) -> list[str | None]:
+    """Return `body` and its ancestors out to the world (None), nearest first."""
+    chain: list[str | None] = [body]
+    while chain[-1] is not None:
+        chain.append(parents[chain[-1]])
+    return chain
+
+
+def _span(bodies: Iterable[str], parents: dict[str, str | None]) -> list[str]:
+    """Return the bodies that one constraint makes a cluster of."""
+    tied = list(bodies)
+    above = [_ancestors(parents[body], parents) for body in tied]
+    common = next(a for a in above[0] if all(a in chain for chain in above))
+    return [
+        member
+        for body in tied
+        for member in _ancestors(body, parents)[: _ancestors(body, parents).index(common)]
+        if member is not None
+    ]
+
+
+def _merged(groups: Iterable[Iterable[str]]) -> list[set[str]]:
+    """Merge the groups that share a member."""
+    merged: list[set[str]] = []
+    for group in groups:
+        new = set(group)
+        apart = [other for other in merged if other.isdisjoint(new)]
+        for other in merged:
+            if not other.isdisjoint(new):
+                new |= other
+        merged = [*apart, new]
+    return merged
+
+
+def _cluster(robot: Robot, group: list[str], parents: dict[str, str | None], index_of: dict[str, int]) -> Cluster:
+    members = [body for body in robot.bodies if body.name in group]
+    free = [body.name for body in members if body.joint.type == "free"]
+    if free and len(group) > 1:
+        ties = ", ".join(c.name for c in robot.constraints if c.bodies[0] in group)
+        expected = f"a tie that does not reach across the free joint of {free[0]}"
+        raise bad(robot.source or robot.name, f"constraint {ties}", tuple(group), expected)
+    output = parents[group[0]]
+    return Cluster(
+        bodies=tuple(group),
+        constraints=tuple(c for c in robot.constraints if c.bodies[0] in group),
+        independent=tuple(name for name in robot.independent if name in group),
+        parent=None if output is None else index_of[output],
+        output_body=output,
+    )

@@ -1,0 +1,167 @@
+"""YAML text -> plain values, each checked for type and finiteness as it is taken out.
+
+Knows YAML and error messages; nothing about robots.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ce_gym.model.errors import RobotError, bad, unknown
+
+_REQUIRED: Any = object()
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML with two repairs: `5e4` is a number (as in YAML 1.2), and a key may stand only once in a mapping."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"duplicate key {key.value!r}: expected each name once", key.start_mark
+                    )
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
+)
+
+
+def read_yaml(path: Path) -> Section:
+    """Read a YAML file that holds one mapping.
+
+    Raises:
+        RobotError: The file is missing, malformed, empty, or holds something else.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise RobotError(f"{path}: cannot be read: expected a YAML file ({_one_line(error)})") from None
+    try:
+        data = yaml.load(text, _Loader)
+    except Exception as error:  # PyYAML also lets IndexError, AttributeError and others out, as for `!!int ''`
+        raise RobotError(f"{path}: malformed YAML: expected a mapping ({_problem(error)})") from None
+    if data is None:
+        raise RobotError(f"{path}: the file is empty: expected a mapping")
+    return Section(str(path), "", data)
+
+
+def _problem(error: Exception) -> str:
+    problem = getattr(error, "problem", None) or _one_line(error)
+    mark = getattr(error, "problem_mark", None)
+    return f"line {mark.line + 1}: {problem}" if mark else problem
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+class Section:
+    """A mapping in a file, together with where it stands; every value that is taken out is checked."""
+
+    def __init__(self, file: str, path: str, data: object):
+        self.file, self.path = file, path
+        if not isinstance(data, dict):
+            raise bad(file, path or "top level", data, "a mapping")
+        for key in data:
+            if not isinstance(key, str):
+                raise bad(file, f"{self.key(key)}", key, "a name; put quotes around it")
+        self.data: dict[str, Any] = data
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.data)
+
+    def key(self, key: object) -> str:
+        """Return the full name of a key, for messages."""
+        return f"{self.path}.{key}" if self.path else str(key)
+
+    def allow(self, *keys: str) -> Section:
+        """Refuse keys other than these; return the section itself."""
+        for key in self.data:
+            if key not in keys:
+                raise unknown(self.file, self.path or "top level", key, keys, "a key that exists")
+        return self
+
+    def get(self, key: str, default: Any = _REQUIRED, expected: str = "a value") -> Any:
+        """Return the raw value, or the default; without a default the key must be there."""
+        if key in self.data:
+            return self.data[key]
+        if default is _REQUIRED:
+            raise bad(self.file, self.key(key), None, expected)
+        return default
+
+    def section(self, key: str) -> Section:
+        """Return the mapping under `key`; an empty one if the key is missing."""
+        return Section(self.file, self.key(key), self.get(key, {}))
+
+    def sections(self) -> Iterator[tuple[str, Section]]:
+        """Iterate over the keys and the mappings under them."""
+        return ((key, self.section(key)) for key in self.data)
+
+    def text(self, key: str, default: Any = _REQUIRED, choices: tuple[str, ...] = ()) -> str:
+        """Return a piece of text, one of `choices` if there are any."""
+        value = self.get(key, default, "text")
+        if value is default:
+            return value
+        if not isinstance(value, str) or not value.strip():
+            raise bad(self.file, self.key(key), value, "text")
+        if choices and value not in choices:
+            raise unknown(self.file, self.key(key), value, choices, f"one of {', '.join(choices)}")
+        return value
+
+    def number(self, key: str, default: Any = _REQUIRED) -> float:
+        """Return a finite number."""
+        value = self.get(key, default, "a finite number")
+        return value if value is default else finite(self.file, self.key(key), value)
+
+    def vector(self, key: str, count: int, default: Any = _REQUIRED) -> tuple[float, ...]:
+        """Return `count` finite numbers."""
+        value = self.get(key, default, f"a list of {count} numbers")
+        if value is default:
+            return value
+        if not isinstance(value, list) or len(value) != count:
+            raise bad(self.file, self.key(key), value, f"a list of {count} numbers")
+        return tuple(finite(self.file, f"{self.key(key)}[{i}]", item) for i, item in enumerate(value))
+
+    def numbers(self) -> tuple[tuple[str, float], ...]:
+        """Return all pairs of a mapping from names to finite numbers."""
+        return tuple((key, self.number(key)) for key in self.data)
+
+    def list(self, key: str) -> list[Any]:
+        """Return a list, empty if the key is missing."""
+        value = self.get(key, [])
+        if not isinstance(value, list):
+            raise bad(self.file, self.key(key), value, "a list")
+        return value
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """Return a list of texts, empty if the key is missing."""
+        for i, item in enumerate(self.list(key)):
+            if not isinstance(item, str):
+                raise bad(self.file, f"{self.key(key)}[{i}]", item, "text")
+        return tuple(self.list(key))
+
+
+def finite(file: str, key: str, value: object) -> float:
+    """Return `value` as a float if it is a finite number (true and false are not numbers)."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            if math.isfinite(value):
+                return float(value)
+        except OverflowError:  # an integer beyond the range of floats
+            value = "a number with hundreds of digits"
+    raise bad(file, key, value, "a finite number")
