@@ -1,0 +1,55 @@
+"""The command `python -m ce_gym.bench`: lists the benchmarks, or runs one and prints its report.
+
+A benchmark is a module of this package with `add_arguments(parser)` and `run(arguments) -> Report`; the first line of
+its docstring is its entry in the list. Knows nothing of what they measure, and imports only the one it runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+BENCHMARKS = ("speed", "instructions", "throughput", "tracking", "stability")
+
+
+def summary(name: str) -> str:
+    """Return the first docstring line of a benchmark, without importing it."""
+    source = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+    return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
+
+
+def listing() -> str:
+    """Return one line for each benchmark."""
+    width = max(len(name) for name in BENCHMARKS)
+    lines = [f"  {name:<{width}}  {summary(name)}" for name in BENCHMARKS]
+    return "\n".join(["Usage: python -m ce_gym.bench NAME [--help] [--json FILE]", "", *lines])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    if not argv or argv[0] in ("-h", "--help"):
+        print(listing())
+        return 0
+    name, *rest = argv
+    if name not in BENCHMARKS:
+        print(f"ce_gym.bench: no benchmark {name!r}; expected one of {', '.join(BENCHMARKS)}", file=sys.stderr)
+        return 2
+    parser = argparse.ArgumentParser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
+    parser.add_argument("--json", metavar="FILE", type=Path, help="also write the report to a JSON file")
+    benchmark = importlib.import_module(f"ce_gym.bench.{name}")
+    benchmark.add_arguments(parser)
+    arguments = parser.parse_args(rest)
+    report = benchmark.run(arguments)
+    print(report.as_text())
+    if arguments.json:
+        arguments.json.write_text(report.as_json(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

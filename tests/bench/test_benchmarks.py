@@ -1,0 +1,113 @@
+"""The measuring code of the benchmarks on small cases; figures that do not depend on the machine."""
+
+import argparse
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ce_gym.bench import instructions, tracking
+from ce_gym.model import load_robot
+
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+
+
+def test_tracking_reproduces_the_published_torques():
+    joints, exact, errors = tracking.torque_errors("mit_humanoid_leg")
+    knee = joints.index("knee_link")
+    assert exact.shape == (10001, 5)
+    np.testing.assert_allclose(errors["none"], [0.288121, 0.266132, 0.989139, 4.309643, 1.587640], atol=1e-6)
+    np.testing.assert_allclose(errors["armature"], [0.206002, 0.178213, 0.364711, 1.044559, 0.826307], atol=1e-6)
+    assert errors["none"][knee] == pytest.approx(4.309643175251027, rel=1e-10)
+    assert errors["armature"][knee] == pytest.approx(1.0445586158983378, rel=1e-10)
+    assert np.abs(exact[:, knee]).max() == pytest.approx(11.229339, abs=1e-6)
+
+
+def test_tracking_samples_are_consistent():
+    q, v, vdot = tracking.sinusoid(2)
+    np.testing.assert_allclose(np.gradient(q[:, 0], tracking.STEP)[1:-1], v[1:-1, 0], atol=1e-4)
+    np.testing.assert_allclose(np.gradient(v[:, 1], tracking.STEP)[1:-1], vdot[1:-1, 1], atol=1e-3)
+
+
+def test_exactness_costs_no_more_than_required():
+    report = instructions.run(argparse.Namespace(robot=[]))
+    assert {row[0] for row in report.tables[0].rows} >= {"mini_cheetah", "mit_humanoid_leg"}
+    assert all(requirement.met for requirement in report.requirements), report.as_text()
+
+
+def test_bare_robot_has_one_group_of_contacts():
+    pytest.importorskip("mujoco")
+    from ce_gym.bench import speed
+
+    robot = speed.bare(load_robot("mini_cheetah"), "foot")
+    assert len(robot.contacts) == 4
+    assert not any(body.shapes for body in robot.bodies)
+
+
+def test_mujoco_stands_at_its_converged_settings_and_not_with_too_few_iterations():
+    pytest.importorskip("mujoco")
+    from ce_gym.bench import mujoco_settings, speed
+
+    robot = speed.bare(load_robot("mini_cheetah"), "foot")
+    _, reference = mujoco_settings.watched(robot, "armature", mujoco_settings.Settings(0.001, "Euler"), 4)
+    assert reference.like(reference)
+    assert reference.contacts == 4.0
+    settings = mujoco_settings.Settings(0.005, "Euler", "Newton", 1, 4)
+    _, hasty = mujoco_settings.watched(robot, "armature", settings, 4)
+    assert not hasty.like(reference)
+
+
+@pytest.mark.parametrize(
+    ("change", "alike"),
+    [({}, True), ({"speed": 0.29}, True), ({"speed": 0.31}, False), ({"height": 0.7}, False)]
+    + [({"slip": 0.2}, False), ({"finite": False}, False)],
+)
+def test_what_counts_as_standing_alike(change, alike):
+    pytest.importorskip("mujoco")
+    from ce_gym.bench.stand import Behaviour
+
+    reference = Behaviour(finite=True, height=0.9, speed=0.2, contacts=4.0, slip=0.01)
+    assert dataclasses.replace(reference, **change).like(reference) is alike
+
+
+def test_ours_stands_like_mujoco():
+    pytest.importorskip("mujoco")
+    from ce_gym.bench import mujoco_settings, speed, stand
+    from ce_gym.dynamics.model import Model
+    from ce_gym.sim import Simulator
+
+    robot = speed.bare(load_robot("mini_cheetah"), "foot")
+    settings = mujoco_settings.Settings(0.001, "Euler", solimp=mujoco_settings.STIFF[0])
+    _, reference = mujoco_settings.watched(robot, "exact", settings, 4)
+    ours = stand.watch_ours(Simulator(Model(robot, "exact"), num_envs=4), robot)
+    assert ours.like(reference)
+    assert ours.contacts == 4.0
+    assert ours.height == pytest.approx(reference.height, abs=0.05)
+
+
+def test_drop_settles():
+    from ce_gym.bench import stability
+    from ce_gym.dynamics.model import Model
+    from ce_gym.sim import Simulator
+
+    outcome = stability.drop(Simulator(Model(load_robot("mini_cheetah")), num_envs=4, dt=0.005))
+    assert outcome.finite
+    assert outcome.stable, outcome
+    assert not stability.Outcome(True, 0.9, 1.0, 0.01, 0.5).stable
+
+
+def test_forward_dynamics_kernel_computes_forward_dynamics():
+    pytest.importorskip("mujoco")
+    from ce_gym.bench import forward
+    from ce_gym.compile import aligned_zeros, lane_count
+    from ce_gym.dynamics.model import Model
+
+    robot, lanes = load_robot("mit_humanoid_leg"), lane_count("float64")
+    model = Model(robot, "exact")
+    states = forward.random_states(model, lanes)
+    arrays = {name: aligned_zeros((1, rows.shape[1], lanes), "float64") for name, rows in states.items()}
+    for name, rows in states.items():
+        arrays[name][0] = rows.T
+    forward.kernel(robot, "exact", "float64")(arrays, lanes)
+    expected = model.forward_dynamics(states["q"], states["v"], states["tau"])
+    np.testing.assert_allclose(arrays["vdot"][0].T, expected, rtol=1e-9, atol=1e-9)

@@ -1,0 +1,39 @@
+"""The command line: lists every benchmark, refuses unknown names, prints and writes reports."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from ce_gym.bench import __main__ as command
+
+
+def test_without_a_name_it_lists_every_benchmark():
+    finished = subprocess.run([sys.executable, "-m", "ce_gym.bench"], capture_output=True, text=True, check=True)
+    for name in command.BENCHMARKS:
+        assert f"\n  {name} " in finished.stdout
+        assert len(command.summary(name)) > 20
+
+
+def test_an_unknown_name_is_one_line(capsys):
+    assert command.main(["sped"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", command.BENCHMARKS)
+def test_every_benchmark_has_help(name, capsys):
+    pytest.importorskip("mujoco")
+    with pytest.raises(SystemExit) as caught:
+        command.main([name, "--help"])
+    assert caught.value.code == 0
+    assert "--json" in capsys.readouterr().out
+
+
+def test_report_is_printed_and_written(tmp_path, capsys):
+    file = tmp_path / "tracking.json"
+    assert command.main(["tracking", "--json", str(file)]) == 0
+    assert "knee_link" in capsys.readouterr().out
+    written = json.loads(file.read_text())
+    assert written["machine"]["cores"]
+    assert [r["met"] for r in written["requirements"]] == [True, True]
