@@ -1,0 +1,104 @@
+"""The command `python -m ce_gym`: what is there, what a robot is made of, how a rollout looked, how fast it all is.
+
+Only parses arguments and hands over; whatever a subcommand needs is imported when it runs, so that `--help` is
+instant. Errors that a user can mend are one line on stderr and exit code 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+
+from ce_gym.viewer.cli import add_view_command
+
+WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
+
+  python -m ce_gym list                  environments and robots
+  python -m ce_gym inspect mini_cheetah  what a robot is made of: bodies, gears, clusters
+  python -m ce_gym view walk.npz         write a recorded rollout as one HTML file (or --live)
+  python -m ce_gym bench                 benchmarks
+
+Each has --help. In Python: gymnasium.make("ce_gym:ce_gym/MiniCheetahVelocity-v0")."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0, or 2 if the user has something to mend."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    if not argv:
+        print(WELCOME)
+        return 0
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return _run(argv)
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # whoever read our output has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if not _can_be_mended(error):
+            raise
+        print(f"ce_gym: {error}", file=sys.stderr)
+        return 2
+
+
+def _run(argv: list[str]) -> int:
+    if argv[0] == "bench":  # has its own parser, so its options must not meet ours
+        return _bench(argv[1:])
+    args = _parser().parse_args(argv)
+    return args.run(args)
+
+
+def _show_warning(message: Warning | str, *_: object) -> None:
+    print(f"ce_gym: warning: {message}", file=sys.stderr)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="ce_gym", description=WELCOME.splitlines()[0])
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    list_ = commands.add_parser("list", help="environments and robots")
+    list_.set_defaults(run=_list)
+    inspect = commands.add_parser("inspect", help="what a robot is made of")
+    inspect.add_argument("robot", metavar="NAME", help="name of a robot, or path of its file")
+    inspect.add_argument("--transmission", default="exact", help="exact (default), coupled, armature or none")
+    inspect.set_defaults(run=_inspect)
+    add_view_command(commands)
+    commands.add_parser("bench", help="benchmarks")
+    return parser
+
+
+def _list(args: argparse.Namespace) -> int:
+    from ce_gym import environment_ids, robots
+
+    for heading, names in {"Environments": environment_ids(), "Robots": robots()}.items():
+        print(f"{heading}:")
+        print("\n".join(f"  {name}" for name in names))
+    return 0
+
+
+def _inspect(args: argparse.Namespace) -> int:
+    from ce_gym.dynamics import Model
+
+    print(Model(args.robot, transmission=args.transmission).describe())
+    return 0
+
+
+def _bench(argv: list[str]) -> int:
+    from ce_gym.bench.__main__ import main as bench
+
+    return bench(argv)
+
+
+def _can_be_mended(error: Exception) -> bool:
+    from ce_gym.model import RobotError
+    from ce_gym.viewer import RolloutError, ViewerError
+
+    return isinstance(error, (RobotError, RolloutError, ViewerError, OSError))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,39 @@
+"""Recorded rollouts and what shows them: one HTML file, or a page on this machine's loopback.
+
+    recorder = Recorder("mini_cheetah", "exact", dt=0.02)
+    recorder.add(time, q, v, contact_forces, command)
+    recorder.rollout().save("walk.npz")
+    write_html(Rollout.load("walk.npz"), "walk.html")
+
+Knows models and rollouts; knows nothing of learning. meshcat is needed only when something is drawn.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ce_gym.viewer.errors import ViewerError
+    from ce_gym.viewer.html import write_html
+    from ce_gym.viewer.live import show
+    from ce_gym.viewer.recorder import Recorder
+    from ce_gym.viewer.rollout import Rollout, RolloutError
+
+__all__ = ["Recorder", "Rollout", "RolloutError", "ViewerError", "show", "write_html"]
+
+_HOMES = {
+    "Recorder": "recorder",
+    "Rollout": "rollout",
+    "RolloutError": "rollout",
+    "ViewerError": "errors",
+    "show": "live",
+    "write_html": "html",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for: the command line parses its arguments without numpy."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,0 +1,114 @@
+"""An actor: one rollout with the world poses of its robot's bodies at the frames to show.
+
+Knows rollouts and posed models; knows no scene around them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.model.description import Robot
+from ce_gym.viewer import tracks
+from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.robot import body_paths, extent
+from ce_gym.viewer.rollout import Rollout
+from ce_gym.viewer.three import Command
+
+Array = NDArray[np.float64]
+
+
+class PosedModel(Protocol):
+    """What the viewer needs of a `ce_gym.Model`."""
+
+    robot: Robot
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of the bodies that `body_poses` returns, in order."""
+        ...
+
+    @property
+    def contact_names(self) -> tuple[str, ...]:
+        """Names of the contacts, in the order of `Rollout.contact_forces`."""
+        ...
+
+    def body_poses(self, q: Array) -> tuple[Array, Array]:
+        """Return positions [m], shape (..., n_bodies, 3), and rotations, shape (..., n_bodies, 3, 3)."""
+        ...
+
+
+class Actor:
+    """One rollout with the world poses of its robot's bodies at the frames to show.
+
+    Attributes:
+        path: Scene path of the robot's world.
+        times: Time since the first frame [s], shape (F,).
+        positions: Of all bodies, in the robot's order [m], shape (F, n_bodies, 3).
+        rotations: Shape (F, n_bodies, 3, 3).
+        contact_names: Of the contacts whose forces were recorded.
+    """
+
+    def __init__(self, rollout: Rollout, model: PosedModel, path: str, max_fps: float) -> None:
+        stride = max(1, round(1.0 / (max_fps * rollout.dt)))
+        frames = np.arange(0, len(rollout), stride)
+        self.rollout, self.model, self.robot, self.path, self.frames = rollout, model, model.robot, path, frames
+        self.times = rollout.times[frames] - rollout.times[0]
+        try:
+            positions, rotations = model.body_poses(rollout.q[frames])
+        except ValueError as error:
+            raise ViewerError(f"rollout of {rollout.robot!r} does not fit the robot: {error}") from None
+        order = [model.body_names.index(body.name) for body in self.robot.bodies]
+        self.positions, self.rotations = np.asarray(positions)[:, order], np.asarray(rotations)[:, order]
+        self.contact_names = self._contact_names()
+        self.low, self.high = extent(self.robot, self.positions[0], self.rotations[0])
+
+    def _contact_names(self) -> tuple[str, ...]:
+        """Return the name of each contact that the rollout has forces of."""
+        name, found = self.rollout.robot, self.rollout.contact_forces.shape[1]
+        names, known = tuple(self.rollout.contact_names), self.model.contact_names
+        if unknown := [contact for contact in names if contact not in known]:
+            raise ViewerError(f"rollout of {name!r} has forces of contact {unknown[0]!r}, which the robot lacks")
+        if found not in (0, len(names or known)):
+            raise ViewerError(f"rollout of {name!r} has forces of {found} contacts; the robot has {len(known)}")
+        return (names or known) if found else ()
+
+    @property
+    def radius(self) -> float:
+        """Radius of a ball around the robot in its first frame [m]."""
+        return max(float(np.linalg.norm(self.high - self.low)) / 2, 0.05)
+
+    def clips(self, end: float) -> Iterator[Command]:
+        """Animate every body against its parent until `end` [s]."""
+        paths = body_paths(self.robot, self.path)
+        index = {body.name: i for i, body in enumerate(self.robot.bodies)}
+        for body in self.robot.bodies:
+            position, rotation = self.positions[:, index[body.name]], self.rotations[:, index[body.name]]
+            if body.parent is not None:
+                # The pose relative to the parent: R_p^T (x - x_p) and R_p^T R.
+                to_parent = np.swapaxes(self.rotations[:, index[body.parent]], -1, -2)
+                offset = position - self.positions[:, index[body.parent]]
+                position, rotation = (to_parent @ offset[..., None])[..., 0], to_parent @ rotation
+            values = {"position": position, "quaternion": tracks.quaternions(rotation)}
+            yield tracks.moving(paths[body.name], self.times, end, values)
+
+
+def smooth(values: Array, times: Array, seconds: float) -> Array:
+    """Return a centred moving average of `values`, shape (F, n), that shrinks towards both ends.
+
+    Args:
+        values: Shape (F, n).
+        times: Evenly spaced [s], shape (F,).
+        seconds: Width of the average [s].
+    """
+    count = len(times)
+    step = (times[-1] - times[0]) / max(count - 1, 1)
+    half = 0 if step == 0 else min(int(seconds / step / 2), count // 2)
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, 0)])
+    reach = np.minimum(np.minimum(np.arange(count), count - 1 - np.arange(count)), half)[:, None]
+    middle = np.arange(count)[:, None]
+    rows = np.arange(values.shape[1])
+    return (total[middle + reach + 1, rows] - total[middle - reach, rows]) / (2 * reach + 1)

@@ -1,0 +1,12 @@
+"""What the viewer says when it cannot show something. Knows nothing else."""
+
+from __future__ import annotations
+
+
+class ViewerError(RuntimeError):
+    """A rollout cannot be shown; the message is one line."""
+
+    @classmethod
+    def missing_meshcat(cls) -> ViewerError:
+        """Return the error for a missing meshcat, with the command that installs it."""
+        return cls('the viewer needs meshcat, which is not installed: pip install "ce_gym[viewer]"')

@@ -1,0 +1,84 @@
+"""Collects the frames of a rollout while something runs. Knows rollouts; knows nothing of what runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ce_gym.viewer.rollout import Rollout, RolloutError
+
+Array = NDArray[np.float64]
+
+
+class Recorder:
+    """Collects frames while something runs.
+
+    Args:
+        robot: Name of the robot, or path of its file.
+        transmission: Transmission level.
+        dt: Time between frames [s].
+        label: A few words for the legend.
+        info: Anything else worth keeping, as text.
+        contact_names: Which contacts the forces belong to; empty means all of the robot's.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        transmission: str,
+        dt: float,
+        *,
+        label: str = "",
+        info: Mapping[str, str] | None = None,
+        contact_names: Sequence[str] = (),
+    ) -> None:
+        self._fixed: dict[str, Any] = {
+            "robot": robot,
+            "transmission": transmission,
+            "dt": dt,
+            "label": label,
+            "info": dict(info or {}),
+            "contact_names": tuple(contact_names),
+        }
+        self._frames: list[tuple[float, Array, Array, Array, Array]] = []
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def add(
+        self, time: float, q: ArrayLike, v: ArrayLike, contact_forces: ArrayLike = (), command: ArrayLike = ()
+    ) -> None:
+        """Append one frame; the arrays are copied.
+
+        Args:
+            time: [s]
+            q: Positions, shape (nq,).
+            v: Velocities, shape (nv,).
+            contact_forces: Force on each contact, world axes [N], shape (n_contacts, 3).
+            command: Shape (n,); see `Rollout.commands`.
+        """
+        forces = np.array(contact_forces, float).reshape(-1, 3)
+        self._frames.append((float(time), np.array(q, float), np.array(v, float), forces, np.array(command, float)))
+
+    def rollout(self) -> Rollout:
+        """Return everything added so far.
+
+        Raises:
+            RolloutError: Nothing was added, or frames differ in shape.
+        """
+        if not self._frames:
+            raise RolloutError("nothing was recorded: expected at least one frame")
+        names = ("times", "q", "v", "contact_forces", "commands")
+        columns = zip(names, zip(*self._frames, strict=True), strict=True)
+        arrays: dict[str, Any] = {name: _stack(name, column) for name, column in columns}
+        return Rollout(**self._fixed, **arrays)
+
+
+def _stack(name: str, column: tuple[Any, ...]) -> Array:
+    shapes = sorted({np.shape(value) for value in column})
+    if len(shapes) > 1:
+        raise RolloutError(f"{name} changes shape from frame to frame: {shapes[0]} and {shapes[1]}")
+    return np.array(column, float)

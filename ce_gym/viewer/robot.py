@@ -1,0 +1,109 @@
+"""A robot as scene nodes: one nested group for each body, its shapes inside.
+
+Groups nest as bodies do, so that a revolute joint moves its group by a rotation alone: animations stay small and
+links do not shrink between frames. Knows the robot description and three.js commands; knows no rollouts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.model.description import Placement, Robot, Shape
+from ce_gym.viewer import three
+from ce_gym.viewer.stand_ins import DARK, LIGHT, rotor_discs, shapes_of
+from ce_gym.viewer.three import Color, Command
+
+Array = NDArray[np.float64]
+
+
+def body_paths(robot: Robot, root: str) -> dict[str, str]:
+    """Return the scene path of each body below `root`, by name."""
+    paths: dict[str, str] = {}
+    for body in robot.bodies:
+        parent = root if body.parent is None else paths[body.parent]
+        paths[body.name] = f"{parent}/{body.name.replace('/', '_')}"
+    return paths
+
+
+def robot_commands(robot: Robot, root: str, *, tint: Color | None = None, opacity: float = 1.0) -> Iterator[Command]:
+    """Draw all bodies of a robot.
+
+    Args:
+        robot: What to draw. If no body has shapes, each is a small ball joined to its parent by a stick.
+        root: Scene path of the whole robot.
+        tint: One colour for everything, in place of the shapes' own.
+        opacity: Factor on the opacity of everything, 0..1.
+    """
+    paths, shapes, discs = body_paths(robot, root), shapes_of(robot), rotor_discs(robot)
+    for body in robot.bodies:
+        for index, shape in enumerate(shapes[body.name]):
+            color = tint or shape.color
+            path = f"{paths[body.name]}/{body.kind}_{index}"
+            yield _shape_command(path, shape, color, opacity * shape.color[3])
+            if body.kind == "rotor" and shape.type == "cylinder":
+                yield _spoke_command(f"{path}_spoke", shape, color, opacity)
+        if body.name in discs:
+            yield from _hidden_disc(f"{paths[body.name]}/inside", discs[body.name], tint, opacity)
+
+
+def _hidden_disc(path: str, disc: Shape, tint: Color | None, opacity: float) -> Iterator[Command]:
+    """Draw a rotor that has no shapes, for whoever looks through the links."""
+    color = tint or disc.color
+    yield _shape_command(f"{path}/disc", disc, color, opacity)
+    yield _spoke_command(f"{path}/spoke", disc, color, opacity)
+    yield three.set_property(path, "visible", False)
+
+
+def _shape_command(path: str, shape: Shape, color: Color, opacity: float) -> Command:
+    matrix = _matrix(shape.placement)
+    if shape.type == "box":
+        return three.mesh(path, three.box(*shape.size), color, matrix, opacity=opacity)
+    if shape.type == "sphere":
+        return three.mesh(path, three.sphere(*shape.size), color, matrix, opacity=opacity)
+    make = three.cylinder if shape.type == "cylinder" else three.capsule
+    return three.mesh(path, make(*shape.size), color, matrix @ three.Y_TO_Z, opacity=opacity)
+
+
+def _spoke_command(path: str, shape: Shape, color: Color, opacity: float) -> Command:
+    """Draw a bar across both faces of a rotor's disc, without which nobody would see it spin."""
+    radius, length = shape.size
+    bar = three.box(1.7 * radius, 0.3 * radius, 1.04 * length)
+    contrast = DARK if sum(color[:3]) > 1.5 else LIGHT
+    return three.mesh(path, bar, contrast, _matrix(shape.placement), opacity=opacity)
+
+
+def _matrix(placement: Placement) -> Array:
+    return three.transform(placement.position, placement.rotation)
+
+
+def extent(robot: Robot, positions: Array, rotations: Array) -> tuple[Array, Array]:
+    """Return the corners of a box around a posed robot [m].
+
+    Args:
+        robot: What is drawn.
+        positions: Of the bodies in the world [m], shape (n_bodies, 3), in the robot's order.
+        rotations: Shape (n_bodies, 3, 3).
+    """
+    low, high = positions.min(0), positions.max(0)
+    shapes = shapes_of(robot)
+    for body, position, rotation in zip(robot.bodies, positions, rotations, strict=True):
+        for shape in shapes[body.name]:
+            centre = position + rotation @ np.array(shape.placement.position)
+            reach = _half_edges(shape, rotation @ np.array(shape.placement.rotation))
+            low, high = np.minimum(low, centre - reach), np.maximum(high, centre + reach)
+    return low, high
+
+
+def _half_edges(shape: Shape, rotation: Array) -> Array:
+    """Return half the edges of a box around a shape, along the world's axes [m]."""
+    if shape.type == "sphere":
+        return np.full(3, shape.size[0])
+    if shape.type == "box":
+        half = np.array(shape.size) / 2
+    else:
+        ends = shape.size[0] if shape.type == "capsule" else 0.0
+        half = np.array([shape.size[0], shape.size[0], shape.size[1] / 2 + ends])
+    return np.abs(rotation) @ half

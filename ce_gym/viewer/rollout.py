@@ -1,0 +1,192 @@
+"""Recorded rollouts: what a robot did, frame by frame, as one small file.
+
+A rollout names its robot and holds arrays; poses of bodies are computed from it when it is shown. Knows numpy and
+files; knows no dynamics and no way of drawing.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT = "ce_gym rollout"
+VERSION = 1
+
+Array = NDArray[np.float64]
+
+
+class RolloutError(ValueError):
+    """A rollout, or a file that should hold one, is not usable; the message is one line."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """States of one robot at T frames.
+
+    Attributes:
+        robot: Name of a robot, or path of its file.
+        transmission: Transmission level it was simulated with.
+        dt: Time between frames [s].
+        times: Time of each frame, strictly increasing [s], shape (T,).
+        q: Positions, shape (T, nq).
+        v: Velocities, shape (T, nv).
+        contact_forces: Force of the ground on each contact, world axes [N], shape (T, n_contacts, 3); n_contacts may
+            be zero. None means zero contacts.
+        commands: What the robot was told to do, shape (T, n); n may be zero. The first two columns are drawn as
+            speed forward and to the left in the frame of the base's heading [m/s]. None means n = 0.
+        label: A few words for the legend.
+        info: Anything else worth keeping, as text.
+        contact_names: Which contacts the forces belong to, for simulations of some contacts only; empty means all of
+            the robot's, in its order.
+    """
+
+    robot: str
+    transmission: str
+    dt: float
+    times: Array
+    q: Array
+    v: Array
+    contact_forces: Array = None  # type: ignore[assignment]  # __post_init__ turns None into an empty array
+    commands: Array = None  # type: ignore[assignment]
+    label: str = ""
+    info: Mapping[str, str] = field(default_factory=dict)
+    contact_names: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        frames = np.size(self.times)
+        empty = {"contact_forces": np.empty((frames, 0, 3)), "commands": np.empty((frames, 0))}
+        for name, ndim in {"times": 1, "q": 2, "v": 2, "contact_forces": 3, "commands": 2}.items():
+            value = getattr(self, name)
+            value = _numbers(name, empty[name] if value is None and name in empty else value)
+            object.__setattr__(self, name, value)
+            _check_array(name, value, ndim, frames)
+        _check_clock(self.dt, self.times)
+        if self.contact_forces.shape[2] != 3:
+            raise RolloutError(f"contact_forces has shape {self.contact_forces.shape}; expected (T, n_contacts, 3)")
+        object.__setattr__(self, "contact_names", tuple(self.contact_names))
+        named, found = len(self.contact_names), self.contact_forces.shape[1]
+        if named and found and named != found:
+            raise RolloutError(f"contact_names has {named} names; contact_forces has {found} contacts")
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the last [s]."""
+        return float(self.times[-1] - self.times[0])
+
+    def save(self, path: str | Path) -> Path:
+        """Write the rollout as a compressed npz, values in single precision, and return its path."""
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "robot": self.robot,
+            "transmission": self.transmission,
+            "dt": float(self.dt),
+            "label": self.label,
+            "info": {str(key): str(value) for key, value in self.info.items()},
+            "contact_names": list(self.contact_names),
+        }
+        path = Path(path)
+        # An open file, since numpy would append .npz to a name that lacks it.
+        with path.open("wb") as file:
+            np.savez_compressed(
+                file,
+                header=np.array(json.dumps(header)),
+                times=self.times,
+                **{name: getattr(self, name).astype(np.float32) for name in ("q", "v", "contact_forces", "commands")},
+            )
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Rollout:
+        """Read what `save` wrote.
+
+        Raises:
+            RolloutError: The file is missing, damaged, of another kind or of a newer version.
+        """
+        entries = _read_entries(Path(path))
+        try:
+            header = _read_header(entries.pop("header"))
+            return cls(**header, **entries)
+        except RolloutError as error:
+            raise RolloutError(f"{path}: {error}") from None
+
+
+def _numbers(name: str, value: Any) -> Array:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise RolloutError(f"{name} is not an array of numbers") from None
+
+
+def _check_array(name: str, value: Array, ndim: int, frames: int) -> None:
+    if frames == 0:
+        raise RolloutError("times is empty: expected at least one frame")
+    if value.ndim != ndim or len(value) != frames:
+        expected = "(T,)" if ndim == 1 else f"{ndim} axes, the first of length {frames} as in times"
+        raise RolloutError(f"{name} has shape {value.shape}; expected {expected}")
+    if not np.isfinite(value).all():
+        frame = int(np.argwhere(~np.isfinite(value))[0][0])
+        raise RolloutError(f"{name} has a number that is not finite in frame {frame}; expected finite numbers")
+
+
+def _check_clock(dt: float, times: Array) -> None:
+    if not (np.isfinite(dt) and dt > 0):
+        raise RolloutError(f"dt is {dt}; expected a positive time in seconds")
+    if (np.diff(times) <= 0).any():
+        raise RolloutError("times does not increase from frame to frame")
+
+
+def _read_entries(path: Path) -> dict[str, Any]:
+    names = {"header", "times", "q", "v", "contact_forces", "commands"}
+    try:
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise RolloutError(f"{path}: not a ce_gym rollout; expected an npz, not a single array")
+        with archive:
+            if not names <= set(archive.files):
+                raise RolloutError(f"{path}: not a ce_gym rollout; expected an npz with {', '.join(sorted(names))}")
+            return {name: archive[name] for name in names}
+    except FileNotFoundError:
+        raise RolloutError(f"{path}: no such file; expected a rollout (.npz)") from None
+    except RolloutError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RolloutError(f"{path}: cannot be read as a rollout ({reason})") from None
+
+
+def _read_header(entry: NDArray[Any]) -> dict[str, Any]:
+    try:
+        header = json.loads(str(entry))
+    except json.JSONDecodeError:
+        header = None
+    if not isinstance(header, dict) or header.pop("format", None) != FORMAT:
+        raise RolloutError(f"not a ce_gym rollout; expected a header with format {FORMAT!r}")
+    version = header.pop("version", None)
+    if version != VERSION:
+        raise RolloutError(f"version is {version!r}; this ce_gym reads version {VERSION}")
+    expected = {
+        "robot": str,
+        "transmission": str,
+        "dt": (int, float),
+        "label": str,
+        "info": dict,
+        "contact_names": list,
+    }
+    for key, kind in expected.items():
+        if not isinstance(header.get(key), kind):
+            raise RolloutError(
+                f"header key {key!r} is {header.get(key)!r}; expected {getattr(kind, '__name__', 'a number')}"
+            )
+    return {key: header[key] for key in expected}

@@ -1,0 +1,178 @@
+"""The few three.js objects and meshcat commands that a scene is made of, as plain dictionaries.
+
+meshcat's browser page takes commands (`set_object`, `set_property`, `set_animation`) packed with MessagePack.
+Building them here, instead of through meshcat's Python classes, needs no server, gives identical bytes for identical
+scenes, and reaches what those classes lack (capsules, lights with shadows, packed animation tracks). The formats are
+those of three.js r132, which meshcat 0.3.2 carries, and of meshcat's `commands.py`. Knows no robots.
+"""
+
+from __future__ import annotations
+
+import base64
+import struct
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ce_gym.viewer.errors import ViewerError
+
+Array = NDArray[np.float64]
+Command = dict[str, Any]
+Color = Sequence[float]
+
+_FLOAT32_ARRAY = 0x17  # MessagePack extension code that meshcat's page decodes as a Float32Array
+FRONT, BACK = 0, 1  # three.js: which faces of a mesh are drawn
+_REPEAT, _LINEAR, _LINEAR_MIPMAP = 1000, 1006, 1008  # three.js texture constants
+
+
+def pack(command: Command) -> bytes:
+    """Return a command as the MessagePack bytes that meshcat's page reads."""
+    umsgpack = _umsgpack()
+    return umsgpack.packb(command, ext_handlers={np.ndarray: lambda array: _pack_array(umsgpack, array)})
+
+
+def _pack_array(umsgpack: Any, array: NDArray[Any]) -> Any:
+    return umsgpack.Ext(_FLOAT32_ARRAY, np.ascontiguousarray(array, dtype="<f4").tobytes())
+
+
+def _umsgpack() -> Any:
+    try:
+        import umsgpack
+    except ImportError:
+        raise ViewerError.missing_meshcat() from None
+    return umsgpack
+
+
+def hex_color(color: Color) -> int:
+    """Return red, green, blue in 0..1 as 0xrrggbb."""
+    red, green, blue = (round(255 * min(max(float(c), 0.0), 1.0)) for c in color[:3])
+    return red << 16 | green << 8 | blue
+
+
+def transform(position: ArrayLike = (0, 0, 0), rotation: ArrayLike | None = None) -> Array:
+    """Return the (4, 4) matrix of a pose."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    if rotation is not None:
+        matrix[:3, :3] = rotation
+    return matrix
+
+
+# three.js turns its cylinders, lathes and spheres about y; robots and this package use z.
+Y_TO_Z = transform(rotation=[[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+def set_object(path: str, kind: str, matrix: Array, **parts: Any) -> Command:
+    """Return the command that puts one three.js object at a path.
+
+    Args:
+        path: Scene path.
+        kind: three.js type, such as "Mesh".
+        matrix: Pose in the frame of the path, shape (4, 4).
+        parts: "geometry", "material", "texture" and "image" become shared resources named after the path; anything
+            else is a property of the object.
+    """
+    scene: Command = {"metadata": {"version": 4.5, "type": "Object"}}
+    item: Command = {"uuid": path, "type": kind, "matrix": matrix.T.ravel().tolist()}
+    resources = {"geometry": "geometries", "material": "materials", "texture": "textures", "image": "images"}
+    for name, value in parts.items():
+        if name not in resources:
+            item[name] = value
+            continue
+        scene[resources[name]] = [{"uuid": f"{path}:{name}", **value}]
+        if name in ("geometry", "material"):
+            item[name] = f"{path}:{name}"
+    return {"type": "set_object", "path": path, "object": {**scene, "object": item}}
+
+
+def mesh(path: str, geometry: Command, color: Color, matrix: Array, *, opacity: float = 1.0) -> Command:
+    """Return the command that draws a solid."""
+    material: Command = {
+        "type": "MeshStandardMaterial",
+        "color": hex_color(color),
+        "roughness": 0.55,
+        "metalness": 0.1,
+        "side": FRONT,
+        "transparent": opacity < 1,
+        "opacity": float(opacity),
+    }
+    return set_object(path, "Mesh", matrix, geometry=geometry, material=material)
+
+
+def textured(path: str, geometry: Command, pixels: NDArray[np.uint8], matrix: Array, **options: Any) -> Command:
+    """Return the command that draws a solid covered by an image.
+
+    Args:
+        path: Scene path.
+        geometry: As returned by `box` and its fellows.
+        pixels: Red, green, blue, shape (height, width, 3).
+        matrix: Pose, shape (4, 4).
+        options: "repeat" (times in each direction, default (1, 1)); anything else belongs to the material.
+    """
+    repeat = [float(times) for times in options.pop("repeat", (1, 1))]
+    texture = {
+        "image": f"{path}:image",
+        "wrap": [_REPEAT, _REPEAT],
+        "repeat": repeat,
+        "minFilter": _LINEAR_MIPMAP,
+        "magFilter": _LINEAR,
+        "anisotropy": 8,
+    }
+    url = "data:image/png;base64," + base64.b64encode(png(pixels)).decode()
+    material = {"map": f"{path}:texture", "color": 0xFFFFFF, **options}
+    return set_object(path, "Mesh", matrix, geometry=geometry, material=material, texture=texture, image={"url": url})
+
+
+def png(pixels: NDArray[np.uint8]) -> bytes:
+    """Return an image, shape (height, width, 3), as a PNG file (RFC 2083)."""
+    height, width, _ = pixels.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in np.ascontiguousarray(pixels))
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = zlib.compress(rows, 9)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+def set_transform(path: str, matrix: Array) -> Command:
+    """Return the command that places everything at a path; `matrix` has shape (4, 4)."""
+    return {"type": "set_transform", "path": path, "matrix": matrix.T.ravel().tolist()}
+
+
+def set_property(path: str, name: str, value: Any) -> Command:
+    """Return the command that sets a property of the object at a path."""
+    return {"type": "set_property", "path": path, "property": name, "value": value}
+
+
+def box(x: float, y: float, z: float) -> Command:
+    """Return a box with edges along the axes [m]."""
+    return {"type": "BoxGeometry", "width": float(x), "height": float(y), "depth": float(z)}
+
+
+def sphere(radius: float) -> Command:
+    """Return a sphere [m]."""
+    return {"type": "SphereGeometry", "radius": float(radius), "widthSegments": 32, "heightSegments": 20}
+
+
+def cylinder(radius: float, length: float, *, top: float | None = None) -> Command:
+    """Return a cylinder about y [m]; `top` is the radius at +y if it differs, zero for a cone."""
+    radii = {"radiusTop": float(radius if top is None else top), "radiusBottom": float(radius)}
+    return {"type": "CylinderGeometry", **radii, "height": float(length), "radialSegments": 40}
+
+
+def capsule(radius: float, length: float) -> Command:
+    """Return a capsule about y: a half circle, a line of `length` [m] and a half circle, turned about y."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 22)
+    heights = radius * np.sin(angles) + np.where(angles > 0, 0.5, -0.5) * length
+    points = [{"x": float(x), "y": float(y)} for x, y in zip(radius * np.cos(angles), heights, strict=True)]
+    return {"type": "LatheGeometry", "points": points, "segments": 32, "phiStart": 0.0, "phiLength": 2 * np.pi}
+
+
+def plane(x: float, y: float) -> Command:
+    """Return a rectangle in the xy plane that faces +z [m]."""
+    return {"type": "PlaneGeometry", "width": float(x), "height": float(y)}

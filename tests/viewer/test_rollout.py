@@ -1,0 +1,152 @@
+"""Rollout files: what goes in comes out, and what is wrong is said in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hopper import make_rollout
+
+from ce_gym.viewer import Recorder, Rollout, RolloutError
+
+ARRAYS = ("times", "q", "v", "contact_forces", "commands")
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    rollout = make_rollout(contact_names=["foot"])
+    loaded = Rollout.load(rollout.save(tmp_path / "walk.npz"))
+    for name in ARRAYS:
+        np.testing.assert_allclose(getattr(loaded, name), getattr(rollout, name), rtol=1e-6, err_msg=name)
+    for name in ("robot", "transmission", "dt", "label", "info", "contact_names"):
+        assert getattr(loaded, name) == getattr(rollout, name)
+
+
+def test_forces_and_commands_may_be_left_out(tmp_path: Path) -> None:
+    rollout = make_rollout(contact_forces=None, commands=None)
+    loaded = Rollout.load(rollout.save(tmp_path / "walk.npz"))
+    assert loaded.contact_forces.shape == (50, 0, 3)
+    assert loaded.commands.shape == (50, 0)
+
+
+def test_file_keeps_the_name_it_was_given(tmp_path: Path) -> None:
+    assert make_rollout().save(tmp_path / "walk.rollout").exists()
+
+
+def test_file_is_small(tmp_path: Path) -> None:
+    rollout = make_rollout(1000)
+    values = sum(getattr(rollout, name).size for name in ARRAYS)
+    assert rollout.save(tmp_path / "walk.npz").stat().st_size < 4 * values + 8 * len(rollout) + 4000
+
+
+def test_recorder_copies_what_it_is_given() -> None:
+    recorder, q = Recorder("hopper", "exact", 0.1, label="a", info={"k": "1"}), np.zeros(2)
+    for k in range(3):
+        q[:] = k
+        recorder.add(0.1 * k, q, q, [[0, 0, k]], [k])
+    rollout = recorder.rollout()
+    assert len(recorder) == len(rollout) == 3
+    np.testing.assert_array_equal(rollout.q[:, 0], [0, 1, 2])
+    np.testing.assert_array_equal(rollout.contact_forces[:, 0, 2], [0, 1, 2])
+    np.testing.assert_array_equal(rollout.commands[:, 0], [0, 1, 2])
+    assert rollout.duration == pytest.approx(0.2)
+    assert (rollout.label, rollout.info) == ("a", {"k": "1"})
+
+
+def test_recorder_refuses_nothing_and_changing_shapes() -> None:
+    recorder = Recorder("hopper", "exact", 0.1)
+    with pytest.raises(RolloutError, match="nothing was recorded"):
+        recorder.rollout()
+    recorder.add(0.0, [1, 2], [1])
+    recorder.add(0.1, [1, 2, 3], [1])
+    with pytest.raises(RolloutError, match="q changes shape"):
+        recorder.rollout()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"q": np.zeros((49, 6))}, "q has shape"),
+        ({"q": np.zeros(50)}, "q has shape"),
+        ({"v": np.full((50, 6), np.nan)}, "v has a number that is not finite in frame 0"),
+        ({"contact_forces": np.zeros((50, 1, 2))}, "contact_forces has shape"),
+        ({"contact_names": ["a", "b"]}, "contact_names has 2 names; contact_forces has 1 contacts"),
+        ({"times": np.zeros(50)}, "times does not increase"),
+        ({"dt": 0.0}, "dt is 0.0"),
+        ({"dt": float("nan")}, "dt is nan"),
+        ({"times": np.zeros(0)}, "times is empty"),
+    ],
+)
+def test_bad_values(changes: dict, message: str) -> None:
+    with pytest.raises(RolloutError, match=message):
+        make_rollout(**changes)
+
+
+def rewritten(
+    path: Path, header: dict | None = None, text: str | None = None, drop: tuple[str, ...] = (), **arrays: np.ndarray
+) -> Path:
+    """Save a good rollout, then write it again with changes."""
+    make_rollout().save(path)
+    with np.load(path) as archive:
+        content = {name: archive[name] for name in archive.files if name not in drop}
+    if header is not None:
+        content["header"] = np.array(json.dumps({**json.loads(str(content["header"])), **header}))
+    if text is not None:
+        content["header"] = np.array(text)
+    with path.open("wb") as file:
+        np.savez(file, **{**content, **arrays}, allow_pickle=True)
+    return path
+
+
+def garbage(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def truncated(path: Path) -> Path:
+    content = make_rollout().save(path).read_bytes()
+    return garbage(path, content[: len(content) // 2])
+
+
+def flipped(path: Path) -> Path:
+    """Damage bytes in the middle, where the compressed numbers are."""
+    content = bytearray(make_rollout(500).save(path).read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 64] = bytes(64)
+    return garbage(path, bytes(content))
+
+
+def single_array(path: Path) -> Path:
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: path, "no such file"),
+        (lambda path: path.parent, "cannot be read"),
+        (lambda path: garbage(path, b""), "cannot be read"),
+        (lambda path: garbage(path, b"hello"), "cannot be read"),
+        (truncated, "cannot be read"),
+        (flipped, "cannot be read"),
+        (single_array, "not a ce_gym rollout"),
+        (lambda path: rewritten(path, drop=("q",)), "not a ce_gym rollout; expected an npz with .*q"),
+        (lambda path: rewritten(path, q=np.array([{}], object)), "cannot be read"),
+        (lambda path: rewritten(path, header={"version": 2}), "version is 2; this ce_gym reads version 1"),
+        (lambda path: rewritten(path, header={"format": "other"}), "expected a header"),
+        (lambda path: rewritten(path, header={"robot": 3}), "header key 'robot' is 3; expected str"),
+        (lambda path: rewritten(path, header={"dt": "x"}), "header key 'dt' is 'x'; expected a number"),
+        (lambda path: rewritten(path, text="{"), "expected a header"),
+        (lambda path: rewritten(path, q=np.full((50, 6), np.inf)), "q has a number that is not finite"),
+        (lambda path: rewritten(path, q=np.array("text")), "q is not an array of numbers"),
+    ],
+)
+def test_bad_files(tmp_path: Path, make, message: str) -> None:
+    path = make(tmp_path / "walk.npz")
+    with pytest.raises(RolloutError, match=message) as caught:
+        Rollout.load(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)

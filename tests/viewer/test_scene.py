@@ -1,0 +1,209 @@
+"""The scene's commands: replayed by a small interpreter, they put every body where the model says it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hopper import StandIn, make_robot, make_rollout
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ce_gym.model.description import ContactSphere
+from ce_gym.viewer import ViewerError, three, tracks
+from ce_gym.viewer.arrows import HIDDEN
+from ce_gym.viewer.scene import ROOT, build_scene
+from ce_gym.viewer.stand_ins import frame_along, rotor_discs
+
+
+def clips_of(commands: list[dict]) -> dict[str, dict[str, np.ndarray]]:
+    """Values of every animated path by track name, two rows where a track is constant."""
+    assert commands[-1]["type"] == "set_animation"
+    result = {}
+    for animation in commands[-1]["animations"]:
+        items = animation["clip"]["tracks"]
+        result[animation["path"]] = {t["name"][1:]: np.reshape(t["values"], (len(t["times"]), -1)) for t in items}
+    return result
+
+
+def matrix_at(clip: dict[str, np.ndarray], frame: int) -> np.ndarray:
+    def value(name: str, default: list[float]) -> np.ndarray:
+        return clip[name][min(frame, len(clip[name]) - 1)] if name in clip else np.array(default)
+
+    x, y, z, w = value("quaternion", [0, 0, 0, 1])
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return three.transform(value("position", [0, 0, 0]), rotation * value("scale", [1, 1, 1]))
+
+
+def world(clips: dict, path: str, frame: int) -> np.ndarray:
+    """Pose of a path, the world's own shift left out."""
+    parts = path.strip("/").split("/")
+    result = np.eye(4)
+    for count in range(2, len(parts) + 1):
+        result = result @ matrix_at(clips.get("/" + "/".join(parts[:count]), {}), frame)
+    return result
+
+
+@pytest.fixture
+def scene() -> list[dict]:
+    return build_scene([make_rollout()], [StandIn(make_robot())])
+
+
+def test_bodies_are_where_the_model_says(scene: list[dict]) -> None:
+    clips, rollout, model = clips_of(scene), make_rollout(), StandIn(make_robot())
+    positions, rotations = model.body_poses(rollout.q)
+    for index, path in enumerate(["base", "base/leg_1", "base/rotor"]):
+        for frame in (0, 7, 31, 49):
+            pose = world(clips, f"{ROOT}/0/{path}", frame)
+            np.testing.assert_allclose(pose[:3, 3], positions[frame, index], atol=1e-9)
+            np.testing.assert_allclose(pose[:3, :3], rotations[frame, index], atol=1e-9)
+
+
+def test_force_arrow_starts_at_the_contact_and_points_along_the_force(scene: list[dict]) -> None:
+    clips, rollout, model = clips_of(scene), make_rollout(), StandIn(make_robot())
+    positions, rotations = model.body_poses(rollout.q)
+    frame = 12
+    pose = world(clips, f"{ROOT}/0/contact forces/foot", frame)
+    contact = positions[frame, 1] + rotations[frame, 1] @ [0, 0, -0.25] - [0, 0, 0.02]
+    np.testing.assert_allclose(pose[:3, 3], contact, atol=1e-9)
+    tip = pose[:3, 2]
+    assert tip[2] > 0.05
+    np.testing.assert_allclose(tip[:2], 0, atol=1e-9)
+
+
+def test_forces_of_some_contacts_go_to_those(scene: list[dict]) -> None:
+    robot = make_robot()
+    two = replace(robot, contacts=(ContactSphere("knee", "base", (0, 0, 0), 0.1), *robot.contacts))
+    commands = build_scene([make_rollout(contact_names=["foot"])], [StandIn(two)])
+    path = f"{ROOT}/0/contact forces/foot"
+    np.testing.assert_allclose(world(clips_of(commands), path, 5)[:3, 3], world(clips_of(scene), path, 5)[:3, 3])
+
+
+def test_no_force_no_arrow(scene: list[dict]) -> None:
+    scale = clips_of(scene)[f"{ROOT}/0/contact forces/foot"]["scale"]
+    np.testing.assert_allclose(scale[0], HIDDEN)  # the force is zero in the first frame
+
+
+def test_command_arrow_turns_with_the_robot(scene: list[dict]) -> None:
+    clips, rollout = clips_of(scene), make_rollout()
+    yaw = rollout.q[20, 3]
+    expected = [0.5 * np.cos(yaw) - 0.1 * np.sin(yaw), 0.5 * np.sin(yaw) + 0.1 * np.cos(yaw)]
+    tip = world(clips, f"{ROOT}/0/command", 20)[:2, 2]
+    np.testing.assert_allclose(tip / np.linalg.norm(tip), expected / np.linalg.norm(expected), atol=1e-9)
+    speed = world(clips, f"{ROOT}/0/velocity", 20)[:2, 2]
+    np.testing.assert_allclose(speed[1] / speed[0], 0.1 / 0.5, rtol=1e-9)
+
+
+def test_the_world_moves_against_the_robot(scene: list[dict]) -> None:
+    shift, rollout = clips_of(scene)[ROOT]["position"], make_rollout()
+    np.testing.assert_allclose(shift[:, :2], -rollout.q[:, :2], atol=1e-9)  # it walks straight ahead
+    assert not shift[:, 2].any()
+
+
+def test_all_clips_last_equally_long() -> None:
+    models = [StandIn(make_robot())] * 2
+    commands = build_scene([make_rollout(50), make_rollout(20)], models)
+    ends = {float(t["times"][-1]) for animation in commands[-1]["animations"] for t in animation["clip"]["tracks"]}
+    assert len(ends) == 1
+    assert ends.pop() == pytest.approx(0.98)
+
+
+def test_neighbours_keep_apart_and_ghosts_do_not() -> None:
+    models, rollouts = [StandIn(make_robot())] * 2, [make_rollout()] * 2
+
+    def lateral(spacing: float | None) -> list[float]:
+        commands = build_scene(rollouts, models, spacing=spacing)
+        moved = [c for c in commands if c["type"] == "set_transform" and c["path"].startswith(f"{ROOT}/")]
+        return [c["matrix"][13] for c in moved]
+
+    left, right = lateral(None)
+    assert left - right > 0.4
+    assert lateral(0.0) == [0.0, 0.0]
+    ghosts = [c for c in build_scene(rollouts, models, spacing=0.0) if c["path"].startswith(f"{ROOT}/1/base/link")]
+    assert ghosts[0]["object"]["materials"][0]["transparent"]
+
+
+def test_high_rates_are_thinned() -> None:
+    rollout = make_rollout(1000, step=0.001)
+    commands = build_scene([rollout], [StandIn(make_robot())], max_fps=50)
+    assert len(clips_of(commands)[f"{ROOT}/0/base"]["quaternion"]) == pytest.approx(50, abs=1)
+
+
+def test_one_frame_is_enough() -> None:
+    commands = build_scene([make_rollout(1)], [StandIn(make_robot())])
+    assert commands[-1]["animations"][0]["clip"]["tracks"][0]["times"].tolist() == [0.0, 0.02]
+
+
+def objects(commands: list[dict], under: str) -> dict[str, str]:
+    found = [c for c in commands if c["type"] == "set_object" and c["path"].startswith(under)]
+    return {c["path"]: c["object"]["geometries"][0]["type"] for c in found}
+
+
+def test_every_kind_of_shape_is_drawn(scene: list[dict]) -> None:
+    drawn = objects(scene, f"{ROOT}/0/base")
+    assert drawn == {
+        f"{ROOT}/0/base/link_0": "BoxGeometry",
+        f"{ROOT}/0/base/leg_1/link_0": "LatheGeometry",
+        f"{ROOT}/0/base/leg_1/link_1": "SphereGeometry",
+        f"{ROOT}/0/base/rotor/rotor_0": "CylinderGeometry",
+        f"{ROOT}/0/base/rotor/rotor_0_spoke": "BoxGeometry",
+    }
+
+
+def test_robot_without_shapes_is_a_stick_figure() -> None:
+    commands = build_scene([make_rollout()], [StandIn(make_robot(shapes=False))])
+    kinds = list(objects(commands, f"{ROOT}/0/base").values())
+    assert kinds.count("SphereGeometry") == 4  # three bodies and a contact
+    assert kinds.count("CylinderGeometry") == 3  # to two children and the contact
+
+
+def test_rotor_without_shapes_is_a_hidden_disc_of_its_inertia() -> None:
+    robot = make_robot(rotor_shape=False)
+    (disc,) = rotor_discs(robot).values()
+    radius, height = disc.size
+    assert 0.5 * radius**2 == pytest.approx(0.01)  # kg m^2 about y, mass 1 kg
+    assert height == pytest.approx(np.sqrt(12 * 0.015 - 3 * radius**2))
+    commands = build_scene([make_rollout()], [StandIn(robot)])
+    hidden = [c for c in commands if c["type"] == "set_property" and c["path"] == f"{ROOT}/0/base/rotor/inside"]
+    assert [(c["property"], c["value"]) for c in hidden] == [("visible", False)]
+
+
+def test_capsule_has_the_length_it_should() -> None:
+    points = three.capsule(0.1, 0.4)["points"]
+    assert max(p["y"] for p in points) == pytest.approx(0.3)
+    assert max(p["x"] for p in points) == pytest.approx(0.1, rel=1e-2)
+    assert min(p["x"] for p in points) == pytest.approx(0, abs=1e-12)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    model = StandIn(make_robot())
+    with pytest.raises(ViewerError, match="does not fit the robot: q has 3 columns"):
+        build_scene([make_rollout(q=np.zeros((50, 3)))], [model])
+    with pytest.raises(ViewerError, match="forces of 2 contacts; the robot has 1"):
+        build_scene([make_rollout(contact_forces=np.zeros((50, 2, 3)))], [model])
+    with pytest.raises(ViewerError, match="contact 'hand', which the robot lacks"):
+        build_scene([make_rollout(contact_names=["hand"])], [model])
+    with pytest.raises(ViewerError, match="nothing to show"):
+        build_scene([], [])
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3))
+def test_quaternions_invert_rotations(q: list[float]) -> None:
+    unit = np.array(q) / np.linalg.norm(q)
+    rotation = matrix_at({"quaternion": unit[None]}, 0)[:3, :3]
+    assert abs(tracks.quaternions(rotation) @ unit) == pytest.approx(1, abs=1e-12)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3))
+def test_frames_are_right_handed_and_point_where_they_should(direction: list[float]) -> None:
+    frame = frame_along(np.array(direction))
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(frame) == pytest.approx(1)
+    assert frame[:, 2] @ direction == pytest.approx(np.linalg.norm(direction), abs=1e-9)
