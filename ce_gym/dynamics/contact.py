@@ -9,8 +9,12 @@ so that `dt J^T C J` joins the body's inertia before the inward pass and the rec
 bodies. This is one Newton step of backward Euler (Anitescu and Potra 2002) with frozen normal, lever arm and normal
 force in the friction; it is dissipative for every step length because C is positive semidefinite.
 
-A contact is active if it *will* be in the ground by the end of the step, `depth + dt depth' > 0`, and pushes; with the
-second condition alone the damper would act above the ground. May know spatial algebra; no robots, no recursions.
+A contact begins if it *will* be in the ground by the end of the step, `depth + dt depth' > 0`, and pushes; with the
+second condition alone the damper would act above the ground. The prediction knows the velocity but not yet the
+acceleration. A loaded foot that its spring has just lifted would therefore be judged gone, fall back, and bounce on the
+steps for ever; so a contact that pushed at the end of the last step goes on as long as it is in the ground. It ends
+when the solution would pull: an active-set method whose iterations are the steps. May know spatial algebra; no robots,
+no recursions.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ class ContactResponse:
     Attributes:
         force: Force at zero acceleration, body axes [N], shape (3,).
         C: Effective damping, body axes [N s/m], shape (3, 3).
+        normal: Unit normal out of the ground, body axes, shape (3,).
         point: Where it acts, in the body frame [m], shape (3,).
         bias: `w x v_p`, shape (3,).
         dt: Step length [s].
@@ -42,6 +47,7 @@ class ContactResponse:
 
     force: SX
     C: SX
+    normal: SX
     point: SX
     bias: SX
     dt: float
@@ -65,7 +71,7 @@ class ContactResponse:
 
 
 def ground_contact(
-    body: BodyState, position: SX, radius: float, material: ContactMaterial, dt: float
+    body: BodyState, position: SX, radius: float, pushed: SX, material: ContactMaterial, dt: float
 ) -> ContactResponse:
     """Evaluate a sphere against the plane z = 0.
 
@@ -73,6 +79,7 @@ def ground_contact(
         body: Kinematics of the body that carries it.
         position: Centre of the sphere in the body frame [m], shape (3,).
         radius: [m].
+        pushed: 1 if the contact pushed at the end of the last step, else 0.
         material: Compliance and friction.
         dt: Step length [s].
     """
@@ -83,12 +90,18 @@ def ground_contact(
     normal_speed = ca.dot(n, velocity)
     normal_slope = material.damping + dt * material.stiffness
     pushing = material.stiffness * depth - normal_slope * normal_speed
-    active = ca.logic_and(depth - dt * normal_speed > 0, pushing > 0)
+    begins = ca.logic_and(depth - dt * normal_speed > 0, pushing > 0)
+    active = ca.logic_or(begins, ca.logic_and(pushed > 0.5, depth > 0))
     normal_force = ca.if_else(active, pushing, 0)
     slip = velocity - normal_speed * n
-    tangent_slope = material.friction * normal_force / ca.sqrt(ca.sumsqr(slip) + SLIP_SPEED**2)
+    tangent_slope = material.friction * ca.fmax(normal_force, 0) / ca.sqrt(ca.sumsqr(slip) + SLIP_SPEED**2)
     normal_excess = ca.if_else(active, normal_slope, 0) - tangent_slope
     C = mirrored(tangent_slope * SX.eye(3) + normal_excess * (n @ n.T))
     return ContactResponse(
-        force=normal_force * n - tangent_slope * slip, C=C, point=point, bias=cross(body.v[:3], velocity), dt=dt
+        force=normal_force * n - tangent_slope * slip,
+        C=C,
+        normal=n,
+        point=point,
+        bias=cross(body.v[:3], velocity),
+        dt=dt,
     )

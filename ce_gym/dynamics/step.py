@@ -63,6 +63,7 @@ class Stepped:
     Attributes:
         q: Positions, shape (nq,).
         v: Velocities, shape (nv,).
+        pushed: 1 for each contact that pushed, else 0, shape (n_contacts,).
         diverged: 1 if the robot has diverged now or before; it then stays where it was.
         torque: Motor torque at each joint, mean over the step [N m or N], shape (nj,).
         contact_forces: Mean force on each contact over the step, world axes [N], shape (3, n_contacts).
@@ -70,25 +71,29 @@ class Stepped:
 
     q: SX
     v: SX
+    pushed: SX
     diverged: SX
     torque: SX
     contact_forces: SX
 
 
-def step(mechanism: Mechanism, q: SX, v: SX, diverged: SX, target: SX, options: StepOptions) -> Stepped:
+def step(
+    mechanism: Mechanism, q: SX, v: SX, pushed: SX, diverged: SX, target: SX, options: StepOptions
+) -> Stepped:
     """Advance one robot by one time step.
 
     Args:
         mechanism: The robot at a transmission level.
         q: Positions, shape (nq,).
         v: Velocities, shape (nv,).
+        pushed: 1 for each contact that pushed in the step before, else 0, shape (n_contacts,).
         diverged: 1 if the robot has diverged before, else 0.
         target: Joint targets or torques, shape (nj,), see `StepOptions.control`.
         options: The scene.
     """
     kinematics = outward_velocity_pass(mechanism, q, v)
     motors, passive = joint_forces(mechanism, q, v, target, options)
-    contacts = touching(mechanism, kinematics, options)
+    contacts = touching(mechanism, kinematics, pushed, options)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
 
     joints = on_coordinates(mechanism, [m + p for m, p in zip(motors, passive, strict=True)])
@@ -98,16 +103,16 @@ def step(mechanism: Mechanism, q: SX, v: SX, diverged: SX, target: SX, options: 
     q_next, v_next = advance(q, v, vdot, options.dt, mechanism.robot.floating)
     sane = ca.logic_and(ca.sumsqr(v_next) < SANE_SPEED**2, diverged < 0.5)  # false if anything is not a number
     ydd = vdot[-len(motors) :] if motors else SX(0, 1)
-    forces = [
-        kinematics.bodies[sphere.body].R @ contact.force_after(a[sphere.body], gravity[sphere.body])
-        for sphere, contact in contacts
-    ]
+    forces = [contact.force_after(a[sphere.body], gravity[sphere.body]) for sphere, contact in contacts]
+    pushes = [ca.dot(contact.normal, force) > 0 for (_, contact), force in zip(contacts, forces, strict=True)]
+    in_world = [kinematics.bodies[sphere.body].R @ f for (sphere, _), f in zip(contacts, forces, strict=True)]
     return Stepped(
         q=ca.if_else(sane, q_next, q),
         v=ca.if_else(sane, v_next, v),
+        pushed=ca.vertcat(SX(0, 1), *pushes),
         diverged=ca.if_else(sane, 0, 1),
         torque=ca.vertcat(*[m.tau - m.slope * ydd[i] for i, m in enumerate(motors)]),
-        contact_forces=ca.horzcat(SX(3, 0), *forces),
+        contact_forces=ca.horzcat(SX(3, 0), *in_world),
     )
 
 
@@ -133,14 +138,15 @@ def joint_forces(
 
 
 def touching(
-    mechanism: Mechanism, kinematics: Kinematics, options: StepOptions
+    mechanism: Mechanism, kinematics: Kinematics, pushed: SX, options: StepOptions
 ) -> list[tuple[ContactSphere, ContactResponse]]:
     """Evaluate every contact sphere of the scene against the ground."""
     spheres = {contact.name: contact for contact in mechanism.robot.contacts}
     pairs = []
-    for sphere in (spheres[name] for name in options.contacts):
+    for i, sphere in enumerate(spheres[name] for name in options.contacts):
         body, position = kinematics.bodies[sphere.body], constant(np.array(sphere.position))
-        pairs.append((sphere, ground_contact(body, position, sphere.radius, options.material, options.dt)))
+        contact = ground_contact(body, position, sphere.radius, pushed[i], options.material, options.dt)
+        pairs.append((sphere, contact))
     return pairs
 
 
@@ -170,11 +176,14 @@ def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str
         outputs: Any of "torque" and "contact_forces"; what is not asked for costs nothing.
 
     Returns:
-        Function (q, v, diverged, target) -> (q, v, diverged, *outputs).
+        Function (q, v, pushed, diverged, target) -> (q, v, pushed, diverged, *outputs); a scene without contacts has no
+        `pushed`.
     """
     q, v = state_symbols(mechanism)
-    diverged, target = SX.sym("diverged"), SX.sym("target", len(mechanism.robot.independent))
-    after = step(mechanism, q, v, diverged, target, options)
-    results = {"q_next": after.q, "v_next": after.v, "diverged_next": after.diverged}
+    state = {"q": q, "v": v, "pushed": SX.sym("pushed", len(options.contacts)), "diverged": SX.sym("diverged")}
+    target = SX.sym("target", len(mechanism.robot.independent))
+    after = step(mechanism, *state.values(), target, options)
+    kept = [name for name in state if state[name].numel()]
+    results = {f"{name}_next": getattr(after, name) for name in kept}
     results |= {name: ca.vec(getattr(after, name)) for name in outputs}
-    return traced("step", {"q": q, "v": v, "diverged": diverged, "target": target}, results)
+    return traced("step", {name: state[name] for name in kept} | {"target": target}, results)

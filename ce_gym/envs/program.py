@@ -73,15 +73,17 @@ class TaskProgram:
         sizes = {
             "q": self.model.nq,
             "v": self.model.nv,
+            "pushed": len(self.contacts),
             "diverged": 1,
             "torque": self.n_joints,
             "action": self.n_joints,
             "command": 3,
             "clock": 1,
-            "air_time": max(self.n_feet, 1),
+            "air_time": self.n_feet,
             "sums": 1 + len(self.reward_terms) + len(self.metric_terms),
         }
-        return sizes | ({"contact_forces": 3 * len(self.contacts)} if self.contact_forces else {})
+        sizes |= {"contact_forces": 3 * len(self.contacts)} if self.contact_forces else {}
+        return {name: size for name, size in sizes.items() if size}
 
     @property
     def sum_names(self) -> list[str]:
@@ -120,8 +122,8 @@ class TaskProgram:
             Call(act, ("action_in",), ("clipped", "target")),
             Call(
                 physics,
-                ("q", "v", "diverged", "target"),
-                ("q", "v", "diverged", *self._physics_outputs),
+                tuple(physics.name_in()),
+                (*physics.name_in()[:-1], *self._physics_outputs),
                 repeat="n_substeps",
             ),
             Call(assess, tuple(assess.name_in()), self._assess_outputs),

@@ -103,7 +103,9 @@ class Simulator:
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} holds a number that is not finite")
             write_rows(self._arrays[name], np.broadcast_to(value, (self.num_envs, size)), chosen)
-        write_rows(self._arrays["diverged"], np.zeros((self.num_envs, 1)), chosen)
+        for name in ("pushed", "diverged"):
+            if name in self._arrays:
+                write_rows(self._arrays[name], np.zeros(self._arrays[name].shape[1]), chosen)
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
         """Advance all robots by `n_substeps` sub-steps.
@@ -195,10 +197,11 @@ def load_step_kernel(model: Model, options: StepOptions, outputs: dict[str, int]
 
     def build() -> Program:
         nj = len(model.joint_links)
-        sizes = {"q": model.nq, "v": model.nv, "diverged": 1} | outputs
+        sizes = {"q": model.nq, "v": model.nv, "pushed": len(options.contacts), "diverged": 1} | outputs
+        sizes = {name: size for name, size in sizes.items() if size}
         buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()] + [Buffer("target", nj, "rows_in")]
         function = step_function(model.mechanism, options, tuple(outputs))
-        call = Call(function, ("q", "v", "diverged", "target"), tuple(sizes), repeat="n_substeps")
+        call = Call(function, tuple(function.name_in()), tuple(sizes), repeat="n_substeps")
         return Program(f"{model.robot.name} {model.transmission} step", tuple(buffers), (call,))
 
     return load_kernel(f"step {model_key(model)} {options!r} {outputs!r}", build, dtype)

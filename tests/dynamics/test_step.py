@@ -24,8 +24,14 @@ def stepper(model: Model, dt: float = 0.005, **options):
     scene = StepOptions(dt, contacts=names, material=material, **options)
     function = step_function(model.mechanism, scene, ("torque", "contact_forces"))
 
+    memory = {"pushed": np.zeros(len(names))}  # carried from step to step, as the simulator does
+
     def step(q, v, target, diverged=0.0):
-        return [np.array(x.full()).ravel() for x in function(q, v, diverged, target)]
+        state = [q, v, memory["pushed"], diverged] if names else [q, v, diverged]
+        results = dict(zip(function.name_out(), function.call([*state, target]), strict=True))
+        if names:
+            memory["pushed"] = results.pop("pushed_next")
+        return [np.array(x.full()).ravel() for x in results.values()]
 
     return step
 

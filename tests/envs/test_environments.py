@@ -1,0 +1,283 @@
+"""Every registered id against Gymnasium's contract, and the equality of single and vector environments."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+
+import ce_gym
+
+IDS = sorted(ce_gym.environment_ids())
+VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
+
+
+def random_actions(steps: int, n: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, n, 12)).astype(np.float32)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_gymnasium_check_env_is_silent(env_id: str):
+    env = gymnasium.make(env_id)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    env.close()
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_spec_survives_json(env_id: str):
+    spec = gymnasium.spec(env_id)
+    again = EnvSpec.from_json(spec.to_json())
+    assert again == spec
+    assert gymnasium.make(again).unwrapped.model.transmission == spec.kwargs["transmission"]
+
+
+def test_every_level_has_an_id():
+    levels = {gymnasium.spec(env_id).kwargs["transmission"] for env_id in IDS}
+    assert levels == {"exact", "coupled", "armature", "none"}
+
+
+def test_ids_work_in_a_process_that_has_not_imported_the_package():
+    code = f"import gymnasium; gymnasium.make('ce_gym:{VELOCITY}').reset(seed=0); print('made')"
+    result = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "made"
+
+
+def test_levels_are_treated_alike():
+    envs = [gymnasium.make(VELOCITY, transmission=level).unwrapped for level in ("exact", "coupled", "armature", "none")]
+    first = envs[0]
+    observation, _ = first.reset(seed=3)
+    for env in envs[1:]:
+        assert env.observation_space == first.observation_space
+        assert env.action_space == first.action_space
+        assert env.model.total_mass == pytest.approx(first.model.total_mass)
+        np.testing.assert_array_equal(env.reset(seed=3)[0], observation)
+        assert env.model.joint_links == first.model.joint_links
+
+
+def rollout(envs, actions: np.ndarray, seed: int) -> list[np.ndarray]:
+    observation, _ = envs.reset(seed=seed)
+    history = [observation]
+    for action in actions:
+        observation, reward, *_ = envs.step(action)
+        history += [observation, reward]
+    return history
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_same_seed_same_rollout_whatever_the_batch(mode: str):
+    """Batch 1, 7, 1024 and threads 1, 2: bitwise equal, through terminations and resets."""
+    actions = random_actions(80, 1024)
+    whole = rollout(gymnasium.make_vec(VELOCITY, num_envs=1024, num_threads=2, autoreset_mode=mode), actions, seed=10)
+    for n, threads in ((1, 1), (7, 1), (7, 2), (1024, 1)):
+        envs = gymnasium.make_vec(VELOCITY, num_envs=n, num_threads=threads, autoreset_mode=mode)
+        for ours, theirs in zip(rollout(envs, actions[:, :n], seed=10), whole, strict=True):
+            np.testing.assert_array_equal(ours, theirs[:n])
+
+
+def test_single_environment_is_lane_zero():
+    actions = random_actions(300, 5, seed=1)
+    envs = gymnasium.make_vec(VELOCITY, num_envs=5, autoreset_mode="SameStep")
+    vector_observation, _ = envs.reset(seed=20)
+    singles = [gymnasium.make(VELOCITY) for _ in range(5)]
+    for i, env in enumerate(singles):
+        np.testing.assert_array_equal(env.reset(seed=20 + i)[0], vector_observation[i])
+    ended = 0
+    for action in actions:
+        observation, reward, terminated, _, infos = envs.step(action)
+        for i, env in enumerate(singles):
+            ours, r, done, _, _ = env.step(action[i])
+            assert r == reward[i]
+            assert done == terminated[i]
+            if done:
+                ended += 1
+                np.testing.assert_array_equal(ours, infos["final_obs"][i])
+                ours, _ = env.reset()
+            np.testing.assert_array_equal(ours, observation[i])
+    assert ended >= 3
+
+
+def test_time_is_up_as_truncation():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=3, max_episode_steps=5, autoreset_mode=AutoresetMode.SAME_STEP)
+    envs.reset(seed=0)
+    zero = np.zeros((3, 12), np.float32)
+    for k in range(1, 11):
+        _, _, terminated, truncated, infos = envs.step(zero)
+        assert truncated.all() == (k % 5 == 0)
+        assert not terminated.any()
+        assert ("final_obs" in infos) == (k % 5 == 0)
+    assert infos["episode_terms"]["length"].tolist() == [5, 5, 5]
+    env = gymnasium.make(VELOCITY, max_episode_steps=5)
+    env.reset(seed=0)
+    assert [env.step(zero[0])[3] for _ in range(5)] == [False] * 4 + [True]
+
+
+def test_next_step_mode_shows_the_reset_one_step_later():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=2, max_episode_steps=3)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    envs.reset(seed=0)
+    zero = np.zeros((2, 12), np.float32)
+    for _ in range(3):
+        *_, truncated, _ = envs.step(zero)
+    assert truncated.all()
+    _, reward, terminated, truncated, _ = envs.step(np.ones((2, 12), np.float32))
+    assert not truncated.any()
+    assert not terminated.any()
+    np.testing.assert_array_equal(reward, 0.0)
+
+
+def test_disabled_mode_wants_a_mask():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=3, max_episode_steps=2, autoreset_mode="Disabled")
+    envs.reset(seed=0)
+    zero = np.zeros((3, 12), np.float32)
+    envs.step(zero)
+    observation, *_ = envs.step(zero)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="3 environments are finished"):
+        envs.step(zero)
+    mask = np.array([True, False, True])
+    after, _ = envs.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(after[1], observation[1])
+    assert (after[mask] != observation[mask]).any(axis=1).all()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="1 environments are finished"):
+        envs.step(zero)
+
+
+def test_mask_is_read_not_taken():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=2)
+    envs.reset(seed=0)
+    options = {"reset_mask": np.array([True, False])}
+    envs.reset(options=options)
+    assert "reset_mask" in options
+    for bad in (np.array([False, False]), np.array([1, 0]), np.array([True])):
+        with pytest.raises(ValueError, match=r"reset_mask=.*expected a bool array of shape \(2,\)"):
+            envs.reset(options={"reset_mask": bad})
+
+
+def test_fresh_arrays_out_of_every_call():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=4, autoreset_mode="SameStep", max_episode_steps=3)
+    envs.reset(seed=0)
+    kept, copies = [], []
+    for action in random_actions(8, 4):
+        observation, reward, terminated, truncated, infos = envs.step(action)
+        arrays = [observation, reward, terminated, truncated, infos["diverged"], *([infos["final_obs"]] if "final_obs" in infos else [])]
+        kept += arrays
+        copies += [a.copy() for a in arrays]
+        assert observation.dtype == np.float32
+    for array, copy in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+    assert not any(np.shares_memory(a, b) for i, a in enumerate(kept) for b in kept[:i])
+
+
+def test_stock_vector_wrappers():
+    envs = NormalizeObservation(RecordEpisodeStatistics(gymnasium.make_vec(VELOCITY, num_envs=6, max_episode_steps=4)))
+    envs.reset(seed=0)
+    for action in random_actions(4, 6):
+        observation, *_, infos = envs.step(action)
+    assert infos["episode"]["l"].tolist() == [4] * 6
+    assert np.isfinite(observation).all()
+
+
+def test_a_diverged_environment_is_flagged_and_reset_alone():
+    actions = random_actions(6, 20)
+    clean = gymnasium.make_vec(VELOCITY, num_envs=20, autoreset_mode="SameStep")
+    envs = gymnasium.make_vec(VELOCITY, num_envs=20, autoreset_mode="SameStep")
+    for e in (clean, envs):
+        e.reset(seed=0)
+    bad = envs.unwrapped.batch.rows("v")
+    bad[13, 8] = np.nan
+    envs.unwrapped.batch.write("v", bad)
+    others = np.arange(20) != 13
+    for k, action in enumerate(actions):
+        expected, ours = clean.step(action), envs.step(action)
+        np.testing.assert_array_equal(ours[0][others], expected[0][others])
+        np.testing.assert_array_equal(ours[1][others], expected[1][others])
+        assert np.isfinite(ours[0]).all()
+        assert ours[4]["diverged"].tolist() == [k == 0 and i == 13 for i in range(20)]
+        assert ours[3][13] == (k == 0)
+
+
+def test_reward_terms_add_up_and_weights_are_arguments():
+    weights = {"torques": 0.0, "alive": 20.0}  # never negative, so that nothing is clipped
+    envs = gymnasium.make_vec(VELOCITY, num_envs=8, max_episode_steps=20, autoreset_mode="SameStep", reward_weights=weights)
+    envs.reset(seed=0)
+    total = np.zeros(8)
+    for action in 0.1 * random_actions(20, 8):
+        _, reward, terminated, _, infos = envs.step(action)
+        total += reward
+        assert not terminated.any()
+    terms = infos["episode_terms"]
+    assert "reward/torques" not in terms
+    np.testing.assert_allclose(terms["reward/alive"], 20 * 20.0 * 0.02)
+    np.testing.assert_allclose(terms["return"], total)
+    parts = sum(value for name, value in terms.items() if name.startswith("reward/"))
+    np.testing.assert_allclose(parts, terms["return"], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"transmission": "rigid"}, "transmission='rigid'; expected one of exact, coupled, armature, none"),
+        ({"task": "fly"}, "task='fly'; expected one of velocity"),
+        ({"robot": "mini_cheeta"}, "mini_cheetah"),
+        ({"robot": "mit_humanoid_leg"}, "fixed base"),
+        ({"reward_weights": {"style": 1.0}}, "no reward term 'style'; expected one of"),
+        ({"dtype": "half"}, "dtype='half'"),
+        ({"num_threads": 0}, "num_threads=0; expected a whole number"),
+        ({"command_range": [[1, 0], [0, 0], [0, 0]]}, "low <= high"),
+        ({"command_period": -1.0}, "command_period=-1.0"),
+        ({"autoreset_mode": "never"}, "autoreset_mode='never'; expected one of"),
+    ],
+)
+def test_bad_arguments(arguments: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make_vec(VELOCITY, num_envs=2, **arguments)
+
+
+@pytest.mark.parametrize("action", [np.full((2, 12), np.nan), np.zeros((2, 11)), np.zeros(12), np.full((2, 12), np.inf)])
+def test_bad_actions_leave_the_environment_usable(action: np.ndarray):
+    envs = gymnasium.make_vec(VELOCITY, num_envs=2)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match="action"):
+        envs.step(action)
+    observation, *_ = envs.step(np.zeros((2, 12), np.float32))
+    assert np.isfinite(observation).all()
+
+
+def test_actions_beyond_the_box_are_clipped():
+    results = []
+    for size in (1.0, 50.0):
+        envs = gymnasium.make_vec(VELOCITY, num_envs=2)
+        envs.reset(seed=0)
+        results.append(envs.step(np.full((2, 12), size))[0])
+    np.testing.assert_array_equal(*results)
+
+
+def test_commands_change_and_some_ask_to_stand():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=512, command_period=0.1, reward_weights={"alive": 1.0})
+    envs.reset(seed=0)
+    seen = []
+    for _ in range(11):
+        envs.step(np.zeros((512, 12), np.float32))
+        seen.append(envs.unwrapped.state()["command"])
+    assert not np.array_equal(seen[0], seen[-1])
+    standing = np.mean([(c == 0).all(axis=1).mean() for c in seen])
+    assert 0.05 < standing < 0.15
+    commands = np.concatenate(seen)
+    assert commands[:, 0].min() < -0.95
+    assert commands[:, 0].max() > 0.95
+    assert np.abs(commands[:, 1]).max() <= 0.5
+
+
+def test_spec_kwargs_are_json():
+    json.dumps(gymnasium.spec(VELOCITY).kwargs)

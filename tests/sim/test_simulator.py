@@ -1,0 +1,155 @@
+"""The simulator: determinism, agreement with the traced step, failure of one lane, bad arguments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ce_gym import Model, Simulator
+from ce_gym.dynamics.step import step_function
+from ce_gym.model import ContactMaterial
+from ce_gym.model.mechanism import LEVELS
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return Model("mini_cheetah")
+
+
+@pytest.fixture(scope="module")
+def start(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, velocities and targets of 40 robots near the ground, some with feet in it."""
+    rng = np.random.default_rng(0)
+    q = np.tile(model.standing_q, (40, 1))
+    q[:, 2] += rng.uniform(-0.01, 0.05, 40)
+    q[:, 7:] += rng.normal(0, 0.2, (40, 12))
+    v = rng.normal(0, 0.5, (40, model.nv))
+    return q, v, q[:, 7:] + rng.normal(0, 0.2, (40, 12))
+
+
+def run(model: Model, start, rows=slice(None), threads: int = 1, dtype: str = "float64", n_substeps: int = 10):
+    q, v, target = (x[rows] for x in start)
+    sim = Simulator(model, len(q), num_threads=threads, dtype=dtype)
+    sim.set_state(q, v)
+    sim.step(target, n_substeps)
+    return sim
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_kernel_follows_the_traced_step(level: str, start):
+    model = Model("mini_cheetah", level)
+    sim = run(model, start)
+    function = step_function(model.mechanism, sim.options, ("torque", "contact_forces"))
+    q, v, target = start
+    for i in (0, 7, 39):
+        state = (q[i], v[i], np.zeros(len(sim.contact_names)), 0.0)
+        for _ in range(10):
+            *state, torque, forces = function(*state, target[i])
+        np.testing.assert_allclose(sim.q[i], np.array(state[0]).ravel(), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(sim.v[i], np.array(state[1]).ravel(), rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(sim.torque[i], np.array(torque).ravel(), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(sim.contact_forces[i].ravel(), np.array(forces).ravel(), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_results_do_not_depend_on_batch_or_threads(model: Model, start, dtype: str):
+    whole = run(model, start, threads=1, dtype=dtype)
+    threaded = run(model, start, threads=2, dtype=dtype)
+    for name in ("q", "v", "contact_forces"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(threaded, name))
+    for rows in (slice(0, 1), slice(3, 10), slice(17, 40)):
+        part = run(model, start, rows, dtype=dtype)
+        np.testing.assert_array_equal(part.q, whole.q[rows])
+        np.testing.assert_array_equal(part.v, whole.v[rows])
+
+
+def test_single_precision_follows_double(model: Model, start):
+    double, single = run(model, start, n_substeps=4), run(model, start, dtype="float32", n_substeps=4)
+    assert np.abs(double.q - single.q).max() < 1e-3
+
+
+def test_a_bad_number_stays_in_its_lane(model: Model, start):
+    q, v, target = start
+    clean = run(model, start)
+    sim = Simulator(model, len(q))
+    sim.set_state(q, v)
+    sim._arrays["v"][1, 9, 3] = np.nan  # lane 11 in double precision
+    sim.step(target, 10)
+    assert np.flatnonzero(sim.diverged).tolist() == [11]
+    others = np.arange(len(q)) != 11
+    np.testing.assert_array_equal(sim.q[others], clean.q[others])
+    sim.reset(sim.diverged)
+    assert not sim.diverged.any()
+    sim.step(target, 10)
+    assert np.isfinite(sim.q).all()
+
+
+def test_partial_reset_leaves_the_others(model: Model, start):
+    sim = run(model, start)
+    before = sim.q
+    mask = np.zeros(40, bool)
+    mask[[3, 39]] = True
+    sim.reset(mask)
+    np.testing.assert_array_equal(sim.q[mask], np.tile(model.standing_q, (2, 1)))
+    np.testing.assert_array_equal(sim.q[~mask], before[~mask])
+
+
+def test_state_is_a_copy(model: Model):
+    sim = Simulator(model, 3)
+    sim.q[:] = 7.0
+    np.testing.assert_array_equal(sim.q[0], model.standing_q)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("stiffness", [1e4, 1e6])
+@pytest.mark.parametrize("dt", [0.0005, 0.01])
+def test_dropped_robots_come_to_rest(model: Model, dt: float, stiffness: float, dtype: str):
+    sim = Simulator(model, 8, dt=dt, dtype=dtype, material=ContactMaterial(stiffness, 500.0, 0.8))
+    q = np.tile(model.standing_q, (8, 1))
+    q[:, 2] += np.linspace(0.01, 0.3, 8)
+    sim.set_state(q, np.zeros(model.nv))
+    sim.step(model.standing_q[7:], round(6.0 / dt))
+    assert not sim.diverged.any()
+    assert np.abs(sim.v).max() < 0.05
+    weight = model.total_mass * 9.81
+    np.testing.assert_allclose(sim.contact_forces[..., 2].sum(axis=1), weight, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs=0; expected at least 1"),
+        ({"dt": -1.0}, "dt=-1.0; expected between 0 and 0.1 s"),
+        ({"dtype": "float16"}, "dtype='float16'; expected 'float64' or 'float32'"),
+        ({"control": "velocity"}, "control='velocity'; expected 'position' or 'torque'"),
+        ({"contacts": "hand"}, "contacts='hand'; expected 'all', a group"),
+        ({"contacts": ["nose"]}, "contacts='nose'; expected names among"),
+        ({"outputs": ("smell",)}, "outputs='smell'; expected any of torque, contact_forces"),
+    ],
+)
+def test_bad_arguments(model: Model, arguments: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        Simulator(model, **arguments)
+
+
+def test_bad_states_and_targets(model: Model):
+    sim = Simulator(model, 2)
+    with pytest.raises(ValueError, match=r"target has shape \(3,\); expected \(12,\) or \(2, 12\)"):
+        sim.step(np.zeros(3))
+    with pytest.raises(ValueError, match="q has shape"):
+        sim.set_state(np.zeros(5), np.zeros(model.nv))
+    with pytest.raises(ValueError, match="v holds a number that is not finite"):
+        sim.set_state(model.standing_q, np.full(model.nv, np.nan))
+    with pytest.raises(ValueError, match="torque is not computed"):
+        _ = Simulator(model, 2, outputs=()).torque
+
+
+def test_fixed_base_robot_without_ground():
+    """The leg swings under gravity: torque control, no contacts, energy hardly drifts."""
+    leg = Model("mit_humanoid_leg")
+    sim = Simulator(leg, 1, dt=1e-4, control="torque", contacts=(), outputs=())
+    sim.set_state(np.full(leg.nq, 0.3), np.zeros(leg.nv))
+    before = sum(leg.energy(sim.q, sim.v))[0]
+    sim.step(np.zeros(leg.nv), 2000)
+    after = sum(leg.energy(sim.q, sim.v))[0]
+    assert abs(after - before) < 0.01 * abs(leg.energy(sim.q, sim.v)[0][0] + 1.0)
