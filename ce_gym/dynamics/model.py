@@ -140,7 +140,8 @@ class Model:
             v: Velocities, shape (..., nv).
             tau: Generalised forces [N m or N], base wrench [moment; force] in the base frame first, shape (..., nv).
 
-        Source: CE-ABA, Chignoli et al., "Recursive rigid-body dynamics algorithms for systems with kinematic loops".
+        Source: CE-ABA, Chignoli, Adrian, Kim, Wensing, "A Propagation Perspective on Recursive Forward Dynamics for
+        Systems with Kinematic Loops", arXiv:2311.13732, Algorithm 1.
         """
         return self._evaluate("forward_dynamics", q, v, tau)[0][..., 0]
 

@@ -1,0 +1,44 @@
+# Two commands on a bare machine: `make demo` and `make test`. Needs Python 3.11+ with venv, and nothing else.
+
+PYTHON ?= python3
+BIN := .venv/bin
+EXTRAS := viewer,train,bench,dev
+
+.PHONY: help venv demo test lint types wheel clean
+
+help:
+	@echo "make demo    train Mini Cheetah to walk, then write a rollout to look at in a browser (a few minutes)"
+	@echo "make test    run the tests"
+	@echo "make lint    ruff: style and format"
+	@echo "make types   pyright: types"
+	@echo "make wheel   build sdist and wheel into dist/"
+	@echo "make venv    create .venv with everything the others need"
+	@echo "make clean   remove .venv and build output"
+
+# The stamp makes a second run skip installation until the metadata changes.
+.venv/installed: pyproject.toml constraints.txt
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	@touch .venv/installed
+
+venv: .venv/installed
+
+demo: .venv/installed
+	@$(BIN)/python train/demo.py
+
+test: .venv/installed
+	$(BIN)/python -m pytest
+
+lint: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: .venv/installed
+	$(BIN)/pyright
+
+wheel: .venv/installed
+	$(BIN)/python -m build --outdir dist
+
+clean:
+	rm -rf .venv build dist

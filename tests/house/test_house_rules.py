@@ -1,0 +1,99 @@
+"""The structure of the package: imports go one way, files stay small, importing is light."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import ce_gym
+
+PACKAGE = Path(ce_gym.__file__).parent
+FILES = sorted(path for path in PACKAGE.rglob("*.py") if "assets" not in path.parts)
+MAY_IMPORT = {
+    "model": set(),
+    "compile": set(),
+    "dynamics": {"model"},
+    "sim": {"model", "dynamics", "compile"},
+    "envs": {"model", "dynamics", "compile", "sim"},
+    "adapters": {"envs"},
+    "viewer": {"model", "dynamics", "sim", "envs"},
+    "bench": {"model", "dynamics", "compile", "sim", "envs", "adapters", "viewer"},
+}
+
+
+def imported_modules(path: Path) -> set[str]:
+    modules = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            modules |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            modules.add(node.module or "")
+    return modules
+
+
+def room_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).parts
+    return parts[0] if len(parts) > 1 else ""
+
+
+def test_every_room_has_a_rule():
+    assert {room_of(path) for path in FILES} - {""} == set(MAY_IMPORT)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_one_way(path: Path):
+    room = room_of(path)
+    if not room:
+        return
+    for module in imported_modules(path):
+        if module == "ce_gym":
+            assert room in ("viewer", "bench", "adapters"), f"{room} must not import the top of the package"
+        elif module.startswith("ce_gym."):
+            target = module.split(".")[1]
+            assert target == room or target in MAY_IMPORT[room], f"{room} must not import {module}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_only_compile_knows_the_compiler(path: Path):
+    if room_of(path) != "compile":
+        assert not {m.split(".")[0] for m in imported_modules(path)} & {"numba", "llvmlite"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_files_say_what_they_are_and_stay_small(path: Path):
+    text = path.read_text()
+    assert ast.get_docstring(ast.parse(text)), f"{path.name} has no docstring"
+    assert len(text.splitlines()) <= 400
+
+
+def strings_in_code(path: Path) -> list[str]:
+    """Every string of a file that is not a docstring."""
+    tree = ast.parse(path.read_text())
+    prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    constants = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    return [node.value for node in constants if id(node) not in prose]
+
+
+def test_no_robot_names_in_algorithms():
+    for path in FILES:
+        if room_of(path) in ("model", "dynamics", "compile", "sim"):
+            assert not [s for s in strings_in_code(path) if any(name in s for name in ce_gym.robots())], path
+
+
+def test_import_is_light():
+    """No learner, no viewer, no compiler is imported before it is needed."""
+    code = "import ce_gym, sys; print([m for m in ('torch', 'meshcat', 'stable_baselines3', 'mujoco', 'numba') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_training_scripts_use_public_names_only():
+    public = {"ce_gym", "ce_gym.adapters", "ce_gym.adapters.sb3", "ce_gym.viewer"}
+    for path in (PACKAGE.parent / "train").glob("*.py"):
+        ours = {m for m in imported_modules(path) if m.split(".")[0] == "ce_gym"}
+        assert ours <= public, f"{path.name} imports {ours - public}"
