@@ -1,0 +1,22 @@
+"""CasADi SX functions as batched SIMD kernels.
+
+Knows casadi, llvmlite, numba and numpy; knows no physics and no other part of ce_gym. Importing this package imports
+none of the heavy ones: `load_kernel` does, when it is called.
+"""
+
+from ce_gym.compile.arrays import aligned_zeros, lane_count
+from ce_gym.compile.cache import source_fingerprint
+from ce_gym.compile.kernel import Kernel
+from ce_gym.compile.loading import load_kernel
+from ce_gym.compile.program import Buffer, Call, Program
+
+__all__ = [
+    "Buffer",
+    "Call",
+    "Kernel",
+    "Program",
+    "aligned_zeros",
+    "lane_count",
+    "load_kernel",
+    "source_fingerprint",
+]

@@ -1,0 +1,39 @@
+"""Tiles in memory: how many lanes a tile has, and zeros that start on a cache line. Knows numpy only."""
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+ALIGNMENT = 64
+"""Bytes of one cache line and of one AVX-512 register."""
+
+
+def lane_count(dtype: DTypeLike) -> int:
+    """Lanes of one tile; one lane is one environment.
+
+    Args:
+        dtype: `float64` or `float32`.
+
+    Returns:
+        8 for float64, 16 for float32: what fills 64 bytes.
+
+    Raises:
+        ValueError: for any other dtype.
+    """
+    name = np.dtype(dtype).name
+    if name not in ("float64", "float32"):
+        raise ValueError(f"dtype: {name!r}, expected 'float64' or 'float32'")
+    return ALIGNMENT // np.dtype(dtype).itemsize
+
+
+def tile_count(num_envs: int, dtype: DTypeLike) -> int:
+    """Tiles that hold `num_envs` lanes; the last one may be padded."""
+    return -(-num_envs // lane_count(dtype))
+
+
+def aligned_zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
+    """Zeros of `shape` in C order that start on a multiple of 64 bytes."""
+    dtype = np.dtype(dtype)
+    n_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    raw = np.zeros(n_bytes + ALIGNMENT, np.uint8)
+    start = -raw.ctypes.data % ALIGNMENT
+    return raw[start : start + n_bytes].view(dtype).reshape(shape)

@@ -1,0 +1,128 @@
+"""A compiled kernel and how it is called: checks of its arguments, addresses, threads.
+
+Knows numpy arrays and the calling convention; LLVM, numba and files stay behind `loading`.
+"""
+
+import weakref
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from ce_gym.compile.arrays import ALIGNMENT, lane_count, tile_count
+from ce_gym.compile.layout import Layout
+from ce_gym.compile.program import Buffer
+from ce_gym.compile.threads import MemoryPool, run_chunks
+
+MachineCode = Callable[[int, int, int, int, int, int], None]
+"""Takes the addresses of the table, the repeat counts and scratch memory, then first tile, end tile, environments."""
+
+KEYS, COUNTERS = np.dtype(np.uint64), np.dtype(np.int64)
+WORD = 8
+"""Bytes of an address or a count."""
+
+
+class Kernel:
+    """Machine code that works through tiles of environments. Several threads may call one at a time.
+
+    Attributes:
+        name: of the program.
+        dtype: of the lanes.
+        lanes: environments in a tile.
+        buffers: by name.
+        repeats: names of the run-time integers.
+    """
+
+    def __init__(self, layout: Layout, run: MachineCode):
+        self.name = layout.name
+        self.dtype = layout.dtype
+        self.lanes = lane_count(layout.dtype)
+        self.buffers: dict[str, Buffer] = {b.name: b for b in layout.buffers}
+        self.repeats = layout.repeats
+        self._run = run
+        self._is_random = layout.is_random
+        self._arguments = [
+            (b.name, b.kind == "tiles", b.size, np.dtype(b.dtype or layout.dtype), b.name in layout.written)
+            for b in layout.arguments
+        ]
+        self._n_addresses = len(self._arguments) + 2 * self._is_random
+        self._tables = MemoryPool(self._n_addresses + len(self.repeats))
+        self._scratch = MemoryPool(layout.scratch_bytes // WORD)
+        self._known: dict[str, tuple[weakref.ref[np.ndarray], int]] = {}
+
+    def __call__(
+        self,
+        arrays: Mapping[str, np.ndarray],
+        num_envs: int,
+        repeats: Mapping[str, int] | None = None,
+        keys: np.ndarray | None = None,
+        counters: np.ndarray | None = None,
+        num_threads: int = 1,
+    ) -> None:
+        """Run the program on every tile.
+
+        Args:
+            arrays: one for each `tiles` buffer, shape (n_tiles, size, lanes), and each `rows_*` buffer, shape
+                (num_envs, size); others are ignored. Those that the program writes are changed in place.
+            num_envs: environments; the last tile may be padded.
+            repeats: a number for each of `self.repeats`.
+            keys: uint64, shape (num_envs,), if the program draws random numbers.
+            counters: int64, shape (num_envs,), likewise.
+            num_threads: threads that share the tiles; the result does not depend on it.
+
+        Raises:
+            ValueError: one line naming the kernel, the array and what was expected.
+        """
+        if num_envs == 0:
+            return
+        n_tiles = tile_count(num_envs, self.dtype)
+        words = self._addresses(arrays, num_envs, n_tiles)
+        if self._is_random:
+            words.append(self._address("keys", keys, (num_envs,), KEYS))
+            words.append(self._address("counters", counters, (num_envs,), COUNTERS))
+        words += [self._count(name, repeats) for name in self.repeats]
+        block = self._tables.take()
+        table, address = block
+        table[: len(words)] = words
+        counts = address + WORD * self._n_addresses
+
+        def work(first_tile: int, end_tile: int) -> None:
+            scratch = self._scratch.take()
+            self._run(address, counts, scratch[1], first_tile, end_tile, num_envs)
+            self._scratch.give(scratch)
+
+        run_chunks(work, n_tiles, num_threads)
+        self._tables.give(block)
+
+    def _addresses(self, arrays: Mapping[str, np.ndarray], num_envs: int, n_tiles: int) -> list[int]:
+        """Addresses of all arrays, in the order of the table."""
+        addresses = []
+        for name, is_tiles, size, dtype, written in self._arguments:
+            array = arrays.get(name)
+            shape = (n_tiles, size, self.lanes) if is_tiles else (num_envs, size)
+            address = self._address(name, array, shape, dtype)
+            if is_tiles and address % ALIGNMENT:
+                raise ValueError(f"kernel {self.name!r}: array {name!r} is not aligned; make it with aligned_zeros")
+            if written and not arrays[name].flags.writeable:
+                raise ValueError(f"kernel {self.name!r}: array {name!r} is read-only, expected a writeable one")
+            addresses.append(address)
+        return addresses
+
+    def _address(self, name: str, array: object, shape: tuple[int, ...], dtype: np.dtype) -> int:
+        """Address of an array that is as it should be."""
+        if not isinstance(array, np.ndarray):
+            got = "nothing" if array is None else type(array).__name__
+        elif array.shape == shape and array.dtype == dtype and array.flags.c_contiguous:
+            # Asking numpy for an address takes longer than all checks together, and most arrays come again.
+            known = self._known.get(name)
+            if known is None or known[0]() is not array:
+                known = self._known[name] = (weakref.ref(array), array.ctypes.data)
+            return known[1]
+        else:
+            order = "C order" if array.flags.c_contiguous else "not in C order"
+            got = f"{array.dtype} {array.shape} {order}"
+        raise ValueError(f"kernel {self.name!r}: array {name!r} is {got}, expected {dtype} {shape} C order")
+
+    def _count(self, name: str, repeats: Mapping[str, int] | None) -> int:
+        if repeats is None or name not in repeats:
+            raise ValueError(f"kernel {self.name!r}: repeats lacks {name!r}, expected a number of repetitions")
+        return repeats[name]

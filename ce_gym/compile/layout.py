@@ -1,0 +1,80 @@
+"""Who passes what to the machine code: the order of addresses and repeats, and where scratch values lie.
+
+Plain data that is stored beside the machine code, so that a cached kernel needs neither CasADi nor the program.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cached_property
+
+from ce_gym.compile.arrays import ALIGNMENT
+from ce_gym.compile.program import Buffer, Program
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The calling convention of one kernel.
+
+    Attributes:
+        name: of the program.
+        dtype: of the lanes.
+        buffers: all buffers of the program, in its order.
+        repeats: names of the run-time integers, in the order they are passed.
+        written: buffers that some call writes.
+    """
+
+    name: str
+    dtype: str
+    buffers: tuple[Buffer, ...]
+    repeats: tuple[str, ...]
+    written: tuple[str, ...]
+
+    @cached_property
+    def arguments(self) -> tuple[Buffer, ...]:
+        """Buffers whose arrays the caller passes, in the order of their addresses; keys and counters follow them."""
+        return tuple(b for b in self.buffers if b.kind in ("tiles", "rows_in", "rows_out"))
+
+    @cached_property
+    def is_random(self) -> bool:
+        """Whether keys and counters are needed."""
+        return any(b.kind == "random" for b in self.buffers)
+
+    @cached_property
+    def scratch_offsets(self) -> dict[str, int]:
+        """Byte at which each per-thread buffer starts; one vector is 64 bytes in either dtype."""
+        offsets, end = {}, 0
+        for buffer in self.buffers:
+            if buffer.kind != "tiles":
+                offsets[buffer.name] = end
+                end += ALIGNMENT * buffer.size
+        return offsets
+
+    @cached_property
+    def scratch_bytes(self) -> int:
+        """Bytes of per-thread memory."""
+        return ALIGNMENT * sum(b.size for b in self.buffers if b.kind != "tiles")
+
+
+def layout_of(program: Program, dtype: str) -> Layout:
+    """The calling convention that follows from a program."""
+    repeats = dict.fromkeys(call.repeat for call in program.calls if call.repeat)
+    written = dict.fromkeys(name for call in program.calls for name in call.outputs)
+    return Layout(program.name, dtype, program.buffers, tuple(repeats), tuple(written))
+
+
+def layout_to_json(layout: Layout) -> str:
+    """Text from which `layout_from_json` makes an equal layout."""
+    return json.dumps(asdict(layout))
+
+
+def layout_from_json(text: str) -> Layout:
+    """Inverse of `layout_to_json`.
+
+    Raises:
+        ValueError, KeyError, TypeError: when the text is not one.
+    """
+    data = json.loads(text)
+    buffers = tuple(Buffer(**buffer) for buffer in data["buffers"])
+    return Layout(data["name"], data["dtype"], buffers, tuple(data["repeats"]), tuple(data["written"]))

@@ -1,0 +1,131 @@
+"""What a kernel is made of: buffers, and calls of SX functions that read and write them. Data and its checks only.
+
+Knows casadi's Function by its interface and nothing of LLVM, files or physics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+if TYPE_CHECKING:
+    import casadi
+
+BufferKind = Literal["tiles", "rows_in", "rows_out", "scratch", "random"]
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """Where the values of every lane live.
+
+    Attributes:
+        name: how calls and callers refer to it.
+        size: values per lane.
+        kind: who owns it and how it is laid out:
+
+            * `tiles`: array (n_tiles, size, lanes) of the kernel's dtype, owned by the caller, changed in place.
+            * `rows_in`: array (num_envs, size), converted to lanes before the first call of a tile. Padding lanes of
+              the last tile repeat its last row.
+            * `rows_out`: array (num_envs, size), written from lanes after the last call of a tile.
+            * `scratch`: passes values from one call to the next within a tile; the kernel owns it.
+            * `random`: uniform numbers in [0, 1), new in every tile: draw i of a lane is a function of the lane's key,
+              its counter and i, and of nothing else.
+        dtype: of a `rows_*` array, `float32` or `float64`; empty means the kernel's own.
+    """
+
+    name: str
+    size: int
+    kind: BufferKind
+    dtype: str = ""
+
+
+@dataclass(frozen=True)
+class Call:
+    """One SX function applied to the lanes of a tile.
+
+    Attributes:
+        function: the SX function. Each input and output fills one whole buffer, column by column.
+        inputs: buffer of each function input.
+        outputs: buffer of each function output; it may be an input's too, since all loads come before any store.
+        repeat: name of a run-time integer, how often in a row it is called; empty means once.
+    """
+
+    function: casadi.Function
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    repeat: str = ""
+
+
+@dataclass(frozen=True)
+class Program:
+    """Calls made in order on every tile.
+
+    Attributes:
+        name: for people, `mini_cheetah exact environment`.
+        buffers: all buffers the calls mention.
+        calls: in the order of execution.
+        skip_unless: a `tiles` buffer of size 1; a tile whose lanes are all zero there is left alone entirely.
+    """
+
+    name: str
+    buffers: tuple[Buffer, ...]
+    calls: tuple[Call, ...]
+    skip_unless: str = ""
+
+
+def check_program(program: Program) -> None:
+    """Refuse a program that cannot be compiled or whose result would depend on what ran before.
+
+    Raises:
+        ValueError: one line naming the program, the buffer or call, and what was expected.
+    """
+    buffers = {buffer.name: buffer for buffer in program.buffers}
+    if len(buffers) != len(program.buffers):
+        raise ValueError(f"program {program.name!r}: buffer names must differ from each other")
+    for buffer in program.buffers:
+        _check_buffer(program.name, buffer)
+    written = {b.name for b in program.buffers if b.kind in ("tiles", "rows_in", "random")}
+    for number, call in enumerate(program.calls):
+        place = f"program {program.name!r}: call {number} ({call.function.name()})"
+        _check_call(place, call, buffers)
+        if unset := [name for name in call.inputs if name not in written]:
+            raise ValueError(f"{place}: reads {unset[0]!r}, expected an earlier call to write it first")
+        written.update(call.outputs)
+    if unset := [b.name for b in program.buffers if b.name not in written and b.kind == "rows_out"]:
+        raise ValueError(f"program {program.name!r}: no call writes the rows_out buffer {unset[0]!r}")
+    if program.skip_unless:
+        flag = buffers.get(program.skip_unless)
+        if flag is None or flag.kind != "tiles" or flag.size != 1:
+            raise ValueError(f"program {program.name!r}: skip_unless must name a tiles buffer of size 1")
+
+
+def _check_buffer(program: str, buffer: Buffer) -> None:
+    place = f"program {program!r}: buffer {buffer.name!r}"
+    if buffer.kind not in get_args(BufferKind):
+        raise ValueError(f"{place}: kind {buffer.kind!r}, expected one of {', '.join(get_args(BufferKind))}")
+    if buffer.size < 1:
+        raise ValueError(f"{place}: size {buffer.size}, expected at least 1")
+    allowed = ("", "float32", "float64") if buffer.kind.startswith("rows") else ("",)
+    if buffer.dtype not in allowed:
+        raise ValueError(f"{place}: dtype {buffer.dtype!r}, expected one of {allowed} for {buffer.kind}")
+
+
+def _check_call(place: str, call: Call, buffers: dict[str, Buffer]) -> None:
+    function = call.function
+    if not function.is_a("SXFunction"):
+        raise ValueError(f"{place}: {function.class_name()}, expected an SX function (expand it first)")
+    if len(set(call.outputs)) != len(call.outputs):
+        raise ValueError(f"{place}: outputs {call.outputs}, expected different buffers")
+    sides = (
+        ("input", call.inputs, function.n_in(), function.numel_in),
+        ("output", call.outputs, function.n_out(), function.numel_out),
+    )
+    for side, names, count, numel in sides:
+        if len(names) != count:
+            raise ValueError(f"{place}: {len(names)} {side} buffers, expected {count}")
+        for position, name in enumerate(names):
+            if name not in buffers:
+                raise ValueError(f"{place}: {side} buffer {name!r} is not among the program's buffers")
+            if buffers[name].size != numel(position):
+                expected = f"{numel(position)} as {side} {position} of the function"
+                raise ValueError(f"{place}: buffer {name!r} has size {buffers[name].size}, expected {expected}")

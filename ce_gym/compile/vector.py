@@ -1,0 +1,126 @@
+"""A thin layer over llvmlite's builder: one value is one vector, one lane of it per environment.
+
+Knows llvmlite's IR classes. llvmlite cannot declare vector intrinsics, so they are declared here by
+their mangled names.
+"""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from llvmlite import ir
+
+from ce_gym.compile.arrays import ALIGNMENT, lane_count
+
+Value: TypeAlias = Any
+"""An llvmlite value. llvmlite's builder makes its methods with decorators that type checkers cannot follow."""
+
+Builder: TypeAlias = Any
+"""An llvmlite IRBuilder, for the same reason."""
+
+ARITHMETIC_FLAGS = ("contract", "arcp", "nsz")
+"""Fast-math freedom of traced arithmetic. Never nnan or ninf: they would delete the test for a diverged state."""
+
+
+class VectorBuilder:
+    """Emits instructions on vectors of `lanes` floats of one dtype at the end of one LLVM block.
+
+    Attributes:
+        builder: the llvmlite builder.
+        dtype: `float64` or `float32`.
+        lanes: elements of a vector.
+        bits: width of one float, 64 or 32.
+        float_type, int_type: the vector type and the integer vector of the same shape.
+    """
+
+    def __init__(self, builder: Builder, dtype: str):
+        self.builder = builder
+        self.dtype = dtype
+        self.lanes = lane_count(dtype)
+        self.bits = 8 * np.dtype(dtype).itemsize
+        scalar = ir.DoubleType() if self.bits == 64 else ir.FloatType()
+        self.float_type = ir.VectorType(scalar, self.lanes)
+        self.int_type = ir.VectorType(ir.IntType(self.bits), self.lanes)
+        self._constants: dict[str, ir.Constant] = {}
+
+    def const(self, number: float) -> ir.Constant:
+        """The same number in every lane, rounded to the dtype."""
+        rounded = float(np.dtype(self.dtype).type(number))
+        key = rounded.hex()
+        if key not in self._constants:
+            self._constants[key] = ir.Constant(self.float_type, [rounded] * self.lanes)
+        return self._constants[key]
+
+    def int_const(self, number: int) -> ir.Constant:
+        """The same integer in every lane."""
+        return ir.Constant(self.int_type, [number] * self.lanes)
+
+    def add(self, a: Value, b: Value) -> Value:
+        """Sum."""
+        return self.builder.fadd(a, b, flags=ARITHMETIC_FLAGS)
+
+    def sub(self, a: Value, b: Value) -> Value:
+        """Difference."""
+        return self.builder.fsub(a, b, flags=ARITHMETIC_FLAGS)
+
+    def mul(self, a: Value, b: Value) -> Value:
+        """Product; it may be contracted with a following sum."""
+        return self.builder.fmul(a, b, flags=ARITHMETIC_FLAGS)
+
+    def div(self, a: Value, b: Value) -> Value:
+        """Quotient."""
+        return self.builder.fdiv(a, b, flags=ARITHMETIC_FLAGS)
+
+    def neg(self, a: Value) -> Value:
+        """Sign changed."""
+        return self.builder.fneg(a)
+
+    def fma(self, a: Value, b: Value, c: Value) -> Value:
+        """`a * b + c`, rounded once."""
+        return self.intrinsic("fma", a, b, c)
+
+    def intrinsic(self, name: str, *operands: Value) -> Value:
+        """`llvm.<name>` on float vectors, such as sqrt, fabs, floor, minnum, copysign."""
+        mangled = f"llvm.{name}.v{self.lanes}f{self.bits}"
+        module = self.builder.module
+        function = module.globals.get(mangled)
+        if function is None:
+            signature = ir.FunctionType(self.float_type, [self.float_type] * len(operands))
+            function = ir.Function(module, signature, mangled)
+        return self.builder.call(function, operands)
+
+    def polynomial(self, x: Value, coefficients: tuple[float, ...]) -> Value:
+        """Horner's scheme; coefficients in ascending order."""
+        result: Value = self.const(coefficients[-1])
+        for coefficient in reversed(coefficients[:-1]):
+            result = self.fma(result, x, self.const(coefficient))
+        return result
+
+    def compare(self, sign: str, a: Value, b: Value) -> Value:
+        """A mask; like C, every comparison with a NaN is false except `!=`."""
+        if sign == "!=":
+            return self.builder.fcmp_unordered(sign, a, b)
+        return self.builder.fcmp_ordered(sign, a, b)
+
+    def select(self, mask: Value, a: Value, b: Value) -> Value:
+        """`a` where the mask is true, else `b`; what is not chosen may be NaN without harm."""
+        return self.builder.select(mask, a, b)
+
+    def to_bits(self, a: Value) -> Value:
+        """The float's bits as an integer."""
+        return self.builder.bitcast(a, self.int_type)
+
+    def from_bits(self, a: Value) -> Value:
+        """The integer's bits as a float."""
+        return self.builder.bitcast(a, self.float_type)
+
+    def load(self, base: Value, index: int) -> Value:
+        """Vector `index` of an aligned buffer that starts at `base`."""
+        return self.builder.load(self.element(base, index), align=ALIGNMENT)
+
+    def store(self, value: Value, base: Value, index: int) -> None:
+        """Write vector `index` of an aligned buffer that starts at `base`."""
+        self.builder.store(value, self.element(base, index), align=ALIGNMENT)
+
+    def element(self, base: Value, index: int) -> Value:
+        """Address of vector `index`."""
+        return self.builder.gep(base, [ir.Constant(ir.IntType(64), index)], inbounds=True)
