@@ -56,7 +56,7 @@ def viscous_damping(yd: SX, damping: float, dt: float) -> JointForce:
 
 
 def limit_stop(y: SX, yd: SX, limits: tuple[float, float], stiffness: float, damping: float, dt: float) -> JointForce:
-    """One-sided springs at the ends of a joint's range; active if the joint will be beyond one by the end of the step."""
+    """One-sided springs at the ends of a joint's range, active if it will be beyond one by the end of the step."""
     total, slope = JointForce(SX(0), 0.0), damping + dt * stiffness
     for bound, side in ((limits[0], 1.0), (limits[1], -1.0)):
         if math.isinf(bound):

@@ -2,7 +2,8 @@
 
 Bodies are visited one by one: accelerations base to tip, forces tip to base, and the cluster's constraint Jacobian
 projects the spanning torques, `tau_y = G^T tau_span`. A rotor's spin adds the couple `h thdd + v_c x* h thd` to its
-carrier and `G_r^T (J thdd + h^T a_c)` to the torques; see ce_aba.py for the symbols. May know kinematics and spatial algebra.
+carrier and `G_r^T (J thdd + h^T a_c)` to the torques; see ce_aba.py for the symbols. May know kinematics and spatial
+algebra.
 """
 
 from __future__ import annotations

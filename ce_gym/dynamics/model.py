@@ -32,8 +32,8 @@ class Model:
     Args:
         robot: A description, the name of a robot that ships with the package, or a path to a robot file.
         transmission: "exact", "coupled", "armature" or "none".
-        locked_rotors: Whether approximated rotors leave their mass and inertia at rest with their carrier (so that total
-            mass is the same at every level). False deletes them, as the constraint-embedding paper does in its figures.
+        locked_rotors: Whether approximated rotors leave their mass and inertia at rest with their carrier, so that
+            total mass is the same at every level. False deletes them, as the constraint-embedding paper does in figures.
         eliminate_rotors: Whether symmetric rotors are eliminated at the exact level. False runs the general algorithm,
             with every rotor a body: the same result, for more work.
 
@@ -115,8 +115,8 @@ class Model:
 
         Args:
             name: "forward_dynamics" (q, v, tau) -> vdot; "inverse_dynamics" (q, v, vdot) -> tau; "mass_matrix" q -> M;
-                "bias_force" (q, v) -> tau at vdot = 0; "spanning" (q, v) -> (q_span, v_span); "body_poses" q -> positions
-                (3, n), rotations (3, 3 n); "contact_points" (q, v) -> positions (3, n), velocities (3, n);
+                "bias_force" (q, v) -> tau at vdot = 0; "spanning" (q, v) -> (q_span, v_span); "body_poses" q ->
+                positions (3, n), rotations (3, 3 n); "contact_points" (q, v) -> positions (3, n), velocities (3, n);
                 "energy" (q, v) -> kinetic, potential.
 
         Raises:
@@ -129,7 +129,7 @@ class Model:
         return self._functions[name]
 
     def n_instructions(self, name: str) -> int:
-        """Return the number of instructions of a traced quantity, the cost measure of the constraint-embedding paper."""
+        """Return the number of instructions of a traced quantity, the cost measure of the paper."""
         return self.casadi_function(name).n_instructions()
 
     def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
@@ -188,10 +188,10 @@ class Model:
 
     def describe(self) -> str:
         """Return a readable account of the robot: figures, and its cluster tree as text."""
-        rotors = sum(1 for _ in self.robot.rotors())
+        base, rotors = "floating" if self.robot.floating else "fixed", sum(1 for _ in self.robot.rotors())
         eliminated = sum(len(spins) for spins in self.mechanism.spins)
         lines = [
-            f"{self.robot.name}: {'floating' if self.robot.floating else 'fixed'} base, {len(self.joint_links)} joints, "
+            f"{self.robot.name}: {base} base, {len(self.joint_links)} joints, "
             f"{len(self.body_names)} bodies of which {rotors} rotors, {len(self.cluster_tree.clusters)} clusters, "
             f"{self.total_mass:.3f} kg",
             f"transmission {self.transmission}: {eliminated} rotors need no body of their own",

@@ -77,9 +77,7 @@ class Stepped:
     contact_forces: SX
 
 
-def step(
-    mechanism: Mechanism, q: SX, v: SX, pushed: SX, diverged: SX, target: SX, options: StepOptions
-) -> Stepped:
+def step(mechanism: Mechanism, q: SX, v: SX, pushed: SX, diverged: SX, target: SX, options: StepOptions) -> Stepped:
     """Advance one robot by one time step.
 
     Args:
@@ -180,9 +178,10 @@ def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str
         `pushed`.
     """
     q, v = state_symbols(mechanism)
-    state = {"q": q, "v": v, "pushed": SX.sym("pushed", len(options.contacts)), "diverged": SX.sym("diverged")}
+    pushed, diverged = SX.sym("pushed", len(options.contacts)), SX.sym("diverged")
     target = SX.sym("target", len(mechanism.robot.independent))
-    after = step(mechanism, *state.values(), target, options)
+    after = step(mechanism, q, v, pushed, diverged, target, options)
+    state = {"q": q, "v": v, "pushed": pushed, "diverged": diverged}
     kept = [name for name in state if state[name].numel()]
     results = {f"{name}_next": getattr(after, name) for name in kept}
     results |= {name: ca.vec(getattr(after, name)) for name in outputs}

@@ -1,6 +1,7 @@
 """Observation blocks: free functions of a `Snapshot` that return a vector of order one.
 
-Scales are those of legged_gym's velocity task, so that policies of similar make see similar numbers. May know snapshots.
+Scales are those of legged_gym's velocity task, so that policies of similar make see similar numbers. May know
+snapshots.
 """
 
 from __future__ import annotations

@@ -157,7 +157,8 @@ class TaskProgram:
         action = SX.sym("action_in", self.n_joints)
         clipped = ca.fmax(-1, ca.fmin(1, action))
         standing = self._snapshot({}).standing_joints
-        return traced("act", {"action_in": action}, {"clipped": clipped, "target": standing + self.task.action_scale * clipped})
+        target = SX(standing) + self.task.action_scale * clipped
+        return traced("act", {"action_in": action}, {"clipped": clipped, "target": target})
 
     def _assess(self) -> tuple[ca.Function, int]:
         """State after the sub-steps -> bookkeeping, observation, outcome [reward, terminated, diverged]."""
@@ -174,7 +175,9 @@ class TaskProgram:
         terminated = ca.logic_and(failed, state["diverged"] < 0.5)
         sums = state["sums"] + ca.vertcat(reward, *terms, *[term(s) for term in self.metric_terms.values()])
 
-        air_time = ca.if_else(s.foot_contact, 0, state["air_time"] + self.control_dt) if self.n_feet else state["air_time"]
+        air_time = (
+            ca.if_else(s.foot_contact, 0, state["air_time"] + self.control_dt) if self.n_feet else state["air_time"]
+        )
         clock = state["clock"] + 1
         period = max(round(self.task.command_period / self.control_dt), 1)
         due = ca.fmod(clock, period) < 0.5

@@ -66,15 +66,21 @@ class LeggedEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]], EzPickl
         """
         outcome = self.batch.step(checked_action(action, (1, self.batch.program.n_joints)))
         diverged = bool(outcome.diverged[0])
-        return outcome.observation[0], float(outcome.reward[0]), bool(outcome.terminated[0]), diverged, {"diverged": diverged}
+        return (
+            outcome.observation[0],
+            float(outcome.reward[0]),
+            bool(outcome.terminated[0]),
+            diverged,
+            {"diverged": diverged},
+        )
 
     def state(self) -> dict[str, NDArray]:
         """Return what a recorder needs: q, v, command and, if computed, contact_forces (n_contacts, 3)."""
         return {name: rows[0] for name, rows in recorded_state(self.batch).items()}
 
 
-def spaces(n_observations: int, n_actions: int) -> tuple[Box, Box]:
-    """Return observation and action space of one robot."""
+def spaces(n_observations: int, n_actions: int) -> tuple[Any, Any]:
+    """Return observation and action space of one robot, both `Box`."""
     bound = OBSERVATION_BOUND
     return Box(-bound, bound, (n_observations,), np.float32), Box(-1.0, 1.0, (n_actions,), np.float32)
 

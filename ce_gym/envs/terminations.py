@@ -1,4 +1,4 @@
-"""Conditions that end an episode as a failure: free functions of a `Snapshot` that return 0 or 1. May know snapshots."""
+"""Conditions that end an episode as a failure: functions of a `Snapshot` that return 0 or 1. May know snapshots."""
 
 from __future__ import annotations
 

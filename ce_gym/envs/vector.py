@@ -20,8 +20,8 @@ Observations = NDArray[np.float32]
 class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
     """Many copies of one robot and one task, stepped by one kernel.
 
-    Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit, whatever
-    the size of the batch and the number of threads. `infos` holds `diverged`, bool (num_envs,): environments whose
+    Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit,
+    whatever the size of the batch and the number of threads. `infos` holds `diverged`, bool (num_envs,): environments whose
     simulation failed numerically; they are truncated at their last good state and reset alone. Where an episode has
     ended, `infos["episode_terms"]` has its length, its return and every reward term and metric (see `Task`).
 
@@ -153,8 +153,15 @@ class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         if not options or "reset_mask" not in options:
             return np.ones(self.num_envs, bool)
         mask = options["reset_mask"]
-        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(f"reset_mask={mask!r}; expected a bool array of shape ({self.num_envs},) with a true entry")
+        if (
+            not isinstance(mask, np.ndarray)
+            or mask.dtype != np.bool_
+            or mask.shape != (self.num_envs,)
+            or not mask.any()
+        ):
+            raise ValueError(
+                f"reset_mask={mask!r}; expected a bool array of shape ({self.num_envs},) with a true entry"
+            )
         return mask
 
     def _seed(self, seed: int | Sequence[int | None] | None) -> None:

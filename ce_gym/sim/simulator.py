@@ -173,7 +173,9 @@ def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, .
     if isinstance(contacts, str):
         groups = sorted({contact.group for contact in robot.contacts})
         chosen = names if contacts == "all" else tuple(c.name for c in robot.contacts if c.group == contacts)
-        _check("contacts", contacts, contacts == "all" or bool(chosen), f"'all', a group ({', '.join(groups)}) or names")
+        _check(
+            "contacts", contacts, contacts == "all" or bool(chosen), f"'all', a group ({', '.join(groups)}) or names"
+        )
         return chosen
     for name in contacts:
         _check("contacts", name, name in names, f"names among {', '.join(names)}")
@@ -182,7 +184,8 @@ def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, .
 
 def model_key(model: Model) -> str:
     """Return a text that is equal for equal models, for cache keys; where a robot was read from does not matter."""
-    return f"{replace(model.robot, source='', notes=())!r} {model.mechanism.level} {model.locked_rotors} {model.eliminated}"
+    figures = replace(model.robot, source="", notes=())
+    return f"{figures!r} {model.transmission} {model.locked_rotors} {model.eliminated}"
 
 
 def load_step_kernel(model: Model, options: StepOptions, outputs: dict[str, int], dtype: str) -> Kernel:

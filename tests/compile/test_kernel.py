@@ -231,16 +231,3 @@ def test_aligned_zeros(dtype):
 def test_other_dtypes_are_refused():
     with pytest.raises(ValueError, match="dtype: 'int32', expected 'float64' or 'float32'"):
         lane_count(np.int32)
-
-
-def test_the_python_part_of_a_call_is_short(kernel):
-    arrays, repeats = arrays_for(kernel, 1), {"n_substeps": 1}
-    keys, counters = np.zeros(1, np.uint64), np.zeros(1, np.int64)
-    best = np.inf
-    for _ in range(20):
-        start = time.thread_time()
-        for _ in range(50):
-            kernel(arrays, 1, repeats, keys, counters)
-        best = min(best, (time.thread_time() - start) / 50)
-    print(f"{best * 1e6:.1f} us a call of 1 environment")
-    assert best < 30e-6

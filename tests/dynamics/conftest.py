@@ -37,14 +37,23 @@ def random_link(rng: np.random.Generator, name: str, parent: str | None, joint: 
     A = rng.normal(size=(3, 3))
     inertia = 0.02 * (A @ A.T + np.eye(3))
     placement = Placement(tuple(rng.normal(0, 0.2, 3)), tuple(map(tuple, random_rotation(rng))))
-    return Body(name, "link", parent, placement, joint, Inertial(1.0 + rng.random(), tuple(rng.normal(0, 0.1, 3)), tuple(map(tuple, inertia))))
+    return Body(
+        name,
+        "link",
+        parent,
+        placement,
+        joint,
+        Inertial(1.0 + rng.random(), tuple(rng.normal(0, 0.1, 3)), tuple(map(tuple, inertia))),
+    )
 
 
 def symmetric_rotor(rng: np.random.Generator, name: str, parent: str | None, lopsided: float = 0.0) -> Body:
     """A rotor about a random axis; `lopsided` breaks its symmetry."""
     placement = Placement(tuple(rng.normal(0, 0.1, 3)), tuple(map(tuple, random_rotation(rng))))
     inertia = ((2e-3 + lopsided, 0.0, 0.0), (0.0, 2e-3, 0.0), (0.0, 0.0, 3e-3))
-    return Body(name, "rotor", parent, placement, Joint("revolute", (0.0, 0.0, 1.0)), Inertial(0.3, (0.0, 0.0, 0.02), inertia))
+    return Body(
+        name, "rotor", parent, placement, Joint("revolute", (0.0, 0.0, 1.0)), Inertial(0.3, (0.0, 0.0, 0.02), inertia)
+    )
 
 
 @pytest.fixture(scope="session")

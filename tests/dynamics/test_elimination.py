@@ -68,7 +68,9 @@ def test_levels_differ_by_reflected_inertia_only(robot: Robot, random_state):
         expected += axis @ np.array(robot.body(rotor).inertial.inertia) @ axis * np.outer(row, row)
     for level, block in (("coupled", expected), ("armature", np.diag(np.diag(expected)))):
         difference = M[level] - M["none"]
-        np.testing.assert_allclose(difference[:, joints, joints], np.broadcast_to(block, difference[:, joints, joints].shape), atol=1e-12)
+        np.testing.assert_allclose(
+            difference[:, joints, joints], np.broadcast_to(block, difference[:, joints, joints].shape), atol=1e-12
+        )
         difference[:, joints, joints] = 0.0
         np.testing.assert_allclose(difference, 0.0, atol=1e-12)
 

@@ -48,7 +48,7 @@ def test_kinetic_energy_is_the_mass_matrix(robot: Robot, random_state):
 
 
 def test_free_fall(random_state):
-    """With no forces and no velocity, a floating robot falls with gravity and keeps its shape: at rest nothing spins."""
+    """With no forces and no velocity, a floating robot falls and keeps its shape: at rest nothing spins."""
     model = Model("mini_cheetah")
     q, v = random_state(model, 5)
     vdot = model.forward_dynamics(q, 0 * v, 0 * v)

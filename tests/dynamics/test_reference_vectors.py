@@ -62,7 +62,9 @@ def test_there_are_states_to_compare(reference: Reference):
 
 
 def test_forward_dynamics(model: Model, reference: Reference):
-    assert relative_error(model.forward_dynamics(reference.q, reference.v, reference["tau"]), reference["ydd"]) < TOLERANCE
+    assert (
+        relative_error(model.forward_dynamics(reference.q, reference.v, reference["tau"]), reference["ydd"]) < TOLERANCE
+    )
 
 
 def test_inverse_dynamics(model: Model, reference: Reference):

@@ -55,7 +55,9 @@ def test_ids_work_in_a_process_that_has_not_imported_the_package():
 
 
 def test_levels_are_treated_alike():
-    envs = [gymnasium.make(VELOCITY, transmission=level).unwrapped for level in ("exact", "coupled", "armature", "none")]
+    envs = [
+        gymnasium.make(VELOCITY, transmission=level).unwrapped for level in ("exact", "coupled", "armature", "none")
+    ]
     first = envs[0]
     observation, _ = first.reset(seed=3)
     for env in envs[1:]:
@@ -170,7 +172,14 @@ def test_fresh_arrays_out_of_every_call():
     kept, copies = [], []
     for action in random_actions(8, 4):
         observation, reward, terminated, truncated, infos = envs.step(action)
-        arrays = [observation, reward, terminated, truncated, infos["diverged"], *([infos["final_obs"]] if "final_obs" in infos else [])]
+        arrays = [
+            observation,
+            reward,
+            terminated,
+            truncated,
+            infos["diverged"],
+            *([infos["final_obs"]] if "final_obs" in infos else []),
+        ]
         kept += arrays
         copies += [a.copy() for a in arrays]
         assert observation.dtype == np.float32
@@ -209,7 +218,9 @@ def test_a_diverged_environment_is_flagged_and_reset_alone():
 
 def test_reward_terms_add_up_and_weights_are_arguments():
     weights = {"torques": 0.0, "alive": 20.0}  # never negative, so that nothing is clipped
-    envs = gymnasium.make_vec(VELOCITY, num_envs=8, max_episode_steps=20, autoreset_mode="SameStep", reward_weights=weights)
+    envs = gymnasium.make_vec(
+        VELOCITY, num_envs=8, max_episode_steps=20, autoreset_mode="SameStep", reward_weights=weights
+    )
     envs.reset(seed=0)
     total = np.zeros(8)
     for action in 0.1 * random_actions(20, 8):
@@ -244,7 +255,9 @@ def test_bad_arguments(arguments: dict, message: str):
         gymnasium.make_vec(VELOCITY, num_envs=2, **arguments)
 
 
-@pytest.mark.parametrize("action", [np.full((2, 12), np.nan), np.zeros((2, 11)), np.zeros(12), np.full((2, 12), np.inf)])
+@pytest.mark.parametrize(
+    "action", [np.full((2, 12), np.nan), np.zeros((2, 11)), np.zeros(12), np.full((2, 12), np.inf)]
+)
 def test_bad_actions_leave_the_environment_usable(action: np.ndarray):
     envs = gymnasium.make_vec(VELOCITY, num_envs=2)
     envs.reset(seed=0)
