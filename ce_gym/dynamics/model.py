@@ -33,7 +33,7 @@ class Model:
         robot: A description, the name of a robot that ships with the package, or a path to a robot file.
         transmission: "exact", "coupled", "armature" or "none".
         locked_rotors: Whether approximated rotors leave their mass and inertia at rest with their carrier, so that
-            total mass is the same at every level. False deletes them, as the constraint-embedding paper does in figures.
+            total mass is the same at every level. False deletes them, as the paper does in its figures.
         eliminate_rotors: Whether symmetric rotors are eliminated at the exact level. False runs the general algorithm,
             with every rotor a body: the same result, for more work.
 

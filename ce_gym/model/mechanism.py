@@ -108,7 +108,7 @@ def build_mechanism(
         robot: The description.
         level: "exact", "coupled", "armature" or "none".
         locked_rotors: Whether the mass and inertia at rest of an approximated rotor stay with its carrier. False
-            deletes them, as in the "unconstrained" and "approximate" systems of the constraint-embedding paper's figures.
+            deletes them, as in the "unconstrained" and "approximate" systems of the paper's figures.
         eliminate: Whether symmetric rotors are eliminated at the exact level; False keeps every rotor as a body, the
             general algorithm that the elimination is tested against.
 
