@@ -22,8 +22,8 @@ class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
 
     Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit,
     whatever the size of the batch and the number of threads. `infos` holds `diverged`, bool (num_envs,): environments
-    whose simulation failed numerically; they are truncated at their last good state and reset alone. Where an episode has
-    ended, `infos["episode_terms"]` has its length, its return and every reward term and metric (see `Task`).
+    whose simulation failed numerically; they are truncated at their last good state and reset alone. Where an episode
+    has ended, `infos["episode_terms"]` has its length, its return and every reward term and metric (see `Task`).
 
     Args:
         num_envs: Number of environments.

@@ -73,8 +73,8 @@ def awkward_robot():
         rotors = [symmetric_rotor(rng, f"{p}_rotor", p, lopsided) for p in ("base", "thigh", "shank")]
         ties = (
             LinearConstraint("a", (("base_rotor", 1.0), ("thigh", -6.0), ("shank", -3.0)), 0.1),
-            LinearConstraint("b", (("thigh_rotor", 1.0), ("shank", -9.0), ("toe", 4.0))),
-            LinearConstraint("c", (("shank_rotor", 1.0), ("toe", 7.0))),
+            LinearConstraint("b", (("thigh_rotor", 1.0), ("thigh", -2.0), ("shank", -9.0), ("toe", 4.0))),
+            LinearConstraint("c", (("shank_rotor", 1.0), ("thigh", 3.0), ("toe", 7.0))),
         )
         return Robot("awkward", tuple(links + rotors), ties, ("thigh", "shank", "toe"))
 

@@ -11,7 +11,7 @@ import pytest
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.contact import SLIP_SPEED
 from ce_gym.dynamics.step import StepOptions, step_function
-from ce_gym.model import ContactMaterial, ContactSphere, Robot
+from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.model.mechanism import LEVELS
 
 ALL = "all"
@@ -119,15 +119,22 @@ def point_bias(model: Model, body: str, point, q, v) -> np.ndarray:
 
 
 def test_free_flight_is_a_straight_line():
-    """Without gravity and joint forces the centre of mass moves uniformly, however the robot tumbles."""
-    robot = replace(Model("mini_cheetah").robot, gravity=(0.0, 0.0, 0.0), contacts=())
-    model = Model(robot)
-    step = stepper(model, 0.001, control="torque", contacts=())
-    q, v = model.standing_q.copy(), np.zeros(model.nv)
-    v[:6] = [2.0, -1.0, 3.0, 0.4, 0.2, -0.3]
-    for _ in range(200):
-        q, v, *_ = step(q, v, np.zeros(12))
-        assert abs(np.linalg.norm(q[3:7]) - 1) < 1e-12
+    """A tumbling body without forces moves uniformly, to rounding, and spins by the exponential map about a main axis."""
+    inertia = ((0.02, 0.0, 0.0), (0.0, 0.03, 0.0), (0.0, 0.0, 0.04))
+    body = Body("brick", "link", None, Placement(), Joint("free"), Inertial(2.0, (0.0, 0.0, 0.0), inertia))
+    model = Model(Robot("brick", (body,), gravity=(0.0, 0.0, 0.0)))
+    step = stepper(model, 0.01, control="torque")
+    q = np.array([0.1, 0.2, 0.3, 0.5, 0.5, 0.5, 0.5])
+    for w in ([3.0, -2.0, 5.0], [0.0, 0.0, 7.0]):
+        v = np.array([*w, 0.4, 0.2, -0.3])
+        world_velocity = model.body_poses(q)[1][0] @ v[3:]
+        start, state = q, q
+        for _ in range(100):
+            state, v, *_ = step(state, v, np.zeros(0))
+            assert abs(np.linalg.norm(state[3:7]) - 1) < 1e-12
+        np.testing.assert_allclose(state[:3], start[:3] + 1.0 * world_velocity, atol=1e-12)
+    relative = model.body_poses(start)[1][0].T @ model.body_poses(state)[1][0]
+    np.testing.assert_allclose(np.arctan2(relative[1, 0], relative[0, 0]), 7.0 - 2 * np.pi, atol=1e-10)
 
 
 def test_rest_depth_is_weight_over_stiffness():

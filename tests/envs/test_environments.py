@@ -139,6 +139,23 @@ def test_next_step_mode_shows_the_reset_one_step_later():
     np.testing.assert_array_equal(reward, 0.0)
 
 
+def test_next_step_mode_draws_what_a_single_environment_draws():
+    """The ignored step uses up no random numbers: after it, the lane goes on as an environment of its own does."""
+    envs = gymnasium.make_vec(VELOCITY, num_envs=3, max_episode_steps=4)
+    envs.reset(seed=30)
+    single = gymnasium.make(VELOCITY, max_episode_steps=4)
+    single.reset(seed=32)
+    for action in random_actions(12, 3, seed=4):
+        observation, _, terminated, truncated, _ = envs.step(action)
+        if (terminated | truncated)[2]:
+            ours = single.step(action[2])[0]
+            np.testing.assert_array_equal(ours, observation[2])
+            after, *_ = envs.step(action)
+            np.testing.assert_array_equal(single.reset()[0], after[2])
+        else:
+            np.testing.assert_array_equal(single.step(action[2])[0], observation[2])
+
+
 def test_disabled_mode_wants_a_mask():
     envs = gymnasium.make_vec(VELOCITY, num_envs=3, max_episode_steps=2, autoreset_mode="Disabled")
     envs.reset(seed=0)
@@ -214,6 +231,19 @@ def test_a_diverged_environment_is_flagged_and_reset_alone():
         assert np.isfinite(ours[0]).all()
         assert ours[4]["diverged"].tolist() == [k == 0 and i == 13 for i in range(20)]
         assert ours[3][13] == (k == 0)
+
+
+def test_divergence_is_a_truncation_even_if_the_robot_has_fallen():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=2, autoreset_mode="SameStep")
+    envs.reset(seed=0)
+    batch = envs.unwrapped.batch
+    q, v = batch.rows("q"), batch.rows("v")
+    q[:, 3:7], v[0, 8] = [0.0, 1.0, 0.0, 0.0], np.nan  # both on their backs
+    batch.write("q", q)
+    batch.write("v", v)
+    _, _, terminated, truncated, _ = envs.step(np.zeros((2, 12), np.float32))
+    assert terminated.tolist() == [False, True]
+    assert truncated.tolist() == [True, False]
 
 
 def test_reward_terms_add_up_and_weights_are_arguments():
