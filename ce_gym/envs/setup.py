@@ -41,7 +41,7 @@ def make_batch(
         reward_weights: Weights that replace or add to those of the task, by the name of the term; 0 removes a term.
         command_range: Bounds of forward [m/s], sideways [m/s] and yaw rate [rad/s] commands, three pairs.
         command_period: Time between new commands [s].
-        contacts: Which contact spheres take part: "all", a group or names.
+        contacts: Which contact spheres take part: "all", or names of groups or spheres.
         contact_forces: Whether contact forces are computed, for recording.
         dtype: "float64" or "float32" for physics.
         num_threads: Threads; the number of usable cores if None.

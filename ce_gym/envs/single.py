@@ -43,6 +43,11 @@ class LeggedEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]], EzPickl
         return self.batch.program.control_dt
 
     @property
+    def contact_names(self) -> tuple[str, ...]:
+        """The contact spheres that take part, in the order of recorded contact forces."""
+        return self.batch.program.contacts
+
+    @property
     def observation_structure(self) -> dict[str, int]:
         """Length of each observation block, in order."""
         return self.batch.program.observation_sizes

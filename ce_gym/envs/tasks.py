@@ -29,7 +29,8 @@ class Task:
         dt: Length of a physics sub-step [s].
         n_substeps: Sub-steps in a control step.
         episode_length: Control steps until time is up.
-        contacts: Which contact spheres take part: "all", a group or names.
+        contacts: Which contact spheres take part: "all", or names of groups or spheres. Spheres whose touching the ground
+            ends the episode need not.
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
     """
 
@@ -44,7 +45,7 @@ class Task:
     dt: float = 0.005
     n_substeps: int = 4
     episode_length: int = 1000
-    contacts: str | tuple[str, ...] = "all"
+    contacts: str | tuple[str, ...] = ("foot", "knee")
     only_positive: bool = True
     reset_noise: Mapping[str, float] = field(
         default_factory=lambda: MappingProxyType({"joint_position": 0.1, "joint_velocity": 0.2, "base_velocity": 0.2})

@@ -32,7 +32,7 @@ class Simulator:
         num_threads: Threads the robots are split over; results do not depend on it.
         control: What `target` means: "position" for joint positions [rad] through the robot's PD gains, "torque" for
             joint torques [N m].
-        contacts: Which contact spheres can touch the ground: "all", the name of a group such as "foot", or names.
+        contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
         material: Compliance and friction of the contacts; the robot's own if None.
         outputs: Which of "torque" and "contact_forces" to compute; those left out cost nothing and read as errors.
 
@@ -164,22 +164,20 @@ class Simulator:
 
 
 def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, ...]:
-    """Return names of contact spheres: all of them, those of a group, or those named.
+    """Return names of contact spheres, in the robot's order.
+
+    Args:
+        robot: The robot.
+        contacts: "all", or names of spheres or groups of spheres, one or several.
 
     Raises:
-        ValueError: If a name or group does not exist.
+        ValueError: If a name is neither a sphere's nor a group's.
     """
-    names = tuple(contact.name for contact in robot.contacts)
-    if isinstance(contacts, str):
-        groups = sorted({contact.group for contact in robot.contacts})
-        chosen = names if contacts == "all" else tuple(c.name for c in robot.contacts if c.group == contacts)
-        _check(
-            "contacts", contacts, contacts == "all" or bool(chosen), f"'all', a group ({', '.join(groups)}) or names"
-        )
-        return chosen
-    for name in contacts:
-        _check("contacts", name, name in names, f"names among {', '.join(names)}")
-    return tuple(contacts)
+    wanted = {contacts} if isinstance(contacts, str) else set(contacts)
+    known = {"all"} | {c.group for c in robot.contacts} | {c.name for c in robot.contacts}
+    for name in sorted(wanted - known):
+        _check("contacts", name, False, f"'all', groups or names among {', '.join(sorted(known - {'all'}))}")
+    return tuple(c.name for c in robot.contacts if wanted & {"all", c.group, c.name})
 
 
 def model_key(model: Model) -> str:
