@@ -1,0 +1,193 @@
+"""Stable-Baselines3's `VecEnv` over a native Gymnasium `VectorEnv`, without processes and without copies.
+
+Stable-Baselines3 wants one information dictionary per environment and step. Building thousands of them costs more
+than the physics, so every running environment shares one empty dictionary, and only those whose episode has just
+ended get one of their own. Knows the two contracts; knows nothing of robots, tasks or physics.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+_RUNNING: dict[str, Any] = {}
+"""What every environment reports in the middle of an episode. Shared: nobody may write to it."""
+
+
+class SB3VecEnv(VecEnv):
+    """A batch of environments as Stable-Baselines3 expects it.
+
+    Arrays are handed on as they come. Stable-Baselines3 keeps observations past the next step and adds to rewards in
+    place, so the wrapped environment must return fresh arrays from every call, as ce_gym's do.
+
+    Args:
+        envs: A vector environment in SAME_STEP autoreset mode.
+
+    Attributes:
+        envs: The wrapped environment.
+        step_seconds: Wall time spent inside `envs.step` so far [s].
+
+    Raises:
+        ValueError: If `envs` resets in another mode.
+    """
+
+    def __init__(self, envs: VectorEnv) -> None:
+        mode = envs.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(f"SB3VecEnv: autoreset_mode is {mode}, expected {AutoresetMode.SAME_STEP}")
+        self.envs = envs
+        self.step_seconds = 0.0
+        self._actions = np.zeros(0, np.float32)
+        self._start = time.monotonic()
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Reset all environments with the seed and options given since the last reset.
+
+        Returns:
+            Observations, shape (num_envs, n_obs).
+        """
+        obs, _ = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self._reset_seeds()
+        self._reset_options()
+        return obs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Remember `actions`, shape (num_envs, n_act), for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all environments.
+
+        Returns:
+            Observations (num_envs, n_obs), rewards (num_envs,), dones (num_envs,) and one dictionary per environment.
+            An environment that is done already shows the first observation of its next episode; its dictionary holds
+            the last one of the old episode as `terminal_observation`, `TimeLimit.truncated`, and `episode`.
+        """
+        start = time.perf_counter()
+        obs, rewards, terminated, truncated, infos = self.envs.step(self._actions)
+        self.step_seconds += time.perf_counter() - start
+        dones = terminated | truncated
+        return obs, rewards.astype(np.float32, copy=False), dones, self._dicts(dones, truncated & ~terminated, infos)
+
+    def _dicts(self, dones: np.ndarray, timed_out: np.ndarray, infos: dict[str, Any]) -> list[dict[str, Any]]:
+        """One dictionary per environment, the shared empty one for those that run on."""
+        dicts = [_RUNNING] * self.num_envs
+        ended = np.flatnonzero(dones)
+        if not len(ended):
+            return dicts
+        diverged = infos.get("diverged", np.zeros(self.num_envs, bool))
+        episodes = self._episodes(ended, infos)
+        for i, episode in zip(ended.tolist(), episodes, strict=True):
+            dicts[i] = {
+                "terminal_observation": infos["final_obs"][i],
+                "TimeLimit.truncated": bool(timed_out[i]),
+                "diverged": bool(diverged[i]),
+                "episode": episode,
+            }
+        return dicts
+
+    def _episodes(self, ended: np.ndarray, infos: dict[str, Any]) -> list[dict[str, float]]:
+        """Return `r`, length `l`, clock `t` and every reward term and metric of the episodes that have just ended."""
+        columns = {key: np.asarray(values)[ended] for key, values in _episode_entries(infos).items()}
+        columns["t"] = np.full(len(ended), time.monotonic() - self._start)
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        return [dict(zip(columns, row, strict=True)) for row in rows]
+
+    def close(self) -> None:
+        """Close the wrapped environment."""
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of the batch, once for each environment asked for.
+
+        Raises:
+            AttributeError: If the wrapped environment has no such attribute.
+        """
+        owner = self.envs if hasattr(self.envs, attr_name) else self.envs.unwrapped
+        return [getattr(owner, attr_name)] * self._count(indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of the whole batch.
+
+        Raises:
+            ValueError: If `indices` names only some of the environments.
+        """
+        self._require_all(attr_name, indices)
+        setattr(self.envs.unwrapped, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list:
+        """Call a method of the batch once and return its result, once for each environment.
+
+        Raises:
+            ValueError: If `indices` names only some of the environments.
+        """
+        self._require_all(method_name, indices)
+        owner = self.envs if hasattr(self.envs, method_name) else self.envs.unwrapped
+        return [getattr(owner, method_name)(*method_args, **method_kwargs)] * self.num_envs
+
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
+        """Say yes to `Monitor` only: its `episode` entry is supplied here, and evaluation relies on it."""
+        return [issubclass(wrapper_class, Monitor)] * self._count(indices)
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Return one rendered image per environment."""
+        frames: Any = self.envs.render()
+        return list(frames or ())
+
+    def _count(self, indices: VecEnvIndices) -> int:
+        """How many environments `indices` names."""
+        return len(list(self._get_indices(indices)))
+
+    def _require_all(self, name: str, indices: VecEnvIndices) -> None:
+        """The batch is one object; a change to a part of it is refused rather than applied to all."""
+        named: Iterable[int] = self._get_indices(indices)
+        if set(named) != set(range(self.num_envs)):
+            raise ValueError(f"{name}: indices is {indices}, expected None: the batch is one environment object")
+
+
+def _episode_entries(infos: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Entries of ended episodes, each shape (num_envs,), under the names that Stable-Baselines3 uses.
+
+    ce_gym's environments report `episode_terms`, sums over the episode of which those called metrics are to be read as
+    means; others report `episode` through Gymnasium's `RecordEpisodeStatistics`.
+    """
+    if "episode_terms" not in infos:
+        return infos["episode"]
+    terms = dict(infos["episode_terms"])
+    length, total = terms.pop("length"), terms.pop("return")
+    means = {key: values / np.maximum(length, 1) for key, values in terms.items() if key.startswith("metrics/")}
+    return {"r": total, "l": length, **terms, **means}
+
+
+def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwargs: Any) -> SB3VecEnv:
+    """Make `num_envs` environments of a registered id, ready for Stable-Baselines3.
+
+    Args:
+        env_id: Such as `"ce_gym/MiniCheetahVelocity-v0"`.
+        num_envs: Size of the batch.
+        seed: Used by the first reset; environment i gets `seed + i`. None seeds from the operating system.
+        **kwargs: Given to the environment, such as `transmission="armature"` or `num_threads=2`.
+
+    Returns:
+        The batch, not yet reset.
+
+    Raises:
+        gymnasium.error.Error: If the id is unknown or has no native vector environment.
+    """
+    mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
+    options = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
+    envs = SB3VecEnv(gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode=mode, **options))
+    if seed is not None:
+        envs.seed(seed)
+    return envs

@@ -1,0 +1,92 @@
+"""A toy vector environment that keeps ce_gym's contract: a point that must move at a commanded speed.
+
+It exists so that the shells for learners and the training scripts are tested without a robot: one action is a force,
+the observation is (speed, command), the reward is one minus the squared error of speed.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+ID = "test/PointMassVelocity-v0"
+
+
+class PointMassVectorEnv(VectorEnv):
+    def __init__(
+        self, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, transmission="exact", horizon=50, standard=False, **_
+    ):
+        self.num_envs, self.horizon, self.standard = num_envs, horizon, standard
+        self.model = SimpleNamespace(robot=SimpleNamespace(name="point", source=""), transmission=transmission)
+        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_fps": 50, "render_modes": []}
+        self.render_mode = None
+        self.single_observation_space = Box(-np.inf, np.inf, (2,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.batch = SimpleNamespace(write=self._write)
+        self.gain = {"exact": 0.2, "coupled": 0.2, "armature": 0.15, "none": 0.1}[transmission]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.fixed = (options or {}).get("command")
+        self.speed, self.command, self.error, self.total = (np.zeros(self.num_envs) for _ in range(4))
+        self.clock = np.zeros(self.num_envs, int)
+        self._restart(np.ones(self.num_envs, bool))
+        return self._obs(), {}
+
+    def step(self, actions):
+        assert actions.shape == (self.num_envs, 1)
+        self.speed = self.speed + self.gain * np.clip(actions[:, 0], -1, 1)
+        error = np.abs(self.speed - self.command)
+        reward = (1.0 - error**2).astype(np.float32)
+        self.clock, self.error, self.total = self.clock + 1, self.error + error, self.total + reward
+        diverged = np.abs(self.speed) > 8.0
+        terminated = np.abs(self.speed) > 3.0
+        truncated = (self.clock >= self.horizon) & ~terminated
+        done = terminated | truncated
+        infos = {"diverged": diverged}
+        if done.any():
+            infos |= self._ending(done)
+            self._restart(done)
+        return self._obs(), reward, terminated, truncated, infos
+
+    def state(self):
+        v = np.zeros((self.num_envs, 7))
+        v[:, 3] = self.speed
+        command = np.stack([self.command, 0 * self.command, 0 * self.command], axis=1)
+        return {
+            "q": np.zeros((self.num_envs, 8)),
+            "v": v,
+            "contact_forces": np.zeros((self.num_envs, 1, 3)),
+            "command": command,
+        }
+
+    def _write(self, name, rows):
+        assert name == "command"
+        self.command[:] = rows[:, 0]
+
+    def _ending(self, done):
+        if self.standard:  # reports no sums of its own
+            return {"final_obs": self._obs(), "_final_obs": done}
+        sums = {"length": self.clock.copy(), "return": self.total.copy(), "reward/speed": self.total.copy()}
+        sums["metrics/velocity_error"] = self.error.copy()
+        return {"final_obs": self._obs(), "_final_obs": done, "episode_terms": sums, "_episode_terms": done}
+
+    def _restart(self, lanes):
+        for array in (self.speed, self.error, self.total, self.clock):
+            array[lanes] = 0
+        drawn = self.np_random.uniform(-1, 1, self.num_envs)
+        self.command[lanes] = drawn[lanes] if self.fixed is None else self.fixed[0]
+
+    def _obs(self):
+        return np.stack([self.speed, self.command], axis=1).astype(np.float32)
+
+
+if ID not in gymnasium.registry:
+    gymnasium.register(ID, vector_entry_point=PointMassVectorEnv)

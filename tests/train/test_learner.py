@@ -1,0 +1,39 @@
+"""The threaded learner computes what Stable-Baselines3's own computes, on any number of threads."""
+
+import numpy as np
+import pytest
+import torch
+from learner import ThreadedPPO
+from point_mass import ID
+from stable_baselines3 import PPO
+
+from ce_gym.adapters.sb3 import make_sb3_vec_env
+
+
+def weights(cls, threads=1, minibatches=1):
+    """All parameters after three rollouts and nine updates."""
+    envs = make_sb3_vec_env(ID, 16, seed=2)
+    model = cls(
+        "MlpPolicy", envs, n_steps=20, batch_size=320 // minibatches, n_epochs=3, seed=1, device="cpu", ent_coef=0.01
+    )
+    model.threads = threads
+    torch.set_num_threads(1)
+    model.learn(3 * 320)
+    return np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()]), model.logger
+
+
+def test_it_is_ppo():
+    """With one minibatch per epoch the order of samples does not matter, so the two must agree."""
+    ours, our_log = weights(ThreadedPPO)
+    theirs, their_log = weights(PPO)
+    np.testing.assert_allclose(ours, theirs, atol=5e-5)
+    untrained = PPO("MlpPolicy", make_sb3_vec_env(ID, 16), seed=1, device="cpu").policy
+    start = np.concatenate([p.detach().numpy().ravel() for p in untrained.parameters()])
+    assert np.abs(theirs - start).max() > 20 * 5e-5  # the tolerance is far below what learning changes
+    for key in ("train/value_loss", "train/approx_kl", "train/entropy_loss", "train/std", "train/explained_variance"):
+        assert our_log.name_to_value[key] == pytest.approx(their_log.name_to_value[key], rel=1e-2, abs=1e-4)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_do_not_change_the_result(threads):
+    np.testing.assert_array_equal(weights(ThreadedPPO, minibatches=4)[0], weights(ThreadedPPO, threads, 4)[0])

@@ -1,0 +1,139 @@
+"""PPO whose updates run on several threads, each on its own share of a minibatch.
+
+Stable-Baselines3 leaves threads to torch, which splits every single matrix product and waits after each; on networks
+of this size that gains a third, and loses nearly everything as soon as another program wants a core. Here a thread
+computes the gradient of its share from beginning to end, and the shares are added in a fixed order: one meeting per
+minibatch, and the same result bit for bit on any number of threads. Knows Stable-Baselines3; no robots, no tasks.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import explained_variance
+from torch import Tensor
+from torch.nn import functional
+
+SHARES = 4
+"""Shares of a minibatch. Fixed, so that results do not depend on the number of threads."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Collected steps, all of them or some; every tensor has one row per step."""
+
+    observations: Tensor
+    actions: Tensor
+    log_probs: Tensor
+    advantages: Tensor
+    returns: Tensor
+
+    def at(self, rows: Tensor) -> Samples:
+        """The steps numbered `rows`."""
+        return Samples(*(tensor[rows] for tensor in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one thread has found out about its share of a minibatch; `figures` are means over the share."""
+
+    weight: float
+    gradient: tuple[Tensor, ...]
+    figures: Tensor
+
+
+FIGURES = ("policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "clip_fraction")
+
+
+class ThreadedPPO(PPO):
+    """PPO of Stable-Baselines3 with the same loss and another division of labour.
+
+    Its policies are saved and loaded as those of `PPO`. Torch itself is expected to use one thread.
+
+    Attributes:
+        threads: Threads of an update.
+    """
+
+    threads = 1
+
+    def train(self) -> None:
+        """Update the policy with the steps collected last."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        samples, figures = self._samples(), []
+        workers = [_replica(self.policy) for _ in range(SHARES)]
+        with ThreadPoolExecutor(self.threads) as pool:
+            each = pool.map if self.threads > 1 else map
+            for _ in range(self.n_epochs):
+                order = torch.from_numpy(np.random.permutation(len(samples.returns)))
+                figures = [self._update(samples, rows, workers, each) for rows in order.split(self.batch_size)]
+        self._n_updates += self.n_epochs
+        self._log(torch.stack(figures).mean(0).tolist())
+
+    def _samples(self) -> Samples:
+        """The rollout buffer as tensors that share its memory."""
+        buffer = self.rollout_buffer
+        arrays = (buffer.observations, buffer.actions, buffer.log_probs, buffer.advantages, buffer.returns)
+        steps = buffer.buffer_size * buffer.n_envs
+        return Samples(*(torch.from_numpy(a.reshape(steps, *a.shape[2:])) for a in arrays))
+
+    def _update(self, samples: Samples, rows: Tensor, workers: list[Any], each: Callable) -> Tensor:
+        """One step of the optimiser on the samples numbered `rows`; `each` maps over shares. Returns FIGURES."""
+        advantages = samples.advantages[rows]
+        centre, scale = advantages.mean(), advantages.std() + 1e-8
+        parts = rows.chunk(SHARES)
+        weights = [len(part) / len(rows) for part in parts]
+
+        def work(worker: ActorCriticPolicy, part: Tensor, weight: float) -> Share:
+            return self._share(worker, samples.at(part), centre, scale, weight)
+
+        shares = list(each(work, workers, parts, weights))
+        parameters = list(self.policy.parameters())
+        for i, parameter in enumerate(parameters):
+            parameter.grad = sum((s.gradient[i] for s in shares[1:]), shares[0].gradient[i])
+        torch.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        self.policy.optimizer.step()
+        return torch.stack([share.weight * share.figures for share in shares]).sum(0)
+
+    def _share(self, policy: ActorCriticPolicy, s: Samples, centre: Tensor, scale: Tensor, weight: float) -> Share:
+        """Gradient of the loss on one share, times its weight (Schulman et al. 2017, arXiv:1707.06347, eq. 7 and 9)."""
+        clip = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
+        advantages = (s.advantages - centre) / scale
+        values, log_probs, entropy = policy.evaluate_actions(s.observations, s.actions)
+        log_ratio = log_probs - s.log_probs
+        ratio = log_ratio.exp()
+        policy_loss = -torch.min(advantages * ratio, advantages * ratio.clamp(1 - clip, 1 + clip)).mean()
+        value_loss = functional.mse_loss(values.flatten(), s.returns)
+        entropy_loss = log_probs.mean() if entropy is None else -entropy.mean()
+        loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
+        gradient = torch.autograd.grad(weight * loss, list(policy.parameters()))
+        with torch.no_grad():
+            kl = (ratio - 1 - log_ratio).mean()  # the estimator k3 of http://joschu.net/blog/kl-approx.html
+            clipped = ((ratio - 1).abs() > clip).float().mean()
+        return Share(weight, gradient, torch.stack([policy_loss, value_loss, entropy_loss, kl, clipped]).detach())
+
+    def _log(self, figures: list[float]) -> None:
+        """Record what Stable-Baselines3 records."""
+        for name, value in zip(FIGURES, figures, strict=True):
+            self.logger.record(f"train/{name}", value)
+        buffer = self.rollout_buffer
+        self.logger.record(
+            "train/explained_variance", explained_variance(buffer.values.ravel(), buffer.returns.ravel())
+        )
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", self.policy.log_std.detach().exp().mean().item())  # type: ignore[union-attr]
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+
+def _replica(policy: Any) -> Any:
+    """A policy with the same parameters, not copies of them, and all else its own: evaluating one changes it."""
+    shared = {id(parameter): parameter for parameter in policy.parameters()}
+    return copy.deepcopy(policy, shared | {id(policy.optimizer): None})

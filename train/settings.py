@@ -1,0 +1,148 @@
+"""PPO settings: what they are, and how they are read from a YAML file and the command line.
+
+One file per robot and task lies in `config/`, found by the name of the environment. A file is complete: every
+setting is in it, none is inherited. Knows nothing of learners, environments or robots.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+CONFIG_FOLDER = Path(__file__).parent / "config"
+
+
+class SettingsError(ValueError):
+    """A settings file or override that cannot be used; the message is one line for the user."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that shapes learning, apart from the environment itself and the seed.
+
+    Attributes:
+        steps: Environment steps to train for, over all environments.
+        num_envs: Environments stepped at once.
+        rollout: Steps of each environment between two updates.
+        minibatches: Parts into which the collected steps are divided.
+        epochs: Times each update goes over the collected steps.
+        hidden: Sizes of the hidden layers, the same for policy and value.
+        activation: Name of a module of `torch.nn`, such as Tanh or ELU.
+        initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
+        learning_rate: Of Adam, at the start.
+        target_kl: KL divergence of one update that the learning rate is adapted to; 0 keeps the rate fixed.
+        gamma: Discount per step.
+        gae_lambda: Of generalised advantage estimation.
+        clip: Clipping range of PPO's probability ratio.
+        entropy: Weight of the entropy bonus.
+        value: Weight of the value loss.
+        max_grad_norm: Gradients are clipped to this norm.
+    """
+
+    steps: int
+    num_envs: int
+    rollout: int
+    minibatches: int
+    epochs: int
+    hidden: tuple[int, ...]
+    activation: str
+    initial_std: float
+    learning_rate: float
+    target_kl: float
+    gamma: float
+    gae_lambda: float
+    clip: float
+    entropy: float
+    value: float
+    max_grad_norm: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The settings as plain data, for a record beside the policy."""
+        return asdict(self)
+
+
+def config_file(env_id: str) -> Path:
+    """The settings file of an environment.
+
+    `namespace/MyRobotTask-Level-v0` takes `my_robot_task_level.yaml` if there is one, else `my_robot_task.yaml`, else
+    `default.yaml`.
+    """
+    name = re.sub(r"-v\d+$", "", env_id.rsplit("/", 1)[-1])
+    for candidate in (name.replace("-", ""), name.split("-")[0]):
+        path = CONFIG_FOLDER / f"{_snake(candidate)}.yaml"
+        if path.exists():
+            return path
+    return CONFIG_FOLDER / "default.yaml"
+
+
+def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
+    """Read a settings file and apply `KEY=VALUE` overrides.
+
+    Raises:
+        SettingsError: If the file cannot be read, or a key is missing, unknown or of the wrong kind.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        reason = str(error).replace("\n", " ")
+        raise SettingsError(f"{path}: cannot be read as YAML: {reason}") from None
+    if not isinstance(data, dict):
+        raise SettingsError(f"{path}: expected one `key: value` per line, got {type(data).__name__}")
+    return make_settings(data | dict(_parse_override(text) for text in overrides), source=str(path))
+
+
+def make_settings(data: Mapping[str, Any], source: str) -> Settings:
+    """Check plain data, key by key, and return it as `Settings`; `source` names it in errors.
+
+    Raises:
+        SettingsError: If a key is missing, unknown or of the wrong kind.
+    """
+    known = {field.name: str(field.type) for field in fields(Settings)}
+    for key in data:
+        if key not in known:
+            raise SettingsError(f"{source}: {key}: unknown setting; expected one of {', '.join(known)}")
+    for key in known:
+        if key not in data:
+            raise SettingsError(f"{source}: {key}: missing; expected {known[key]}")
+    return Settings(**{key: _convert(source, key, data[key], kind) for key, kind in known.items()})
+
+
+def _parse_override(text: str) -> tuple[str, Any]:
+    """Split one `KEY=VALUE`."""
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise SettingsError(f"--set {text}: expected KEY=VALUE")
+    return key.strip().replace("-", "_"), yaml.safe_load(value)
+
+
+def _convert(source: str, key: str, value: Any, kind: str) -> Any:
+    """Convert one value. Numbers may be written 1e-3 or 6e6, which YAML 1.1 reads as text."""
+    try:
+        if kind == "int":
+            number = float(value)
+            if number != int(number) or number <= 0:
+                raise ValueError
+            return int(number)
+        if kind == "float":
+            number = float(value)
+            if not 0 <= number < float("inf"):
+                raise ValueError
+            return number
+        if kind == "str":
+            return str(value)
+        return tuple(_convert(source, key, size, "int") for size in value)
+    except (TypeError, ValueError, OverflowError) as error:
+        if isinstance(error, SettingsError):
+            raise
+        wanted = {"int": "a positive whole number", "float": "a number >= 0"}.get(kind, "a list of layer sizes")
+        raise SettingsError(f"{source}: {key}: {value!r}; expected {wanted}") from None
+
+
+def _snake(name: str) -> str:
+    """`MyRobotTask` as `my_robot_task`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
