@@ -59,7 +59,8 @@ def record(
         period = 1.0 / native.metadata["render_fps"]
         commands = np.repeat([c for _, c in script], [round(t / period) for t, _ in script], axis=0)
         names = native.contact_names
-        recorder = Recorder(native.model.robot.name, native.model.transmission, period, label=label, contact_names=names)
+        robot = native.model.robot.name
+        recorder = Recorder(robot, native.model.transmission, period, label=label, contact_names=names)
         obs, done = envs.reset(), np.zeros(1, bool)
         for step, command in enumerate(commands):
             native.batch.write("command", command[None])

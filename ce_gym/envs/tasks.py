@@ -29,8 +29,8 @@ class Task:
         dt: Length of a physics sub-step [s].
         n_substeps: Sub-steps in a control step.
         episode_length: Control steps until time is up.
-        contacts: Which contact spheres take part: "all", or names of groups or spheres. Spheres whose touching the ground
-            ends the episode need not.
+        contacts: Which contact spheres take part: "all", or names of groups or spheres. Spheres that end the episode
+            when they touch the ground need not.
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
     """
 

@@ -119,7 +119,7 @@ def point_bias(model: Model, body: str, point, q, v) -> np.ndarray:
 
 
 def test_free_flight_is_a_straight_line():
-    """A tumbling body without forces moves uniformly, to rounding, and spins by the exponential map about a main axis."""
+    """A tumbling body without forces moves uniformly, and about a main axis it spins uniformly, to rounding."""
     inertia = ((0.02, 0.0, 0.0), (0.0, 0.03, 0.0), (0.0, 0.0, 0.04))
     body = Body("brick", "link", None, Placement(), Joint("free"), Inertial(2.0, (0.0, 0.0, 0.0), inertia))
     model = Model(Robot("brick", (body,), gravity=(0.0, 0.0, 0.0)))
