@@ -98,7 +98,7 @@ class ThreadedPPO(PPO):
         shares = list(each(work, workers, parts, weights))
         parameters = list(self.policy.parameters())
         for i, parameter in enumerate(parameters):
-            parameter.grad = sum((s.gradient[i] for s in shares[1:]), shares[0].gradient[i])
+            parameter.grad = torch.stack([share.gradient[i] for share in shares]).sum(0)
         torch.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         self.policy.optimizer.step()
         return torch.stack([share.weight * share.figures for share in shares]).sum(0)
