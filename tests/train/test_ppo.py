@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -114,7 +115,15 @@ def test_the_deadline_stops_training_and_saves(tmp_path):
 
 
 def test_ctrl_c_saves_a_usable_policy(tmp_path, capsys):
-    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt_once_training_runs() -> None:
+        while signal.getsignal(signal.SIGINT) is before:
+            time.sleep(0.02)
+        time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt_once_training_runs, daemon=True).start()
     code = main(["--env", ID, "--steps", "1e9", "--out", str(tmp_path), *FAST])
     assert code == 130
     assert "--resume" in capsys.readouterr().out

@@ -7,9 +7,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 import webbrowser
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -120,7 +122,12 @@ def test_bench_is_handed_its_own_options(capsys: pytest.CaptureFixture[str]) -> 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT to send")
 def test_live_ends_with_ctrl_c_and_leaves_nothing(standing: Path) -> None:
     command = [sys.executable, "-m", "ce_gym", "view", str(standing), "--live"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a test run in the background ignores Ctrl-C
+    options = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True, "preexec_fn": heed}
+    with subprocess.Popen(command, **options) as process:
+        guard = threading.Timer(60, process.kill)
+        guard.daemon = True
+        guard.start()
         assert process.stdout is not None
         url = process.stdout.readline().split()[2]
         with urllib.request.urlopen(url, timeout=10) as answer:
