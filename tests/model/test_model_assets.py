@@ -147,7 +147,7 @@ def test_second_load_is_equal_and_hashes_alike(name):
     assert first is not second
     assert first == second
     assert hash(first) == hash(second)
-    assert robots() == NAMES
+    assert set(NAMES) <= set(robots())
 
 
 def test_published_inertia_is_warned_about_once():
@@ -163,6 +163,7 @@ def test_published_inertia_is_warned_about_once():
 def test_assets_are_found_in_a_wheel_and_in_a_checkout(tmp_path, inside):
     package = Path(ce_gym.model.__file__).parents[1]
     shutil.copytree(package / "model", tmp_path / "ce_gym" / "model")
+    (tmp_path / "ce_gym" / "__init__.py").touch()  # else an installed package would come first
     source = ce_gym.model.assets_folder()
     shutil.copytree(source, tmp_path / "ce_gym" / "assets" if inside else tmp_path / "assets")
     code = "import ce_gym.model as m; print(m.__file__, m.robots(), m.load_robot('mit_humanoid_leg').source)"
@@ -170,5 +171,5 @@ def test_assets_are_found_in_a_wheel_and_in_a_checkout(tmp_path, inside):
     result = subprocess.run(
         [sys.executable, "-P", "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    assert str(NAMES) in result.stdout
+    assert all(name in result.stdout for name in NAMES)
     assert result.stdout.count(str(tmp_path)) == 2
