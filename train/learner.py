@@ -121,7 +121,7 @@ class ThreadedPPO(PPO):
         return Share(weight, gradient, torch.stack([policy_loss, value_loss, entropy_loss, kl, clipped]).detach())
 
     def _log(self, figures: list[float]) -> None:
-        """Record what Stable-Baselines3 records."""
+        """Record what Stable-Baselines3 records; losses are those of the last epoch, not means over all."""
         for name, value in zip(FIGURES, figures, strict=True):
             self.logger.record(f"train/{name}", value)
         buffer = self.rollout_buffer

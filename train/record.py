@@ -63,7 +63,7 @@ def record(
         recorder = Recorder(robot, native.model.transmission, period, label=label, contact_names=names)
         obs, done = envs.reset(), np.zeros(1, bool)
         for step, command in enumerate(commands):
-            native.batch.write("command", command[None])
+            native.set_command(command)
             _add_frame(recorder, step * period, native.state())
             action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
             obs, _, done, _ = envs.step(action)

@@ -159,15 +159,12 @@ class SB3VecEnv(VecEnv):
 def _episode_entries(infos: dict[str, Any]) -> dict[str, np.ndarray]:
     """Entries of ended episodes, each shape (num_envs,), under the names that Stable-Baselines3 uses.
 
-    ce_gym's environments report `episode_terms`, sums over the episode of which those called metrics are to be read as
-    means; others report `episode` through Gymnasium's `RecordEpisodeStatistics`.
+    ce_gym's environments report `episode_terms`; others report `episode` through Gymnasium's `RecordEpisodeStatistics`.
     """
     if "episode_terms" not in infos:
         return infos["episode"]
     terms = dict(infos["episode_terms"])
-    length, total = terms.pop("length"), terms.pop("return")
-    means = {key: values / np.maximum(length, 1) for key, values in terms.items() if key.startswith("metrics/")}
-    return {"r": total, "l": length, **terms, **means}
+    return {"r": terms.pop("return"), "l": terms.pop("length"), **terms}
 
 
 def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwargs: Any) -> SB3VecEnv:

@@ -72,8 +72,8 @@ def stand_still(s: Snapshot) -> SX:
 
 
 def feet_air_time(s: Snapshot) -> SX:
-    """At each touchdown, how long the foot was in the air beyond 0.2 s, while motion is commanded [s]."""
-    gained = ca.dot(s.air_time - 0.2, s.landed) / s.control_dt  # an event, not a rate: the step cancels
+    """At each touchdown, how long the foot was in the air beyond 0.1 s, while motion is commanded [s]."""
+    gained = ca.dot(s.air_time - 0.1, s.landed) / s.control_dt  # an event, not a rate: the step cancels
     return ca.if_else(s.commanded_to_move, gained, 0)
 
 

@@ -23,7 +23,8 @@ class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
     Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit,
     whatever the size of the batch and the number of threads. `infos` holds `diverged`, bool (num_envs,): environments
     whose simulation failed numerically; they are truncated at their last good state and reset alone. Where an episode
-    has ended, `infos["episode_terms"]` has its length, its return and every reward term and metric (see `Task`).
+    has ended, `infos["episode_terms"]` has its length, its return, the sum of every reward term and the mean of every
+    metric (see `Task`).
 
     Args:
         num_envs: Number of environments.
@@ -136,7 +137,7 @@ class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
             self._elapsed[resetting] = 0
         done = terminated | truncated
         if done.any():
-            infos["episode_terms"] = {"length": self._elapsed * done, **self.batch.episode_sums(done)}
+            infos["episode_terms"] = self._episode_terms(done)
             infos["_episode_terms"] = done
             if self.autoreset_mode == AutoresetMode.SAME_STEP:
                 infos["final_obs"], infos["_final_obs"] = observation.copy(), done.copy()
@@ -152,6 +153,21 @@ class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
     def state(self) -> dict[str, NDArray]:
         """Return what a recorder needs: q, v, command and, if computed, contact_forces (num_envs, n_contacts, 3)."""
         return recorded_state(self.batch)
+
+    def set_command(self, command: NDArray[Any]) -> None:
+        """Command velocities until the task draws new ones.
+
+        Args:
+            command: Forward [m/s], sideways [m/s], yaw rate [rad/s], shape (3,) or (num_envs, 3).
+        """
+        self.batch.write("command", np.broadcast_to(command, (self.num_envs, 3)))
+
+    def _episode_terms(self, done: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+        """Length, sums of reward terms and means of metrics of the episodes that have just ended, zero elsewhere."""
+        length = self._elapsed * done
+        terms = self.batch.episode_sums(done)
+        means = {key: sums / np.maximum(length, 1) for key, sums in terms.items() if key.startswith("metrics/")}
+        return {"length": length, **terms, **means}
 
     def _reset_mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
         """Read, but do not take away, the mask: wrappers outside look at it too."""

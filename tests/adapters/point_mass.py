@@ -75,7 +75,7 @@ class PointMassVectorEnv(VectorEnv):
         if self.standard:  # reports no sums of its own
             return {"final_obs": self._obs(), "_final_obs": done}
         sums = {"length": self.clock.copy(), "return": self.total.copy(), "reward/speed": self.total.copy()}
-        sums["metrics/velocity_error"] = self.error.copy()
+        sums["metrics/velocity_error"] = self.error / np.maximum(self.clock, 1)
         return {"final_obs": self._obs(), "_final_obs": done, "episode_terms": sums, "_episode_terms": done}
 
     def _restart(self, lanes):

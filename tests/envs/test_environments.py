@@ -259,6 +259,7 @@ def test_reward_terms_add_up_and_weights_are_arguments():
         assert not terminated.any()
     terms = infos["episode_terms"]
     assert "reward/torques" not in terms
+    assert (terms["metrics/forward_speed_error"] < 3.0).all()  # a mean, not a sum
     np.testing.assert_allclose(terms["reward/alive"], 20 * 20.0 * 0.02)
     np.testing.assert_allclose(terms["return"], total)
     parts = sum(value for name, value in terms.items() if name.startswith("reward/"))
@@ -320,6 +321,14 @@ def test_commands_change_and_some_ask_to_stand():
     assert commands[:, 0].min() < -0.95
     assert commands[:, 0].max() > 0.95
     assert np.abs(commands[:, 1]).max() <= 0.5
+
+
+def test_commands_can_be_set():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=3)
+    envs.reset(seed=0)
+    envs.unwrapped.set_command(np.array([0.3, -0.1, 0.7]))
+    observation, *_ = envs.step(np.zeros((3, 12), np.float32))
+    np.testing.assert_allclose(observation[:, 9:12], np.tile([0.6, -0.2, 0.175], (3, 1)), rtol=1e-6)
 
 
 def test_spec_kwargs_are_json():

@@ -80,9 +80,10 @@ def strings_in_code(path: Path) -> list[str]:
 
 
 def test_no_robot_names_in_algorithms():
+    robots = [name for name in ce_gym.robots() if not name.endswith("_bar")]  # a four-bar is a mechanism before a robot
     for path in FILES:
         if room_of(path) in ("model", "dynamics", "compile", "sim"):
-            assert not [s for s in strings_in_code(path) if any(name in s for name in ce_gym.robots())], path
+            assert not [s for s in strings_in_code(path) if any(name in s for name in robots)], path
 
 
 def test_import_is_light():

@@ -13,8 +13,19 @@ from ce_gym.adapters.sb3 import make_sb3_vec_env
 def weights(cls, threads=1, minibatches=1):
     """All parameters after three rollouts and nine updates."""
     envs = make_sb3_vec_env(ID, 16, seed=2)
+    # Plain descent shows the length of a gradient, which Adam would hide; a narrow range, that ratios are clipped.
+    descent = {"policy_kwargs": {"optimizer_class": torch.optim.SGD}, "learning_rate": 0.03, "max_grad_norm": 1e9}
     model = cls(
-        "MlpPolicy", envs, n_steps=20, batch_size=320 // minibatches, n_epochs=3, seed=1, device="cpu", ent_coef=0.01
+        "MlpPolicy",
+        envs,
+        n_steps=20,
+        batch_size=320 // minibatches,
+        n_epochs=3,
+        seed=1,
+        device="cpu",
+        ent_coef=0.01,
+        clip_range=0.02,
+        **descent,
     )
     model.threads = threads
     torch.set_num_threads(1)
@@ -30,8 +41,8 @@ def test_it_is_ppo():
     untrained = PPO("MlpPolicy", make_sb3_vec_env(ID, 16), seed=1, device="cpu").policy
     start = np.concatenate([p.detach().numpy().ravel() for p in untrained.parameters()])
     assert np.abs(theirs - start).max() > 20 * 5e-5  # the tolerance is far below what learning changes
-    for key in ("train/value_loss", "train/approx_kl", "train/entropy_loss", "train/std", "train/explained_variance"):
-        assert our_log.name_to_value[key] == pytest.approx(their_log.name_to_value[key], rel=1e-2, abs=1e-4)
+    for key in ("train/approx_kl", "train/std", "train/explained_variance"):
+        assert our_log.name_to_value[key] == pytest.approx(their_log.name_to_value[key], rel=1e-2, abs=1e-5)
 
 
 @pytest.mark.parametrize("threads", [2, 3])

@@ -1,0 +1,103 @@
+"""A robot of one's own gets environments under its own ids, or one line that says what it lacks."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from ce_gym.envs.custom import register_robot
+from ce_gym.envs.tasks import TASKS
+from ce_gym.model import RobotError, assets_folder
+from ce_gym.model.mechanism import LEVELS
+
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+
+
+@pytest.fixture
+def dog(tmp_path: Path):
+    """Return a function that writes a copy of a shipped robot, with edits, under another name."""
+
+    def write(*edits: tuple[str, str], name: str = "my-dog") -> Path:
+        shutil.copytree(assets_folder() / "mini_cheetah", tmp_path / name, dirs_exist_ok=True)
+        path = tmp_path / name / "mini_cheetah.yaml"
+        text = path.read_text()
+        for old, new in (("name: mini_cheetah", f"name: {name}"), *edits):
+            assert old in text
+            text = text.replace(old, new)
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.fixture(autouse=True)
+def registry():
+    """Leave the registry as it was."""
+    before = dict(gymnasium.registry)
+    yield
+    gymnasium.registry.clear()
+    gymnasium.registry.update(before)
+
+
+def test_every_task_at_every_level_has_an_id(dog):
+    ids = register_robot(dog())
+    assert len(set(ids)) == len(TASKS) * (1 + len(LEVELS))
+    assert set(ids) >= {"ce_gym/MyDogVelocity-v0", "ce_gym/MyDogVelocity-Armature-v0"}
+    assert all(env_id in gymnasium.registry for env_id in ids)
+    assert Path(gymnasium.spec(ids[0]).kwargs["robot"]).is_absolute(), "it works from any folder"
+
+
+def test_the_environment_is_that_robot_s(dog):
+    path = dog(("height: ", "height: 0.01 #"))
+    ids = register_robot(path, name="flat dog")
+    assert ids[0] == "ce_gym/FlatDogVelocity-v0"
+    env = gymnasium.make("ce_gym/FlatDogVelocity-None-v0")
+    observation, _ = env.reset(seed=0)
+    assert observation in env.observation_space
+    *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert not info.get("diverged", False)
+    env.close()
+
+
+def test_twice_is_once_but_another_robot_needs_another_name(dog):
+    path = dog()
+    assert register_robot(path) == register_robot(str(path))
+    other = dog(name="my_dog")
+    with pytest.raises(RobotError, match=r"MyDogVelocity-v0'.*expected an id that no other robot has"):
+        register_robot(other)
+    assert register_robot(other, name="Rex")[0] == "ce_gym/RexVelocity-v0"
+
+
+def test_a_shipped_robot_s_ids_are_not_taken_over(dog):
+    with pytest.raises(RobotError, match="MiniCheetahVelocity"):
+        register_robot(dog(), name="mini_cheetah")
+
+
+@pytest.mark.parametrize(
+    ("edits", "message"),
+    [
+        ([("group: foot", "group: hoof")], "'foot' is missing: expected at least one contact sphere"),
+        ([("kp: 20.0", "kp: 0.0")], "gains.kp.HR_abad_link is 0.0: expected a position gain"),
+        ([("height: ", "height: -")], "pose.height is -"),
+    ],
+    ids=["no feet", "no gains", "no height"],
+)
+def test_what_a_task_needs_is_said(dog, edits, message):
+    with pytest.raises(RobotError) as caught:
+        register_robot(dog(*edits))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_fixed_robot_cannot_walk():
+    with pytest.raises(RobotError, match="base is 'fixed': expected a floating base"):
+        register_robot(assets_folder() / "mit_humanoid_leg" / "mit_humanoid_leg.yaml")
+
+
+def test_a_name_needs_letters(dog):
+    with pytest.raises(RobotError, match="expected a name with letters"):
+        register_robot(dog(), name="--")
