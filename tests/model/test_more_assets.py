@@ -1,0 +1,231 @@
+"""The humanoids carry the published figures, with the repairs their files speak of, and stand on flat feet."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from ce_gym.model import Robot, cluster_tree, load_robot, robots
+from ce_gym.model.description import ContactSphere
+
+FACTS = Path(__file__).resolve().parents[1] / "data" / "facts"
+NAMES = {"mit_humanoid": "mit_humanoid", "jvrc1": "jvrc1_symmetric"}
+
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+
+
+@pytest.fixture(scope="module", params=list(NAMES))
+def robot(request) -> Robot:
+    return load_robot(request.param)
+
+
+@pytest.fixture(scope="module")
+def facts(robot) -> dict:
+    return yaml.safe_load((FACTS / f"{NAMES[robot.name]}.yaml").read_text(encoding="utf-8"))
+
+
+def rotation(rpy) -> np.ndarray:
+    """An independent Rz Ry Rx."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return about_z @ about_y @ about_x
+
+
+def standing(robot: Robot, facts: dict) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Position and rotation of each link in the standing pose, from the published placements alone."""
+    poses, angles = {}, dict(robot.pose.joints)
+    for fact in facts["bodies"]:
+        if fact["joint"]["type"] == "free":
+            poses[fact["name"]] = (np.array([0, 0, robot.pose.height]), np.eye(3))
+        elif fact["kind"] == "link":
+            p, R = poses[fact["parent"]]
+            turn = rotation(angles.get(fact["name"], 0.0) * np.array(fact["joint"]["axis"]))
+            place = fact["placement"]
+            poses[fact["name"]] = (p + R @ place["xyz"], R @ rotation(place["rpy"]) @ turn)
+    return poses
+
+
+def soles(robot: Robot) -> list[ContactSphere]:
+    return [contact for contact in robot.contacts if contact.group == "foot"]
+
+
+def test_they_are_found_by_name():
+    assert set(NAMES) <= set(robots())
+
+
+def test_bodies_are_the_published_ones(robot, facts):
+    assert {body.name for body in robot.bodies} == {body["name"] for body in facts["bodies"]}
+    for fact in facts["bodies"]:
+        body = robot.body(fact["name"])
+        assert body.kind == ("rotor" if fact["kind"] == "rotor" else "link")
+        assert (body.parent or "ground") == fact["parent"]
+        assert body.joint.type == fact["joint"]["type"]
+        assert body.placement.position == tuple(fact["placement"]["xyz"])
+        np.testing.assert_allclose(body.placement.rotation, rotation(fact["placement"]["rpy"]), atol=1e-15)
+        if body.joint.type != "free":
+            assert body.joint.axis == tuple(fact["joint"]["axis"])
+
+
+def test_mass_properties_are_the_published_ones(robot, facts):
+    for fact in facts["bodies"]:
+        inertial = robot.body(fact["name"]).inertial
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = inertial.inertia
+        assert inertial.mass == fact["inertial"]["mass"]
+        assert inertial.com == tuple(fact["inertial"]["com"])
+        assert [xx, xy, xz, yy, yz, zz] == fact["inertial"]["inertia"]
+        assert (yx, zx, zy) == (xy, xz, yz)
+    assert robot.total_mass == pytest.approx(facts["counts"]["total_mass"], abs=1e-12)
+
+
+def test_clusters_and_ratios_are_the_published_ones(robot, facts):
+    """The published rows G solve our constraints, and the order of clusters and coordinates is theirs."""
+    clusters = cluster_tree(robot).clusters
+    assert [set(cluster.bodies) for cluster in clusters] == [set(fact["bodies"]) for fact in facts["clusters"]]
+    independent = [joint for fact in facts["clusters"] for joint in fact["constraint"].get("independent", [])]
+    assert list(robot.independent) == independent
+    assert len(list(robot.rotors())) == facts["counts"]["rotors"]
+    for cluster, fact in zip(clusters, facts["clusters"], strict=True):
+        assert list(cluster.independent) == fact["constraint"].get("independent", [])
+        if fact["constraint"]["type"] == "linear":
+            K = np.array([[dict(c.coefficients).get(b, 0.0) for b in fact["bodies"]] for c in cluster.constraints])
+            np.testing.assert_array_equal(K @ np.array(fact["constraint"]["G"]), 0.0)
+            assert len(K) == len(fact["bodies"]) - fact["n_independent"]
+        else:
+            assert not cluster.constraints
+
+
+def test_limits_are_the_published_ones(robot, facts):
+    assert set(facts["limits"]["joints"]) == set(robot.independent)
+    for link, limits in facts["limits"]["joints"].items():
+        joint = robot.body(link).joint
+        assert (joint.position, joint.velocity, joint.torque) == (
+            tuple(limits["position"]),
+            limits["velocity"],
+            limits["torque"],
+        )
+
+
+def test_motors_reach_the_limits_of_their_joints(robot):
+    """Of the joint furthest along a belt, for a motor whose belt runs over several."""
+    ratios = {constraint.name: dict(constraint.coefficients) for constraint in robot.constraints}
+    assert {motor.rotor for motor in robot.motors} == {rotor.name for rotor in robot.rotors()}
+    for motor in robot.motors:
+        link = [name for name in robot.independent if name in ratios[motor.rotor]][-1]
+        ratio, joint = -ratios[motor.rotor][link], robot.body(link).joint
+        assert motor.torque * ratio == pytest.approx(joint.torque, rel=1e-12)
+        assert motor.velocity == pytest.approx(joint.velocity * ratio, rel=1e-12)
+
+
+def test_soles_lie_flat_on_the_ground(robot, facts):
+    poses = standing(robot, facts)
+    heights = [(p + R @ sole.position)[2] for sole in soles(robot) for p, R in [poses[sole.body]]]
+    assert np.abs(heights).max() < 1e-6
+    assert list(Counter(sole.body for sole in soles(robot)).values()) == [4, 4]
+    assert all(sole.radius == 0.0 for sole in soles(robot))
+    clear = [contact for contact in robot.contacts if contact.group != "foot"]
+    assert min((p + R @ c.position)[2] - c.radius for c in clear for p, R in [poses[c.body]]) > 0.1
+
+
+def test_centre_of_mass_is_above_the_middle_of_the_soles(robot, facts):
+    poses, moment = standing(robot, facts), np.zeros(3)
+    for body in robot.bodies:
+        p, R = poses[body.name if body.kind == "link" else body.parent]
+        if body.kind == "rotor":  # its centre of mass is its origin
+            p = p + R @ body.placement.position
+        moment += body.inertial.mass * (p + R @ body.inertial.com)
+    corners = np.array([p + R @ sole.position for sole in soles(robot) for p, R in [poses[sole.body]]])
+    np.testing.assert_allclose(moment[:2] / robot.total_mass, corners.mean(axis=0)[:2], atol=2e-3)
+
+
+def test_soles_are_the_published_ones(robot, facts):
+    """Toe and heel points of the one robot; the sole of the other, to a hundredth of a metre."""
+    corners = np.array([sole.position for sole in soles(robot)])
+    if "foot_sole" in facts:
+        centre, half = np.array(facts["foot_sole"]["centre"]), np.array(facts["foot_sole"]["half_extents_xy"])
+        expected = np.array([centre[:2] - half, centre[:2] + half]).round(2)
+        assert corners[:, 2] == pytest.approx(centre[2], abs=1e-6)
+        np.testing.assert_array_equal([corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)], expected)
+    else:
+        points = {p["name"]: p["offset"] for p in facts["contact_points"]}
+        for sole in soles(robot):
+            x, _, z = points[f"{sole.name.rpartition('_')[0]}_contact"]
+            assert (sole.position[0], sole.position[2]) == (x, z)
+
+
+def test_left_and_right_mirror_each_other(robot):
+    """Contacts, placements, limits, pose and gains; joints about x and z turn the other way round."""
+
+    def other(name: str) -> str:
+        return name.replace("left", "right")
+
+    contacts = {contact.name: contact for contact in robot.contacts}
+    pose, kp, kd = dict(robot.pose.joints), dict(robot.gains.kp), dict(robot.gains.kd)
+    for contact in (c for c in robot.contacts if "left" in c.name):
+        twin = contacts[other(contact.name)]
+        assert (twin.body, twin.radius, twin.group) == (other(contact.body), contact.radius, contact.group)
+    for body in (b for b in robot.bodies if "left" in b.name):
+        twin = robot.body(other(body.name))
+        x, y, z = body.placement.position
+        assert twin.placement.position == (x, -y, z)
+        assert len(twin.shapes) == len(body.shapes)
+        for shape, mirrored in zip(body.shapes, twin.shapes, strict=True):
+            x, y, z = shape.placement.position
+            assert (mirrored.size, mirrored.color) == (shape.size, shape.color)
+            assert mirrored.placement.position == (x, -y, z)
+        if body.name in robot.independent:
+            sign = 1 if body.joint.axis[1] else -1
+            low, high = body.joint.position
+            assert twin.joint.position == ((low, high) if sign == 1 else (-high, -low))
+            assert pose[twin.name] == sign * pose[body.name]
+            assert (kp[twin.name], kd[twin.name]) == (kp[body.name], kd[body.name])
+
+
+def test_gains_and_pose_cover_every_joint(robot):
+    assert tuple(joint for joint, _ in robot.gains.kp) == robot.independent
+    assert tuple(joint for joint, _ in robot.gains.kd) == robot.independent
+    assert {joint for joint, _ in robot.pose.joints} == set(robot.independent)
+    for joint, angle in robot.pose.joints:
+        low, high = robot.body(joint).joint.position
+        assert low <= angle <= high
+
+
+def test_falling_is_noticed(robot):
+    assert Counter(contact.group for contact in robot.contacts)["knee"] == 2
+    assert Counter(contact.group for contact in robot.contacts)["arm"] == 4
+    assert Counter(contact.group for contact in robot.contacts)["torso"] >= 8
+
+
+def test_feet_are_drawn_down_to_the_soles(robot):
+    """Boxes are not turned in these feet, so that half their height below their centre is where they end."""
+    for sole in soles(robot):
+        boxes = [shape for shape in robot.body(sole.body).shapes if shape.type == "box"]
+        lowest = min(shape.placement.position[2] - shape.size[2] / 2 for shape in boxes)
+        assert lowest == pytest.approx(sole.position[2], abs=1e-9)
+
+
+def test_every_link_is_drawn(robot):
+    assert all(body.shapes for body in robot.bodies if body.kind == "link")
+
+
+def test_repairs_are_noted():
+    """Both hips of the repaired robot are at one height, and its file says that the published ones are not."""
+    jvrc1 = load_robot("jvrc1")
+    assert jvrc1.body("right-hip-pitch").placement.position == (0.0, -0.096, 0.0)
+    assert jvrc1.body("left-hip-pitch").placement.position == (0.0, 0.096, 0.0)
+    assert any("repaired" in note and "hip" in note for note in jvrc1.notes)
+    assert any("inertia" in note for note in jvrc1.notes)
+
+
+def test_links_are_a_plain_urdf(robot):
+    """Whatever reads URDF can read the links: nothing of the paper authors' extension, no rotors, no capsules."""
+    root = ElementTree.parse(Path(robot.source).with_suffix(".urdf")).getroot()
+    assert {element.tag for element in root} == {"material", "link", "joint"}
+    assert {shape.tag for shape in root.iterfind(".//geometry/*")} <= {"box", "cylinder", "sphere"}
+    assert not [link for link in root.iter("link") if "rotor" in link.get("name", "")]
