@@ -259,12 +259,12 @@ class _Condenser:
             condensed.D += ca.diag(J * ca.vec(G_r) ** 2)
             return
         condensed.D += J * (G_r.T @ G_r)
+        condensed.bias += G_r.T * (J * g_r)
         if level == "coupled":
             return
         axis, w = self._spin_frame(spin)
         h = ca.vertcat(J * axis, SX(3, 1))
         f = ca.vertcat(J * axis * g_r + cross(w, J * axis) * thd, SX(3, 1))
-        condensed.bias += G_r.T * (J * g_r)
         if spin.carrier in self.inside:
             carrier = self.inside[spin.carrier]
             condensed.bias += G_r.T * ca.dot(h, zeta[spin.carrier])

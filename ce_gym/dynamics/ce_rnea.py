@@ -90,11 +90,15 @@ def inward_force_pass(
 
 
 def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qdd: SX) -> SX:
-    """Torque of the reflected inertia: the whole block, or its diagonal at the armature level, shape (d,)."""
+    """Torque of the reflected inertia: the whole block, or its diagonal at the armature level, shape (d,).
+
+    With closed loops `G_r` varies; the whole block then has a velocity term `G_r^T J g_r`, the diagonal does without.
+    """
     G, index, cluster = coordinates.G, coordinates.index, mechanism.tree.clusters[k]
     ydd = qdd[[index[name] for name in cluster.independent]]
     torque = SX(G.shape[1], 1)
     for spin in mechanism.spins[k]:
-        G_r = G[index[spin.rotor], :]
-        torque += spin.inertia * (ca.vec(G_r) ** 2 * ydd if mechanism.level == "armature" else G_r.T @ (G_r @ ydd))
+        row = index[spin.rotor]
+        G_r = G[row, :]
+        torque += spin.inertia * (ca.vec(G_r) ** 2 * ydd if mechanism.level == "armature" else G_r.T * qdd[row])
     return torque

@@ -5,7 +5,8 @@ a subset of them. All that the recursions need is
 
     q = gamma(y),   qd = G yd,   qdd = G ydd + g        (constraint-embedding paper, eq. explicit_constraints)
 
-`G` and `g` are derived from `gamma` by automatic differentiation, never by hand. May know descriptions and CasADi.
+`G` and `g` are derived by automatic differentiation, never by hand. Here for clusters whose constraints are all
+linear; closure.py does the others. May know descriptions and CasADi.
 """
 
 from __future__ import annotations
@@ -15,11 +16,28 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from ce_gym.dynamics.closure import Closure
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.description import LinearConstraint
 from ce_gym.model.errors import RobotError
 
 SX = ca.SX
+
+
+@dataclass(frozen=True)
+class LoopState:
+    """How a cluster's loops are closed at one state.
+
+    Attributes:
+        guessed: Rows of the dependent coordinates that were found from a guess.
+        gap: Largest residual of the rows that were solved by iteration; 0 if all were solved by formulas.
+        nearness: 1 at the reference pose, 0 at a singularity, negative beyond: the smallest determinant of the blocks
+            of the constraint Jacobian, relative to the reference pose.
+    """
+
+    guessed: tuple[int, ...]
+    gap: SX
+    nearness: SX
 
 
 @dataclass(frozen=True)
@@ -32,6 +50,7 @@ class ClusterCoordinates:
         qd: Spanning velocities, shape (n,).
         G: Constraint Jacobian, shape (n, d).
         g: Velocity-product acceleration of the constraint, shape (n,).
+        loop: What closed loops add; None if all constraints are linear.
     """
 
     index: dict[str, int]
@@ -39,6 +58,7 @@ class ClusterCoordinates:
     qd: SX
     G: SX
     g: SX
+    loop: LoopState | None = None
 
 
 def cluster_coordinates(cluster: Cluster, y: SX, yd: SX) -> ClusterCoordinates:
@@ -51,6 +71,17 @@ def cluster_coordinates(cluster: Cluster, y: SX, yd: SX) -> ClusterCoordinates:
     q, G_at, g_at = evaluate(y, yd)
     G_at, g_at = ca.sparsify(G_at), ca.sparsify(g_at)
     return ClusterCoordinates({name: i for i, name in enumerate(cluster.bodies)}, q, G_at @ yd, G_at, g_at)
+
+
+def loop_coordinates(cluster: Cluster, closure: Closure, y: SX, yd: SX, guess: SX) -> ClusterCoordinates:
+    """Evaluate a cluster with closed loops at `y` (d,), `yd` (d,) and a guess of what needs one, (n_guess,)."""
+    z, gap = closure.locate(y, guess)
+    G, g, nearness = closure.rates(y, z, yd)
+    G, g = ca.sparsify(G), ca.sparsify(g)
+    q, qd = closure.spanning(y, z), G @ yd
+    guessed = tuple(closure.assembly.unknown[j] for j in closure.guessed)
+    loop = LoopState(guessed, gap, nearness)
+    return ClusterCoordinates({name: i for i, name in enumerate(cluster.bodies)}, q, qd, G, g, loop)
 
 
 def explicit_constraint(cluster: Cluster, y: SX) -> SX:

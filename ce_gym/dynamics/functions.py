@@ -12,14 +12,19 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.ce_aba import (
+    BodyTerms,
     JointTerms,
     gravity_acceleration,
     inward_inertia_pass,
     outward_acceleration_pass,
 )
 from ce_gym.dynamics.ce_rnea import inverse_dynamics
+from ce_gym.dynamics.closure import reference_guess
+from ce_gym.dynamics.constraints import ClusterCoordinates
 from ce_gym.dynamics.kinematics import Kinematics, constant, is_free, outward_velocity_pass
-from ce_gym.dynamics.spatial import SX, axis_rotation
+from ce_gym.dynamics.residuals import gap as constraint_gap
+from ce_gym.dynamics.spatial import SX, axis_rotation, cross
+from ce_gym.model.description import LinearConstraint
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -29,57 +34,108 @@ def traced(name: str, inputs: dict[str, SX], outputs: dict[str, SX]) -> ca.Funct
     return ca.Function(name, list(inputs.values()), shared, list(inputs), list(outputs))
 
 
-def state_symbols(mechanism: Mechanism) -> tuple[SX, SX]:
-    """Return fresh symbols for positions and velocities, shapes (nq,) and (nv,)."""
+def state_symbols(mechanism: Mechanism) -> tuple[SX, SX, SX]:
+    """Return fresh symbols for positions (nq,), velocities (nv,) and guesses of dependent positions (n_guess,)."""
     joints = len(mechanism.robot.independent)
     floating = mechanism.robot.floating
-    return SX.sym("q", joints + (7 if floating else 0)), SX.sym("v", joints + (6 if floating else 0))
+    q, v = SX.sym("q", joints + (7 if floating else 0)), SX.sym("v", joints + (6 if floating else 0))
+    return q, v, SX.sym("guess", len(reference_guess(mechanism)))
+
+
+def _function(name: str, guess: SX, inputs: dict[str, SX], outputs: dict[str, SX]) -> ca.Function:
+    """Trace a function that has an input `guess` only if the robot needs one."""
+    return traced(name, inputs | ({"guess": guess} if guess.numel() else {}), outputs)
 
 
 def _forward_dynamics(mechanism: Mechanism) -> ca.Function:
-    q, v = state_symbols(mechanism)
+    q, v, guess = state_symbols(mechanism)
     tau = SX.sym("tau", v.shape[0])
-    kinematics = outward_velocity_pass(mechanism, q, v)
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
     articulation = inward_inertia_pass(mechanism, kinematics, JointTerms(tau, SX(*tau.shape)), {})
     vdot, _ = outward_acceleration_pass(mechanism, kinematics, articulation)
-    return traced("forward_dynamics", {"q": q, "v": v, "tau": tau}, {"vdot": vdot})
+    return _function("forward_dynamics", guess, {"q": q, "v": v, "tau": tau}, {"vdot": vdot})
+
+
+def _forward_dynamics_with_wrenches(mechanism: Mechanism) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    tau, wrenches = SX.sym("tau", v.shape[0]), SX.sym("wrenches", 6 * len(mechanism.robot.bodies))
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
+    on_bodies, on_joints = external_wrenches(mechanism, kinematics, ca.reshape(wrenches, 6, -1))
+    joints = JointTerms(tau + on_joints, SX(*tau.shape))
+    articulation = inward_inertia_pass(mechanism, kinematics, joints, on_bodies)
+    vdot, _ = outward_acceleration_pass(mechanism, kinematics, articulation)
+    inputs = {"q": q, "v": v, "tau": tau, "wrenches": wrenches}
+    return _function("forward_dynamics_with_wrenches", guess, inputs, {"vdot": vdot})
 
 
 def _inverse_dynamics(mechanism: Mechanism) -> ca.Function:
-    q, v = state_symbols(mechanism)
+    q, v, guess = state_symbols(mechanism)
     vdot = SX.sym("vdot", v.shape[0])
-    tau = inverse_dynamics(mechanism, outward_velocity_pass(mechanism, q, v), vdot)
-    return traced("inverse_dynamics", {"q": q, "v": v, "vdot": vdot}, {"tau": tau})
+    tau = inverse_dynamics(mechanism, outward_velocity_pass(mechanism, q, v, guess), vdot)
+    return _function("inverse_dynamics", guess, {"q": q, "v": v, "vdot": vdot}, {"tau": tau})
 
 
 def _mass_matrix(mechanism: Mechanism) -> ca.Function:
-    q, v = state_symbols(mechanism)
+    q, v, guess = state_symbols(mechanism)
     vdot = SX.sym("vdot", v.shape[0])
-    at_rest = outward_velocity_pass(mechanism, q, SX(*v.shape))
+    at_rest = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
     M = ca.jacobian(inverse_dynamics(mechanism, at_rest, vdot), vdot)  # tau = M vdot + bias is linear in vdot
-    return traced("mass_matrix", {"q": q}, {"M": M})
+    return _function("mass_matrix", guess, {"q": q}, {"M": M})
 
 
 def _bias_force(mechanism: Mechanism) -> ca.Function:
-    q, v = state_symbols(mechanism)
-    tau = inverse_dynamics(mechanism, outward_velocity_pass(mechanism, q, v), SX(*v.shape))
-    return traced("bias_force", {"q": q, "v": v}, {"tau": tau})
+    q, v, guess = state_symbols(mechanism)
+    tau = inverse_dynamics(mechanism, outward_velocity_pass(mechanism, q, v, guess), SX(*v.shape))
+    return _function("bias_force", guess, {"q": q, "v": v}, {"tau": tau})
 
 
 def _spanning(mechanism: Mechanism) -> ca.Function:
-    q, v = state_symbols(mechanism)
-    kinematics = outward_velocity_pass(mechanism, q, v)
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
     positions, velocities = spanning_coordinates(mechanism, kinematics)
     floating = mechanism.robot.floating
     names = [body.name for body in mechanism.robot.bodies if body.joint.type != "free"]
     q_span = ca.vertcat(*([q[:7]] if floating else []), *[positions[name] for name in names])
     v_span = ca.vertcat(*([v[:6]] if floating else []), *[velocities[name] for name in names])
-    return traced("spanning", {"q": q, "v": v}, {"q_span": q_span, "v_span": v_span})
+    return _function("spanning", guess, {"q": q, "v": v}, {"q_span": q_span, "v_span": v_span})
+
+
+def _spanning_acceleration(mechanism: Mechanism) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    vdot = SX.sym("vdot", v.shape[0])
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
+    accelerations = {}
+    for coordinates, rows in zip(kinematics.coordinates, kinematics.rows, strict=True):
+        if coordinates is not None:
+            qdd = coordinates.G @ vdot[rows] + coordinates.g
+            accelerations |= {name: qdd[i] for name, i in coordinates.index.items()}
+    names = [body.name for body in mechanism.robot.bodies if body.joint.type != "free"]
+    base = [vdot[:6]] if mechanism.robot.floating else []
+    spanning = ca.vertcat(*base, *[accelerations[name] for name in names])
+    return _function("spanning_acceleration", guess, {"q": q, "v": v, "vdot": vdot}, {"vdot_span": spanning})
+
+
+def _spanning_jacobian(mechanism: Mechanism) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    _, velocities = spanning_coordinates(mechanism, outward_velocity_pass(mechanism, q, v, guess))
+    names = [body.name for body in mechanism.robot.bodies if body.joint.type != "free"]
+    base = [v[:6]] if mechanism.robot.floating else []
+    G = ca.jacobian(ca.vertcat(*base, *[velocities[name] for name in names]), v)
+    return _function("spanning_jacobian", guess, {"q": q}, {"G": G})
+
+
+def _loops(mechanism: Mechanism) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
+    _, nearness = loop_state(kinematics)
+    dependent = guessed_coordinates(kinematics, SX(*v.shape), 0.0)
+    outputs = {"dependent": dependent, "gap": loop_gap(mechanism, kinematics), "nearness": nearness}
+    return _function("loops", guess, {"q": q}, outputs)
 
 
 def _body_poses(mechanism: Mechanism) -> ca.Function:
-    q, v = state_symbols(mechanism)
-    kinematics = outward_velocity_pass(mechanism, q, SX(*v.shape))
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
     angles, _ = spanning_coordinates(mechanism, kinematics)
     positions, rotations = [], []
     for body in mechanism.robot.bodies:
@@ -93,25 +149,25 @@ def _body_poses(mechanism: Mechanism) -> ca.Function:
         positions.append(p)
         rotations.append(R)
     outputs = {"positions": ca.horzcat(*positions), "rotations": ca.horzcat(*rotations)}
-    return traced("body_poses", {"q": q}, outputs)
+    return _function("body_poses", guess, {"q": q}, outputs)
 
 
 def _contact_points(mechanism: Mechanism) -> ca.Function:
-    q, v = state_symbols(mechanism)
-    kinematics = outward_velocity_pass(mechanism, q, v)
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
     positions, velocities = [SX(3, 0)], [SX(3, 0)]
     for contact in mechanism.robot.contacts:
         body, r = kinematics.bodies[contact.body], constant(np.array(contact.position))
         positions.append(body.point_position(r))
         velocities.append(body.R @ body.point_velocity(r))
     outputs = {"positions": ca.horzcat(*positions), "velocities": ca.horzcat(*velocities)}
-    return traced("contact_points", {"q": q, "v": v}, outputs)
+    return _function("contact_points", guess, {"q": q, "v": v}, outputs)
 
 
 def _energy(mechanism: Mechanism) -> ca.Function:
-    q, v = state_symbols(mechanism)
-    kinematics = outward_velocity_pass(mechanism, q, v)
-    at_rest = outward_velocity_pass(mechanism, q, SX(*v.shape))
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
+    at_rest = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
     momentum = inverse_dynamics(mechanism, at_rest, v) - inverse_dynamics(mechanism, at_rest, SX(*v.shape))
     potential = SX(0)
     gravity = gravity_acceleration(mechanism)
@@ -120,7 +176,63 @@ def _energy(mechanism: Mechanism) -> ca.Function:
         moment = constant(np.array([body.inertia[2, 4], body.inertia[0, 5], body.inertia[1, 3]]))  # mass * com
         state = kinematics.bodies[name]
         potential -= ca.dot(gravity, mass * state.p + state.R @ moment)
-    return traced("energy", {"q": q, "v": v}, {"kinetic": ca.dot(v, momentum) / 2, "potential": potential})
+    return _function("energy", guess, {"q": q, "v": v}, {"kinetic": ca.dot(v, momentum) / 2, "potential": potential})
+
+
+def loop_gap(mechanism: Mechanism, kinematics: Kinematics) -> SX:
+    """Return the norm of the residuals of all loops, rods and functions, redundant rows included [m or -]."""
+    angles, _ = spanning_coordinates(mechanism, kinematics)
+    loops = [tie for tie in mechanism.robot.constraints if not isinstance(tie, LinearConstraint)]
+    rows = [constraint_gap(mechanism.robot, tie, angles) for tie in loops]
+    return ca.norm_2(ca.vertcat(*rows)) if rows else SX(0)
+
+
+def loop_state(kinematics: Kinematics) -> tuple[SX, SX]:
+    """Return the largest gap and the smallest nearness of all clusters with closed loops, see `LoopState`."""
+    gap, nearness = SX(0), SX(1)
+    for coordinates in kinematics.coordinates:
+        if coordinates is not None and coordinates.loop is not None:
+            gap, nearness = ca.fmax(gap, coordinates.loop.gap), ca.fmin(nearness, coordinates.loop.nearness)
+    return gap, nearness
+
+
+def guessed_coordinates(kinematics: Kinematics, vdot: SX, dt: float) -> SX:
+    """Return the dependent coordinates that were found from a guess, a time `dt` [s] later, shape (n_guess,)."""
+    later = [SX(0, 1)]
+    for coordinates, rows in zip(kinematics.coordinates, kinematics.rows, strict=True):
+        if coordinates is not None and coordinates.loop is not None and coordinates.loop.guessed:
+            qdd = coordinates.G @ vdot[rows] + coordinates.g / 2  # positions move by dt * (G yd_next + dt / 2 * g)
+            later.append((coordinates.q + dt * (coordinates.qd + dt * qdd))[list(coordinates.loop.guessed)])
+    return ca.vertcat(*later)
+
+
+def external_wrenches(mechanism: Mechanism, kinematics: Kinematics, wrenches: SX) -> tuple[dict[str, BodyTerms], SX]:
+    """Take wrenches in the world to forces on the bodies of the recursion and on the independent coordinates.
+
+    Args:
+        mechanism: The mechanism.
+        kinematics: From the outward velocity pass.
+        wrenches: [moment about the world's origin; force] on each body of the robot, world axes, shape (6, n_bodies).
+    """
+    on_bodies: dict[str, SX] = {}
+    tau = SX(sum(len(rows) for rows in kinematics.rows), 1)
+    for i, body in enumerate(mechanism.robot.bodies):
+        moment, force = wrenches[:3, i], wrenches[3:, i]
+        carrier = body.name if body.name in kinematics.bodies else body.parent
+        if carrier is not None:
+            state = kinematics.bodies[carrier]
+            about_origin = moment - cross(state.p, force)
+            old = on_bodies.get(carrier, SX(6, 1))
+            on_bodies[carrier] = old + ca.vertcat(state.R.T @ about_origin, state.R.T @ force)
+        if carrier != body.name:  # a rotor that is no body of the recursion still turns
+            k = mechanism.tree.cluster_of(body.name)
+            coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
+            R, p = (state.R, state.p) if carrier is not None else (SX.eye(3), SX(3, 1))
+            axis = R @ constant(np.array(body.placement.rotation) @ np.array(body.joint.axis))
+            at = p + R @ constant(np.array(body.placement.position))
+            G_r = coordinates.G[coordinates.index[body.name], :]
+            tau[kinematics.rows[k]] += G_r.T * ca.dot(axis, moment - cross(at, force))
+    return {name: BodyTerms(SX(6, 6), force) for name, force in on_bodies.items()}, tau
 
 
 def spanning_coordinates(mechanism: Mechanism, kinematics: Kinematics) -> tuple[dict[str, SX], dict[str, SX]]:
@@ -141,10 +253,14 @@ def turned(axis: Sequence[float], angle: SX) -> SX:
 
 FUNCTIONS: dict[str, Callable[[Mechanism], ca.Function]] = {
     "forward_dynamics": _forward_dynamics,
+    "forward_dynamics_with_wrenches": _forward_dynamics_with_wrenches,
     "inverse_dynamics": _inverse_dynamics,
     "mass_matrix": _mass_matrix,
     "bias_force": _bias_force,
     "spanning": _spanning,
+    "spanning_acceleration": _spanning_acceleration,
+    "spanning_jacobian": _spanning_jacobian,
+    "loops": _loops,
     "body_poses": _body_poses,
     "contact_points": _contact_points,
     "energy": _energy,

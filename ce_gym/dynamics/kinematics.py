@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from ce_gym.dynamics.constraints import ClusterCoordinates, cluster_coordinates
+from ce_gym.dynamics.closure import closures, reference_guess
+from ce_gym.dynamics.constraints import ClusterCoordinates, cluster_coordinates, loop_coordinates
 from ce_gym.dynamics.spatial import (
     SX,
     Transform,
@@ -84,14 +85,18 @@ def is_free(mechanism: Mechanism, cluster: Cluster) -> bool:
     return mechanism.bodies[cluster.bodies[0]].joint_type == "free" if cluster.bodies[0] in mechanism.bodies else False
 
 
-def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX) -> Kinematics:
+def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None = None) -> Kinematics:
     """Compute transforms, velocities and world poses of all bodies, base to tip (paper Alg. 1, outward pass 1).
 
     Args:
         mechanism: The mechanism.
         q: Positions, shape (nq,).
         v: Velocities, shape (nv,).
+        guess: Guess of the dependent coordinates that are found by iteration, shape (n_guess,); those of the reference
+            pose if None.
     """
+    guess = SX(reference_guess(mechanism)) if guess is None else guess
+    used = 0
     kinematics = Kinematics(rows=independent_rows(mechanism))
     position_offset = 1 if mechanism.robot.floating else 0  # the quaternion has one entry more than its velocity
     for k in mechanism.tree.base_to_tip():
@@ -101,7 +106,12 @@ def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX) -> Kinematics:
             kinematics.bodies[cluster.bodies[0]] = _free_base(q, v)
             continue
         y, yd = q[[row + position_offset for row in rows]], v[rows]
-        coordinates = cluster_coordinates(cluster, y, yd)
+        closure = closures(mechanism)[k]
+        if closure is None:
+            coordinates = cluster_coordinates(cluster, y, yd)
+        else:
+            first, used = used, used + len(closure.guessed)
+            coordinates = loop_coordinates(cluster, closure, y, yd, guess[first:used])
         kinematics.coordinates.append(coordinates)
         for body in mechanism.moving(cluster):
             i = coordinates.index[body.name]

@@ -7,6 +7,7 @@ May know the algorithms of this room and descriptions; no compilation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -14,12 +15,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ce_gym.dynamics.closure import closures, reference_guess
 from ce_gym.dynamics.functions import FUNCTIONS
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
 from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
+
+CONTINUATION_STEPS = 16
+"""Steps in which dependent joints are followed from the reference pose to a configuration."""
 
 
 class Model:
@@ -56,6 +61,8 @@ class Model:
         self.mechanism = build_mechanism(
             self.robot, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors
         )
+        self.guess = reference_guess(self.mechanism)
+        self._has_loops = any(closures(self.mechanism))
         self._functions: dict[str, ca.Function] = {}
 
     def __repr__(self) -> str:
@@ -132,18 +139,32 @@ class Model:
         """Return the number of instructions of a traced quantity, the cost measure of the paper."""
         return self.casadi_function(name).n_instructions()
 
-    def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
+    def forward_dynamics(
+        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: dict[str, ArrayLike] | None = None
+    ) -> Array:
         """Return the acceleration `vdot`, shape (..., nv), that forces produce.
 
         Args:
             q: Positions, shape (..., nq).
             v: Velocities, shape (..., nv).
             tau: Generalised forces [N m or N], base wrench [moment; force] in the base frame first, shape (..., nv).
+            wrenches: Wrenches [moment about the world's origin; force] on bodies, world axes [N m, N], by name of the
+                body, shape (..., 6) each.
+
+        Raises:
+            ValueError: If a shape is wrong, a body does not exist, or a loop does not close at `q`.
 
         Source: CE-ABA, Chignoli, Adrian, Kim, Wensing, "A Propagation Perspective on Recursive Forward Dynamics for
         Systems with Kinematic Loops", arXiv:2311.13732, Algorithm 1.
         """
-        return self._evaluate("forward_dynamics", q, v, tau)[0][..., 0]
+        if wrenches is None:
+            return self._evaluate("forward_dynamics", q, v, tau)[0][..., 0]
+        for name in wrenches:
+            if name not in self.body_names:
+                raise ValueError(f"wrench on {name!r}: expected the name of a body of {self.robot.name}")
+        each = [np.asarray(wrenches.get(name, np.zeros(6)), dtype=float) for name in self.body_names]
+        stacked = np.concatenate(np.broadcast_arrays(*each), axis=-1)
+        return self._evaluate("forward_dynamics_with_wrenches", q, v, tau, stacked)[0][..., 0]
 
     def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
         """Return the generalised force, shape (..., nv) [N m or N], that produces the acceleration `vdot` (..., nv)."""
@@ -164,6 +185,99 @@ class Model:
         """
         q_span, v_span = self._evaluate("spanning", q, v)
         return q_span[..., 0], v_span[..., 0]
+
+    def from_spanning(self, q_span: ArrayLike, v_span: ArrayLike) -> tuple[Array, Array]:
+        """Return the `q` and `v` of a configuration given by every joint, in the order of `spanning`.
+
+        Args:
+            q_span: Positions, shape (..., nq_span).
+            v_span: Velocities, shape (..., nv_span).
+
+        Raises:
+            ValueError: If the constraints are not met, to 1e-6, at these positions and velocities, or are met in
+                another way than the robot's reference pose is assembled.
+        """
+        q_span, v_span = np.asarray(q_span, dtype=float), np.asarray(v_span, dtype=float)
+        base = (7, 6) if self.robot.floating else (0, 0)
+        joints = [self.spanning_names.index(name) for name in self.joint_links]
+        q = q_span[..., [*range(base[0]), *(base[0] + i for i in joints)]]
+        v = v_span[..., [*range(base[1]), *(base[1] + i for i in joints)]]
+        expected = self.spanning(q, v)
+        turned = np.exp(1j * (expected[0] - q_span)[..., base[0] :]) - 1  # whole turns do not matter
+        for name, error in (("q_span", turned), ("v_span", expected[1] - v_span)):
+            if error.size and np.abs(error).max() > 1e-6:
+                raise ValueError(f"{name} misses the constraints of {self.robot.name} by {np.abs(error).max():.2g}")
+        return q, v
+
+    def spanning_acceleration(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
+        """Return accelerations of every joint, in the order of `spanning` velocities, shape (..., nv_span)."""
+        return self._evaluate("spanning_acceleration", q, v, vdot)[0][..., 0]
+
+    def actuator_matrix(self, q: ArrayLike, actuated: Sequence[str] | None = None) -> Array:
+        """Return `W`, shape (..., n, nv), that takes efforts of actuators to generalised forces, `tau = W^T effort`.
+
+        Row i is the velocity of actuator i for unit independent velocities, whichever joints are actuated and however
+        many (footnote on general actuation of arXiv:2311.13732).
+
+        Args:
+            q: Positions, shape (..., nq).
+            actuated: Bodies whose joints are actuated; the rotors of the robot's motors if None.
+
+        Raises:
+            ValueError: If a body does not exist.
+        """
+        chosen = [motor.rotor for motor in self.robot.motors] if actuated is None else list(actuated)
+        for name in chosen:
+            if name not in self.spanning_names:
+                raise ValueError(f"actuated {name!r}: expected the name of a body with a joint of {self.robot.name}")
+        base = 6 if self.robot.floating else 0
+        G = self._evaluate("spanning_jacobian", q)[0]
+        return G[..., [base + self.spanning_names.index(name) for name in chosen], :]
+
+    def loop_gap(self, q: ArrayLike) -> Array:
+        """Return the norm of the residuals of all loops, rods and functions, redundant rows included, shape (...).
+
+        In metres for loops and rods; 0 if there are none, not a number where loops cannot be closed by their formulas.
+        """
+        return self._evaluate("loops", q)[1][..., 0, 0]
+
+    def nearness(self, q: ArrayLike) -> Array:
+        """Return how far a configuration is from a singularity of the independent joints, shape (...).
+
+        It is 1 at the reference pose, and smaller or negative nearer to or beyond a singularity: the smallest
+        determinant among the blocks of the constraint Jacobian of the dependent joints, relative to that pose. It is -1
+        where the loops cannot be closed.
+        """
+        return self._evaluate("loops", q)[2][..., 0, 0]
+
+    def dependent_guess(self, q: ArrayLike) -> Array:
+        """Return the dependent coordinates that no formula gives, followed from the reference pose to `q`.
+
+        Args:
+            q: Positions, shape (..., nq).
+
+        Returns:
+            The input `guess` of the traced functions [rad or m], shape (..., n_guess).
+
+        Raises:
+            ValueError: If a loop does not close at `q` or on the straight way there.
+        """
+        q = np.asarray(q, dtype=float)
+        if q.ndim == 0 or q.shape[-1] != self.nq:
+            raise ValueError(f"q has shape {q.shape}; expected (..., {self.nq})")
+        loops, start = self.casadi_function("loops"), self.standing_q
+        flat = q.reshape(-1, self.nq)
+        guess = np.tile(self.guess, (len(flat), 1))
+        shares = [*np.linspace(0.0, 1.0, CONTINUATION_STEPS + 1)[1:], 1.0]  # twice at the end, to the last digit
+        for share in shares if guess.size else ():
+            here = flat + (1.0 - share) * (start - flat)
+            found, gap, nearness = (np.array(out.full()) for out in loops.map(len(flat)).call([here.T, guess.T]))
+            guess = found.T
+            if not nearness.min() > 0.0:
+                raise ValueError(f"the loops of {self.robot.name} pass a singularity on the way to this q")
+        if guess.size and not gap.max() < 1e-9:
+            raise ValueError(f"the loops of {self.robot.name} do not close at this q: gap {gap.max():.2g}")
+        return guess.reshape(*q.shape[:-1], len(self.guess))
 
     def body_poses(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return where all bodies are, in the order of `body_names`.
@@ -186,6 +300,19 @@ class Model:
         kinetic, potential = self._evaluate("energy", q, v)
         return kinetic[..., 0, 0], potential[..., 0, 0]
 
+    def loop_report(self) -> str:
+        """Return one line for each cluster with closed loops: how it is solved and how well it is conditioned."""
+        lines = []
+        for cluster, closure in zip(self.cluster_tree.clusters, closures(self.mechanism), strict=True):
+            if closure is not None:
+                found = sum(len(block.unknowns) for block in closure.blocks if block.formula is not None)
+                lines.append(
+                    f"loops of {', '.join(tie.name for tie in cluster.constraints)}: {found} joints by formula, "
+                    f"{len(closure.guessed)} by iteration, {closure.assembly.dropped} redundant rows dropped, "
+                    f"condition number {closure.assembly.condition:.3g} for {', '.join(cluster.independent)}"
+                )
+        return "\n".join(lines)
+
     def describe(self) -> str:
         """Return a readable account of the robot: figures, and its cluster tree as text."""
         base, rotors = "floating" if self.robot.floating else "fixed", sum(1 for _ in self.robot.rotors())
@@ -197,6 +324,7 @@ class Model:
             f"transmission {self.transmission}: {eliminated} rotors need no body of their own",
             "",
             self.cluster_tree.as_text(),
+            *(["", self.loop_report()] if self.loop_report() else []),
         ]
         return "\n".join(lines)
 
@@ -204,6 +332,8 @@ class Model:
         """Evaluate a traced function on arrays that share leading batch dimensions; outputs (..., rows, columns)."""
         function = self.casadi_function(name)
         arrays = [np.asarray(a, dtype=float) for a in arguments]
+        if "guess" in function.name_in():
+            arrays.append(self.dependent_guess(arrays[0]))
         for i, a in enumerate(arrays):
             if a.ndim == 0 or a.shape[-1] != function.size1_in(i):
                 raise ValueError(
@@ -219,5 +349,12 @@ class Model:
         for i, output in enumerate(outputs):
             rows, columns = function.size_out(i)
             value = np.asarray(ca.DM(output).full()).reshape(rows, count, columns)
+            if (
+                self._has_loops
+                and name != "loops"
+                and np.isnan(value).any()
+                and not any(np.isnan(a).any() for a in flat)
+            ):
+                raise ValueError(f"{name}: the loops of {self.robot.name} cannot be closed at this q")
             results.append(np.moveaxis(value, 1, 0).reshape(*batch, rows, columns))
         return results

@@ -27,14 +27,19 @@ from ce_gym.dynamics.ce_aba import (
     inward_inertia_pass,
     outward_acceleration_pass,
 )
+from ce_gym.dynamics.closure import closures
 from ce_gym.dynamics.contact import ContactResponse, ground_contact
-from ce_gym.dynamics.functions import state_symbols, traced
+from ce_gym.dynamics.functions import guessed_coordinates, loop_gap, loop_state, state_symbols, traced
 from ce_gym.dynamics.integration import advance
 from ce_gym.dynamics.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.dynamics.spatial import SX
 from ce_gym.model.description import ContactMaterial, ContactSphere
 from ce_gym.model.mechanism import Mechanism
 
+LOST_LOOP = 1e-5
+"""A robot with a loop whose residual is larger has diverged [m]."""
+SINGULAR = 1e-3
+"""A robot whose loops are nearer than this to a singularity (see `Model.nearness`) has diverged."""
 SANE_SPEED = 1e4
 """A robot any of whose velocities is beyond this, or not a number, has diverged [rad/s or m/s]."""
 
@@ -64,20 +69,35 @@ class Stepped:
         q: Positions, shape (nq,).
         v: Velocities, shape (nv,).
         pushed: 1 for each contact that pushed, else 0, shape (n_contacts,).
+        dependent: Where the dependent coordinates that no formula gives will be, roughly, shape (n_guess,).
         diverged: 1 if the robot has diverged now or before; it then stays where it was.
         torque: Motor torque at each joint, mean over the step [N m or N], shape (nj,).
         contact_forces: Mean force on each contact over the step, world axes [N], shape (3, n_contacts).
+        loop_gap: Norm of the residuals of the closed loops at the start of the step [m or -].
+        nearness: Distance from a singularity there, see `Model.nearness`.
     """
 
     q: SX
     v: SX
     pushed: SX
+    dependent: SX
     diverged: SX
     torque: SX
     contact_forces: SX
+    loop_gap: SX
+    nearness: SX
 
 
-def step(mechanism: Mechanism, q: SX, v: SX, pushed: SX, diverged: SX, target: SX, options: StepOptions) -> Stepped:
+def step(
+    mechanism: Mechanism,
+    q: SX,
+    v: SX,
+    pushed: SX,
+    diverged: SX,
+    target: SX,
+    options: StepOptions,
+    dependent: SX | None = None,
+) -> Stepped:
     """Advance one robot by one time step.
 
     Args:
@@ -88,8 +108,10 @@ def step(mechanism: Mechanism, q: SX, v: SX, pushed: SX, diverged: SX, target: S
         diverged: 1 if the robot has diverged before, else 0.
         target: Joint targets or torques, shape (nj,), see `StepOptions.control`.
         options: The scene.
+        dependent: Guess of the dependent coordinates that no formula gives, from the step before, shape (n_guess,);
+            those of the reference pose if None.
     """
-    kinematics = outward_velocity_pass(mechanism, q, v)
+    kinematics = outward_velocity_pass(mechanism, q, v, dependent)
     motors, passive = joint_forces(mechanism, q, v, target, options)
     contacts = touching(mechanism, kinematics, pushed, options)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
@@ -99,7 +121,10 @@ def step(mechanism: Mechanism, q: SX, v: SX, pushed: SX, diverged: SX, target: S
     vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation)
 
     q_next, v_next = advance(q, v, vdot, options.dt, mechanism.robot.floating)
+    dependent_next = guessed_coordinates(kinematics, vdot, options.dt)
     sane = ca.logic_and(ca.sumsqr(v_next) < SANE_SPEED**2, diverged < 0.5)  # false if anything is not a number
+    if any(closures(mechanism)):
+        sane = ca.logic_and(sane, loops_close(mechanism, kinematics, q_next, dependent_next))
     ydd = vdot[-len(motors) :] if motors else SX(0, 1)
     forces = [contact.force_after(a[sphere.body], gravity[sphere.body]) for sphere, contact in contacts]
     pushes = [ca.dot(contact.normal, force) > 0 for (_, contact), force in zip(contacts, forces, strict=True)]
@@ -108,10 +133,24 @@ def step(mechanism: Mechanism, q: SX, v: SX, pushed: SX, diverged: SX, target: S
         q=ca.if_else(sane, q_next, q),
         v=ca.if_else(sane, v_next, v),
         pushed=ca.vertcat(SX(0, 1), *pushes),
+        dependent=ca.if_else(sane, dependent_next, SX(0, 1) if dependent is None else dependent),
         diverged=ca.if_else(sane, 0, 1),
         torque=ca.vertcat(*[m.tau - m.slope * ydd[i] for i, m in enumerate(motors)]),
         contact_forces=ca.horzcat(SX(3, 0), *in_world),
+        loop_gap=loop_gap(mechanism, kinematics),
+        nearness=loop_state(kinematics)[1],
     )
+
+
+def loops_close(mechanism: Mechanism, before: Kinematics, q: SX, dependent: SX) -> SX:
+    """Return 1 if all closed loops can be assembled at the next positions `q`, away from singularities; else 0.
+
+    A singularity where branches meet could be stepped over; being halfway to it within one step counts as being there.
+    """
+    still = SX(q.shape[0] - (1 if mechanism.robot.floating else 0), 1)
+    gap, nearness = loop_state(outward_velocity_pass(mechanism, q, still, dependent))
+    away = ca.logic_and(nearness > SINGULAR, nearness > loop_state(before)[1] / 2)
+    return ca.logic_and(gap < LOST_LOOP, away)
 
 
 def joint_forces(
@@ -171,17 +210,17 @@ def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
-        outputs: Any of "torque" and "contact_forces"; what is not asked for costs nothing.
+        outputs: Any of "torque", "contact_forces", "loop_gap", "nearness"; what is not asked for costs nothing.
 
     Returns:
-        Function (q, v, pushed, diverged, target) -> (q, v, pushed, diverged, *outputs); a scene without contacts has no
-        `pushed`.
+        Function (q, v, pushed, dependent, diverged, target) -> (q, v, pushed, dependent, diverged, *outputs); a scene
+        without contacts has no `pushed`, a robot whose loops are closed by formulas no `dependent`.
     """
-    q, v = state_symbols(mechanism)
+    q, v, dependent = state_symbols(mechanism)
     pushed, diverged = SX.sym("pushed", len(options.contacts)), SX.sym("diverged")
     target = SX.sym("target", len(mechanism.robot.independent))
-    after = step(mechanism, q, v, pushed, diverged, target, options)
-    state = {"q": q, "v": v, "pushed": pushed, "diverged": diverged}
+    after = step(mechanism, q, v, pushed, diverged, target, options, dependent)
+    state = {"q": q, "v": v, "pushed": pushed, "dependent": dependent, "diverged": diverged}
     kept = [name for name in state if state[name].numel()]
     results = {f"{name}_next": getattr(after, name) for name in kept}
     results |= {name: ca.vec(getattr(after, name)) for name in outputs}

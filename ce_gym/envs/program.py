@@ -74,6 +74,7 @@ class TaskProgram:
             "q": self.model.nq,
             "v": self.model.nv,
             "pushed": len(self.contacts),
+            "dependent": len(self.model.guess),
             "diverged": 1,
             "torque": self.n_joints,
             "action": self.n_joints,
@@ -201,6 +202,8 @@ class TaskProgram:
         chosen, draws = SX.sym("chosen"), Draws()
         fresh = {name: SX(size, 1) for name, size in self.state_sizes.items()}
         fresh["q"], fresh["v"] = self._start(draws)
+        if "dependent" in fresh:
+            fresh["dependent"] = SX(self.model.guess)
         fresh["command"] = self._new_command(draws)
         after = {name: ca.if_else(chosen > 0.5, ca.densify(fresh[name]), state[name]) for name in state}
         seen = self._snapshot(after | {"previous_action": after["action"]})

@@ -16,12 +16,16 @@ from ce_gym.model.errors import bad
 RELATIVE_TOLERANCE = 1e-9
 
 
-def check_body(body: Body, file: str) -> None:
-    """Check the figures of one body."""
+def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
+    """Check the figures of one body.
+
+    A rotor needs no mass of its own; a link may be massless, with an inertia of zero too, if it `may_be_massless`.
+    """
     where = f"{body.kind} {body.name!r}"
     mass = body.inertial.mass
-    if not math.isfinite(mass) or mass < 0.0 or (mass == 0.0 and body.kind == "link"):
-        raise bad(file, f"{where} mass", mass, "a mass above 0 [kg]" if body.kind == "link" else "a mass of 0 or more")
+    massless = body.kind == "rotor" or (may_be_massless and not np.any(body.inertial.inertia))
+    if not math.isfinite(mass) or mass < 0.0 or (mass == 0.0 and not massless):
+        raise bad(file, f"{where} mass", mass, "a mass of 0 or more" if massless else "a mass above 0 [kg]")
     check_finite(file, f"{where} centre of mass", body.inertial.com)
     _check_inertia(file, f"{where} inertia", np.array(body.inertial.inertia))
     check_finite(file, f"{where} position", body.placement.position)

@@ -14,7 +14,8 @@ import numpy as np
 
 from ce_gym.model.body_checks import check_body, check_finite, violates_triangle_inequality
 from ce_gym.model.clusters import Cluster, cluster_tree
-from ce_gym.model.description import Robot
+from ce_gym.model.constraint_checks import check_constraint
+from ce_gym.model.description import LinearConstraint, Robot
 from ce_gym.model.errors import InertiaWarning, bad, unknown
 
 
@@ -29,8 +30,9 @@ def check_robot(robot: Robot) -> None:
     """
     file = robot.source or robot.name
     _check_tree(robot, file)
+    supported = {body.parent for body in robot.bodies} | _dependent(robot)
     for body in robot.bodies:
-        check_body(body, file)
+        check_body(body, file, may_be_massless=body.name in supported and body.joint.type != "free")
     _check_constraints(robot, file)
     _check_independent(robot, file)
     _check_contacts(robot, file)
@@ -39,6 +41,12 @@ def check_robot(robot: Robot) -> None:
     impossible = tuple(body.name for body in robot.bodies if violates_triangle_inequality(body))
     if impossible:
         _warn_of_inertia(robot.name, impossible)
+
+
+def _dependent(robot: Robot) -> set[str]:
+    """Bodies that others move: such a body, or one that carries another, can be so light that its mass is left out."""
+    tied = {name for constraint in robot.constraints for name in constraint.bodies}
+    return tied - set(robot.independent)
 
 
 def _check_tree(robot: Robot, file: str) -> None:
@@ -59,20 +67,9 @@ def _check_tree(robot: Robot, file: str) -> None:
 
 
 def _check_constraints(robot: Robot, file: str) -> None:
-    names = {body.name: body for body in robot.bodies}
     _check_unique(file, "constraint name", [constraint.name for constraint in robot.constraints])
     for constraint in robot.constraints:
-        key = f"constraint {constraint.name!r}"
-        for body, coefficient in constraint.coefficients:
-            if body not in names:
-                raise unknown(file, key, body, names, "the name of a body")
-            if names[body].joint.type == "free":
-                raise bad(file, key, body, "a body whose joint has one degree of freedom")
-            if not math.isfinite(coefficient) or coefficient == 0.0:
-                raise bad(file, f"{key} coefficient of {body!r}", coefficient, "a finite number other than 0")
-        if len(set(constraint.bodies)) < 2 or len(set(constraint.bodies)) < len(constraint.bodies):
-            raise bad(file, key, constraint.bodies, "at least two different bodies, each once")
-        check_finite(file, f"{key} offset", (constraint.offset,))
+        check_constraint(constraint, robot, file)
 
 
 def _check_independent(robot: Robot, file: str) -> None:
@@ -82,13 +79,16 @@ def _check_independent(robot: Robot, file: str) -> None:
             raise unknown(file, "independent", joint, names, "the name of a body whose joint has one degree of freedom")
     _check_unique(file, "independent", robot.independent)
     for cluster in cluster_tree(robot).clusters:
-        if robot.body(cluster.bodies[0]).joint.type != "free":
+        linear = all(isinstance(constraint, LinearConstraint) for constraint in cluster.constraints)
+        if (
+            linear and robot.body(cluster.bodies[0]).joint.type != "free"
+        ):  # others are solved to be checked: a Model does
             _check_determined(cluster, file)
 
 
 def _check_determined(cluster: Cluster, file: str) -> None:
     """The constraints of a cluster must determine its dependent coordinates from the independent ones."""
-    rows = [dict(constraint.coefficients) for constraint in cluster.constraints]
+    rows = [dict(tie.coefficients) for tie in cluster.constraints if isinstance(tie, LinearConstraint)]
     count = len(cluster.bodies) - len(rows)
     key = f"independent joints among {', '.join(cluster.bodies)}"
     if count < 1:
@@ -134,6 +134,7 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
     check_finite(file, "pose.height", (robot.pose.height,))
     check_finite(file, "gravity", robot.gravity)
     _check_joint_values(robot, file, "pose.joints", robot.pose.joints)
+    _check_assembly(robot, file)
     for key, pairs in (("gains.kp", robot.gains.kp), ("gains.kd", robot.gains.kd)):
         _check_joint_values(robot, file, key, pairs)
         for joint, gain in pairs:
@@ -142,6 +143,15 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
         for joint in robot.independent:
             if pairs and joint not in dict(pairs):
                 raise bad(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")
+
+
+def _check_assembly(robot: Robot, file: str) -> None:
+    dependent = [b.name for b in robot.bodies if b.joint.type != "free" and b.name not in robot.independent]
+    _check_unique(file, "assembly", [joint for joint, _ in robot.assembly])
+    for joint, value in robot.assembly:
+        if joint not in dependent:
+            raise unknown(file, "assembly", joint, dependent, "the name of a dependent joint")
+        check_finite(file, f"assembly.{joint}", (value,))
 
 
 def _check_joint_values(robot: Robot, file: str, key: str, pairs: tuple[tuple[str, float], ...]) -> None:

@@ -2,13 +2,16 @@
 
 Found by analysis of the graph, for any robot. Knows only the robot description.
 
-A constraint over the joints of some bodies makes one cluster of those bodies and of everything between them: take the
-nearest common ancestor of their *parents*; every body on the way from there (exclusive) to each of them (inclusive)
-belongs to the cluster. Clusters that share a body are merged. So, in the terms of the paper's figure 3:
+A constraint over the *joints* of some bodies makes one cluster of those bodies and of everything between them: take
+the nearest common ancestor of their parents; every body on the way from there (exclusive) to each of them (inclusive)
+belongs to the cluster. A closed loop or rod ties the *bodies* themselves, so the nearest common ancestor of the bodies
+is taken instead, and may be one of them. Clusters that share a body are merged. So, in the terms of the paper's figure
+3:
 
 - a link and its rotor on the same parent form one cluster;
 - a belt (knee, ankle on the knee, both rotors on the thigh) forms one cluster of four;
-- a tie between a body and its grandchild takes in the body between them.
+- a tie between a body and its grandchild takes in the body between them;
+- a loop nested in another, or two loops through one body, form one cluster.
 
 All base bodies of a cluster hang on one output body, as the recursive algorithms need: that is so for one constraint
 by construction, and if two clusters share a body then both output bodies are ancestors of it, so one of the two lies
@@ -18,10 +21,10 @@ bodies lie strictly nearer to the root than their clusters, clusters form a tree
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from ce_gym.model.description import Constraint, Robot
+from ce_gym.model.description import Constraint, LoopConstraint, Robot, RodConstraint
 from ce_gym.model.errors import bad
 
 
@@ -89,12 +92,18 @@ def cluster_tree(robot: Robot) -> ClusterTree:
         RobotError: A constraint reaches across a free joint.
     """
     parents = {body.name: body.parent for body in robot.bodies}
-    groups = _merged([[name] for name in parents] + [_span(c.bodies, parents) for c in robot.constraints])
+    spans = [_constraint_span(constraint, parents, robot) for constraint in robot.constraints]
+    groups = _merged([[name] for name in parents] + spans)
     order = {name: i for i, name in enumerate(parents)}
     # Bodies are listed parents before children, so this order puts a cluster behind the one that carries it.
     members = sorted((sorted(group, key=order.__getitem__) for group in groups), key=lambda group: order[group[0]])
     index_of = {body: i for i, group in enumerate(members) for body in group}
-    return ClusterTree(tuple(_cluster(robot, group, parents, index_of) for group in members))
+    ties: list[list[Constraint]] = [[] for _ in members]
+    for constraint, span in zip(robot.constraints, spans, strict=True):
+        ties[index_of[span[0]]].append(constraint)
+    return ClusterTree(
+        tuple(_cluster(robot, group, tuple(tie), parents, index_of) for group, tie in zip(members, ties, strict=True))
+    )
 
 
 def _ancestors(body: str | None, parents: dict[str, str | None]) -> list[str | None]:
@@ -105,17 +114,26 @@ def _ancestors(body: str | None, parents: dict[str, str | None]) -> list[str | N
     return chain
 
 
-def _span(bodies: Iterable[str], parents: dict[str, str | None]) -> list[str]:
+def _constraint_span(constraint: Constraint, parents: dict[str, str | None], robot: Robot) -> list[str]:
     """Return the bodies that one constraint makes a cluster of."""
-    tied = list(bodies)
-    above = [_ancestors(parents[body], parents) for body in tied]
+    if isinstance(constraint, LoopConstraint | RodConstraint):
+        ends: list[str | None] = [constraint.first, constraint.second]
+        span = _between(ends, ends, parents)
+    else:
+        span = _between(constraint.bodies, [parents[body] for body in constraint.bodies], parents)
+    if not span:
+        ends = [constraint.first, constraint.second]  # type: ignore[union-attr]
+        key = f"constraint {constraint.name!r}"
+        raise bad(robot.source or robot.name, key, tuple(ends), "two bodies that can move against each other")
+    return span
+
+
+def _between(tied: Sequence[str | None], below: Sequence[str | None], parents: dict[str, str | None]) -> list[str]:
+    """Return the bodies on the ways to `tied` from the nearest common ancestor of `below`, without the ancestor."""
+    above = [_ancestors(body, parents) for body in below]
     common = next(a for a in above[0] if all(a in chain for chain in above))
-    return [
-        member
-        for body in tied
-        for member in _ancestors(body, parents)[: _ancestors(body, parents).index(common)]
-        if member is not None
-    ]
+    chains = [_ancestors(body, parents) for body in tied]
+    return [member for chain in chains for member in chain[: chain.index(common)] if member is not None]
 
 
 def _merged(groups: Iterable[Iterable[str]]) -> list[set[str]]:
@@ -131,17 +149,23 @@ def _merged(groups: Iterable[Iterable[str]]) -> list[set[str]]:
     return merged
 
 
-def _cluster(robot: Robot, group: list[str], parents: dict[str, str | None], index_of: dict[str, int]) -> Cluster:
+def _cluster(
+    robot: Robot,
+    group: list[str],
+    ties: tuple[Constraint, ...],
+    parents: dict[str, str | None],
+    index_of: dict[str, int],
+) -> Cluster:
     members = [body for body in robot.bodies if body.name in group]
     free = [body.name for body in members if body.joint.type == "free"]
     if free and len(group) > 1:
-        ties = ", ".join(c.name for c in robot.constraints if c.bodies[0] in group)
+        names = ", ".join(constraint.name for constraint in ties)
         expected = f"a tie that does not reach across the free joint of {free[0]}"
-        raise bad(robot.source or robot.name, f"constraint {ties}", tuple(group), expected)
+        raise bad(robot.source or robot.name, f"constraint {names}", tuple(group), expected)
     output = parents[group[0]]
     return Cluster(
         bodies=tuple(group),
-        constraints=tuple(c for c in robot.constraints if c.bodies[0] in group),
+        constraints=ties,
         independent=tuple(name for name in robot.independent if name in group),
         parent=None if output is None else index_of[output],
         output_body=output,

@@ -132,7 +132,86 @@ class LinearConstraint:
         return tuple(body for body, _ in self.coefficients)
 
 
-Constraint = LinearConstraint
+@dataclass(frozen=True)
+class LoopConstraint:
+    """A joint that closes a loop: a frame on one body and a frame on another share their origin, and perhaps an axis.
+
+    Attributes:
+        name: For messages.
+        joint: "revolute" shares origin and axis (5 rows, of which a planar loop needs 2); "ball" only the origin (3).
+        first: A body, or None for the world.
+        second: Another body, or None for the world.
+        first_placement: Pose of the joint frame in `first`.
+        second_placement: Pose of the joint frame in `second`.
+        axis: Unit axis of a revolute joint in the joint frame.
+    """
+
+    name: str
+    joint: Literal["revolute", "ball"]
+    first: str | None
+    second: str | None
+    first_placement: Placement = Placement()
+    second_placement: Placement = Placement()
+    axis: Vec3 = (0.0, 0.0, 1.0)
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies that the joint holds together, the world left out."""
+        return tuple(body for body in (self.first, self.second) if body is not None)
+
+
+@dataclass(frozen=True)
+class RodConstraint:
+    """A massless rod with ball joints at its ends: a point of one body keeps its distance from a point of another.
+
+    Attributes:
+        name: For messages.
+        first: A body, or None for the world.
+        second: Another body, or None for the world.
+        first_point: Where the rod ends on `first` [m].
+        second_point: Where the rod ends on `second` [m].
+        length: [m].
+    """
+
+    name: str
+    first: str | None
+    second: str | None
+    first_point: Vec3
+    second_point: Vec3
+    length: float
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies that the rod ties together, the world left out."""
+        return tuple(body for body in (self.first, self.second) if body is not None)
+
+
+@dataclass(frozen=True)
+class FunctionConstraint:
+    """A function of joint coordinates that a user registered under a name, see `register_constraint`.
+
+    With `dependent` empty the function is implicit, `phi(coordinates of arguments) = 0`; otherwise it is explicit,
+    `coordinates of dependent = gamma(coordinates of arguments)`.
+
+    Attributes:
+        name: For messages.
+        function: Name under which the function is registered.
+        arguments: Bodies whose joint coordinates are its arguments, in order.
+        dependent: Bodies whose joint coordinates an explicit function returns, in order.
+    """
+
+    name: str
+    function: str
+    arguments: tuple[str, ...]
+    dependent: tuple[str, ...] = ()
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies whose joint coordinates the constraint ties together."""
+        return (*self.dependent, *self.arguments)
+
+
+Constraint = LinearConstraint | LoopConstraint | RodConstraint | FunctionConstraint
 
 
 @dataclass(frozen=True)
@@ -224,6 +303,8 @@ class Robot:
         motors: One for each driven rotor.
         pose: The standing pose.
         gains: PD gains for position control of the independent joints.
+        assembly: Pairs (body, angle) for dependent joints: where they are, roughly, in the standing pose. Chooses among
+            the ways in which closed loops can be assembled; those not named are near zero [rad or m].
         gravity: Acceleration of free fall in the world frame [m/s^2].
         source: The file it was read from, for messages.
         notes: Facts a user should know, such as repaired figures.
@@ -238,6 +319,7 @@ class Robot:
     motors: tuple[Motor, ...] = ()
     pose: Pose = Pose()
     gains: Gains = Gains()
+    assembly: tuple[tuple[str, float], ...] = ()
     gravity: Vec3 = (0.0, 0.0, -9.81)
     source: str = field(default="", compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)

@@ -76,7 +76,7 @@ class MovingBody:
     inertia: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mechanism:
     """A robot at one transmission level, ready for the recursions.
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from ce_gym.model.checks import check_robot
 from ce_gym.model.description import (
     Body,
+    Constraint,
     ContactMaterial,
     ContactSphere,
     Gains,
@@ -23,15 +24,16 @@ from ce_gym.model.description import (
     Pose,
     Robot,
 )
-from ce_gym.model.errors import bad, unknown
+from ce_gym.model.errors import bad
 from ce_gym.model.placement import compose, rotation_from_rpy, symmetric, transform_point, vec3
 from ce_gym.model.reading import Section, finite, read_yaml
-from ce_gym.model.urdf import WORLD, Base, Frame, read_urdf
+from ce_gym.model.urdf import Base, Frame, read_urdf
 from ce_gym.model.urdf_elements import unit_axis
+from ce_gym.model.yaml_constraints import coefficients, frame_named, read_constraints
 
 _KEYS = (
     *("name", "urdf", "base", "sources", "notes", "gravity"),
-    *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "gains"),
+    *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains"),
 )
 _ROTOR_KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
 
@@ -53,7 +55,11 @@ def robot_from_yaml(path: Path) -> Robot:
     frames = dict(tree.frames)
     rotors = tuple(_rotors(file.section("rotors"), frames))
     bodies = _interleaved(tree.bodies, rotors, file.section("rotors"))
-    constraints = (*tree.constraints, *_gears(file.section("rotors"), bodies), *_linear(file, bodies))
+    constraints = (
+        *tree.constraints,
+        *_gears(file.section("rotors"), bodies),
+        *read_constraints(file, bodies, frames),
+    )
     independent = _independent(file, bodies, constraints)
     pose = file.section("pose").allow("height", "joints")
     robot = Robot(
@@ -66,6 +72,7 @@ def robot_from_yaml(path: Path) -> Robot:
         motors=tuple(_motors(file.section("motors"))),
         pose=Pose(pose.number("height", 0.0), pose.section("joints").numbers()),
         gains=_gains(file.section("gains"), independent),
+        assembly=file.section("assembly").numbers(),
         gravity=vec3(file.vector("gravity", 3, (0.0, 0.0, -9.81))),
         source=str(path),
         notes=(*tree.notes, *file.texts("notes")),
@@ -84,7 +91,7 @@ def _rotors(section: Section, frames: dict[str, Frame]) -> Iterator[Body]:
         rotor.allow(*_ROTOR_KEYS)
         if name in frames:
             raise bad(rotor.file, section.key(name), name, "a name that no other body has")
-        carrier, mount = _frame(rotor, "parent", frames)
+        carrier, mount = frame_named(rotor, "parent", frames)
         pose = Placement(vec3(rotor.vector("xyz", 3)), rotation_from_rpy(*rotor.vector("rpy", 3, (0.0, 0.0, 0.0))))
         axis = unit_axis(rotor.file, rotor.key("axis"), rotor.vector("axis", 3))
         inertial = Inertial(
@@ -92,14 +99,6 @@ def _rotors(section: Section, frames: dict[str, Frame]) -> Iterator[Body]:
         )
         frames[name] = (name, Placement())
         yield Body(name, "rotor", carrier, compose(mount, pose), Joint("revolute", axis), inertial)
-
-
-def _frame(section: Section, key: str, frames: dict[str, Frame]) -> Frame:
-    """Return the body that carries the frame named under `key`, and the frame's pose in that body."""
-    name = section.text(key)
-    if name not in frames and name != WORLD:
-        raise unknown(section.file, section.key(key), name, frames, "the name of a body")
-    return frames.get(name, (None, Placement()))
 
 
 def _interleaved(links: tuple[Body, ...], rotors: tuple[Body, ...], section: Section) -> tuple[Body, ...]:
@@ -121,34 +120,18 @@ def _gears(section: Section, bodies: Iterable[Body]) -> Iterator[LinearConstrain
             raise bad(figures.file, figures.key("ratios"), {}, "at least one link and its gear ratio")
         if rotor in ratios:
             raise bad(figures.file, ratios.key(rotor), rotor, "a link other than the rotor itself")
-        pairs = _coefficients(ratios, names)
+        pairs = coefficients(ratios, names)
         yield LinearConstraint(rotor, ((rotor, 1.0), *((link, -ratio) for link, ratio in pairs)))
 
 
-def _coefficients(section: Section, names: list[str]) -> tuple[tuple[str, float], ...]:
-    """Return pairs of a body and a number other than 0."""
-    for body in section:
-        if body not in names:
-            raise unknown(section.file, section.path, body, names, "the name of a body")
-        if section.number(body) == 0.0:
-            raise bad(section.file, section.key(body), 0.0, "a number other than 0")
-    return section.numbers()
-
-
-def _linear(file: Section, bodies: Iterable[Body]) -> Iterator[LinearConstraint]:
-    names = [body.name for body in bodies]
-    for i, entry in enumerate(file.list("constraints")):
-        tie = Section(file.file, f"constraints[{i}]", entry).allow("name", "type", "coefficients", "offset")
-        tie.text("type", choices=("linear",))
-        pairs = _coefficients(tie.section("coefficients"), names)
-        yield LinearConstraint(tie.text("name"), pairs, tie.number("offset", 0.0))
-
-
-def _independent(file: Section, bodies: tuple[Body, ...], constraints: tuple[LinearConstraint, ...]) -> tuple[str, ...]:
+def _independent(file: Section, bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> tuple[str, ...]:
+    if "independent" not in file and not all(isinstance(tie, LinearConstraint) for tie in constraints):
+        expected = "the joints whose coordinates are independent, because loops and functions do not say which are"
+        raise bad(file.file, "independent", None, expected)
     return file.texts("independent") if "independent" in file else _default_independent(bodies, constraints)
 
 
-def _default_independent(bodies: Iterable[Body], constraints: Iterable[LinearConstraint]) -> tuple[str, ...]:
+def _default_independent(bodies: Iterable[Body], constraints: Iterable[Constraint]) -> tuple[str, ...]:
     """Return the links that no constraint solves for; a constraint solves for the body it names first."""
     solved = {constraint.bodies[0] for constraint in constraints if constraint.bodies}
     return tuple(
@@ -159,7 +142,7 @@ def _default_independent(bodies: Iterable[Body], constraints: Iterable[LinearCon
 def _contacts(section: Section, frames: dict[str, Frame]) -> Iterator[ContactSphere]:
     for name, contact in section.sections():
         contact.allow("body", "position", "radius", "group")
-        body, pose = _frame(contact, "body", frames)
+        body, pose = frame_named(contact, "body", frames)
         if body is None:
             raise bad(contact.file, contact.key("body"), contact.text("body"), "a body that moves")
         centre = transform_point(pose, vec3(contact.vector("position", 3)))

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from ce_gym.compile import Buffer, Call, Kernel, Program, load_kernel
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.step import StepOptions, step_function
-from ce_gym.model import ContactMaterial, Robot
+from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
-OUTPUTS = ("torque", "contact_forces")
+OUTPUTS = ("torque", "contact_forces", "loop_gap", "nearness")
 
 
 class Simulator:
@@ -34,7 +34,8 @@ class Simulator:
             joint torques [N m].
         contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
         material: Compliance and friction of the contacts; the robot's own if None.
-        outputs: Which of "torque" and "contact_forces" to compute; those left out cost nothing and read as errors.
+        outputs: Which of "torque", "contact_forces", "loop_gap" and "nearness" to compute; those left out cost nothing
+            and read as errors.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -51,7 +52,7 @@ class Simulator:
         control: str = "position",
         contacts: str | Sequence[str] = "all",
         material: ContactMaterial | None = None,
-        outputs: Sequence[str] = OUTPUTS,
+        outputs: Sequence[str] = ("torque", "contact_forces"),
     ) -> None:
         _check("num_envs", num_envs, num_envs >= 1, "at least 1")
         _check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
@@ -65,6 +66,7 @@ class Simulator:
         self.contact_names = select_contacts(model.robot, contacts)
         self.options = StepOptions(dt, control, self.contact_names, material or model.robot.material)  # type: ignore[arg-type]
         sizes = {"torque": len(model.joint_links), "contact_forces": 3 * len(self.contact_names)}
+        sizes |= {"loop_gap": 1, "nearness": 1}
         self._outputs = {name: sizes[name] for name in OUTPUTS if name in outputs and sizes[name] > 0}
         self._kernel = load_step_kernel(model, self.options, self._outputs, dtype)
         self._arrays = {
@@ -91,7 +93,7 @@ class Simulator:
             mask: Which robots, bool, shape (num_envs,); all of them if None.
 
         Raises:
-            ValueError: If a shape is wrong or a number is not finite.
+            ValueError: If a shape is wrong, a number is not finite, or a loop does not close.
         """
         chosen = None if mask is None else np.asarray(mask, dtype=bool)
         if chosen is not None and chosen.shape != (self.num_envs,):
@@ -106,6 +108,9 @@ class Simulator:
         for name in ("pushed", "diverged"):
             if name in self._arrays:
                 write_rows(self._arrays[name], np.zeros(self._arrays[name].shape[1]), chosen)
+        if "dependent" in self._arrays:
+            guess = self.model.dependent_guess(q)
+            write_rows(self._arrays["dependent"], np.broadcast_to(guess, (self.num_envs, guess.shape[-1])), chosen)
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
         """Advance all robots by `n_substeps` sub-steps.
@@ -157,6 +162,16 @@ class Simulator:
             return np.zeros((self.num_envs, 0, 3), self.dtype)
         return self._read("contact_forces").reshape(self.num_envs, -1, 3)
 
+    @property
+    def loop_gap(self) -> NDArray:
+        """Norm of the residuals of the closed loops, start of the last sub-step [m or -], shape (num_envs,)."""
+        return self._read("loop_gap")[:, 0]
+
+    @property
+    def nearness(self) -> NDArray:
+        """Distance from a singularity, see `Model.nearness`, start of the last sub-step, shape (num_envs,)."""
+        return self._read("nearness")[:, 0]
+
     def _read(self, name: str) -> NDArray:
         if name not in self._arrays:
             raise ValueError(f"{name} is not computed; ask for it with Simulator(..., outputs=({name!r},))")
@@ -183,7 +198,11 @@ def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, .
 def model_key(model: Model) -> str:
     """Return a text that is equal for equal models, for cache keys; where a robot was read from does not matter."""
     figures = replace(model.robot, source="", notes=())
-    return f"{figures!r} {model.transmission} {model.locked_rotors} {model.eliminated}"
+    functions = [tie for tie in figures.constraints if isinstance(tie, FunctionConstraint)]
+    traced = [
+        model.casadi_function("loops").serialize() for _ in functions[:1]
+    ]  # their text is not part of the description
+    return f"{figures!r} {model.transmission} {model.locked_rotors} {model.eliminated} {traced}"
 
 
 def load_step_kernel(model: Model, options: StepOptions, outputs: dict[str, int], dtype: str) -> Kernel:
@@ -198,7 +217,8 @@ def load_step_kernel(model: Model, options: StepOptions, outputs: dict[str, int]
 
     def build() -> Program:
         nj = len(model.joint_links)
-        sizes = {"q": model.nq, "v": model.nv, "pushed": len(options.contacts), "diverged": 1} | outputs
+        sizes = {"q": model.nq, "v": model.nv, "pushed": len(options.contacts)}
+        sizes |= {"dependent": len(model.guess), "diverged": 1} | outputs
         sizes = {name: size for name, size in sizes.items() if size}
         buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()] + [Buffer("target", nj, "rows_in")]
         function = step_function(model.mechanism, options, tuple(outputs))

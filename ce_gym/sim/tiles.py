@@ -25,7 +25,7 @@ def tiles(num_envs: int, size: int, dtype: str) -> NDArray:
 def read_rows(array: NDArray, num_envs: int) -> NDArray:
     """Return a copy of a tiled array as rows, shape (num_envs, size)."""
     n_tiles, size, lanes = array.shape
-    return np.ascontiguousarray(array.transpose(0, 2, 1).reshape(n_tiles * lanes, size)[:num_envs])
+    return array.transpose(0, 2, 1).reshape(n_tiles * lanes, size)[:num_envs].copy()
 
 
 def write_rows(array: NDArray, rows: ArrayLike, mask: NDArray[np.bool_] | None = None) -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
 from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Placement, Robot, load_robot
+
+sys.path.insert(0, str(Path(__file__).parent))  # makes facts.py importable by name
 
 
 @pytest.fixture(scope="session", params=["mini_cheetah", "mit_humanoid_leg"])

@@ -1,0 +1,96 @@
+"""Closed loops in time: they stay closed, iterations follow them, and singularities freeze a robot."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ce_gym.dynamics import Model
+from ce_gym.model import Robot, load_robot
+from ce_gym.sim.simulator import Simulator
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "dynamics"))  # for linkages.py
+from linkages import spatial_four_bar
+
+DT = 0.005
+
+
+def turning(torque: float = 20.0) -> Robot:
+    """The spatial crank-rocker, found by iteration, with friction at the crank so that its speed stays finite."""
+    robot = spatial_four_bar()
+    crank, *rest = robot.bodies
+    crank = replace(crank, joint=replace(crank.joint, torque=torque, damping=0.2))
+    return replace(robot, bodies=(crank, *rest))
+
+
+ROBOTS = {name: lambda name=name: load_robot(name) for name in ("four_bar", "six_bar", "planar_leg_linkage", "tello")}
+ROBOTS["spatial four-bar"] = turning
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_loops_stay_closed_for_a_minute(name: str):
+    """60 s under random torque, anew every 0.1 s: the gap that the kernel itself sees is at most 1e-10 m."""
+    model = Model(ROBOTS[name]())
+    simulator = Simulator(model, 8, DT, control="torque", outputs=("loop_gap", "nearness"))
+    limit = np.array([min(model.robot.body(joint).joint.torque, 10.0) for joint in model.joint_links])
+    rng, worst, start = np.random.default_rng(0), 0.0, simulator.q
+    for _ in range(600):
+        simulator.step(rng.uniform(-0.3, 0.3, (8, len(limit))) * limit, 20)
+        worst = max(worst, float(simulator.loop_gap.max()))
+    assert not simulator.diverged.any()
+    assert worst <= 1e-10
+    assert np.abs(simulator.q - start).max() > 0.1  # it did move
+    if len(model.guess):
+        assert np.abs(simulator.q - start).max() > 2 * np.pi  # all the way round
+
+
+def test_iterations_follow_a_fast_crank():
+    """At 20 rad/s the guess of one step to the next is good enough for rounding error."""
+    model = Model(turning())
+    simulator = Simulator(model, 1, DT, control="torque", outputs=("loop_gap",))
+    simulator.set_state(model.standing_q, [20.0])
+    for _ in range(50):
+        simulator.step([0.0], 1)
+        assert simulator.loop_gap[0] < 1e-12
+    # the carried branch is the one that a walk from the reference pose finds
+    turned = simulator.q[0] % (2 * np.pi)
+    assert model.loop_gap(turned) < 1e-12
+
+
+def test_a_singularity_freezes_the_robot():
+    """Without its limits the parallelogram is driven flat: flagged and frozen at finite numbers, in a good position."""
+    robot = load_robot("four_bar")
+    crank, *rest = robot.bodies
+    free = replace(crank, joint=replace(crank.joint, position=(-np.inf, np.inf)))
+    model = Model(replace(robot, bodies=(free, *rest)))
+    simulator = Simulator(model, 2, DT, control="torque", outputs=("nearness",))
+    for _ in range(100):
+        simulator.step([[-5.0], [0.0]], 10)
+    assert simulator.diverged.tolist() == [True, False]
+    assert 0 < simulator.q[0, 0] < 0.1  # it stopped before, at the last position that closes
+    assert np.isfinite(simulator.q).all()
+    assert np.isfinite(simulator.v).all()
+    assert model.loop_gap(simulator.q[0]) < 1e-12
+    simulator.reset()
+    assert not simulator.diverged.any()
+
+
+def test_a_start_that_cannot_be_closed_is_refused():
+    model = Model(replace(turning(), independent=("crank",)))
+    simulator = Simulator(model, 2, DT, control="torque")
+    simulator.set_state([[0.3], [1.0]], np.zeros((2, 1)))
+    np.testing.assert_allclose(simulator.q, [[0.3], [1.0]])
+
+
+def test_one_robot_does_not_depend_on_the_others():
+    model = Model(turning())
+    alone, together = (Simulator(model, n, DT, control="torque") for n in (1, 5))
+    together.set_state(np.linspace(0.7, 1.1, 5)[:, None], np.zeros((5, 1)))
+    for _ in range(20):
+        alone.step([0.3], 5)
+        together.step([0.3], 5)
+    np.testing.assert_array_equal(alone.q[0], together.q[0])
