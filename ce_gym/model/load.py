@@ -9,28 +9,55 @@ import os
 from pathlib import Path
 
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError, unknown
-from ce_gym.model.yaml_file import robot_from_urdf, robot_from_yaml
+from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.mjcf_import import robot_from_mjcf
+from ce_gym.model.reading import read_yaml
+from ce_gym.model.urdf import Base
+from ce_gym.model.urdf_graph import UrdfGraph
+from ce_gym.model.urdf_plus import robot_from_graph
+from ce_gym.model.yaml_file import robot_from_yaml
 
-_READERS = {".yaml": robot_from_yaml, ".yml": robot_from_yaml, ".urdf": robot_from_urdf}
 
-
-def load_robot(name_or_path: str | os.PathLike[str]) -> Robot:
+def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = None) -> Robot:
     """Load a robot.
 
+    | file    | what it is                                                                                       |
+    |---------|--------------------------------------------------------------------------------------------------|
+    | `.yaml` | the project's own format: names a plain URDF, adds rotors, transmissions, motors, contacts, pose |
+    | `.urdf` | URDF+ if it has `<loop>`, `<coupling>` or `independent`; a plain URDF otherwise. A YAML file     |
+    |         | of the same name beside a plain URDF is read with it if its key `urdf` names the URDF            |
+    | `.xml`  | MJCF, read through the package `mujoco`                                                          |
+
     Args:
-        name_or_path: A name such as "mini_cheetah" (`robots()` lists them), or the path of a .yaml or .urdf file.
+        name_or_path: A name such as "mini_cheetah" (`robots()` lists them), or the path of a file.
+        floating: Whether the root link of a URDF or URDF+ moves freely or is fixed to the world. By default a root
+            link without mass, or called "world", is fixed. The other formats say it themselves.
 
     Raises:
         RobotError: There is no such robot, or its description is wrong; one line that says where and how.
     """
     path = Path(name_or_path)
     if isinstance(name_or_path, str) and not path.suffix and len(path.parts) <= 1:
-        return robot_from_yaml(_asset(name_or_path))
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise RobotError(f"{path}: file type {path.suffix!r}: expected a name or a file that ends in .yaml or .urdf")
-    return reader(path)
+        path = _asset(name_or_path)
+    kind = path.suffix.lower()
+    if kind == ".urdf":
+        return _from_urdf(path, floating)
+    if floating is not None:
+        raise bad(str(path), "floating", floating, "None, because the file itself says what its base is")
+    if kind in (".yaml", ".yml"):
+        return robot_from_yaml(path)
+    if kind == ".xml":
+        return robot_from_mjcf(path)
+    raise RobotError(f"{path}: file type {path.suffix!r}: expected a name or a file that ends in .yaml, .urdf or .xml")
+
+
+def _from_urdf(path: Path, floating: bool | None) -> Robot:
+    base: Base | None = None if floating is None else "floating" if floating else "fixed"
+    graph = UrdfGraph(path)
+    beside = path.with_suffix(".yaml")
+    if base is None and not graph.is_plus and beside.is_file() and read_yaml(beside).data.get("urdf") == path.name:
+        return robot_from_yaml(beside)
+    return robot_from_graph(graph, base)
 
 
 def robots() -> list[str]:

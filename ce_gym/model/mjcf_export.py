@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.description import Robot, Shape
+from ce_gym.model.description import LinearConstraint, Robot, Shape
 from ce_gym.model.errors import RobotError
 from ce_gym.model.mechanism import Mechanism, MovingBody, build_mechanism
 
@@ -104,14 +104,18 @@ def joint_ties(robot: Robot) -> dict[str, Tie]:
     """Return every joint coordinate as a function of the independent ones, by joint name.
 
     Raises:
-        RobotError: If the independent joints do not determine the others.
+        RobotError: If the independent joints do not determine the others, or a constraint is not linear.
     """
+    linear = [constraint for constraint in robot.constraints if isinstance(constraint, LinearConstraint)]
+    for constraint in robot.constraints:
+        if constraint not in linear:
+            raise RobotError(f"{robot.name}: constraint {constraint.name!r}: expected a linear one for MJCF")
     names = [body.name for body in robot.bodies if body.joint.type != "free"]
     dependent = [name for name in names if name not in robot.independent]
-    rows = [dict(constraint.coefficients) for constraint in robot.constraints]
+    rows = [dict(constraint.coefficients) for constraint in linear]
     to_dependent = np.array([[row.get(name, 0.0) for name in dependent] for row in rows]).reshape(len(rows), -1)
     to_independent = np.array([[row.get(name, 0.0) for name in robot.independent] for row in rows])
-    offset = np.array([constraint.offset for constraint in robot.constraints])
+    offset = np.array([constraint.offset for constraint in linear])
     ties = {name: Tie({name: 1.0}) for name in robot.independent}
     if dependent:
         if to_dependent.shape[0] != len(dependent) or np.linalg.matrix_rank(to_dependent) < len(dependent):

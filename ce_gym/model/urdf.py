@@ -53,9 +53,21 @@ def read_urdf(path: Path, base: Base | None = None) -> UrdfTree:
             if it is called "world" or has no mass.
 
     Raises:
-        RobotError: The file is missing, malformed, or describes something that is not a tree of rigid bodies.
+        RobotError: The file is missing, malformed, or describes something that is not a tree of rigid bodies; or it is
+            URDF+, whose loops and couplings must not be lost.
     """
-    return _Reader(UrdfGraph(path), base).tree()
+    graph = UrdfGraph(path)
+    if graph.is_plus:
+        raise bad(graph.file, "<loop>, <coupling> or independent", "URDF+", "a plain URDF; load the URDF+ file itself")
+    tree = read_tree(graph, base)
+    for body in tree.bodies:
+        check_body(body, graph.file)
+    return tree
+
+
+def read_tree(graph: UrdfGraph, base: Base | None = None) -> UrdfTree:
+    """Read the tree of a file that has been parsed; as `read_urdf`, but the figures of bodies are not checked."""
+    return _Reader(graph, base).tree()
 
 
 class _Reader:
@@ -71,8 +83,6 @@ class _Reader:
 
     def tree(self) -> UrdfTree:
         bodies = tuple(self._body(link) for link in self.graph.order if self._moves(link))
-        for body in bodies:
-            check_body(body, self.file)
         mimics = tuple(self._mimics())
         name = self.graph.robot.get("name") or Path(self.file).stem
         return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes))

@@ -98,7 +98,7 @@ def joint(file: str, where: str, element: Element, joint_type: str) -> Joint:
         ends = number(file, where, limit, "lower", ends[0]), number(file, where, limit, "upper", ends[1])
     return Joint(
         type="prismatic" if joint_type == "prismatic" else "revolute",
-        axis=_axis(file, where, element),
+        axis=axis(file, where, element),
         position=ends,
         torque=number(file, where, limit, "effort", _NO_LIMIT),
         velocity=number(file, where, limit, "velocity", _NO_LIMIT),
@@ -114,11 +114,12 @@ def unit_axis(file: str, key: str, axis: tuple[float, ...]) -> Vec3:
     return vec3([x / length + 0.0 for x in axis])
 
 
-def _axis(file: str, where: str, element: Element) -> Vec3:
-    axis = element.find("axis")
-    if axis is None:
+def axis(file: str, where: str, parent: Element) -> Vec3:
+    """Return the unit vector in the <axis> of `parent`; x if there is none."""
+    element = parent.find("axis")
+    if element is None:
         return (1.0, 0.0, 0.0)  # the format's default
-    return unit_axis(file, f"{where} <axis xyz>", numbers(file, where, axis, "xyz", 3))
+    return unit_axis(file, f"{where} <axis xyz>", numbers(file, where, element, "xyz", 3))
 
 
 def shape(file: str, where: str, visual: Element, colors: dict[str, Color]) -> Shape | None:

@@ -53,6 +53,14 @@ class UrdfGraph:
         self.order = self._parents_first()
         self.root = self.order[0]
 
+    @property
+    def is_plus(self) -> bool:
+        """Whether the file uses what URDF+ adds: <loop>, <coupling>, or `independent` on a joint."""
+        added = [self.robot.find(tag) for tag in ("loop", "coupling")]
+        return any(element is not None for element in added) or any(
+            joint.element.get("independent") is not None for joint in self.joints.values()
+        )
+
     def welded_to(self, link: str) -> Iterator[str]:
         """Iterate over `link` and the links beyond it that fixed joints tie to it, parents before children."""
         welded = {link}

@@ -1,8 +1,11 @@
 """A small robot in two files that tests bend: a leg (thigh, shank with a welded foot) with a gear at each joint."""
 
+import sys
 from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # makes the shared MJCF files importable by name
 
 URDF = """\
 <robot name="leg">
@@ -69,5 +72,16 @@ def write_robot(tmp_path: Path):
         (tmp_path / "leg.urdf").write_text(urdf, encoding="utf-8")
         (tmp_path / "leg.yaml").write_text(yaml, encoding="utf-8")
         return tmp_path / "leg.yaml"
+
+    return write
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    """Write MJCF text and return the path of the file."""
+
+    def write(text: str) -> Path:
+        (tmp_path / "m.xml").write_text(text)
+        return tmp_path / "m.xml"
 
     return write

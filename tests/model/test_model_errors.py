@@ -76,8 +76,8 @@ YAML_ERRORS = [
     (("gains:", "constraints: {}\ngains:"), ["leg.yaml", "constraints", "{}", "a list"]),
     (("gains:", "constraints: [3]\ngains:"), ["leg.yaml", "constraints[0]", "3", "a mapping"]),
     (
-        ("gains:", "constraints: [{name: t, type: loop, coefficients: {}}]\ngains:"),
-        ["leg.yaml", "constraints[0].type", "'loop'", "linear"],
+        ("gains:", "constraints: [{name: t, type: belt, coefficients: {}}]\ngains:"),
+        ["leg.yaml", "constraints[0].type", "'belt'", "linear"],
     ),
     (
         ("gains:", "constraints: [{name: t, type: linear, coefficients: {thigh: 1}}]\ngains:"),
@@ -234,11 +234,11 @@ def test_urdf_files_that_hold_no_robot(tmp_path, content, parts):
     ("name", "parts"),
     [
         ("mini_cheeta", ["robot", "'mini_cheeta'", "did you mean 'mini_cheetah'"]),
-        ("zebra", ["robot", "'zebra'", "mini_cheetah, mit_humanoid_leg"]),
+        ("zebra", ["robot", "'zebra'", "mini_cheetah, mit_humanoid"]),
         ("", ["robot", "''", "mini_cheetah"]),
         ("no/such/robot.yaml", ["no/such/robot.yaml", "cannot be read", "No such file"]),
         ("no/such/robot.urdf", ["no/such/robot.urdf", "cannot be read", "No such file"]),
-        ("robot.json", ["robot.json", "'.json'", ".yaml or .urdf"]),
+        ("robot.json", ["robot.json", "'.json'", ".yaml, .urdf or .xml"]),
         ("nul\0.urdf", ["cannot be read"]),
     ],
 )

@@ -1,0 +1,86 @@
+"""Environments of a robot of one's own, under ids of its own. May know descriptions, tasks and Gymnasium's registry.
+
+    ids = ce_gym.register_robot("my_robot.yaml")
+    env = gymnasium.make("ce_gym/MyRobotVelocity-Armature-v0")
+
+The registry belongs to one process: a worker process that is not a fork must call `register_robot` again, or be given
+the `EnvSpec` in place of the id.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import gymnasium
+
+from ce_gym.envs.tasks import TASKS
+from ce_gym.model.description import Robot
+from ce_gym.model.errors import bad
+from ce_gym.model.load import load_robot
+from ce_gym.model.mechanism import LEVELS
+
+
+def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tuple[str, ...]:
+    """Register every task at every transmission level for a robot; harmless if done before.
+
+    Args:
+        path: A robot file that `load_robot` reads: .yaml, .urdf (a plain URDF needs its YAML file for contacts and
+            gains) or .xml.
+        name: What the ids start with; by default the robot's own name, `my_robot` as `MyRobot`.
+
+    Returns:
+        The ids: `ce_gym/<Name><Task>-v0`, which is the exact level, and `ce_gym/<Name><Task>-<Level>-v0`.
+
+    Raises:
+        RobotError: The file is wrong, the robot lacks what the tasks need, or another robot has the ids already.
+    """
+    file = Path(path).resolve()
+    robot = load_robot(file)
+    check_ready(robot)
+    stem = "".join(word[:1].upper() + word[1:] for word in re.split(r"[\W_]+", name or robot.name))
+    if not stem:
+        raise bad(str(file), "name", name or robot.name, "a name with letters or digits in it")
+    ids = []
+    for task in TASKS:
+        for level in (None, *LEVELS):
+            env_id = f"ce_gym/{stem}{task.capitalize()}{f'-{level.capitalize()}' if level else ''}-v0"
+            _register(env_id, {"robot": str(file), "task": task, "transmission": level or "exact"})
+            ids.append(env_id)
+    return tuple(ids)
+
+
+def check_ready(robot: Robot) -> None:
+    """Check that a robot has what every task needs.
+
+    Raises:
+        RobotError: It has not; one line that says what to add.
+    """
+    file = robot.source or robot.name
+    if not robot.floating:
+        raise bad(file, "base", "fixed", "a floating base, because tasks are about walking")
+    if not any(contact.group == "foot" for contact in robot.contacts):
+        raise bad(file, "contacts of group 'foot'", None, "at least one contact sphere in this group")
+    if not robot.independent:
+        raise bad(file, "independent", (), "at least one joint")
+    gains = dict(robot.gains.kp)
+    for joint in robot.independent:
+        if not gains.get(joint):
+            raise bad(file, f"gains.kp.{joint}", gains.get(joint), "a position gain above 0 (actions are targets)")
+    if not robot.pose.height > 0.0:
+        raise bad(file, "pose.height", robot.pose.height, "the height of the standing base above 0 [m]")
+
+
+def _register(env_id: str, arguments: dict[str, str]) -> None:
+    if env_id in gymnasium.registry:
+        if dict(gymnasium.registry[env_id].kwargs) != arguments:
+            raise bad(arguments["robot"], "environment id", env_id, "an id that no other robot has; give it a `name`")
+        return
+    gymnasium.register(
+        env_id,
+        entry_point="ce_gym.envs.single:LeggedEnv",
+        vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
+        max_episode_steps=TASKS[arguments["task"]].episode_length,
+        kwargs=arguments,
+    )

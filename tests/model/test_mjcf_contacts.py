@@ -1,0 +1,108 @@
+"""MJCF import: contacts, actuators, pose and looks; what cannot be represented is said, in one warning."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from mjcf_files import ANKLE, CHAIN, GEOMS, RODS, ROUGH, mjcf
+
+from ce_gym.model import load_robot
+
+pytest.importorskip("mujoco")
+from ce_gym.model.mjcf_source import LossyImportWarning
+
+
+def test_contacts_actuators_pose_and_looks(write):
+    actuator = '<position joint="hip" kp="5" kv="0.5" gear="3" forcerange="-4 2"/>'
+    key = '<keyframe><key qpos="7 8 0.43 1 0 0 0 0.25" ctrl="0"/></keyframe>'
+    start = '<mujoco model="m"><compiler angle="radian" autolimits="true"/>'
+    text = f"{start}{GEOMS}<actuator>{actuator}</actuator>{key}</mujoco>"
+    robot = load_robot(write(text))
+    groups = {sphere.name: sphere.group for sphere in robot.contacts}
+    assert groups == {f"hull_corner{i}": "torso" for i in range(1, 9)} | {"shin_top": "knee", "shin_bottom": "foot"}
+    toe = next(sphere for sphere in robot.contacts if sphere.name == "shin_bottom")
+    assert (toe.body, toe.radius) == ("leg", 0.02)
+    np.testing.assert_allclose(toe.position, (0, 0, -0.4), atol=1e-12)
+    corner = next(sphere for sphere in robot.contacts if sphere.name == "hull_corner1")
+    np.testing.assert_allclose(corner.position, (0.2, 0.1, 0.05), atol=1e-12)
+    assert robot.material.friction == 0.6
+    joint = robot.body("leg").joint
+    assert (joint.position, joint.damping, joint.torque) == ((-1.0, 2.0), 0.3, 12.0)
+    assert (robot.gains.kp, robot.gains.kd) == ((("leg", 45.0),), (("leg", 4.5),))
+    assert (robot.pose.height, robot.pose.joints) == (0.43, (("leg", 0.25),))
+    assert [shape.type for shape in robot.body("trunk").shapes] == ["box", "sphere"]
+    assert robot.body("leg").shapes[0].size == pytest.approx((0.02, 0.4))
+    assert robot.gravity == (0.0, 0.0, -9.81)
+
+
+@pytest.mark.parametrize(
+    ("mask", "rest", "touching"),
+    [
+        ("", "", {"shin_top", "shin_bottom"}),
+        ("", '<contact><exclude body1="world" body2="leg"/></contact>', set()),
+        ('contype="0" conaffinity="0"', "", set()),
+        ('contype="2" conaffinity="2"', "", set()),
+        (
+            'contype="0" conaffinity="0"',
+            '<contact><pair geom1="floor" geom2="shin"/></contact>',
+            {"shin_top", "shin_bottom"},
+        ),
+    ],
+)
+def test_only_what_mujoco_lets_touch_the_ground_is_a_contact(write, mask, rest, touching):
+    geoms = GEOMS.replace('name="shin"', f'name="shin" {mask}')
+    robot = load_robot(write(f"<mujoco>{geoms}{rest}</mujoco>"))
+    assert {sphere.name for sphere in robot.contacts if sphere.body == "leg"} == touching
+
+
+def test_physics_that_the_file_switches_off(write):
+    robot = load_robot(write(f'<mujoco><option><flag gravity="disable" contact="disable"/></option>{GEOMS}</mujoco>'))
+    assert robot.gravity == (0.0, 0.0, 0.0)
+    assert robot.contacts == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (mjcf(CHAIN.replace('name="a"', 'name="a" stiffness="3"')), "spring of joint a"),
+        (mjcf(CHAIN.replace('name="a"', 'name="a" frictionloss="3"')), "dry friction of joint a"),
+        (mjcf(CHAIN.replace('name="arm"', 'name="arm" gravcomp="1"')), "gravity compensation of body arm"),
+        (mjcf(CHAIN, extra='<option wind="1 0 0"/>'), "wind"),
+        (mjcf(CHAIN, '<joint name="e" joint1="f" joint2="a" polycoef="0 1 2 0 0"/>'), "polynomial of equality e"),
+        (mjcf(CHAIN, '<joint name="e" joint1="f" joint2="a" active="false"/>'), "equality e, which is not active"),
+        (mjcf(ANKLE, '<tendon name="e" tendon1="l_rod" tendon2="r_rod"/>', RODS), "equality e"),
+        (mjcf(CHAIN, actuator='<adhesion name="m" body="arm" ctrlrange="0 1"/>'), "actuator m"),
+        (mjcf(CHAIN, actuator='<general name="m" joint="a" dyntype="filter" dynprm="0.1"/>'), "activation dynamics"),
+        (mjcf(CHAIN, actuator='<position name="m" joint="a" kp="1"/>'), "a position gain for slider"),
+        (mjcf(CHAIN, actuator='<velocity name="m" joint="a" kv="1"/>'), "velocity actuators"),
+        (mjcf(CHAIN, "", '<fixed name="t" stiffness="2"><joint joint="a" coef="1"/></fixed>'), "tendon t"),
+        (mjcf(CHAIN + '<geom name="g" type="box" size="1 1 1"/>'), "obstacle g"),
+        (f"<mujoco>{GEOMS.replace('capsule', 'cylinder')}</mujoco>", "contact of geom shin"),
+        (f"<mujoco>{GEOMS.replace(ROUGH, ROUGH.replace('0.6', '0.9'))}</mujoco>", "than 0.9"),
+    ],
+    ids=lambda value: value[:40] if not value.startswith("<") else "",
+)
+def test_what_cannot_be_represented_is_said_once(write, text, what):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        robot = load_robot(write(text))
+    messages = [str(w.message) for w in caught if issubclass(w.category, LossyImportWarning)]
+    assert len(messages) == 1
+    assert what in messages[0]
+    assert "\n" not in messages[0]
+    assert any(what in note for note in robot.notes)
+
+
+def test_without_mujoco_the_error_says_what_to_install(write):
+    path = write(mjcf(CHAIN))
+    code = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "from ce_gym.model import RobotError, load_robot\n"
+        f"try: load_robot({str(path)!r})\nexcept RobotError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert "pip install 'ce_gym[mjcf]'" in done.stdout

@@ -1,0 +1,308 @@
+"""MJCF import: the mass matrix, accelerations and constraints of an imported file are MuJoCo's own."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from mjcf_files import ANKLE, BARS, CHAIN, CONNECT, RODS, SEVEN, lump, mjcf
+
+from ce_gym.dynamics import Model
+from ce_gym.model import LinearConstraint, LoopConstraint, RobotError, RodConstraint, load_robot
+from ce_gym.model.mjcf_export import to_mjcf
+
+mujoco = pytest.importorskip("mujoco")
+from ce_gym.model.mjcf_import import robot_from_mjcf  # noqa: E402
+from ce_gym.model.mjcf_source import LossyImportWarning  # noqa: E402
+
+TOLERANCE = 1e-9
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning"),
+    pytest.mark.filterwarnings("error::ce_gym.model.mjcf_source.LossyImportWarning"),
+]
+
+
+class Peer:
+    """MuJoCo's own equations for a file, in the coordinates of the robot imported from it."""
+
+    def __init__(self, path, robot, model: Model):
+        self.mj = mujoco.MjModel.from_xml_path(str(path))
+        self.mj.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        self.data = mujoco.MjData(self.mj)
+        self.model, self.robot = model, robot
+        self.base = 6 if robot.floating else 0
+
+    def joints(self) -> list[str]:
+        """Our name for each of MuJoCo's scalar joints, in MuJoCo's order."""
+        names = []
+        for j in range(self.mj.njnt):
+            body = self.mj.jnt_bodyid[j]
+            last = j == self.mj.body_jntadr[body] + self.mj.body_jntnum[body] - 1
+            if self.mj.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE:
+                names.append(self.mj.body(body).name if last else self.mj.joint(j).name)
+        return names
+
+    def set_state(self, q, v):
+        q_span, v_span = self.model.spanning(q, v)
+        at, offset = self.model.spanning_names, bool(self.base)
+        columns = [self.base + at.index(name) for name in self.joints()]
+        qpos = np.concatenate([q_span[: self.base + offset], q_span[[c + offset for c in columns]]])
+        self.set(qpos, np.concatenate([self._base_velocity(q, v), v_span[columns]]))
+
+    def _base_velocity(self, q, v):
+        return np.concatenate([self.rotation(q) @ v[3:6], v[:3]]) if self.base else np.zeros(0)
+
+    @staticmethod
+    def rotation(q):
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, q[3:7])
+        return matrix.reshape(3, 3)
+
+    def set(self, qpos, qvel):
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(self.mj, self.data)
+
+    def mass_matrix(self):
+        full = np.zeros((self.mj.nv, self.mj.nv))
+        mujoco.mj_fullM(self.mj, self.data, full)
+        return full
+
+    def jacobian(self):
+        rows = self.data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        return self.data.efc_J.reshape(-1, self.mj.nv)[: self.data.nefc][rows].copy()
+
+    def gap(self):
+        rows = self.data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        return float(np.abs(self.data.efc_pos[rows]).max(initial=0.0))
+
+    def jacobian_rate(self, h=1e-3):
+        """Jdot v by a central difference of fourth order."""
+        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        total = 0.0
+        for step, weight in ((1, 8.0), (-1, -8.0), (2, -1.0), (-2, 1.0)):
+            moved = qpos.copy()
+            mujoco.mj_integratePos(self.mj, moved, qvel, step * h)
+            self.set(moved, qvel)
+            total = total + weight * self.jacobian() @ qvel / (12 * h)
+        self.set(qpos, qvel)
+        return total
+
+    def acceleration(self, q, v, tau):
+        """Solve MuJoCo's KKT system, in numpy; returns the acceleration of our independent coordinates."""
+        force = np.zeros(self.mj.nv)
+        names = self.joints()
+        for i, name in enumerate(self.robot.independent):
+            force[self.base + names.index(name)] = tau[self.base + i]
+        if self.base:
+            force[:3], force[3:6] = self.rotation(q) @ tau[3:6], tau[:3]
+        J, n = self.jacobian(), self.mj.nv
+        K = np.block([[self.mass_matrix(), J.T], [J, np.zeros((len(J), len(J)))]])
+        rate = self.jacobian_rate() if len(J) else np.zeros(0)
+        right = np.concatenate([force - self.data.qfrc_bias, -rate])
+        qacc = np.linalg.lstsq(K, right, rcond=1e-13)[0][:n]  # rows of planar loops are redundant
+        base = np.concatenate([qacc[3:6], self.rotation(q).T @ qacc[:3] - np.cross(v[:3], v[3:6])]) if self.base else []
+        return np.concatenate([base, qacc[[self.base + names.index(name) for name in self.robot.independent]]])
+
+
+def compare(path, robot, level="coupled", spread=0.3, seed=0):
+    model = Model(robot, level)
+    peer = Peer(path, robot, model)
+    rng = np.random.default_rng(seed)
+    pose = dict(robot.pose.joints)
+    for _ in range(4):
+        y = np.array([pose[name] for name in robot.independent]) + rng.uniform(-spread, spread, len(robot.independent))
+        quat = rng.normal(size=4)
+        base = np.concatenate([rng.normal(size=3), quat / np.linalg.norm(quat)]) if robot.floating else np.zeros(0)
+        q, v, tau = np.concatenate([base, y]), rng.uniform(-1, 1, model.nv), rng.uniform(-5, 5, model.nv)
+        peer.set_state(q, v)
+        assert peer.gap() < 1e-9
+        theirs = peer.acceleration(q, v, tau)
+        ours = model.forward_dynamics(q, v, tau)
+        assert np.abs(ours - theirs).max() <= TOLERANCE * max(1.0, np.abs(theirs).max())
+        if len(peer.joints()) == len(robot.independent) and not robot.floating:
+            M = peer.mass_matrix()
+            assert np.abs(model.mass_matrix(q) - M).max() <= TOLERANCE * np.abs(M).max()
+
+
+@pytest.mark.parametrize("level", ["armature", "coupled"])
+@pytest.mark.parametrize("base", ["", "<freejoint/>"])
+def test_trees_with_armature(write, base, level):
+    chain = CHAIN.replace('"w2"', '"w2" armature="0.1"').replace('name="s"', 'name="s" armature="2"')
+    chain = chain.replace('name="f"', 'name="f" armature="0.3"')
+    tilt = "" if base else 'euler="0.1 0.2 0.3"'
+    trunk = f'<body name="trunk" pos="0 0 1" {tilt}>{base}{lump(5)}{chain}</body>'
+    path = write(mjcf(trunk, actuator='<motor joint="f" gear="30"/>'))
+    robot = load_robot(path)
+    assert robot.floating == bool(base)
+    compare(path, robot, level)
+
+
+def test_what_is_read_of_a_tree(write):
+    robot = load_robot(write(mjcf(CHAIN)))
+    assert [body.name for body in robot.bodies] == ["arm", "slider", "w1", "wrist", "finger"]
+    assert robot.independent == ("arm", "slider", "w1", "wrist", "finger")
+    assert robot.body("w1").inertial.mass == 0.0, "a massless link between two joints of one body"
+    assert robot.body("wrist").inertial.mass == pytest.approx(0.8), "the plate is welded to it"
+    assert dict(robot.pose.joints)["arm"] == 0.4, "ref is the coordinate at which the file was drawn"
+
+
+@pytest.mark.parametrize(
+    ("equality", "tendon", "dependent"),
+    [
+        ('<joint joint1="f" joint2="a" polycoef="0.2 -3 0 0 0"/>', "", {"finger"}),
+        ('<joint joint1="f" polycoef="0.3 0 0 0 0"/>', "", set()),
+        (
+            '<joint joint1="f" polycoef="0.3 0 0 0 0"/><tendon tendon1="t" polycoef="0.1 0 0 0 0"/>',
+            '<fixed name="t"><joint joint="f" coef="2"/><joint joint="a" coef="1"/><joint joint="s" coef="3"/></fixed>',
+            None,
+        ),
+        (
+            '<tendon tendon1="t" tendon2="u" polycoef="0.1 2 0 0 0"/>',
+            '<fixed name="t"><joint joint="f" coef="2"/><joint joint="a" coef="1"/></fixed>'
+            '<fixed name="u"><joint joint="a" coef="1"/><joint joint="w1" coef="-3"/></fixed>',
+            None,
+        ),
+    ],
+)
+def test_linear_equalities(write, equality, tendon, dependent):
+    path = write(mjcf(CHAIN, equality, tendon))
+    robot = load_robot(path)
+    moving = {body.name for body in robot.bodies}
+    if dependent is not None:
+        assert moving - set(robot.independent) == dependent
+    assert all(isinstance(tie, LinearConstraint) for tie in robot.constraints)
+    if "joint2" in equality or "tendon2" in equality:
+        assert len(robot.independent) == 4
+        compare(path, robot)
+    else:
+        assert "finger" not in moving, "a joint held still is a weld"
+        held = Held(path, robot, Model(robot, "coupled"))
+        held.check()
+
+
+class Held(Peer):
+    """A file in which joint f is held still: MuJoCo still has its coordinate."""
+
+    def joints(self):
+        return [name for name in super().joints() if name != "finger"]
+
+    def check(self):
+        q, v = np.full(self.model.nq, 0.2), np.full(self.model.nv, 0.5)
+        q_span, v_span = self.model.spanning(q, v)
+        columns = [self.model.spanning_names.index(name) for name in self.joints()]
+        self.set(np.append(q_span[columns], 0.3), np.append(v_span[columns], 0.0))
+        assert self.gap() < 1e-12
+        tau = np.linspace(-1, 1, self.model.nv)
+        ours, theirs = self.model.forward_dynamics(q, v, tau), self.acceleration(q, v, tau)
+        assert np.abs(ours - theirs).max() <= TOLERANCE * np.abs(theirs).max()
+
+
+def test_gears_written_as_rotor_bodies_are_rotors(write):
+    disc = '<inertial mass="0.2" pos="0 0 0" diaginertia="1e-3 1e-3 2e-3"/>'
+    world = (
+        f'<body name="disc" pos="0 0.1 0"><joint name="d"/>{disc}</body>'
+        f'<body name="arm"><joint name="a"/>{lump()}</body>'
+    )
+    path = write(mjcf(world, '<joint joint1="a" joint2="d" polycoef="0 0.1 0 0 0"/>', actuator='<motor joint="a"/>'))
+    robot = load_robot(path)
+    assert [body.name for body in robot.rotors()] == ["disc"]
+    assert robot.independent == ("arm",)
+    compare(path, robot, "exact")
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        CONNECT,
+        '<connect name="pin" site1="tip" site2="top"/>',
+        '<weld name="w" body1="rod" body2="handle"/>',
+    ],
+)
+def test_closed_loops(write, equality):
+    handle = f'<body name="handle" pos="0 0 0.4"><joint name="handle" axis="0 1 0"/>{lump(0.1)}</body>'
+    world = BARS.replace('<site name="top"', handle + '<site name="top"') if "weld" in equality else BARS
+    path = write(mjcf(world, equality, actuator='<motor joint="crank"/>'))
+    robot = load_robot(path)
+    assert robot.independent == ("crank",)
+    assert all(isinstance(tie, LoopConstraint) for tie in robot.constraints)
+    compare(path, robot, "exact")
+
+
+def test_a_welded_tip_leaves_one_freedom_of_seven(write):
+    path = write(mjcf(SEVEN, '<weld body1="b6"/>'))
+    robot = load_robot(path)
+    assert len(robot.independent) == 1
+    compare(path, robot, "exact", spread=0.05)
+
+
+def test_tendons_of_fixed_length_are_rods(write):
+    equalities = '<tendon tendon1="l_rod"/><tendon tendon1="r_rod"/>'
+    path = write(mjcf(ANKLE, equalities, RODS, '<motor joint="pitch"/><motor joint="roll"/>'))
+    robot = load_robot(path)
+    assert robot.independent == ("cross", "foot"), "driven joints are independent"
+    assert [type(tie) for tie in robot.constraints] == [RodConstraint] * 2
+    compare(path, robot, "exact", spread=0.1)
+
+
+def test_exact_knows_more_than_mujoco_only_where_the_ratio_is_known(write):
+    joint = '<joint name="f" axis="0.6 0 0.8" armature="0.05"/>'
+    world = CHAIN.replace('<joint name="f" axis="0.6 0 0.8"/>', joint)
+    path = write(mjcf(world))
+    unknown, known = robot_from_mjcf(path), robot_from_mjcf(path, gear_ratios={"f": -20.0})
+    q = np.full(5, 0.3)
+    reference = Model(unknown, "armature").mass_matrix(q)
+    assert np.abs(Model(known, "armature").mass_matrix(q) - reference).max() < 1e-12
+    assert np.abs(Model(unknown, "exact").mass_matrix(q) - reference).max() < 1e-6
+    assert np.abs(Model(known, "exact").mass_matrix(q) - reference).max() > 1e-3
+    assert known.total_mass == pytest.approx(unknown.total_mass)
+    geared = load_robot(write(mjcf(world, actuator='<motor joint="f" gear="-20"/>')))
+    assert geared.constraints == known.constraints
+    with pytest.raises(RobotError, match="gear_ratios is 'g'"):
+        robot_from_mjcf(path, gear_ratios={"g": 20.0})
+    with pytest.raises(RobotError, match=r"gear_ratios\.f is 0\.0"):
+        robot_from_mjcf(path, gear_ratios={"f": 0.0})
+
+
+def test_a_rotor_that_does_not_fit_its_carrier_is_said_and_left_at_the_limit(write):
+    world = CHAIN.replace('name="f"', 'name="f" armature="5"')
+    path = write(mjcf(world, actuator='<motor joint="f" gear="2"/>'))
+    with pytest.warns(LossyImportWarning, match="gear ratio at finger"):
+        robot = load_robot(path)
+    compare(path, robot, "armature")
+
+
+def test_armature_of_tendons_and_motors(write):
+    tendon = '<fixed name="t" armature="0.4"><joint joint="f" coef="2"/><joint joint="w1" coef="-1"/></fixed>'
+    try:
+        path = write(mjcf(CHAIN, "", tendon, '<motor joint="a" gear="5" armature="0.002"/>'))
+        mujoco.MjModel.from_xml_path(str(path))
+    except ValueError:
+        pytest.skip("this MuJoCo has no such attribute")
+    compare(path, load_robot(path), "coupled")
+
+
+@pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid_leg"])
+@pytest.mark.parametrize("level", ["armature", "coupled", "exact"])
+def test_round_trip(write, name, level):
+    """Exported and imported again: the same mass matrix, of MuJoCo's compiled file and of the import."""
+    original = load_robot(name)
+    path = write(to_mjcf(original, level, ground=original.floating))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LossyImportWarning)
+        robot = load_robot(path)
+    compare(path, robot, level)
+    assert {sphere.group for sphere in robot.contacts} == {sphere.group for sphere in original.contacts}
+    radii, centres = ({c.name: getattr(c, key) for c in original.contacts} for key in ("radius", "position"))
+    assert {c.name: c.radius for c in robot.contacts} == pytest.approx(radii, abs=1e-3), "MuJoCo has no points"
+    assert {c.name: c.position for c in robot.contacts} == {n: pytest.approx(x, abs=1e-12) for n, x in centres.items()}
+    assert dict(robot.gains.kp) == dict(original.gains.kp)
+    assert dict(robot.pose.joints) == pytest.approx(
+        dict.fromkeys(original.independent, 0.0) | dict(original.pose.joints)
+    )
+    if name == "mit_humanoid_leg":  # MuJoCo refuses Mini Cheetah's published inertia
+        q = np.array([dict(original.pose.joints).get(j, 0.0) for j in robot.independent])
+        ours = Model(robot, level).mass_matrix(q)
+        order = [robot.independent.index(j) for j in original.independent]
+        theirs = Model(original, level).mass_matrix(q[order])
+        assert np.abs(ours[np.ix_(order, order)] - theirs).max() <= TOLERANCE * np.abs(theirs).max()
