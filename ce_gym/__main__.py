@@ -16,8 +16,8 @@ from ce_gym.viewer.cli import add_view_command
 
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
 
-  python -m ce_gym list                  environments and robots
-  python -m ce_gym inspect mini_cheetah  what a robot is made of: bodies, gears, clusters
+  python -m ce_gym list                  robots and environments
+  python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
   python -m ce_gym view walk.npz         write a recorded rollout as one HTML file (or --live)
   python -m ce_gym bench                 benchmarks
 
@@ -60,11 +60,12 @@ def _show_warning(message: Warning | str, *_: object) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ce_gym", description=WELCOME.splitlines()[0])
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    list_ = commands.add_parser("list", help="environments and robots")
+    list_ = commands.add_parser("list", help="robots and environments")
     list_.set_defaults(run=_list)
     inspect = commands.add_parser("inspect", help="what a robot is made of")
     inspect.add_argument("robot", metavar="NAME", help="name of a robot, or path of its file")
     inspect.add_argument("--transmission", default="exact", help="exact (default), coupled, armature or none")
+    inspect.add_argument("--no-errors", action="store_true", help="do not compare the levels in random states")
     inspect.set_defaults(run=_inspect)
     add_view_command(commands)
     commands.add_parser("bench", help="benchmarks")
@@ -72,18 +73,21 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from ce_gym import environment_ids, robots
+    from ce_gym import environment_ids
+    from ce_gym.model.listing import robot_table
 
-    for heading, names in {"Environments": environment_ids(), "Robots": robots()}.items():
-        print(f"{heading}:")
-        print("\n".join(f"  {name}" for name in names))
+    print(f"Robots:\n{robot_table()}\n\nEnvironments:")
+    print("\n".join(f"  {name}" for name in environment_ids()))
     return 0
 
 
 def _inspect(args: argparse.Namespace) -> int:
     from ce_gym.dynamics import Model
+    from ce_gym.dynamics.report_text import transmission_report
 
-    print(Model(args.robot, transmission=args.transmission).describe())
+    model = Model(args.robot, transmission=args.transmission)
+    print(f"{model.describe()}\n", flush=True)
+    print(transmission_report(model, states=0) if args.no_errors else transmission_report(model))
     return 0
 
 

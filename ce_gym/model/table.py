@@ -1,0 +1,27 @@
+"""Aligned plain-text tables for people to read in a terminal. Knows nothing of robots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+Cell = str | int | float | None
+
+
+def table_text(columns: Sequence[str], rows: Sequence[Sequence[Cell]], indent: str = "  ") -> str:
+    """Return rows under headings: words to the left, columns of numbers to the right, nothing for None."""
+    cells = [[cell_text(cell) for cell in row] for row in rows]
+    widths = [max(len(line[i]) for line in [columns, *cells]) for i in range(len(columns))]
+    right = [not any(isinstance(row[i], str) for row in rows) for i in range(len(columns))]
+
+    def line(row: Sequence[str]) -> str:
+        aligned = [x.rjust(w) if r else x.ljust(w) for x, w, r in zip(row, widths, right, strict=True)]
+        return (indent + "  ".join(aligned)).rstrip()
+
+    return "\n".join([line(columns), line(["-" * width for width in widths]), *map(line, cells)])
+
+
+def cell_text(cell: Cell) -> str:
+    """Return one cell: four significant digits for a float, empty for None."""
+    if cell is None:
+        return ""
+    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
