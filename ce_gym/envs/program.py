@@ -163,8 +163,8 @@ class TaskProgram:
 
     def _assess(self) -> tuple[ca.Function, int]:
         """State after the sub-steps -> bookkeeping, observation, outcome [reward, terminated, diverged]."""
-        used = ("q", "v", "diverged", "torque", "action", "command", "clock", "air_time", "sums")
-        state = {name: SX.sym(name, self.state_sizes[name]) for name in used}
+        used = ("q", "v", "dependent", "diverged", "torque", "action", "command", "clock", "air_time", "sums")
+        state = {name: SX.sym(name, self.state_sizes[name]) for name in used if name in self.state_sizes}
         clipped, draws = SX.sym("clipped", self.n_joints), Draws()
         values = state | {"action": clipped, "previous_action": state["action"]}
         s = self._snapshot(values)

@@ -101,7 +101,7 @@ class Snapshot:
     @cached_property
     def kinematics(self) -> Kinematics:
         """Poses and velocities of all bodies."""
-        return outward_velocity_pass(self.mechanism, self.q, self.v)
+        return outward_velocity_pass(self.mechanism, self.q, self.v, self._values.get("dependent"))
 
     def touching(self, group: str) -> SX:
         """Whether each contact sphere of a group is on the ground, 0 or 1, shape (n,)."""
