@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from ce_gym.envs.program import OBSERVATION_BOUND
 from ce_gym.envs.setup import make_batch
+from ce_gym.envs.shell import BatchShell
 
 
-class LeggedEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]], EzPickle):
+class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]], EzPickle):
     """One robot and one task.
 
     Observations and actions are float32 vectors; `observation_structure` names the blocks of the observation. `info`
@@ -36,21 +37,6 @@ class LeggedEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]], EzPickl
         self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
         self.render_mode = None
         self._seeded = False
-
-    @property
-    def dt(self) -> float:
-        """Length of a control step [s]."""
-        return self.batch.program.control_dt
-
-    @property
-    def contact_names(self) -> tuple[str, ...]:
-        """The contact spheres that take part, in the order of recorded contact forces."""
-        return self.batch.program.contacts
-
-    @property
-    def observation_structure(self) -> dict[str, int]:
-        """Length of each observation block, in order."""
-        return self.batch.program.observation_sizes
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

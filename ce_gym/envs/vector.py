@@ -12,12 +12,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ce_gym.envs.setup import make_batch
+from ce_gym.envs.shell import BatchShell
 from ce_gym.envs.single import checked_action, recorded_state, spaces
 
 Observations = NDArray[np.float32]
 
 
-class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
+class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
     """Many copies of one robot and one task, stepped by one kernel.
 
     Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit,
@@ -70,21 +71,6 @@ class LeggedVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         self._finished = np.zeros(num_envs, bool)
         self._observation = np.zeros((num_envs, self.batch.observation_size), np.float32)
         self._seeded = False
-
-    @property
-    def dt(self) -> float:
-        """Length of a control step [s]."""
-        return self.batch.program.control_dt
-
-    @property
-    def contact_names(self) -> tuple[str, ...]:
-        """The contact spheres that take part, in the order of recorded contact forces."""
-        return self.batch.program.contacts
-
-    @property
-    def observation_structure(self) -> dict[str, int]:
-        """Length of each observation block, in order."""
-        return self.batch.program.observation_sizes
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
