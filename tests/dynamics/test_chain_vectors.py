@@ -1,4 +1,4 @@
-"""The library's uniform and random chains and the published JVRC-1, on every reference state, from the figures alone."""
+"""The library's uniform and random chains and the published JVRC-1, on every reference state, from figures alone."""
 
 from __future__ import annotations
 
