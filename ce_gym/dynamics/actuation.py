@@ -15,7 +15,7 @@ from ce_gym.dynamics.spatial import SX
 from ce_gym.model.description import Robot
 
 LIMIT_FREQUENCY = 2 * math.pi * 20.0
-"""Natural frequency of a soft joint limit [rad/s]: its stiffness is `gain * LIMIT_FREQUENCY`, see `limit_stop`."""
+"""Stiffness over damping of a soft joint limit [1/s]; the stop relaxes in the inverse of it, 8 ms."""
 
 
 @dataclass

@@ -65,9 +65,8 @@ class Articulation:
         U: Force at the handle for a unit independent acceleration, shape (6, d).
         D: Inertia of the cluster's own motion, shape (d, d).
         u: Generalised force left after all biases, shape (d,).
-        handle: Transform from the output body to the handle.
         handle_body: The body whose frame is the handle; None if the handle is the output body's frame.
-        base: Articulated inertia and bias force of a floating base.
+        base: Articulated inertia of a floating base and the force left on it; None for a fixed base.
     """
 
     U: dict[int, SX] = field(default_factory=dict)

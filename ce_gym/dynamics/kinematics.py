@@ -62,7 +62,7 @@ class Kinematics:
     Attributes:
         bodies: State of every moving body, by name.
         coordinates: Spanning coordinates of every cluster; None for a floating base.
-        y: Slice of each cluster's independent coordinates inside `v`.
+        rows: Rows of each cluster's independent coordinates inside `v`.
     """
 
     bodies: dict[str, BodyState] = field(default_factory=dict)
