@@ -8,13 +8,14 @@ from ce_gym.compile.arrays import aligned_zeros, lane_count
 from ce_gym.compile.cache import source_fingerprint
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.loading import load_kernel
-from ce_gym.compile.program import Buffer, Call, Program
+from ce_gym.compile.program import Buffer, Call, Program, Repeat
 
 __all__ = [
     "Buffer",
     "Call",
     "Kernel",
     "Program",
+    "Repeat",
     "aligned_zeros",
     "lane_count",
     "load_kernel",

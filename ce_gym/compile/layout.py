@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 
 from ce_gym.compile.arrays import ALIGNMENT
-from ce_gym.compile.program import Buffer, Program
+from ce_gym.compile.program import Buffer, Program, Repeat
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Layout:
 
 def layout_of(program: Program, dtype: str) -> Layout:
     """The calling convention that follows from a program."""
-    repeats = dict.fromkeys(call.repeat for call in program.calls if call.repeat)
+    repeats = dict.fromkeys(step.times for step in program.steps if isinstance(step, Repeat))
     written = dict.fromkeys(name for call in program.calls for name in call.outputs)
     return Layout(program.name, dtype, program.buffers, tuple(repeats), tuple(written))
 

@@ -47,13 +47,27 @@ class Call:
         function: the SX function. Each input and output fills one whole buffer, column by column.
         inputs: buffer of each function input.
         outputs: buffer of each function output; it may be an input's too, since all loads come before any store.
-        repeat: name of a run-time integer, how often in a row it is called; empty means once.
+        only_if: a buffer of size 1; the call is left out where it is zero in all lanes of a tile. To keep lanes
+            independent of their neighbours it must change nothing in a lane where the buffer is zero.
     """
 
     function: casadi.Function
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    repeat: str = ""
+    only_if: str = ""
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """Calls made in order, several times over.
+
+    Attributes:
+        times: name of a run-time integer.
+        calls: what is repeated.
+    """
+
+    times: str
+    calls: tuple[Call, ...]
 
 
 @dataclass(frozen=True)
@@ -63,14 +77,19 @@ class Program:
     Attributes:
         name: for people, `mini_cheetah exact environment`.
         buffers: all buffers the calls mention.
-        calls: in the order of execution.
+        steps: calls and repeated calls, in the order of execution.
         skip_unless: a `tiles` buffer of size 1; a tile whose lanes are all zero there is left alone entirely.
     """
 
     name: str
     buffers: tuple[Buffer, ...]
-    calls: tuple[Call, ...]
+    steps: tuple[Call | Repeat, ...]
     skip_unless: str = ""
+
+    @property
+    def calls(self) -> tuple[Call, ...]:
+        """All calls, repeated or not, each once."""
+        return tuple(c for step in self.steps for c in (step.calls if isinstance(step, Repeat) else (step,)))
 
 
 def check_program(program: Program) -> None:
@@ -88,15 +107,21 @@ def check_program(program: Program) -> None:
     for number, call in enumerate(program.calls):
         place = f"program {program.name!r}: call {number} ({call.function.name()})"
         _check_call(place, call, buffers)
-        if unset := [name for name in call.inputs if name not in written]:
+        if call.only_if:
+            _check_flag(f"{place}: only_if", buffers.get(call.only_if))
+        read = (*call.inputs, *([call.only_if] if call.only_if else []))
+        if unset := [name for name in read if name not in written]:
             raise ValueError(f"{place}: reads {unset[0]!r}, expected an earlier call to write it first")
         written.update(call.outputs)
     if unset := [b.name for b in program.buffers if b.name not in written and b.kind == "rows_out"]:
         raise ValueError(f"program {program.name!r}: no call writes the rows_out buffer {unset[0]!r}")
     if program.skip_unless:
-        flag = buffers.get(program.skip_unless)
-        if flag is None or flag.kind != "tiles" or flag.size != 1:
-            raise ValueError(f"program {program.name!r}: skip_unless must name a tiles buffer of size 1")
+        _check_flag(f"program {program.name!r}: skip_unless", buffers.get(program.skip_unless), ("tiles",))
+
+
+def _check_flag(place: str, flag: Buffer | None, kinds: tuple[str, ...] = ("tiles", "scratch")) -> None:
+    if flag is None or flag.kind not in kinds or flag.size != 1:
+        raise ValueError(f"{place} must name a {' or '.join(kinds)} buffer of size 1")
 
 
 def _check_buffer(program: str, buffer: Buffer) -> None:

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import casadi
 from llvmlite import ir
 
 from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.layout import Layout
 from ce_gym.compile.lowering import lower_function
-from ce_gym.compile.program import Buffer, Call, Program
+from ce_gym.compile.program import Buffer, Call, Program, Repeat
 from ce_gym.compile.random import emit_uniform
 from ce_gym.compile.vector import Builder, Value, VectorBuilder
 
@@ -35,10 +36,7 @@ def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tup
     if not program.skip_unless:
         work.emit()
         return
-    flag = VectorBuilder(builder, layout.dtype)
-    awake = flag.compare("!=", flag.load(work.lanes[program.skip_unless], 0), flag.const(0.0))
-    any_awake = builder.icmp_unsigned("!=", builder.bitcast(awake, ir.IntType(flag.lanes)), ir.IntType(flag.lanes)(0))
-    with builder.if_then(any_awake):
+    with builder.if_then(work.any_lane(program.skip_unless)):
         work.emit()
 
 
@@ -56,6 +54,13 @@ class _TileWork:
         remaining = builder.sub(num_envs, self.first_env)
         self.valid_lanes = self._smaller(remaining, INT(self.vectors.lanes))
         self.lanes = {b.name: self._lanes_of(b, scratch, tile) for b in program.buffers}
+        self.bodies: dict[casadi.Function, ir.Function] = {}
+
+    def any_lane(self, name: str) -> Value:
+        """Whether a buffer of size 1 is not zero in some lane."""
+        v, bits = self.vectors, ir.IntType(self.vectors.lanes)
+        set_lanes = v.compare("!=", v.load(self.lanes[name], 0), v.const(0.0))
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(set_lanes, bits), bits(0))
 
     def emit(self) -> None:
         """All work on the tile, in order."""
@@ -66,8 +71,13 @@ class _TileWork:
             self._rows_to_lanes(buffer)
         if kinds["random"]:
             self._fill_random(kinds["random"])
-        for number, call in enumerate(self.program.calls):
-            self._call(number, call)
+        for step in self.program.steps:
+            if isinstance(step, Repeat):
+                with self._repeated(step.times):
+                    for call in step.calls:
+                        self._call(call)
+            else:
+                self._call(step)
         for buffer in kinds["rows_out"]:
             self._lanes_to_rows(buffer)
 
@@ -131,28 +141,34 @@ class _TileWork:
             result = b.insert_element(result, b.load(b.gep(words, [env])), ir.IntType(32)(lane))
         return result
 
-    def _call(self, number: int, call: Call) -> None:
-        """Call one lowered function, as often as its repeat says."""
-        names = call.inputs + call.outputs
-        body = self._body(number, call)
-        pointers = [self.lanes[name] for name in names]
-        if not call.repeat:
+    @contextmanager
+    def _repeated(self, times: str) -> Iterator[None]:
+        """What is built inside `with` is done as often as a run-time integer says."""
+        count = self.builder.load(self.builder.gep(self.repeats, [INT(self.layout.repeats.index(times))]))
+        with _loop(self.builder, count, "repeat"):
+            yield
+
+    def _call(self, call: Call) -> None:
+        """Call one lowered function, if it is needed."""
+        body = self.bodies.get(call.function) or self._body(call.function)
+        self.bodies[call.function] = body
+        pointers = [self.lanes[name] for name in call.inputs + call.outputs]
+        if not call.only_if:
             self.builder.call(body, pointers)
             return
-        count = self.builder.load(self.builder.gep(self.repeats, [INT(self.layout.repeats.index(call.repeat))]))
-        with _loop(self.builder, count, "repeat"):
+        with self.builder.if_then(self.any_lane(call.only_if)):
             self.builder.call(body, pointers)
 
-    def _body(self, number: int, call: Call) -> ir.Function:
-        """The call's own LLVM function: one long block that the optimiser sees alone."""
+    def _body(self, function: casadi.Function) -> ir.Function:
+        """A function's own LLVM function: one long block that the optimiser sees alone."""
         pointer = self.vectors.float_type.as_pointer()
-        signature = ir.FunctionType(ir.VoidType(), [pointer] * (len(call.inputs) + len(call.outputs)))
-        body = ir.Function(self.builder.module, signature, f"call_{number}")
+        signature = ir.FunctionType(ir.VoidType(), [pointer] * (function.n_in() + function.n_out()))
+        body = ir.Function(self.builder.module, signature, f"call_{len(self.bodies)}")
         body.linkage = "internal"
         body.attributes.add("noinline")
         body.attributes.alignstack = ALIGNMENT  # else spilled vectors straddle two cache lines each
         vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype)
-        lower_function(vectors, call.function, body.args[: len(call.inputs)], body.args[len(call.inputs) :])
+        lower_function(vectors, function, body.args[: function.n_in()], body.args[function.n_in() :])
         vectors.builder.ret_void()
         return body
 

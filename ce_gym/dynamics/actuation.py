@@ -1,7 +1,12 @@
 """Forces on the independent coordinates, linearly implicit in the step: motors, damping, joint limits.
 
-Each is `tau - slope * ydd` with the force taken one step ahead, exactly as in contact.py; the slope joins `D` of the
-cluster. A saturated motor gives a constant torque and has no slope. May know CasADi and descriptions.
+Each is `tau - slope @ ydd` with the force taken one step ahead, exactly as in contact.py; the slope joins `D` of the
+cluster. A saturated motor gives a constant torque and has no slope.
+
+Controllers ask for torques at the joints. "Ideal" motors deliver them up to the joints' limits. "Limited" motors are
+the ones the robot has: their torques `tau_m` and speeds `W yd` belong to rotors, with `W` the rows of the constraint
+Jacobian, and what they do to the joints is `W^T tau_m`. Limits and friction there do not depend on the transmission
+level. May know CasADi, descriptions and kinematics.
 """
 
 from __future__ import annotations
@@ -11,61 +16,129 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from ce_gym.dynamics.kinematics import Kinematics
+from ce_gym.dynamics.scene import Scene
 from ce_gym.dynamics.spatial import SX
-from ce_gym.model.description import Robot
+from ce_gym.model.description import Motor, Robot
 
 LIMIT_FREQUENCY = 2 * math.pi * 20.0
 """Stiffness over damping of a soft joint limit [1/s]; the stop relaxes in the inverse of it, 8 ms."""
+COULOMB_SPEED = 0.1
+"""Rotor speed at which the dry friction of a motor reaches 1/sqrt(2) of its full value [rad/s]."""
 
 
 @dataclass
 class JointForce:
-    """A force on one coordinate, `tau - slope * ydd` over the step.
+    """A force on coordinates, `tau - slope @ ydd` over the step.
 
     Attributes:
-        tau: At zero acceleration [N m or N].
-        slope: [kg m^2 or kg].
+        tau: At zero acceleration [N m or N], shape (n,).
+        slope: Symmetric [kg m^2 or kg], shape (n, n).
     """
 
     tau: SX
-    slope: SX | float
+    slope: SX
 
     def __add__(self, other: JointForce) -> JointForce:
         """Return both acting together."""
         return JointForce(self.tau + other.tau, self.slope + other.slope)
 
 
-def position_motor(y: SX, yd: SX, target: SX, kp: float, kd: float, limit: float, dt: float) -> JointForce:
-    """A proportional-derivative position controller with a torque limit, evaluated at the end of the step."""
-    damping = kd + dt * kp
-    tau = kp * (target - y) - damping * yd
-    if math.isinf(limit):
-        return JointForce(tau, dt * damping)
-    saturated = ca.fabs(tau) > limit
-    return JointForce(ca.fmax(-limit, ca.fmin(limit, tau)), ca.if_else(saturated, 0, dt * damping))
+def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce:
+    """Return what the motors are asked for at the joints: a torque, or a proportional-derivative position control."""
+    if scene.options.control == "torque":
+        return JointForce(target, SX(target.shape[0], target.shape[0]))
+    damping = scene.figures.kd + dt * scene.figures.kp
+    return JointForce(scene.figures.kp * (target - y) - damping * yd, ca.diag(dt * damping))
 
 
-def torque_motor(command: SX, limit: float) -> JointForce:
-    """A motor that delivers the commanded torque up to its limit."""
-    return JointForce(command if math.isinf(limit) else ca.fmax(-limit, ca.fmin(limit, command)), 0.0)
+def motor_forces(scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float) -> JointForce:
+    """Return what the motors deliver of the torques they are asked for."""
+    robot, strength = scene.mechanism.robot, scene.figures.strength
+    force = JointForce(strength * asked.tau, strength * asked.slope)
+    actuated = actuated_clusters(scene, kinematics) if scene.options.motors == "limited" else []
+    for rows, W, motors in actuated:
+        local = JointForce(force.tau[rows], force.slope[rows, rows])
+        local = _through_motors(local, W, W @ yd[rows], motors, strength, dt)
+        force.tau[rows], force.slope[rows, rows] = local.tau, local.slope
+    driven = {row for rows, _, _ in actuated for row in rows}
+    for row, name in enumerate(robot.independent):
+        limit = robot.body(name).joint.torque
+        if row not in driven and not math.isinf(limit):
+            tau, limit = force.tau[row], strength * limit
+            force.slope[row, row] = ca.if_else(ca.fabs(tau) > limit, 0, force.slope[row, row])
+            force.tau[row] = ca.fmax(-limit, ca.fmin(limit, tau))
+    return JointForce(force.tau, ca.sparsify(force.slope))
 
 
-def viscous_damping(yd: SX, damping: float, dt: float) -> JointForce:
-    """Friction proportional to speed."""
-    return JointForce(-damping * yd, dt * damping)
+def actuated_clusters(scene: Scene, kinematics: Kinematics) -> list[tuple[list[int], SX, list[Motor]]]:
+    """Return, for each cluster with motors, its rows of `y`, the matrix `W` (n_motors, d), and its motors.
+
+    Row i of `W` is the speed of motor i for unit velocities of the independent joints (footnote on general actuation
+    of arXiv:2311.13732); torques of motors go the other way, `tau = W^T tau_m`.
+    """
+    mechanism, first = scene.mechanism, 6 if scene.mechanism.robot.floating else 0
+    found = []
+    for cluster, rows, coordinates in zip(
+        mechanism.tree.clusters, kinematics.rows, kinematics.coordinates, strict=True
+    ):
+        motors = [motor for motor in mechanism.robot.motors if motor.rotor in cluster.bodies]
+        if motors and coordinates is not None:
+            W = coordinates.G[[coordinates.index[motor.rotor] for motor in motors], :]
+            found.append(([row - first for row in rows], ca.sparsify(W), motors))
+    return found
 
 
-def limit_stop(y: SX, yd: SX, limits: tuple[float, float], stiffness: float, damping: float, dt: float) -> JointForce:
-    """One-sided springs at the ends of a joint's range, active if it will be beyond one by the end of the step."""
-    total, slope = JointForce(SX(0), 0.0), damping + dt * stiffness
-    for bound, side in ((limits[0], 1.0), (limits[1], -1.0)):
-        if math.isinf(bound):
-            continue
-        depth, speed = side * (bound - y), side * yd
-        push = stiffness * depth - slope * speed
-        active = ca.logic_and(depth - dt * speed > 0, push > 0)
-        total += JointForce(side * ca.if_else(active, push, 0), ca.if_else(active, dt * slope, 0))
-    return total
+def _through_motors(asked: JointForce, W: SX, speed: SX, motors: list[Motor], strength: SX, dt: float) -> JointForce:
+    """Share joint torques out to motors, limit each, take its friction off, and carry the sum back to the joints."""
+    to_motors = _effort_matrix(W)
+    tau, slope = to_motors @ asked.tau, to_motors @ asked.slope @ to_motors.T
+    free = SX.eye(len(motors))
+    friction, friction_slope = SX(len(motors), 1), SX(len(motors), 1)
+    for i, motor in enumerate(motors):
+        low, high = _available_torque(motor, speed[i])
+        if math.isfinite(motor.torque):
+            low, high = low * strength, high * strength
+            free[i, i] = ca.logic_and(tau[i] < high, tau[i] > low)
+            tau[i] = ca.fmax(low, ca.fmin(high, tau[i]))
+        drag = motor.damping + (motor.friction / ca.sqrt(speed[i] ** 2 + COULOMB_SPEED**2) if motor.friction else 0)
+        friction[i], friction_slope[i] = drag * speed[i], dt * drag
+    slope = free @ slope @ free + ca.diag(friction_slope)  # a saturated motor does not answer to speed
+    return JointForce(W.T @ (tau - friction), W.T @ slope @ W)
+
+
+def _effort_matrix(W: SX) -> SX:
+    """Return the matrix that takes joint torques to motor torques: inverse of `W^T`, least squares if not square."""
+    n, d = W.shape
+    if n == d:
+        return ca.inv(W.T)
+    return W @ ca.inv(W.T @ W) if n > d else ca.inv(W @ W.T) @ W
+
+
+def _available_torque(motor: Motor, speed: SX) -> tuple[SX, SX]:
+    """Return the torques between which a motor can choose at a speed of its rotor [N m].
+
+    On the torque-speed line the voltage allows `stall (1 - speed / velocity)` forwards, and likewise backwards; the
+    current, at most `torque`.
+    """
+    limit = motor.torque
+    if math.isinf(limit) or math.isinf(motor.velocity):
+        return SX(-limit), SX(limit)
+    stall = limit if motor.stall is None else motor.stall
+    forwards = stall * (1 - speed / motor.velocity)
+    backwards = stall * (1 + speed / motor.velocity)
+    return -ca.fmax(0, ca.fmin(limit, backwards)), ca.fmax(0, ca.fmin(limit, forwards))
+
+
+def passive_forces(robot: Robot, y: SX, yd: SX, dt: float) -> JointForce:
+    """Return viscous friction and stops of all independent joints."""
+    total = [_viscous_damping(yd[i], robot.body(name).joint.damping, dt) for i, name in enumerate(robot.independent)]
+    for i, name in enumerate(robot.independent):
+        stiffness, damping = limit_stiffness(robot, name)
+        tau, slope = _stop(y[i], yd[i], robot.body(name).joint.position, stiffness, damping, dt)
+        total[i] = total[i][0] + tau, total[i][1] + slope
+    tau, slopes = ca.vertcat(SX(0, 1), *[t for t, _ in total]), ca.vertcat(SX(0, 1), *[s for _, s in total])
+    return JointForce(tau, ca.diag(slopes))
 
 
 def limit_stiffness(robot: Robot, name: str) -> tuple[float, float]:
@@ -73,3 +146,20 @@ def limit_stiffness(robot: Robot, name: str) -> tuple[float, float]:
     torque = robot.body(name).joint.torque
     stiffness = 20.0 * torque if math.isfinite(torque) else 1e3
     return stiffness, stiffness / LIMIT_FREQUENCY
+
+
+def _viscous_damping(yd: SX, damping: float, dt: float) -> tuple[SX, SX]:
+    return SX(-damping * yd), SX(dt * damping)
+
+
+def _stop(y: SX, yd: SX, limits: tuple[float, float], stiffness: float, damping: float, dt: float) -> tuple[SX, SX]:
+    """One-sided springs at the ends of a joint's range, active if it will be beyond one by the end of the step."""
+    tau, total, slope = SX(0), SX(0), damping + dt * stiffness
+    for bound, side in ((limits[0], 1.0), (limits[1], -1.0)):
+        if math.isinf(bound):
+            continue
+        depth, speed = side * (bound - y), side * yd
+        push = stiffness * depth - slope * speed
+        active = ca.logic_and(depth - dt * speed > 0, push > 0)
+        tau, total = tau + side * ca.if_else(active, push, 0), total + ca.if_else(active, dt * slope, 0)
+    return tau, total

@@ -37,7 +37,7 @@ class JointTerms:
 
     Attributes:
         tau: Generalised forces, base wrench [moment; force] first, shape (nv,).
-        slope: Added to the diagonal of `D`: implicit damping and stiffness [kg m^2 or kg], shape (nv,).
+        slope: Added to `D`: implicit damping and stiffness [kg m^2 or kg], shape (nv, nv); zero between clusters.
     """
 
     tau: SX
@@ -104,7 +104,7 @@ def inward_inertia_pass(
             continue
         handle = _handle_body(mechanism, cluster, mechanism.spins[k])
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
-        D = mirrored(condensed.D) + ca.diag(joints.slope[rows])
+        D = mirrored(condensed.D + joints.slope[rows, rows])
         U, u = condensed.U, joints.tau[rows] - condensed.bias
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
         articulation.handle_body[k] = handle.name if handle else None
@@ -155,7 +155,7 @@ def outward_acceleration_pass(
 
 def gravity_acceleration(mechanism: Mechanism) -> SX:
     """Return the acceleration of free fall in the world, shape (3,)."""
-    return constant(np.array(mechanism.robot.gravity))
+    return constant(mechanism.gravity)
 
 
 def _parent_acceleration(body: MovingBody, a: dict[str, SX], gravity: SX) -> SX:

@@ -1,20 +1,28 @@
-"""Penalty contact between spheres and flat ground, linearly implicit in the step.
+"""Penalty contact between spheres and the ground, linearly implicit in the step.
 
-A contact is a spring and damper in the normal direction and regularised Coulomb friction in the tangent plane. Its
-force is taken one step ahead: with the acceleration `a` of the body still unknown,
+A contact is a spring and damper along the normal and a bristle in the tangent plane: an elastic deflection `s` from an
+anchor, damped, that slips when it would carry more than Coulomb's cone allows. Its force is a function of the velocity
+`v+` of the point at the end of the step, linearised about a velocity `w`,
 
-    f+ = f0 - dt C (J a + w x v_p),        C = Dn n n^T + Dt (1 - n n^T),   Dn = d + dt k,   Dt = mu lam / s,
+    f+ = F(w) - C (v+ - w),    v+ = v + dt (J a + omega x v),    C = Dn n n^T + Dt,
 
-so that `dt J^T C J` joins the body's inertia before the inward pass and the recursion stays linear in the number of
-bodies. This is one Newton step of backward Euler (Anitescu and Potra 2002) with frozen normal, lever arm and normal
-force in the friction; it is dissipative for every step length because C is positive semidefinite.
+with the acceleration `a` of the body still unknown. `dt J^T C J` joins the body's inertia before the inward pass and
+the recursion stays linear in the number of bodies. This is Newton's method on backward Euler (Anitescu and Potra 2002)
+with frozen normal and lever arm. C is positive semidefinite: no step length makes a lasting contact unstable.
 
-A contact begins if it *will* be in the ground by the end of the step, `depth + dt depth' > 0`, and pushes; with the
-second condition alone the damper would act above the ground. The prediction knows the velocity but not yet the
-acceleration. A loaded foot that its spring has just lifted would therefore be judged gone, fall back, and bounce on the
-steps for ever; so a contact that pushed at the end of the last step goes on as long as it is in the ground. It ends
-when the solution would pull: an active-set method whose iterations are the steps. May know spatial algebra; no robots,
-no recursions.
+Normal force, with depth `d`, and friction, with cone `mu lam` and the trial force `x` of a bristle that sticks:
+
+    lam = k d - (c + dt k) v_n   (Kelvin-Voigt)        lam = k d+ (1 - h v_n)+   (Hunt-Crossley, linearised)
+    x = k_t s + (mu lam / v_s + dt k_t) v_t            f_t = -min(1, mu lam / |x|) x
+
+One pass with w = v: a slipping contact keeps the slope of a sticking one, scaled by mu lam / |x| (the secant). That
+never reverses a velocity, and is slow to break away. Two passes: the first with the true slope (the tangent, none along
+the slip), the second about its result, in which a contact whose slip would have turned round sticks.
+
+A contact begins if it *will* be in the ground by the end of the step, `d - dt v_n > 0`, and pushes. The prediction
+knows the velocity but not yet the acceleration: a loaded foot that its spring has just lifted would be judged gone,
+fall back, and bounce on the steps for ever. So a contact that pushed at the end of the last step goes on as long as it
+is in the ground. May know spatial algebra; no robots, no recursions.
 """
 
 from __future__ import annotations
@@ -26,30 +34,73 @@ import casadi as ca
 from ce_gym.dynamics.ce_aba import BodyTerms
 from ce_gym.dynamics.kinematics import BodyState
 from ce_gym.dynamics.spatial import SX, cross, mirrored, skew, symmetric_blocks
-from ce_gym.model.description import ContactMaterial
 
-SLIP_SPEED = 1e-2
-"""Slip speed at which regularised friction reaches 1/sqrt(2) of its full value [m/s]."""
+CONE_TOLERANCE = 0.02
+"""Share by which a sticking contact may leave the cone before its step is solved again."""
+CONE_FLOOR = 1e-6
+"""The same as a force, for cones near zero [N]."""
+
+
+@dataclass(frozen=True)
+class Compliance:
+    """Figures of a contact, numbers or symbols.
+
+    Attributes:
+        stiffness: Normal stiffness `k` [N/m].
+        damping: Normal damping `c` of Kelvin and Voigt [N s/m].
+        dissipation: Normal dissipation `h` of Hunt and Crossley [s/m]; None for Kelvin and Voigt.
+        friction: Coulomb coefficient `mu` [-].
+        slip_speed: Speed `v_s` at which damping alone carries the full friction [m/s].
+        bristle: Tangential stiffness `k_t` [N/m]; 0 for none.
+    """
+
+    stiffness: SX
+    damping: SX
+    dissipation: SX | None
+    friction: SX
+    slip_speed: SX
+    bristle: SX
+
+
+@dataclass
+class Touch:
+    """Where a sphere is above the ground and how it moves. In body axes.
+
+    Attributes:
+        normal: Unit normal out of the ground, shape (3,).
+        point: The sphere's lowest point, in the body frame [m], shape (3,).
+        depth: How far it is in the ground [m].
+        velocity: Of the point [m/s], shape (3,).
+        bias: Its acceleration for a body that does not accelerate, `omega x v` [m/s^2], shape (3,).
+        load: Its normal force over the last step [N].
+        anchor: Deflection of the bristle, shape (3,) [m].
+    """
+
+    normal: SX
+    point: SX
+    depth: SX
+    velocity: SX
+    bias: SX
+    load: SX
+    anchor: SX
 
 
 @dataclass
 class ContactResponse:
-    """One contact's force as an affine function of its body's acceleration.
+    """One contact's force over the step, linear in the velocity of its point at the end, `force - C (v+ - v)`.
 
     Attributes:
-        force: Force at zero acceleration, body axes [N], shape (3,).
+        force: For an unchanged velocity, body axes [N], shape (3,).
         C: Effective damping, body axes [N s/m], shape (3, 3).
-        normal: Unit normal out of the ground, body axes, shape (3,).
-        point: Where it acts, in the body frame [m], shape (3,).
-        bias: `w x v_p`, shape (3,).
+        slip: Direction in which friction slips, shape (3,); zero while it sticks.
+        touch: Where it acts.
         dt: Step length [s].
     """
 
     force: SX
     C: SX
-    normal: SX
-    point: SX
-    bias: SX
+    slip: SX
+    touch: Touch
     dt: float
 
     def body_terms(self, gravity: SX) -> BodyTerms:
@@ -58,50 +109,133 @@ class ContactResponse:
         Args:
             gravity: Acceleration of free fall in body axes, shape (3,); the recursion's `a` does not contain it.
         """
-        r = skew(self.point)
+        r = skew(self.touch.point)
         rC = r @ self.C
         inertia = symmetric_blocks(mirrored(rC @ r.T), rC, self.C) * self.dt
-        force = self.force - self.dt * (self.C @ (self.bias + gravity))
-        return BodyTerms(inertia, ca.vertcat(cross(self.point, force), force))
+        force = self.force - self.dt * (self.C @ (self.touch.bias + gravity))
+        return BodyTerms(inertia, ca.vertcat(cross(self.touch.point, force), force))
 
-    def force_after(self, a: SX, gravity: SX) -> SX:
-        """Return the force over the step, body axes [N], once the body's acceleration minus gravity is known."""
-        point_acceleration = a[3:] + cross(a[:3], self.point) + gravity + self.bias
-        return self.force - self.dt * (self.C @ point_acceleration)
+    def velocity_gain(self, a: SX, gravity: SX) -> SX:
+        """Return what the point's velocity gains in the step, body axes [m/s], given its body's acceleration."""
+        return self.dt * (a[3:] + cross(a[:3], self.touch.point) + gravity + self.touch.bias)
+
+    def force_after(self, gain: SX) -> SX:
+        """Return the force over the step, body axes [N], given the gain in velocity."""
+        return self.force - self.C @ gain
 
 
-def ground_contact(
-    body: BodyState, position: SX, radius: float, pushed: SX, material: ContactMaterial, dt: float
-) -> ContactResponse:
-    """Evaluate a sphere against the plane z = 0.
+def touch_ground(body: BodyState, position: SX, radius: float, height: SX, normal: SX, load: SX, anchor: SX) -> Touch:
+    """Place a sphere against the plane that the ground is nearby.
 
     Args:
         body: Kinematics of the body that carries it.
         position: Centre of the sphere in the body frame [m], shape (3,).
         radius: [m].
-        pushed: 1 if the contact pushed at the end of the last step, else 0.
-        material: Compliance and friction.
-        dt: Step length [s].
+        height: Of the ground under the centre [m].
+        normal: Unit normal of the ground there, world axes, shape (3,).
+        load: Its normal force over the last step [N].
+        anchor: Horizontal deflection of its bristle, world axes [m], shape (2,), or (0,) for none.
     """
-    n = body.R[2, :].T  # upwards, in body axes
-    depth = radius - (body.p[2] + ca.dot(n, position))
+    n = body.R.T @ normal
+    depth = radius - normal[2] * (body.point_position(position)[2] - height)
     point = position - radius * n
     velocity = body.point_velocity(point)
-    normal_speed = ca.dot(n, velocity)
-    normal_slope = material.damping + dt * material.stiffness
-    pushing = material.stiffness * depth - normal_slope * normal_speed
-    begins = ca.logic_and(depth - dt * normal_speed > 0, pushing > 0)
-    active = ca.logic_or(begins, ca.logic_and(pushed > 0.5, depth > 0))
-    normal_force = ca.if_else(active, pushing, 0)
-    slip = velocity - normal_speed * n
-    tangent_slope = material.friction * ca.fmax(normal_force, 0) / ca.sqrt(ca.sumsqr(slip) + SLIP_SPEED**2)
-    normal_excess = ca.if_else(active, normal_slope, 0) - tangent_slope
-    C = mirrored(tangent_slope * SX.eye(3) + normal_excess * (n @ n.T))
-    return ContactResponse(
-        force=normal_force * n - tangent_slope * slip,
-        C=C,
-        normal=n,
-        point=point,
-        bias=cross(body.v[:3], velocity),
-        dt=dt,
-    )
+    deflection = SX(3, 1)
+    if anchor.numel():  # in the tangent plane: the normal has no part in it
+        deflection = body.R.T @ ca.vertcat(anchor, -ca.dot(normal[:2], anchor) / normal[2])
+    return Touch(n, point, depth, velocity, cross(body.v[:3], velocity), load, deflection)
+
+
+def normal_law(touch: Touch, compliance: Compliance, dt: float) -> tuple[SX, SX]:
+    """Return the normal force as `force - slope * v_n+`, both zero for a contact that is not there."""
+    c, v_n = compliance, ca.dot(touch.normal, touch.velocity)
+    rate = c.stiffness * ca.fmax(0, 1 - c.dissipation * v_n) if c.dissipation is not None else c.stiffness
+    slope = c.damping + dt * rate
+    force = rate * touch.depth
+    if c.dissipation is not None:
+        growth = ca.if_else(v_n < 1 / c.dissipation, c.stiffness * c.dissipation * ca.fmax(touch.depth, 0), 0)
+        slope, force = slope + growth, force + growth * v_n
+    pushing = force - slope * v_n
+    begins = ca.logic_and(touch.depth - dt * v_n > 0, pushing > 0)
+    active = ca.logic_or(begins, ca.logic_and(touch.load > 0, touch.depth > 0))
+    return ca.if_else(active, force, 0), ca.if_else(active, slope, 0)
+
+
+@dataclass
+class Contact:
+    """A sphere that may be touching the ground, for the length of one step.
+
+    Attributes:
+        body: Name of the body that carries it.
+        touch: Where it is.
+        compliance: What it is made of.
+        dt: Step length [s].
+    """
+
+    body: str
+    touch: Touch
+    compliance: Compliance
+    dt: float
+
+    def __post_init__(self) -> None:
+        self.normal_force, self.normal_slope = normal_law(self.touch, self.compliance, self.dt)
+
+    @property
+    def sliding(self) -> SX:
+        """Velocity of the point in the tangent plane, body axes [m/s], shape (3,)."""
+        n, velocity = self.touch.normal, self.touch.velocity
+        return velocity - ca.dot(n, velocity) * n
+
+    def secant(self) -> ContactResponse:
+        """Linearise about the present velocity, with the slope of sticking scaled into the cone."""
+        cone, slope, x, size = self._trial(SX(3, 1))
+        share = ca.fmin(1, cone / size)
+        return self._response(share * x, share * slope, SX(3, 1), SX(3, 1))
+
+    def tangent(self, gain: SX, slipped: SX) -> ContactResponse:
+        """Linearise about a velocity with the true slope, which is none along the slip.
+
+        Args:
+            gain: What the velocity gained in the pass before, shape (3,) [m/s]; zero in the first.
+            slipped: Direction of slip in the pass before, shape (3,); a contact that turned round in it sticks.
+        """
+        cone, slope, x, size = self._trial(gain)
+        onwards = ca.logic_or(ca.sumsqr(slipped) < 0.5, ca.dot(slipped, x) > cone)
+        slips = ca.logic_and(size > cone, onwards)
+        share = ca.if_else(slips, cone / size, 1)
+        return self._response(share * x, share * slope, ca.if_else(slips, x / size, 0), gain)
+
+    def misjudged(self, gain: SX, slip: SX) -> SX:
+        """Return 1 if a contact taken to slip has turned round, or one taken to stick has left the cone; else 0."""
+        cone, _, x, size = self._trial(gain)
+        slips = ca.sumsqr(slip) > 0.5
+        return ca.if_else(slips, ca.dot(slip, x) < cone, size > (1 + CONE_TOLERANCE) * cone + CONE_FLOOR)
+
+    def anchor_after(self, gain: SX) -> SX:
+        """Return the deflection of the bristle at the end of the step, body axes [m], given the gain in velocity."""
+        c, n, velocity = self.compliance, self.touch.normal, self.touch.velocity + gain
+        cone = ca.if_else(self.normal_slope > 0, c.friction * self.touch.load, 0)
+        s = self.touch.anchor + self.dt * (velocity - ca.dot(n, velocity) * n)
+        return s * ca.fmin(1, cone / (c.bristle * _length(s)))
+
+    def normal_after(self, gain: SX) -> SX:
+        """Return the normal force over the step [N], given the gain in velocity."""
+        return self.normal_force - self.normal_slope * ca.dot(self.touch.normal, self.touch.velocity + gain)
+
+    def _trial(self, gain: SX) -> tuple[SX, SX, SX, SX]:
+        """Return the cone [N], and the slope [N s/m] and force (3,) [N] of a bristle that sticks, with its norm."""
+        c, n, velocity = self.compliance, self.touch.normal, self.touch.velocity + gain
+        cone = ca.if_else(self.normal_slope > 0, c.friction * self.touch.load, 0)
+        slope = cone / c.slip_speed + self.dt * c.bristle
+        x = c.bristle * self.touch.anchor + slope * (velocity - ca.dot(n, velocity) * n)
+        return cone, slope, x, _length(x)
+
+    def _response(self, friction: SX, slope: SX, slip: SX, gain: SX) -> ContactResponse:
+        n = self.touch.normal
+        C = mirrored(slope * SX.eye(3) + (self.normal_slope - slope) * (n @ n.T) - slope * (slip @ slip.T))
+        force = self.normal_after(gain) * n - friction + C @ gain
+        return ContactResponse(force, C, slip, self.touch, self.dt)
+
+
+def _length(x: SX) -> SX:
+    return ca.sqrt(ca.sumsqr(x) + 1e-20)

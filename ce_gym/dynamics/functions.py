@@ -51,7 +51,7 @@ def _forward_dynamics(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     tau = SX.sym("tau", v.shape[0])
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    articulation = inward_inertia_pass(mechanism, kinematics, JointTerms(tau, SX(*tau.shape)), {})
+    articulation = inward_inertia_pass(mechanism, kinematics, JointTerms(tau, SX(tau.numel(), tau.numel())), {})
     vdot, _ = outward_acceleration_pass(mechanism, kinematics, articulation)
     return _function("forward_dynamics", guess, {"q": q, "v": v, "tau": tau}, {"vdot": vdot})
 
@@ -61,7 +61,7 @@ def _forward_dynamics_with_wrenches(mechanism: Mechanism) -> ca.Function:
     tau, wrenches = SX.sym("tau", v.shape[0]), SX.sym("wrenches", 6 * len(mechanism.robot.bodies))
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
     on_bodies, on_joints = external_wrenches(mechanism, kinematics, ca.reshape(wrenches, 6, -1))
-    joints = JointTerms(tau + on_joints, SX(*tau.shape))
+    joints = JointTerms(tau + on_joints, SX(tau.numel(), tau.numel()))
     articulation = inward_inertia_pass(mechanism, kinematics, joints, on_bodies)
     vdot, _ = outward_acceleration_pass(mechanism, kinematics, articulation)
     inputs = {"q": q, "v": v, "tau": tau, "wrenches": wrenches}

@@ -142,6 +142,6 @@ def joint_transform(body: MovingBody, q: SX) -> tuple[Transform, SX]:
     return Transform(axis_rotation(axis, q) @ to_home, constant(body.position)), ca.vertcat(axis, SX(3, 1))
 
 
-def constant(x: np.ndarray) -> SX:
-    """Return a numeric array as a sparse SX, so that its zeros are structural."""
-    return SX(ca.sparsify(ca.DM(x)))
+def constant(x: np.ndarray | SX) -> SX:
+    """Return an array of figures as SX; of numbers as a sparse one, so that its zeros are structural."""
+    return x if isinstance(x, SX) else SX(ca.sparsify(ca.DM(x)))

@@ -21,13 +21,14 @@ import numpy as np
 from ce_gym.compile import Buffer, Call, Program
 from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.scene import StepOptions, state_sizes
 from ce_gym.dynamics.spatial import SX
-from ce_gym.dynamics.step import StepOptions, step_function
 from ce_gym.envs import metrics, observations, rewards, terminations
 from ce_gym.envs.draws import Draws
 from ce_gym.envs.snapshot import Snapshot
 from ce_gym.envs.tasks import Task
 from ce_gym.sim.simulator import select_contacts
+from ce_gym.sim.substeps import substeps
 
 Term = Callable[[Snapshot], SX]
 
@@ -58,7 +59,7 @@ class TaskProgram:
         self.metric_terms = {name: _term(metrics, "metric", name) for name in self.task.metrics}
         self.observation_terms = {name: _term(observations, "observation", name) for name in self.task.observations}
         self.contacts = select_contacts(robot, self.task.contacts)
-        self.options = StepOptions(self.task.dt, "position", self.contacts, robot.material)
+        self.options = StepOptions(self.task.dt, "position", self.contacts, robot.material, self.task.friction)
         self.n_joints = len(robot.independent)
         self.n_feet = sum(contact.group == "foot" for contact in robot.contacts)
 
@@ -71,10 +72,7 @@ class TaskProgram:
     def state_sizes(self) -> dict[str, int]:
         """State buffers of one robot, by name."""
         sizes = {
-            "q": self.model.nq,
-            "v": self.model.nv,
-            "pushed": len(self.contacts),
-            "dependent": len(self.model.guess),
+            **state_sizes(self.model.mechanism, self.options),
             "diverged": 1,
             "torque": self.n_joints,
             "action": self.n_joints,
@@ -109,7 +107,7 @@ class TaskProgram:
     def step_program(self) -> Program:
         """Return act, physics and assess as one program."""
         act, (assess, n_draws) = self._act(), self._assess()
-        physics = step_function(self.model.mechanism, self.options, self._physics_outputs)
+        _, scratch, physics = substeps(self.model.mechanism, self.options, self._physics_outputs)
         buffers = [Buffer(name, size, "tiles") for name, size in self.state_sizes.items()]
         buffers += [
             Buffer("action_in", self.n_joints, "rows_in", "float32"),
@@ -118,15 +116,11 @@ class TaskProgram:
             Buffer("draws", n_draws, "random"),
             Buffer("observation", self.observation_size, "rows_out", "float32"),
             Buffer("outcome", 3, "rows_out", "float64"),
+            *scratch,
         ]
         calls = (
             Call(act, ("action_in",), ("clipped", "target")),
-            Call(
-                physics,
-                tuple(physics.name_in()),
-                (*physics.name_in()[:-1], *self._physics_outputs),
-                repeat="n_substeps",
-            ),
+            *physics,
             Call(assess, tuple(assess.name_in()), self._assess_outputs),
         )
         return Program(f"{self.model.robot.name} {self.model.transmission} environment", tuple(buffers), calls)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Task:
         episode_length: Control steps until time is up.
         contacts: Which contact spheres take part: "all", or names of groups or spheres. Spheres that end the episode
             when they touch the ground need not.
+        friction: "tangent" or "secant", see `ce_gym.Simulator`.
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
     """
 
@@ -46,6 +48,7 @@ class Task:
     n_substeps: int = 4
     episode_length: int = 1000
     contacts: str | tuple[str, ...] = ("foot", "knee")
+    friction: Literal["tangent", "secant"] = "tangent"
     only_positive: bool = True
     reset_noise: Mapping[str, float] = field(
         default_factory=lambda: MappingProxyType({"joint_position": 0.1, "joint_velocity": 0.2, "base_velocity": 0.2})

@@ -113,10 +113,12 @@ def _check_contacts(robot: Robot, file: str) -> None:
         check_finite(file, f"{key}.position", contact.position)
         if not 0.0 <= contact.radius < math.inf:
             raise bad(file, f"{key}.radius", contact.radius, "0 or more [m]")
-    for name in ("stiffness", "damping", "friction"):
+    for name in ("stiffness", "damping", "friction", "bristle", "dissipation"):
         value = getattr(robot.material, name)
-        if not 0.0 <= value < math.inf:
+        if value is not None and not 0.0 <= value < math.inf:
             raise bad(file, f"material.{name}", value, "0 or more")
+    if not 0.0 < robot.material.slip_speed < math.inf:
+        raise bad(file, "material.slip_speed", robot.material.slip_speed, "more than 0 [m/s]")
 
 
 def _check_motors(robot: Robot, file: str) -> None:
@@ -125,9 +127,12 @@ def _check_motors(robot: Robot, file: str) -> None:
     for motor in robot.motors:
         if motor.rotor not in rotors:
             raise unknown(file, "motors", motor.rotor, rotors, "the name of a rotor")
-        for name, value in (("torque", motor.torque), ("velocity", motor.velocity)):
-            if not value >= 0.0:
+        for name in ("torque", "velocity", "stall", "damping", "friction"):
+            value = getattr(motor, name)
+            if value is not None and not value >= 0.0:
                 raise bad(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
+        if motor.velocity == 0.0:
+            raise bad(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
 
 
 def _check_pose_and_gains(robot: Robot, file: str) -> None:

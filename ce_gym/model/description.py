@@ -235,17 +235,23 @@ class ContactSphere:
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """Compliance and friction of a robot's contacts with the ground.
+    """Compliance and friction of a robot's contacts with the ground, figures of each contact sphere.
 
     Attributes:
-        stiffness: Normal stiffness of each contact sphere [N/m].
-        damping: Normal damping of each contact sphere [N s/m].
+        stiffness: Normal stiffness [N/m].
+        damping: Normal damping of Kelvin and Voigt's law [N s/m].
         friction: Coulomb coefficient [-].
+        slip_speed: Speed at which the damping of friction alone carries its full force [m/s].
+        bristle: Tangential stiffness of a contact that sticks [N/m]; 0 lets it creep.
+        dissipation: Normal dissipation of Hunt and Crossley's law [s/m], which then takes the place of damping.
     """
 
     stiffness: float = 5e4
     damping: float = 500.0
     friction: float = 0.8
+    slip_speed: float = 0.1
+    bristle: float = 5e4
+    dissipation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -254,13 +260,19 @@ class Motor:
 
     Attributes:
         rotor: Name of the rotor body.
-        torque: Largest torque at the rotor [N m].
+        torque: Largest torque at the rotor, as the current allows [N m].
         velocity: No-load speed of the rotor [rad/s].
+        stall: Torque at standstill, as the voltage allows, where the torque-speed line starts [N m]; `torque` if None.
+        damping: Viscous friction of the rotor [N m s/rad].
+        friction: Dry friction of the rotor [N m].
     """
 
     rotor: str
     torque: float = float("inf")
     velocity: float = float("inf")
+    stall: float | None = None
+    damping: float = 0.0
+    friction: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,7 @@ class Mechanism:
         tree: Clusters of the robot, including eliminated rotors.
         bodies: The bodies that take part in the recursion, by name, parents first.
         spins: Spins of eliminated or approximated rotors, in each cluster.
+        gravity: Acceleration of free fall in the world [m/s^2], shape (3,).
     """
 
     robot: Robot
@@ -93,6 +94,7 @@ class Mechanism:
     tree: ClusterTree
     bodies: dict[str, MovingBody]
     spins: tuple[tuple[Spin, ...], ...]
+    gravity: Array
 
     def moving(self, cluster: Cluster) -> list[MovingBody]:
         """Return the bodies of a cluster that take part in the recursion, parents first."""
@@ -135,7 +137,7 @@ def build_mechanism(
     spins = tuple(
         tuple(_spin(robot.body(name)) for name in cluster.bodies if name not in kept) for cluster in tree.clusters
     )
-    return Mechanism(robot, level, tree, bodies, spins)  # type: ignore[arg-type]
+    return Mechanism(robot, level, tree, bodies, spins, np.array(robot.gravity))  # type: ignore[arg-type]
 
 
 def is_axisymmetric(rotor: Body) -> bool:

@@ -151,12 +151,12 @@ def _contacts(section: Section, frames: dict[str, Frame]) -> Iterator[ContactSph
 
 def _motors(section: Section) -> Iterator[Motor]:
     for rotor, motor in section.sections():
-        motor.allow("torque", "velocity")
-        yield Motor(rotor, motor.number("torque", float("inf")), motor.number("velocity", float("inf")))
+        motor.allow("torque", "velocity", "stall", "damping", "friction")
+        yield Motor(rotor, **{key: motor.number(key) for key in motor})
 
 
 def _material(section: Section) -> ContactMaterial:
-    section.allow("stiffness", "damping", "friction")
+    section.allow("stiffness", "damping", "friction", "slip_speed", "bristle", "dissipation")
     return ContactMaterial(**{key: section.number(key) for key in section})
 
 

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.compile import Buffer, Call, Kernel, Program, load_kernel
+from ce_gym.compile import Buffer, Kernel, Program, load_kernel
+from ce_gym.dynamics.methods import METHODS
 from ce_gym.dynamics.model import Model
-from ce_gym.dynamics.step import StepOptions, step_function
+from ce_gym.dynamics.parameters import parameter_defaults
+from ce_gym.dynamics.scene import Control, Friction, Motors, StepOptions
+from ce_gym.dynamics.trace import OUTPUTS
 from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
+from ce_gym.sim.substeps import substeps
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
-
-OUTPUTS = ("torque", "contact_forces", "loop_gap", "nearness")
 
 
 class Simulator:
@@ -27,15 +30,22 @@ class Simulator:
     Args:
         model: The robot at a transmission level.
         num_envs: Number of robots.
-        dt: Length of a sub-step [s]; the step is linearly implicit and stable to 10 ms and more.
+        dt: Length of a sub-step [s]; the default method is stable to 10 ms and more.
         dtype: "float64" or "float32" for state and arithmetic.
         num_threads: Threads the robots are split over; results do not depend on it.
         control: What `target` means: "position" for joint positions [rad] through the robot's PD gains, "torque" for
             joint torques [N m].
         contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
         material: Compliance and friction of the contacts; the robot's own if None.
-        outputs: Which of "torque", "contact_forces", "loop_gap" and "nearness" to compute; those left out cost nothing
-            and read as errors.
+        outputs: Which of "torque", "motor_speed", "power", "contact_forces", "error", "loop_gap" and "nearness" to
+            compute; those left out cost nothing and read as errors.
+        method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
+            scenes).
+        friction: "tangent" solves steps with a change from stick to slip twice; "secant" is faster and slow to break
+            away.
+        motors: "ideal" for the joints' torque limits; "limited" for torque, torque-speed line and friction of the
+            motors themselves.
+        parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -53,27 +63,45 @@ class Simulator:
         contacts: str | Sequence[str] = "all",
         material: ContactMaterial | None = None,
         outputs: Sequence[str] = ("torque", "contact_forces"),
+        method: str = "euler",
+        friction: str = "tangent",
+        motors: str = "ideal",
+        parameters: Sequence[str] = (),
     ) -> None:
         _check("num_envs", num_envs, num_envs >= 1, "at least 1")
         _check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
-        _check("dtype", dtype, dtype in ("float64", "float32"), "'float64' or 'float32'")
         _check("num_threads", num_threads, num_threads >= 1, "at least 1")
-        _check("control", control, control in ("position", "torque"), "'position' or 'torque'")
+        _choice("dtype", dtype, ("float64", "float32"))
+        _choice("control", control, get_args(Control))
+        _choice("method", method, tuple(METHODS))
+        _choice("friction", friction, get_args(Friction))
+        _choice("motors", motors, get_args(Motors))
         for name in outputs:
-            _check("outputs", name, name in OUTPUTS, f"any of {', '.join(OUTPUTS)}")
+            _choice("outputs", name, tuple(OUTPUTS))
         self.model, self.num_envs, self.dt = model, num_envs, dt
         self.dtype, self.num_threads = dtype, num_threads
         self.contact_names = select_contacts(model.robot, contacts)
-        self.options = StepOptions(dt, control, self.contact_names, material or model.robot.material)  # type: ignore[arg-type]
-        sizes = {"torque": len(model.joint_links), "contact_forces": 3 * len(self.contact_names)}
-        sizes |= {"loop_gap": 1, "nearness": 1}
-        self._outputs = {name: sizes[name] for name in OUTPUTS if name in outputs and sizes[name] > 0}
-        self._kernel = load_step_kernel(model, self.options, self._outputs, dtype)
+        self.options = StepOptions(
+            dt=dt,
+            control=control,  # type: ignore[arg-type]
+            contacts=self.contact_names,
+            material=material or model.robot.material,
+            friction=friction,  # type: ignore[arg-type]
+            method=method,
+            motors=motors,  # type: ignore[arg-type]
+            parameters=tuple(parameters),
+        )
+        defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
+        self._kernel = load_step_kernel(model, self.options, tuple(name for name in OUTPUTS if name in outputs), dtype)
         self._arrays = {
             name: tiles(num_envs, buffer.size, dtype)
             for name, buffer in self._kernel.buffers.items()
             if buffer.kind == "tiles"
         }
+        ends = np.cumsum([0, *(len(default) for default in defaults.values())])
+        self._columns = {name: slice(*ends[i : i + 2]) for i, name in enumerate(defaults)}
+        if defaults:
+            write_rows(self._arrays["parameters"], np.concatenate(list(defaults.values())))
         self.reset()
 
     def reset(self, mask: ArrayLike | None = None) -> None:
@@ -105,9 +133,11 @@ class Simulator:
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} holds a number that is not finite")
             write_rows(self._arrays[name], np.broadcast_to(value, (self.num_envs, size)), chosen)
-        for name in ("pushed", "diverged"):
-            if name in self._arrays:
-                write_rows(self._arrays[name], np.zeros(self._arrays[name].shape[1]), chosen)
+        zeros = {name: np.zeros(self._arrays[name].shape[1]) for name in ("anchor", "diverged") if name in self._arrays}
+        if self.contact_names:
+            zeros["load"] = self._resting_load(q)
+        for name, rows in zeros.items():
+            write_rows(self._arrays[name], np.broadcast_to(rows, (self.num_envs, rows.shape[-1])), chosen)
         if "dependent" in self._arrays:
             guess = self.model.dependent_guess(q)
             write_rows(self._arrays["dependent"], np.broadcast_to(guess, (self.num_envs, guess.shape[-1])), chosen)
@@ -134,6 +164,32 @@ class Simulator:
             repeats={"n_substeps": n_substeps},
             num_threads=self.num_threads,
         )
+
+    def set_parameter(self, name: str, value: ArrayLike, mask: ArrayLike | None = None) -> None:
+        """Set a figure that was declared in `parameters`.
+
+        Args:
+            name: "gravity", "friction", "stiffness", "damping", "kp", "kd", "motor_strength", "rotor_inertia",
+                "added_mass:BODY" or "com_shift:BODY"; sizes and units are in `ce_gym.dynamics.parameters.PARAMETERS`.
+            value: Shape (num_envs, size) or (size,) or ().
+            mask: Which robots, bool, shape (num_envs,); all of them if None.
+
+        Raises:
+            ValueError: If the parameter was not declared, or a shape is wrong.
+        """
+        if name not in self._columns:
+            declared = ", ".join(self._columns) or "none"
+            raise ValueError(
+                f"parameter {name!r}; expected one of those declared with Simulator(..., parameters=): {declared}"
+            )
+        rows = read_rows(self._arrays["parameters"], self.num_envs)
+        columns = self._columns[name]
+        size = columns.stop - columns.start
+        new = np.asarray(value, dtype=float)
+        if new.shape not in ((), (size,), (self.num_envs, size)) or not np.isfinite(new).all():
+            raise ValueError(f"{name} has shape {new.shape}; expected ({size},) or ({self.num_envs}, {size}), finite")
+        rows[:, columns] = new
+        write_rows(self._arrays["parameters"], rows, None if mask is None else np.asarray(mask, dtype=bool))
 
     @property
     def q(self) -> NDArray:
@@ -163,6 +219,21 @@ class Simulator:
         return self._read("contact_forces").reshape(self.num_envs, -1, 3)
 
     @property
+    def motor_speed(self) -> NDArray:
+        """Speeds of the motors' rotors at the end of the last sub-step [rad/s], shape (num_envs, n_motors)."""
+        return self._read("motor_speed")
+
+    @property
+    def power(self) -> NDArray:
+        """Mechanical power of the motors at the joints, end of the last sub-step [W], shape (num_envs, nj)."""
+        return self._read("power")
+
+    @property
+    def error(self) -> NDArray:
+        """Estimated error of the last sub-step in `v`, of methods that have one [rad/s or m/s], shape (num_envs,)."""
+        return self._read("error")[:, 0]
+
+    @property
     def loop_gap(self) -> NDArray:
         """Norm of the residuals of the closed loops, start of the last sub-step [m or -], shape (num_envs,)."""
         return self._read("loop_gap")[:, 0]
@@ -171,6 +242,13 @@ class Simulator:
     def nearness(self) -> NDArray:
         """Distance from a singularity, see `Model.nearness`, start of the last sub-step, shape (num_envs,)."""
         return self._read("nearness")[:, 0]
+
+    def _resting_load(self, q: ArrayLike) -> NDArray:
+        """Return the springs' forces on the contacts [N], shape (..., n_contacts): what friction has to go by."""
+        chosen = [self.model.contact_names.index(name) for name in self.contact_names]
+        radius = np.array([self.model.robot.contacts[i].radius for i in chosen])
+        centres, _ = self.model.contact_points(q, np.zeros(self.model.nv))
+        return self.options.material.stiffness * np.maximum(radius - centres[..., chosen, 2], 0)
 
     def _read(self, name: str) -> NDArray:
         if name not in self._arrays:
@@ -205,27 +283,28 @@ def model_key(model: Model) -> str:
     return f"{figures!r} {model.transmission} {model.locked_rotors} {model.eliminated} {traced}"
 
 
-def load_step_kernel(model: Model, options: StepOptions, outputs: dict[str, int], dtype: str) -> Kernel:
+def load_step_kernel(model: Model, options: StepOptions, outputs: tuple[str, ...], dtype: str) -> Kernel:
     """Compile, or load from the cache, the kernel that repeats a sub-step.
 
     Args:
         model: The robot at a transmission level.
         options: The scene.
-        outputs: Sizes of the optional outputs to compute, by name.
+        outputs: What to compute besides the state.
         dtype: "float64" or "float32".
     """
 
     def build() -> Program:
-        nj = len(model.joint_links)
-        sizes = {"q": model.nq, "v": model.nv, "pushed": len(options.contacts)}
-        sizes |= {"dependent": len(model.guess), "diverged": 1} | outputs
-        sizes = {name: size for name, size in sizes.items() if size}
-        buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()] + [Buffer("target", nj, "rows_in")]
-        function = step_function(model.mechanism, options, tuple(outputs))
-        call = Call(function, tuple(function.name_in()), tuple(sizes), repeat="n_substeps")
-        return Program(f"{model.robot.name} {model.transmission} step", tuple(buffers), (call,))
+        sizes, scratch, steps = substeps(model.mechanism, options, outputs)
+        joints = sizes.pop("target", 0)
+        buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()]
+        buffers += [Buffer("target", joints, "rows_in")] if joints else []
+        return Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + scratch), steps)
 
     return load_kernel(f"step {model_key(model)} {options!r} {outputs!r}", build, dtype)
+
+
+def _choice(argument: str, value: object, choices: tuple[str, ...]) -> None:
+    _check(argument, value, value in choices, " or ".join(repr(choice) for choice in choices))
 
 
 def _check(argument: str, value: object, valid: bool, expected: str) -> None:

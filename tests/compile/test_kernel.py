@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ce_gym.compile import Buffer, Call, Program, aligned_zeros, lane_count, load_kernel
+from ce_gym.compile import Buffer, Call, Program, Repeat, aligned_zeros, lane_count, load_kernel
 
 DTYPES = ["float64", "float32"]
 
@@ -31,7 +31,7 @@ def pipeline():
     )
     calls = (
         Call(mix, ("action", "noise"), ("work",)),
-        Call(step, ("state", "work"), ("state",), "n_substeps"),
+        Repeat("n_substeps", (Call(step, ("state", "work"), ("state",)),)),
         Call(observe, ("state", "work"), ("observation", "reward")),
     )
     return Program("pipeline", buffers, calls, skip_unless="awake")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.contact import SLIP_SPEED
-from ce_gym.dynamics.step import StepOptions, step_function
+from ce_gym.dynamics.scene import StepOptions, state_sizes
+from ce_gym.dynamics.trace import step_function
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.model.mechanism import LEVELS
 
@@ -18,34 +18,46 @@ ALL = "all"
 
 
 def stepper(model: Model, dt: float = 0.005, **options):
-    contacts = options.pop("contacts", ALL)
+    contacts, start = options.pop("contacts", ALL), options.pop("start", None)
     names = model.contact_names if contacts == ALL else contacts
     material = options.pop("material", model.robot.material)
     scene = StepOptions(dt, contacts=names, material=material, **options)
     function = step_function(model.mechanism, scene, ("torque", "contact_forces"))
 
-    memory = {"pushed": np.zeros(len(names))}  # carried from step to step, as the simulator does
+    sizes = state_sizes(model.mechanism, scene)
+    memory = {
+        name: np.zeros(sizes[name]) for name in ("load", "anchor") if name in sizes
+    }  # as the simulator carries it
+    memory |= {name: np.asarray(value, float) for name, value in (start or {}).items()}
 
     def step(q, v, target, diverged=0.0):
-        state = [q, v, memory["pushed"], diverged] if names else [q, v, diverged]
-        results = dict(zip(function.name_out(), function.call([*state, target]), strict=True))
-        if names:
-            memory["pushed"] = results.pop("pushed_next")
-        return [np.array(x.full()).ravel() for x in results.values()]
+        given = {"q": q, "v": v, **memory, "diverged": diverged} | ({"target": target} if len(target) else {})
+        results = function(**given)
+        for name in memory:
+            memory[name] = results.pop(f"{name}_next").full()
+        order = [name for name in function.name_out() if name in results]
+        return [results[name].full().ravel() for name in order]
 
     return step
 
 
+@pytest.mark.parametrize("bristle", [0.0, 2e4])
+@pytest.mark.parametrize("dissipation", [None, 5.0])
 @pytest.mark.parametrize("level", LEVELS)
-def test_step_equals_a_dense_solve(level: str, random_state):
+def test_step_equals_a_dense_solve(level: str, dissipation: float | None, bristle: float):
     """(M + dt J^T C J + slope) vdot = tau - bias + J^T (f0 - dt C Jdot v), assembled in numpy from its parts."""
-    model, dt, material = Model("mini_cheetah", level), 0.004, ContactMaterial(3e4, 200.0, 0.7)
+    model, dt = Model("mini_cheetah", level), 0.004
+    material = ContactMaterial(3e4, 0.0 if dissipation else 200.0, 0.7, 0.05, bristle, dissipation)
     rng = np.random.default_rng(5)
     q, v = model.standing_q.copy(), rng.normal(0, 0.3, model.nv)
     q[2] -= 0.003
     q[7:] += rng.normal(0, 0.02, 12)
     target = q[7:] + rng.normal(0, 0.05, 12)
-    _, v_next, _, torque, forces = stepper(model, dt, material=material)(q, v, target)
+    loads = rng.uniform(5, 40, len(model.contact_names))
+    anchors = rng.normal(0, 2e-4, (len(loads), 2))
+    start = {"load": loads} | ({"anchor": anchors.ravel()} if bristle else {})
+    step = stepper(model, dt, material=material, friction="secant", start=start)
+    _, v_next, _, torque, forces = step(q, v, target)
 
     robot = model.robot
     A, b = model.mass_matrix(q), -model.bias_force(q, v)
@@ -55,7 +67,10 @@ def test_step_equals_a_dense_solve(level: str, random_state):
     b[joints] += kp * (target - q[7:]) - (kd + dt * kp) * v[6:] - damping * v[6:]
     A[joints, joints] += dt * (kd + dt * kp + damping)
     expected_forces = []
-    parts = [contact_parts(model, sphere, q, v, dt, material) for sphere in robot.contacts]
+    parts = [
+        contact_parts(model, sphere, q, v, dt, material, load, anchor)
+        for sphere, load, anchor in zip(robot.contacts, loads, anchors, strict=True)
+    ]
     for J, Jdot_v, f0, C in parts:
         A += dt * J.T @ C @ J
         b += J.T @ (f0 - dt * C @ Jdot_v)
@@ -69,20 +84,27 @@ def test_step_equals_a_dense_solve(level: str, random_state):
     np.testing.assert_allclose(torque, kp * (target - q[7:]) - (kd + dt * kp) * (v[6:] + dt * vdot[6:]), atol=1e-9)
 
 
-def contact_parts(model: Model, sphere: ContactSphere, q, v, dt: float, material: ContactMaterial):
+def contact_parts(model: Model, sphere: ContactSphere, q, v, dt: float, material: ContactMaterial, load, anchor):
     """World-frame J, Jdot v, force at zero acceleration and effective damping of one sphere, by numpy."""
     lowest = sphere_bottom(model, sphere, q)
     world_point, J = point_jacobian(model, sphere.body, lowest, q)
     Jdot_v = point_bias(model, sphere.body, lowest, q, v)
     velocity, n = J @ v, np.array([0.0, 0.0, 1.0])
-    depth, normal_slope = -world_point[2], material.damping + dt * material.stiffness
-    push = material.stiffness * depth - normal_slope * velocity[2]
-    if depth - dt * velocity[2] <= 0 or push <= 0:
+    depth, k, up = -world_point[2], material.stiffness, velocity[2]
+    if material.dissipation is None:
+        normal_slope, push = material.damping + dt * k, k * depth - (material.damping + dt * k) * up
+    else:  # lam(depth, rate) = k depth (1 + h rate), expanded about the present and taken one step ahead
+        h = material.dissipation
+        normal_slope = k * h * max(depth, 0.0) + dt * k * (1 - h * up)
+        push = k * (1 - h * up) * (depth - dt * up)
+    if not (depth - dt * up > 0 and push > 0) and not (depth > 0 and load > 0):
         return J, Jdot_v, np.zeros(3), np.zeros((3, 3))
-    slip = velocity - velocity[2] * n
-    tangent_slope = material.friction * push / np.sqrt(slip @ slip + SLIP_SPEED**2)
-    C = normal_slope * np.outer(n, n) + tangent_slope * (np.eye(3) - np.outer(n, n))
-    return J, Jdot_v, push * n - tangent_slope * slip, C
+    slip, cone = velocity - up * n, material.friction * load
+    slope = cone / material.slip_speed + dt * material.bristle
+    trial = material.bristle * (np.array([*anchor, 0.0]) if material.bristle else 0.0) + slope * slip
+    share = min(1.0, cone / np.linalg.norm(trial))
+    C = normal_slope * np.outer(n, n) + share * slope * (np.eye(3) - np.outer(n, n))
+    return J, Jdot_v, push * n - share * trial, C
 
 
 def sphere_bottom(model: Model, sphere: ContactSphere, q) -> np.ndarray:

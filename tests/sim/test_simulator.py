@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator
-from ce_gym.dynamics.step import step_function
+from ce_gym.dynamics.trace import step_function
 from ce_gym.model import ContactMaterial
 from ce_gym.model.mechanism import LEVELS
 
@@ -42,7 +42,8 @@ def test_kernel_follows_the_traced_step(level: str, start):
     function = step_function(model.mechanism, sim.options, ("torque", "contact_forces"))
     q, v, target = start
     for i in (0, 7, 39):
-        state = (q[i], v[i], np.zeros(len(sim.contact_names)), 0.0)
+        n = len(sim.contact_names)
+        state = (q[i], v[i], sim._resting_load(q[i]), np.zeros(2 * n), 0.0)
         for _ in range(10):
             *state, torque, forces = function(*state, target[i])
         np.testing.assert_allclose(sim.q[i], np.array(state[0]).ravel(), rtol=1e-9, atol=1e-9)
@@ -124,7 +125,7 @@ def test_dropped_robots_come_to_rest(model: Model, dt: float, stiffness: float, 
         ({"control": "velocity"}, "control='velocity'; expected 'position' or 'torque'"),
         ({"contacts": "hand"}, "contacts='hand'; expected 'all', groups or names among"),
         ({"contacts": ["nose"]}, "contacts='nose'; expected 'all', groups or names among"),
-        ({"outputs": ("smell",)}, "outputs='smell'; expected any of torque, contact_forces"),
+        ({"outputs": ("smell",)}, "outputs='smell'; expected 'torque' or 'motor_speed'"),
     ],
 )
 def test_bad_arguments(model: Model, arguments: dict, message: str):

@@ -1,0 +1,123 @@
+"""A time step as a traced function: state in, state out, a robot that has gone astray frozen where it was.
+
+May know everything in this room.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from ce_gym.dynamics.actuation import actuated_clusters
+from ce_gym.dynamics.closure import closures
+from ce_gym.dynamics.functions import loop_gap, loop_state, traced
+from ce_gym.dynamics.kinematics import Kinematics, outward_velocity_pass
+from ce_gym.dynamics.methods import METHODS
+from ce_gym.dynamics.parameters import parameter_defaults
+from ce_gym.dynamics.scene import State, StepOptions, make_scene, symbolic_state
+from ce_gym.dynamics.spatial import SX
+from ce_gym.dynamics.step import Stepped, attempt, stacked
+from ce_gym.model.mechanism import Mechanism
+
+LOST_LOOP = 1e-5
+"""A robot with a loop whose residual is larger has diverged [m]."""
+SINGULAR = 1e-3
+"""A robot whose loops are nearer than this to a singularity (see `Model.nearness`) has diverged."""
+SANE_SPEED = 1e4
+"""A robot any of whose velocities is beyond this, or not a number, has diverged [rad/s or m/s]."""
+
+
+def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
+    """Trace a step.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+        outputs: Names among `OUTPUTS`; what is not asked for costs nothing.
+
+    Returns:
+        Function (*state, diverged, *given) -> (*state, diverged, *outputs): `state` are the parts of `State` that the
+        scene has; `given` is `target` if there are joints, `parameters` if any are declared, and `ground` on a field.
+    """
+    given = _Given(mechanism, options)
+    method = METHODS[options.method]
+    stepped = method.step(given.scene, given.state, given.target, options.dt)
+    return traced("step", given.inputs(), given.results(stepped, outputs))
+
+
+def attempt_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
+    """Trace one attempt at an Euler step: called again with the hints it leaves, where it says so, it makes the step.
+
+    Returns:
+        Function (*state, diverged, *given, hints) -> (*state, diverged, hints, misjudged, *outputs), see
+        `step_function`; hints are zero at first, shape (6 n_contacts,).
+    """
+    given, hints = _Given(mechanism, options), SX.sym("hints", 6, len(options.contacts))
+    stepped = attempt(given.scene, given.state, given.target, options.dt, hints)
+    results = given.results(stepped, outputs)
+    kept = {name: results.pop(name) for name in list(results) if name.endswith("_next")}
+    kept |= {"hints_next": ca.vec(stepped.hints), "misjudged": stepped.misjudged}
+    return traced("attempt", given.inputs() | {"hints": ca.vec(hints)}, kept | results)
+
+
+OUTPUTS = {
+    "torque": "motor torque at each joint, mean over the step [N m or N]",
+    "motor_speed": "speed of each motor's rotor at the end of the step [rad/s]",
+    "power": "mechanical power of the motors at each joint, end of the step [W]",
+    "contact_forces": "force on each contact, mean over the step, world axes [N]",
+    "error": "estimated error of the step in the velocities, of methods that have one [rad/s or m/s]",
+    "loop_gap": "norm of the residuals of the closed loops, start of the step [m or -]",
+    "nearness": "distance from a singularity, see `Model.nearness`, start of the step",
+}
+"""What a step can report, if asked."""
+
+
+class _Given:
+    """Symbols of one robot before a step, and what becomes of them."""
+
+    def __init__(self, mechanism: Mechanism, options: StepOptions) -> None:
+        robot, n = mechanism.robot, len(options.contacts)
+        self.mechanism = mechanism
+        self.state, self.diverged = symbolic_state(mechanism, options), SX.sym("diverged")
+        self.target = SX.sym("target", len(robot.independent))
+        defaults = parameter_defaults(robot, options.material, options.parameters)
+        self.parameters = SX.sym("parameters", sum(len(default) for default in defaults.values()))
+        self.ground = SX.sym("ground", 3, n if options.ground == "field" else 0)
+        self.scene = make_scene(mechanism, options, self.parameters, self.ground)
+
+    def inputs(self) -> dict[str, SX]:
+        given = {"target": self.target, "parameters": self.parameters, "ground": ca.vec(self.ground)}
+        given = {name: value for name, value in given.items() if value.numel()}
+        return dict(self.state.items()) | {"diverged": self.diverged} | given
+
+    def results(self, stepped: Stepped, outputs: tuple[str, ...]) -> dict[str, SX]:
+        """State after the step, or as it was if the robot has diverged now or before, and outputs."""
+        after = stepped.state
+        sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, self.diverged < 0.5)  # false if it is not a number
+        if any(closures(self.mechanism)):
+            sane = ca.logic_and(sane, loops_close(self.mechanism, stepped.solved.kinematics, after))
+        results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in self.state.items()}
+        results["diverged_next"] = ca.if_else(sane, 0, 1)
+        return results | {name: ca.vec(self._output(name, stepped)) for name in outputs}
+
+    def _output(self, name: str, stepped: Stepped) -> SX:
+        n = self.target.numel()
+        yd = stepped.state.v[stepped.state.v.numel() - n :]
+        kinematics = stepped.solved.kinematics
+        if name == "motor_speed":
+            return stacked([W @ yd[rows] for rows, W, _ in actuated_clusters(self.scene, kinematics)])
+        if name == "power":
+            return stepped.torque * yd
+        if name == "loop_gap":
+            return loop_gap(self.mechanism, kinematics)
+        return loop_state(kinematics)[1] if name == "nearness" else getattr(stepped, name)
+
+
+def loops_close(mechanism: Mechanism, before: Kinematics, after: State) -> SX:
+    """Return 1 if all closed loops can be assembled at the end of a step, away from singularities; else 0.
+
+    A singularity where branches meet could be stepped over; being halfway to it within one step counts as being there.
+    """
+    still = SX(*after.v.shape)
+    gap, nearness = loop_state(outward_velocity_pass(mechanism, after.q, still, after.dependent))
+    away = ca.logic_and(nearness > SINGULAR, nearness > loop_state(before)[1] / 2)
+    return ca.logic_and(gap < LOST_LOOP, away)
