@@ -16,9 +16,12 @@ import numpy as np
 from mujoco import rollout
 from numpy.typing import NDArray
 
-from ce_gym.model.description import Robot
+from ce_gym.model.description import LinearConstraint, Robot
+from ce_gym.model.errors import RobotError
+from ce_gym.model.joint_ties import joint_ties
 from ce_gym.model.mechanism import build_mechanism
-from ce_gym.model.mjcf_export import joint_ties, mass_properties, quaternion, to_mjcf
+from ce_gym.model.mjcf_export import SMALLEST_INERTIA, mass_properties, to_mjcf
+from ce_gym.model.mjcf_text import quaternion
 
 Array = NDArray[np.float64]
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -48,7 +51,7 @@ def load(
         _, _, inertia = mass_properties(moving.inertia)
         moments, axes = np.linalg.eigh(inertia)
         axes *= np.sign(np.linalg.det(axes))
-        model.body(moving.name).inertia[:] = moments
+        model.body(moving.name).inertia[:] = np.maximum(moments, SMALLEST_INERTIA)
         model.body(moving.name).iquat[:] = quaternion(axes)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
@@ -70,7 +73,14 @@ class Coordinates:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, robot: Robot) -> Coordinates:
-        """Read the order of joints from a compiled model."""
+        """Read the order of joints from a compiled model.
+
+        Raises:
+            RobotError: The robot has closed loops, whose coordinates are no linear map of the independent ones.
+        """
+        loops = [tie.name for tie in robot.constraints if not isinstance(tie, LinearConstraint)]
+        if loops:
+            raise RobotError(f"{robot.name}: constraint {loops[0]!r}: expected only linear ones for this comparison")
         names = [model.joint(i).name for i in range(model.njnt)]
         if robot.floating:
             names = names[1:]

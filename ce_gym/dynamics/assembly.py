@@ -84,6 +84,7 @@ class Assembler:
         self.appears = set(np.flatnonzero(pattern.any(axis=0)).tolist())
         self.independent = [cluster.bodies.index(name) for name in cluster.independent]
         self.dependent = [i for i in range(self.n) if i not in self.independent]
+        self.unit = self._units()
 
     def assemble(self) -> Assembly:
         """Return the cluster at its reference pose.
@@ -109,10 +110,23 @@ class Assembler:
         names = ", ".join(tie.name for tie in self.cluster.constraints)
         return RobotError(f"{self.robot.source or self.robot.name}: the cluster tied by {names} {problem}")
 
+    def _units(self) -> Array:
+        """Units of the coordinates [rad or m], shape (n,): in theirs, rotors move about as fast as what they drive.
+
+        That makes steps and condition numbers those of the loops, whatever the gear ratios are.
+        """
+        unit = np.ones(self.n)
+        for i in set(range(self.n)) - self.appears:
+            rows = self.A[self.A[:, i] != 0.0]
+            unit[i] = max((float(np.abs(row).max() / abs(row[i])) for row in rows), default=1.0)
+        return unit
+
     def _all(self, q: Array) -> tuple[Array, Array]:
-        """Residual and Jacobian of all rows, linear ones first."""
+        """Residual of all rows, linear ones first, and their Jacobian by the coordinates in their units."""
         phi, K = (np.array(out.full()) for out in self.evaluate.call([ca.DM(q)]))
-        return np.concatenate([self.A @ q - self.b, phi[:, 0]]), np.vstack([self.A, K])
+        scale = np.abs(self.A).max(axis=1, initial=0.0)
+        linear = (self.A @ q - self.b) / scale
+        return np.concatenate([linear, phi[:, 0]]), np.vstack([self.A / scale[:, None], K]) * self.unit
 
     def _close(self, q: Array, free: list[int]) -> tuple[Array, float]:
         """Move the coordinates `free` until the constraints are met, by a damped Gauss-Newton iteration."""
@@ -122,7 +136,7 @@ class Assembler:
             if np.abs(phi).max() < 1e-15:
                 break
             step = -np.linalg.lstsq(K[:, free], phi, rcond=1e-10)[0]
-            q[free] += step * min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
+            q[free] += self.unit[free] * step * min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
         return q, float(np.abs(self._all(q)[0]).max())
 
     def _start(self) -> Array:
@@ -132,7 +146,8 @@ class Assembler:
     def _independent_rows(self, q: Array) -> tuple[int, ...]:
         """Find rows that are not implied by others, in configurations around the reference pose that meet them all."""
         rng = np.random.default_rng(0)
-        moved = [self._close(q + rng.uniform(-_SPREAD, _SPREAD, self.n), list(range(self.n))) for _ in range(_SAMPLES)]
+        spread = self.unit * rng.uniform(-_SPREAD, _SPREAD, (_SAMPLES, self.n))
+        moved = [self._close(q + sample, list(range(self.n))) for sample in spread]
         Ks = [self._all(valid)[1] for valid, gap in moved if gap < CLOSED]
         if not Ks:
             raise self._error("does not close at the standing pose, nor near it: expected `pose` and `assembly` near")

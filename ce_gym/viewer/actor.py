@@ -81,6 +81,13 @@ class Actor:
         """Radius of a ball around the robot in its first frame [m]."""
         return max(float(np.linalg.norm(self.high - self.low)) / 2, 0.05)
 
+    @property
+    def middle(self) -> Array:
+        """What the camera follows [m], shape (F, 2): the base, or the middle of a robot whose base is fixed."""
+        if self.robot.floating:
+            return self.positions[:, 0, :2]
+        return np.tile((self.low + self.high)[:2] / 2, (len(self.times), 1))
+
     def clips(self, end: float) -> Iterator[Command]:
         """Animate every body against its parent until `end` [s]."""
         paths = body_paths(self.robot, self.path)

@@ -93,8 +93,8 @@ def _stage(actors: list[Actor], spacing: float) -> Iterator[Command]:
 
 
 def _follow(actors: list[Actor], end: float) -> Command:
-    """Move the world against the robots' mean path, so that they stay before the camera."""
+    """Move the world against the mean path of the robots' middles, so that they stay before the camera."""
     times = max((actor.times for actor in actors), key=len)
-    paths = [[np.interp(times, actor.times, actor.positions[:, 0, axis]) for axis in (0, 1)] for actor in actors]
+    paths = [[np.interp(times, actor.times, actor.middle[:, axis]) for axis in (0, 1)] for actor in actors]
     centre = smooth(np.mean(paths, 0).T, times, FOLLOW_SECONDS)
     return tracks.moving(ROOT, times, end, {"position": np.column_stack([-centre, np.zeros(len(times))])})

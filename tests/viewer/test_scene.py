@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ce_gym.model.description import ContactSphere
-from ce_gym.viewer import ViewerError, three, tracks
+from ce_gym.viewer import Rollout, ViewerError, three, tracks
 from ce_gym.viewer.arrows import HIDDEN
 from ce_gym.viewer.scene import ROOT, build_scene
 from ce_gym.viewer.stand_ins import frame_along, rotor_discs
@@ -105,6 +105,16 @@ def test_the_world_moves_against_the_robot(scene: list[dict]) -> None:
     shift, rollout = clips_of(scene)[ROOT]["position"], make_rollout()
     np.testing.assert_allclose(shift[:, :2], -rollout.q[:, :2], atol=1e-9)  # it walks straight ahead
     assert not shift[:, 2].any()
+
+
+def test_a_robot_with_a_fixed_base_is_in_the_middle_of_the_picture() -> None:
+    from ce_gym.dynamics import Model
+
+    model = Model("four_bar")
+    q = np.tile(model.standing_q, (3, 1))
+    rollout = Rollout("four_bar", "exact", 0.02, 0.02 * np.arange(3), q, np.zeros((3, 1)))
+    shift = clips_of(build_scene([rollout], [model]))[ROOT]["position"]
+    np.testing.assert_allclose(shift[:, :2], [[-0.5, -0.25]] * len(shift), atol=0.02)  # a bar of 1 m, arms of 0.5 m
 
 
 def test_all_clips_last_equally_long() -> None:
