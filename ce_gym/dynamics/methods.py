@@ -28,7 +28,10 @@ class Method(Protocol):
         order: Its global error is of this order in the step length, where the motion is smooth.
     """
 
-    order: int
+    @property
+    def order(self) -> int:
+        """See above."""
+        ...
 
     def step(self, scene: Scene, state: State, target: SX, dt: float) -> Stepped:
         """Advance one robot by `dt` [s], the target held constant."""
