@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from ce_gym.bench.report import Cell, Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import LinearConstraint, load_robot, robots
+from ce_gym.model.mechanism import is_axisymmetric
 
 LEVELS = ("exact", "coupled", "armature", "none")
 FUNCTIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix")
@@ -37,6 +38,7 @@ LIBRARY = {
     "mini_cheetah": LibraryCount(11133, 7222),
     "mit_humanoid": LibraryCount(21115, 12334),
     "mit_humanoid_leg": LibraryCount(2931, None),
+    "jvrc1": LibraryCount(27534, 14941),
 }
 
 
@@ -58,8 +60,7 @@ def run(arguments: argparse.Namespace) -> Report:
             library = LIBRARY[robot.name]
             share = library.exact / library.approximate if library.approximate else None
             rows.append((robot.name, "the paper's library", library.exact, None, None, share))
-        exact = Model(robot).mechanism
-        if any(rotor.name in exact.bodies for rotor in robot.rotors()):
+        if not all(is_axisymmetric(rotor) for rotor in robot.rotors()):
             report.remarks.append(f"{robot.name}: not all rotors are symmetric about their axes, so no bar is set.")
             continue
         cost = counts["exact"][0] / counts["armature"][0]

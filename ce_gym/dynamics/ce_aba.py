@@ -14,7 +14,8 @@ pure couple). With `thd = G_r yd`, `a_c = X_c a + S_c ydd + z_c` it adds
     D += G_r^T J G_r + S_c^T h G_r + (S_c^T h G_r)^T     U += X_c^T h G_r
     u -= G_r^T (J g_r + h^T z_c) + S_c^T f               p += X_c^T f,   f = h g_r + v_c x* h thd
 
-where S_c and z_c vanish if c is the output body. May know kinematics, spatial algebra and mechanisms.
+where S_c and z_c vanish if c is the output body. A rotor that is not symmetric adds a little more to its carrier and to
+u, see rotors.py. May know kinematics, spatial algebra and mechanisms.
 """
 
 from __future__ import annotations
@@ -26,7 +27,16 @@ import numpy as np
 
 from ce_gym.dynamics.constraints import ClusterCoordinates
 from ce_gym.dynamics.kinematics import Kinematics, constant, is_free
-from ce_gym.dynamics.spatial import SX, Transform, cross, cross_force, mirrored, solve_positive_definite
+from ce_gym.dynamics.rotors import lateral_inertia
+from ce_gym.dynamics.spatial import (
+    SX,
+    Transform,
+    cross,
+    cross_force,
+    mirrored,
+    solve_positive_definite,
+    symmetric_blocks,
+)
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, snapped
 
@@ -102,10 +112,11 @@ def inward_inertia_pass(
             base = cluster.bodies[0]
             articulation.base = IA[base], joints.tau[rows] - pA[base]
             continue
+        lateral_bias = _add_lateral_inertias(mechanism, kinematics, k, IA, pA)
         handle = _handle_body(mechanism, cluster, mechanism.spins[k])
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
         D = mirrored(condensed.D + joints.slope[rows, rows])
-        U, u = condensed.U, joints.tau[rows] - condensed.bias
+        U, u = condensed.U, joints.tau[rows] - condensed.bias - lateral_bias
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
         articulation.handle_body[k] = handle.name if handle else None
         if cluster.output_body is None:
@@ -117,6 +128,23 @@ def inward_inertia_pass(
         IA[cluster.output_body] += X.inertia_to_parent(Ia)
         pA[cluster.output_body] += X.force_to_parent(pa)
     return articulation
+
+
+def _add_lateral_inertias(
+    mechanism: Mechanism, kinematics: Kinematics, k: int, IA: dict[str, SX], pA: dict[str, SX]
+) -> SX:
+    """Add the lateral inertia of a cluster's rotors to their carriers, in place; return the cluster's bias, (d,)."""
+    bias = SX(len(kinematics.rows[k]), 1)
+    coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
+    for spin in mechanism.spins[k]:
+        if spin.carrier is not None:
+            row = coordinates.index[spin.rotor]
+            w = kinematics.bodies[spin.carrier].v[:3]
+            lateral = lateral_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
+            IA[spin.carrier] += symmetric_blocks(lateral.inertia, SX(3, 3), SX(3, 3))
+            pA[spin.carrier] += ca.vertcat(lateral.couple, SX(3, 1))
+            bias += coordinates.G[row, :].T * lateral.torque
+    return bias
 
 
 def outward_acceleration_pass(
@@ -257,21 +285,22 @@ class _Condenser:
         if level == "armature":
             condensed.D += ca.diag(J * ca.vec(G_r) ** 2)
             return
-        condensed.D += J * (G_r.T @ G_r)
+        momentum = J * G_r  # products in this order are shared between D, U and the biases
+        condensed.D += momentum.T @ G_r
         condensed.bias += G_r.T * (J * g_r)
         if level == "coupled":
             return
         axis, w = self._spin_frame(spin)
-        h = ca.vertcat(J * axis, SX(3, 1))
-        f = ca.vertcat(J * axis * g_r + cross(w, J * axis) * thd, SX(3, 1))
+        couple = ca.vertcat(axis, SX(3, 1))  # h = J couple
+        f = ca.vertcat(axis * (J * g_r) + cross(w, axis * (J * thd)), SX(3, 1))
         if spin.carrier in self.inside:
             carrier = self.inside[spin.carrier]
-            condensed.bias += G_r.T * ca.dot(h, zeta[spin.carrier])
-            h, coupling = self._to_handle(carrier, h)
+            condensed.bias += momentum.T * ca.dot(couple, zeta[spin.carrier])
+            couple, coupling = self._to_handle(carrier, couple)
             f, torques = self._to_handle(carrier, f)
-            condensed.D += G.T @ coupling @ G_r + (G.T @ coupling @ G_r).T
+            condensed.D += G.T @ coupling @ momentum + (G.T @ coupling @ momentum).T
             condensed.bias += G.T @ torques
-        condensed.U += h @ G_r
+        condensed.U += couple @ momentum
         condensed.force += f
 
     def _spin_frame(self, spin: Spin) -> tuple[SX, SX]:

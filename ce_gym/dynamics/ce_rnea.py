@@ -2,8 +2,8 @@
 
 Bodies are visited one by one: accelerations base to tip, forces tip to base, and the cluster's constraint Jacobian
 projects the spanning torques, `tau_y = G^T tau_span`. A rotor's spin adds the couple `h thdd + v_c x* h thd` to its
-carrier and `G_r^T (J thdd + h^T a_c)` to the torques; see ce_aba.py for the symbols. May know kinematics and spatial
-algebra.
+carrier and `G_r^T (J thdd + h^T a_c)` to the torques, see ce_aba.py for the symbols; for that of rotors that are not
+symmetric see rotors.py. May know kinematics and spatial algebra.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import casadi as ca
 from ce_gym.dynamics.ce_aba import gravity_acceleration
 from ce_gym.dynamics.constraints import ClusterCoordinates
 from ce_gym.dynamics.kinematics import Kinematics, constant, is_free
+from ce_gym.dynamics.rotors import lateral_inertia
 from ce_gym.dynamics.spatial import SX, cross, cross_force
 from ce_gym.model.mechanism import Mechanism
 
@@ -75,9 +76,11 @@ def inward_force_pass(
                 row, J = coordinates.index[spin.rotor], spin.inertia
                 spanning[row] = J * qdd[k][row]
                 if spin.carrier is not None:
-                    h, w = J * constant(spin.axis), kinematics.bodies[spin.carrier].v[:3]
-                    spanning[row] += ca.dot(h, a[spin.carrier][:3])
-                    f[spin.carrier] += ca.vertcat(h * qdd[k][row] + cross(w, h) * coordinates.qd[row], SX(3, 1))
+                    h, w, wd = J * constant(spin.axis), kinematics.bodies[spin.carrier].v[:3], a[spin.carrier][:3]
+                    lateral = lateral_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
+                    spanning[row] += ca.dot(h, wd) + lateral.torque
+                    couple = h * qdd[k][row] + cross(w, h * coordinates.qd[row]) + lateral.inertia @ wd + lateral.couple
+                    f[spin.carrier] += ca.vertcat(couple, SX(3, 1))
         for body in reversed(mechanism.moving(cluster)):
             state = kinematics.bodies[body.name]
             spanning[coordinates.index[body.name]] = state.S.T @ f[body.name]

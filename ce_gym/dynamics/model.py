@@ -39,8 +39,8 @@ class Model:
         transmission: "exact", "coupled", "armature" or "none".
         locked_rotors: Whether approximated rotors leave their mass and inertia at rest with their carrier, so that
             total mass is the same at every level. False deletes them, as the paper does in its figures.
-        eliminate_rotors: Whether symmetric rotors are eliminated at the exact level. False runs the general algorithm,
-            with every rotor a body: the same result, for more work.
+        eliminate_rotors: Whether rotors that need no body are eliminated at the exact level. False runs the general
+            algorithm, with every rotor a body: the same result, for more work.
 
     Raises:
         RobotError: If the robot file or the level is not valid.

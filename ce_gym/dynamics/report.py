@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.model import Model
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.description import LinearConstraint
-from ce_gym.model.mechanism import LEVELS, Spin
+from ce_gym.model.mechanism import LEVELS, Spin, is_axisymmetric
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class RotorFigures:
         carrier: Name of the body it is mounted on; None is the world.
         inertia: Moment of inertia about its spin axis [kg m^2].
         ratios: Speed of the rotor for unit speed of each independent joint that turns it, by joint.
-        symmetric: Whether its inertia is symmetric about its spin axis, so that exactness needs no body for it.
+        symmetric: Whether its inertia is symmetric about its spin axis.
     """
 
     name: str
@@ -205,14 +205,13 @@ def _figures(model: Model, cluster: Cluster, spins: tuple[Spin, ...], G: dict[st
     first = model.nv - len(model.joint_links)
     columns = [first + model.joint_links.index(joint) for joint in cluster.independent]
     rows = np.array([G[spin.rotor][columns] for spin in spins])
-    bodies = model.mechanism.bodies  # a rotor that is still a body at the exact level is not symmetric
     rotors = tuple(
         RotorFigures(
             spin.rotor,
             spin.carrier,
             spin.inertia,
             {joint: float(ratio) for joint, ratio in zip(cluster.independent, row, strict=True) if ratio != 0.0},
-            spin.rotor not in bodies,
+            is_axisymmetric(model.robot.body(spin.rotor)),
         )
         for spin, row in zip(spins, rows, strict=True)
     )

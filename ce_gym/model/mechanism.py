@@ -10,15 +10,16 @@ the body that carries it, so total mass, coordinates and limits are the same at 
 | `armature` | the diagonal of that matrix                                                                  |
 | `none`     | nothing                                                                                      |
 
-At `exact`, a rotor that is symmetric about its spin axis never has to become a body of the recursion: its inertia is
-constant in its carrier's frame and its spin enters as a `Spin`. Any other rotor stays a body of its cluster. That is
-decided here, rotor by rotor. May know descriptions and numpy, nothing symbolic.
+At `exact`, a rotor that spins about a principal axis through its centre of mass never has to become a body of the
+recursion: its mass, its axial and its mean lateral inertia are constant in its carrier's frame. Its spin, and the
+difference of its lateral moments if it is not symmetric, enter as a `Spin`. Any other rotor stays a body of its
+cluster. That is decided here, rotor by rotor. May know descriptions and numpy, nothing symbolic.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -38,19 +39,25 @@ AXISYMMETRY_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Spin:
-    """The spin of a rotor whose inertia at rest has been merged into its carrier.
+    """The spin of a rotor whose inertia at rest has been merged into its carrier, all but `lateral`.
 
     Attributes:
         rotor: Name of the rotor.
         carrier: Name of the body it is mounted on; None is the world.
         axis: Unit spin axis in the carrier's frame, shape (3,).
         inertia: Moment of inertia about the axis [kg m^2].
+        lateral: Half the difference of the two lateral principal moments [kg m^2], where it has not been merged because
+            it turns with the rotor: at the exact level, if the rotor is not symmetric. Otherwise 0.
+        heavy_axis: Unit lateral principal axis of the larger moment at rotor angle zero, in the carrier's frame, shape
+            (3,); any lateral axis if `lateral` is 0.
     """
 
     rotor: str
     carrier: str | None
     axis: Array
     inertia: float
+    lateral: float
+    heavy_axis: Array
 
 
 @dataclass(frozen=True)
@@ -111,8 +118,8 @@ def build_mechanism(
         level: "exact", "coupled", "armature" or "none".
         locked_rotors: Whether the mass and inertia at rest of an approximated rotor stay with its carrier. False
             deletes them, as in the "unconstrained" and "approximate" systems of the paper's figures.
-        eliminate: Whether symmetric rotors are eliminated at the exact level; False keeps every rotor as a body, the
-            general algorithm that the elimination is tested against.
+        eliminate: Whether rotors that spin about a principal axis are eliminated at the exact level; False keeps every
+            rotor as a body, the general algorithm that the elimination is tested against.
 
     Raises:
         RobotError: If the level does not exist.
@@ -123,34 +130,40 @@ def build_mechanism(
     kept = {
         body.name
         for body in robot.bodies
-        if body.kind == "link" or (level == "exact" and not (eliminate and is_axisymmetric(body)))
+        if body.kind == "link" or (level == "exact" and not (eliminate and has_principal_axis(body)))
     }
     carriers = {body.parent for body in robot.bodies}
     for body in robot.bodies:
         if body.name not in kept and body.name in carriers:
             raise RobotError(f"{robot.name}: rotor {body.name!r} carries another body; only links can")
+    merged = {b.name: _averaged(b) if level == "exact" else b for b in robot.bodies if b.name not in kept}
     inertias = {name: spatial_inertia(robot.body(name)) for name in kept}
-    for body in robot.bodies:
-        if body.name not in kept and body.parent is not None and (locked_rotors or level == "exact"):
-            inertias[body.parent] = inertias[body.parent] + _seen_from_parent(body)
+    for rotor in merged.values():
+        if rotor.parent is not None and (locked_rotors or level == "exact"):
+            inertias[rotor.parent] = inertias[rotor.parent] + _seen_from_parent(rotor)
     bodies = {b.name: _moving_body(b, inertias[b.name]) for b in robot.bodies if b.name in kept}
     spins = tuple(
-        tuple(_spin(robot.body(name)) for name in cluster.bodies if name not in kept) for cluster in tree.clusters
+        tuple(_spin(robot.body(name), merged[name]) for name in cluster.bodies if name in merged)
+        for cluster in tree.clusters
     )
     return Mechanism(robot, level, tree, bodies, spins, np.array(robot.gravity))  # type: ignore[arg-type]
 
 
+def has_principal_axis(rotor: Body) -> bool:
+    """Whether a rotor spins about a principal axis of its inertia, with its centre of mass on that axis."""
+    u = np.array(rotor.joint.axis)
+    inertia = np.array(rotor.inertial.inertia)
+    tilt = float(np.abs(np.cross(u, inertia @ u)).max())
+    offset = rotor.inertial.mass * float(np.linalg.norm(np.cross(u, np.array(rotor.inertial.com)))) ** 2
+    tolerance = AXISYMMETRY_TOLERANCE * float(np.abs(inertia).max())
+    return rotor.joint.type == "revolute" and tilt <= tolerance and offset <= tolerance
+
+
 def is_axisymmetric(rotor: Body) -> bool:
     """Whether a rotor's inertia is symmetric about its spin axis and its centre of mass lies on it."""
-    u = np.array(rotor.joint.axis)
-    com = np.array(rotor.inertial.com)
-    inertia = np.array(rotor.inertial.inertia)
-    spin = skew(u)
+    spin, inertia = skew(np.array(rotor.joint.axis)), np.array(rotor.inertial.inertia)
     asymmetry = float(np.abs(spin @ inertia - inertia @ spin).max())
-    offset = rotor.inertial.mass * float(np.linalg.norm(np.cross(u, com))) ** 2
-    scale = float(np.abs(inertia).max())
-    revolute = rotor.joint.type == "revolute"
-    return revolute and asymmetry <= AXISYMMETRY_TOLERANCE * scale and offset <= AXISYMMETRY_TOLERANCE * scale
+    return has_principal_axis(rotor) and asymmetry <= AXISYMMETRY_TOLERANCE * float(np.abs(inertia).max())
 
 
 def skew(x: Array) -> Array:
@@ -191,13 +204,28 @@ def _moving_body(body: Body, inertia: Array) -> MovingBody:
     )
 
 
-def _spin(rotor: Body) -> Spin:
+def _averaged(rotor: Body) -> Body:
+    """Return a rotor with the mean of its inertia over all angles, which is that of two angles a right angle apart."""
+    if is_axisymmetric(rotor):
+        return rotor
+    u, inertia = np.array(rotor.joint.axis), np.array(rotor.inertial.inertia)
+    quarter_turn = skew(u) + np.outer(u, u)
+    mean = (inertia + quarter_turn @ inertia @ quarter_turn.T) / 2
+    return replace(rotor, inertial=replace(rotor.inertial, inertia=tuple(map(tuple, mean.tolist()))))
+
+
+def _spin(rotor: Body, merged: Body) -> Spin:
+    """Return the spin of a rotor of which `merged` stays with its carrier."""
     axis = np.array(rotor.joint.axis)
     moment = float(axis @ np.array(rotor.inertial.inertia) @ axis)
     com_offset = math.fsum(np.cross(axis, np.array(rotor.inertial.com)) ** 2)
+    moments, axes = np.linalg.eigh(np.array(rotor.inertial.inertia) - np.array(merged.inertial.inertia))
+    to_carrier = np.array(rotor.placement.rotation)
     return Spin(
         rotor=rotor.name,
         carrier=rotor.parent,
-        axis=snapped(np.array(rotor.placement.rotation) @ axis),
+        axis=snapped(to_carrier @ axis),
         inertia=moment + rotor.inertial.mass * com_offset,
+        lateral=float(moments[-1]),
+        heavy_axis=snapped(to_carrier @ axes[:, -1]),
     )

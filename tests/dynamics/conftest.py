@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,10 +53,10 @@ def random_link(rng: np.random.Generator, name: str, parent: str | None, joint: 
     )
 
 
-def symmetric_rotor(rng: np.random.Generator, name: str, parent: str | None, lopsided: float = 0.0) -> Body:
-    """A rotor about a random axis; `lopsided` breaks its symmetry."""
+def rotor(rng: np.random.Generator, name: str, parent: str | None, lopsided: float, tilted: float) -> Body:
+    """A rotor about a random axis; `lopsided` breaks its symmetry, `tilted` makes its axis no principal one."""
     placement = Placement(tuple(rng.normal(0, 0.1, 3)), tuple(map(tuple, random_rotation(rng))))
-    inertia = ((2e-3 + lopsided, 0.0, 0.0), (0.0, 2e-3, 0.0), (0.0, 0.0, 3e-3))
+    inertia = ((2e-3 + lopsided, lopsided / 2, tilted), (lopsided / 2, 2e-3, 0.0), (tilted, 0.0, 3e-3))
     return Body(
         name, "rotor", parent, placement, Joint("revolute", (0.0, 0.0, 1.0)), Inertial(0.3, (0.0, 0.0, 0.02), inertia)
     )
@@ -66,21 +67,25 @@ def awkward_robot():
     """Return a function that makes a floating robot with belts whose rotors sit on every possible carrier.
 
     Bodies of the one big cluster: thigh -> shank -> toe. Rotors: on the base (the output body), on the thigh and on the
-    shank (inside the cluster), about axes parallel to nothing, with belts over several joints.
+    shank (inside the cluster), about axes parallel to nothing, with belts over several joints. Without `floating`, the
+    world takes the place of the base.
     """
 
-    def make(lopsided: float = 0.0) -> Robot:
+    def make(lopsided: float = 0.0, tilted: float = 0.0, floating: bool = True) -> Robot:
         rng = np.random.default_rng(7)
         axes = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), tuple(np.array([1.0, 2.0, 2.0]) / 3)]
         links = [random_link(rng, "base", None, Joint("free"))]
         for name, parent, axis in zip(("thigh", "shank", "toe"), ("base", "thigh", "shank"), axes, strict=True):
             links.append(random_link(rng, name, parent, Joint("revolute", axis)))
-        rotors = [symmetric_rotor(rng, f"{p}_rotor", p, lopsided) for p in ("base", "thigh", "shank")]
+        rotors = [rotor(rng, f"{p}_rotor", p, lopsided, tilted) for p in ("base", "thigh", "shank")]
         ties = (
             LinearConstraint("a", (("base_rotor", 1.0), ("thigh", -6.0), ("shank", -3.0)), 0.1),
             LinearConstraint("b", (("thigh_rotor", 1.0), ("thigh", -2.0), ("shank", -9.0), ("toe", 4.0))),
             LinearConstraint("c", (("shank_rotor", 1.0), ("thigh", 3.0), ("toe", 7.0))),
         )
-        return Robot("awkward", tuple(links + rotors), ties, ("thigh", "shank", "toe"))
+        bodies = links + rotors
+        if not floating:
+            bodies = [replace(b, parent=None if b.parent == "base" else b.parent) for b in bodies if b.name != "base"]
+        return Robot("awkward", tuple(bodies), ties, ("thigh", "shank", "toe"))
 
     return make
