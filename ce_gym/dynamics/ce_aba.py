@@ -32,10 +32,10 @@ from ce_gym.dynamics.spatial import (
     SX,
     Transform,
     cross,
-    cross_force,
     mirrored,
     solve_positive_definite,
     symmetric_blocks,
+    turning_force,
 )
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, snapped
@@ -101,7 +101,7 @@ def inward_inertia_pass(
     pA: dict[str, SX] = {}
     for name, body in mechanism.bodies.items():
         state, inertia = kinematics.bodies[name], constant(body.inertia)
-        IA[name], pA[name] = inertia, cross_force(state.v, inertia @ state.v)
+        IA[name], pA[name] = inertia, turning_force(inertia, state.v[:3])
         if name in external:
             IA[name], pA[name] = IA[name] + external[name].inertia, pA[name] - external[name].force
 
@@ -153,7 +153,7 @@ def outward_acceleration_pass(
     """Compute accelerations, base to tip (paper Alg. 1, outward pass 2, without its misprint).
 
     Returns:
-        vdot, shape (nv,), in the coordinates of `v`; and the spatial acceleration of every body *minus gravity*, body
+        vdot, shape (nv,), in the coordinates of `v`; and the acceleration of every body *minus gravity*, body
         coordinates, shape (6,) each.
     """
     gravity = gravity_acceleration(mechanism)
@@ -165,7 +165,8 @@ def outward_acceleration_pass(
             base = cluster.bodies[0]
             inertia, force = articulation.base  # type: ignore[misc]
             a[base] = solve_positive_definite(inertia, force)
-            vdot[rows] = a[base] + ca.vertcat(SX(3, 1), kinematics.bodies[base].R.T @ gravity)
+            state = kinematics.bodies[base]
+            vdot[rows] = a[base] + ca.vertcat(SX(3, 1), state.R.T @ gravity - cross(state.v[:3], state.v[3:]))
             continue
         a_output = a[cluster.output_body] if cluster.output_body is not None else ca.vertcat(SX(3, 1), -gravity)
         handle = articulation.handle_body[k]

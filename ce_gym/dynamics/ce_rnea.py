@@ -14,7 +14,7 @@ from ce_gym.dynamics.ce_aba import gravity_acceleration
 from ce_gym.dynamics.constraints import ClusterCoordinates
 from ce_gym.dynamics.kinematics import Kinematics, constant, is_free
 from ce_gym.dynamics.rotors import lateral_inertia
-from ce_gym.dynamics.spatial import SX, cross, cross_force
+from ce_gym.dynamics.spatial import SX, cross, turning_force
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -32,8 +32,8 @@ def inverse_dynamics(mechanism: Mechanism, kinematics: Kinematics, vdot: SX) -> 
     a, qdd = outward_acceleration(mechanism, kinematics, vdot)
     f = {}
     for name, body in mechanism.bodies.items():
-        inertia, v = constant(body.inertia), kinematics.bodies[name].v
-        f[name] = inertia @ a[name] + cross_force(v, inertia @ v)
+        inertia, w = constant(body.inertia), kinematics.bodies[name].v[:3]
+        f[name] = inertia @ a[name] + turning_force(inertia, w)
     return inward_force_pass(mechanism, kinematics, a, f, qdd)
 
 
@@ -47,7 +47,8 @@ def outward_acceleration(mechanism: Mechanism, kinematics: Kinematics, vdot: SX)
         cluster, rows = mechanism.tree.clusters[k], kinematics.rows[k]
         if is_free(mechanism, cluster):
             base = cluster.bodies[0]
-            a[base] = vdot[rows] - ca.vertcat(SX(3, 1), kinematics.bodies[base].R.T @ gravity)
+            state = kinematics.bodies[base]
+            a[base] = vdot[rows] + ca.vertcat(SX(3, 1), cross(state.v[:3], state.v[3:]) - state.R.T @ gravity)
             qdd.append(vdot[rows])
             continue
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]

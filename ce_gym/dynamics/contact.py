@@ -4,7 +4,7 @@ A contact is a spring and damper along the normal and a bristle in the tangent p
 anchor, damped, that slips when it would carry more than Coulomb's cone allows. Its force is a function of the velocity
 `v+` of the point at the end of the step, linearised about a velocity `w`,
 
-    f+ = F(w) - C (v+ - w),    v+ = v + dt (J a + omega x v),    C = Dn n n^T + Dt,
+    f+ = F(w) - C (v+ - w),    v+ = v + dt (J a + omega x (omega x r)),    C = Dn n n^T + Dt,
 
 with the acceleration `a` of the body still unknown. `dt J^T C J` joins the body's inertia before the inward pass and
 the recursion stays linear in the number of bodies. This is Newton's method on backward Euler (Anitescu and Potra 2002)
@@ -71,7 +71,7 @@ class Touch:
         point: The sphere's lowest point, in the body frame [m], shape (3,).
         depth: How far it is in the ground [m].
         velocity: Of the point [m/s], shape (3,).
-        bias: Its acceleration for a body that does not accelerate, `omega x v` [m/s^2], shape (3,).
+        bias: Its acceleration for a body that does not accelerate, `omega x (omega x r)` [m/s^2], shape (3,).
         load: Its normal force over the last step [N].
         anchor: Deflection of the bristle, shape (3,) [m].
     """
@@ -139,11 +139,11 @@ def touch_ground(body: BodyState, position: SX, radius: float, height: SX, norma
     n = body.R.T @ normal
     depth = radius - normal[2] * (body.point_position(position)[2] - height)
     point = position - radius * n
-    velocity = body.point_velocity(point)
+    velocity, w = body.point_velocity(point), body.v[:3]
     deflection = SX(3, 1)
     if anchor.numel():  # in the tangent plane: the normal has no part in it
         deflection = body.R.T @ ca.vertcat(anchor, -ca.dot(normal[:2], anchor) / normal[2])
-    return Touch(n, point, depth, velocity, cross(body.v[:3], velocity), load, deflection)
+    return Touch(n, point, depth, velocity, cross(w, cross(w, point)), load, deflection)
 
 
 def normal_law(touch: Touch, compliance: Compliance, dt: float) -> tuple[SX, SX]:

@@ -1,8 +1,12 @@
 """Where the bodies of a mechanism are and how they move: the outward velocity pass.
 
 Coordinates: `q = [base position, base quaternion wxyz, y]`, `v = [base angular, base linear (base frame), yd]`; a
-fixed base has only `y` and `yd`. `y` are the independent coordinates in the robot's order. May know spatial algebra,
-constraints and mechanisms.
+fixed base has only `y` and `yd`. `y` are the independent coordinates in the robot's order.
+
+Accelerations of bodies are classical everywhere in this room: [angular; that of the material point at the origin], not
+Featherstone's spatial ones, from which they differ by `[0; w x v_origin]` (2008, section 2.11). Both transform by `X`,
+so the recursions are the same; but these need no linear velocities, which saves 5 to 10 % of all instructions. May know
+spatial algebra, constraints and mechanisms.
 """
 
 from __future__ import annotations
@@ -19,7 +23,6 @@ from ce_gym.dynamics.spatial import (
     Transform,
     axis_rotation,
     cross,
-    cross_motion,
     quaternion_to_rotation,
 )
 from ce_gym.model.clusters import Cluster
@@ -34,7 +37,8 @@ class BodyState:
         X: Motion transform from its parent body.
         S: Motion subspace of its own joint, shape (6, 1); (6, 6) for a free base.
         v: Spatial velocity in body coordinates, shape (6,).
-        c: Velocity-product acceleration of its own joint, `v x S qd`, shape (6,). Constraint terms `S g` not included.
+        c: Velocity-product acceleration, centripetal and Coriolis, of the step from its parent, `a = X a_parent + S qdd
+            + c`, shape (6,). Constraint terms `S g` not included.
         R: Rotation, body to world, shape (3, 3). Rows nobody asks for cost nothing.
         p: Origin in the world [m], shape (3,).
     """
@@ -131,7 +135,9 @@ def _outward(body: MovingBody, parent: BodyState | None, q: SX, qd: SX) -> BodyS
     R, p, v = (parent.R, parent.p, parent.v) if parent is not None else (SX.eye(3), SX(3, 1), still)
     vJ = S * qd
     velocity = X.motion(v) + vJ
-    return BodyState(X=X, S=S, v=velocity, c=cross_motion(velocity, vJ), R=R @ X.E.T, p=p + R @ X.p)
+    centripetal = X.E @ cross(v[:3], cross(v[:3], X.p))
+    c = ca.vertcat(cross(velocity[:3], vJ[:3]), centripetal + 2 * cross(velocity[:3], vJ[3:]))
+    return BodyState(X=X, S=S, v=velocity, c=c, R=R @ X.E.T, p=p + R @ X.p)
 
 
 def joint_transform(body: MovingBody, q: SX) -> tuple[Transform, SX]:

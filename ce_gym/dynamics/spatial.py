@@ -33,16 +33,13 @@ def mirrored(m: SX) -> SX:
     return ca.triu2symm(ca.triu(m))
 
 
-def cross_motion(v: SX, m: SX) -> SX:
-    """Return `v x m`, the rate of change of motion vector `m` moving with velocity `v`. Featherstone eq. 2.31."""
-    w, u = v[:3], v[3:]
-    return ca.vertcat(cross(w, m[:3]), cross(w, m[3:]) + cross(u, m[:3]))
+def turning_force(inertia: SX, w: SX) -> SX:
+    """Return the force on a body of spatial inertia (6, 6) that turns at `w` without classical acceleration, (6,).
 
-
-def cross_force(v: SX, f: SX) -> SX:
-    """Return `v x* f`, the rate of change of force vector `f` moving with velocity `v`. Featherstone eq. 2.32."""
-    w, u = v[:3], v[3:]
-    return ca.vertcat(cross(w, f[:3]) + cross(u, f[3:]), cross(w, f[3:]))
+    `[w x (I w); w x (w x m c)]` of Newton and Euler, about the body's origin.
+    """
+    momentum = inertia @ ca.vertcat(w, SX(3, 1))
+    return ca.vertcat(cross(w, momentum[:3]), cross(w, momentum[3:]))
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def test_ours_are_linear_in_depth_and_below_the_library(without_loops):
 
 def test_writes_pictures_and_tables(without_loops, tmp_path):
     pytest.importorskip("matplotlib")
-    arguments = argparse.Namespace(out=tmp_path / "new", branches=[1, 2], depth=3, chain_depths=[5])
+    arguments = argparse.Namespace(out=tmp_path / "new", branches=[1, 2], depth=3, chain_depths=[10])
     report = paper.run(arguments)
     written = {path.name for path in (tmp_path / "new").iterdir()}
     pictures = {"depth_link_and_rotor.png", "depth_belt_pair.png", "locality.png", "approximation.png", "tracking.png"}
