@@ -22,16 +22,18 @@ class Outcome:
     """What a control step leaves behind, fresh arrays.
 
     Attributes:
-        observation: float32, shape (num_envs, n_obs).
+        observation: float32, the policy's and then the critic's, shape (num_envs, n_obs).
         reward: float64, shape (num_envs,).
         terminated: Failed, shape (num_envs,).
         diverged: Numerically diverged and frozen at the last good state, shape (num_envs,).
+        terms: Weighted reward terms, in the order of the task, shape (num_envs, n_terms).
     """
 
     observation: NDArray[np.float32]
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     diverged: NDArray[np.bool_]
+    terms: NDArray[np.float64]
 
 
 class Batch:
@@ -75,11 +77,11 @@ class Batch:
         """Carry out one control step.
 
         Args:
-            action: Shape (num_envs, n_joints), finite; clipped to [-1, 1].
+            action: Shape (num_envs, n_actions), finite; clipped to [-1, 1].
             ignored: Copies about to be reset, whose step must not use up random numbers, shape (num_envs,).
         """
         observation = np.empty((self.num_envs, self.observation_size), np.float32)
-        outcome = np.empty((self.num_envs, 3))
+        outcome = np.empty((self.num_envs, 3 + len(self.program.reward_terms)))
         self._step(
             self._arrays | {"action_in": action, "observation": observation, "outcome": outcome},
             self.num_envs,
@@ -89,11 +91,16 @@ class Batch:
             num_threads=self.num_threads,
         )
         self._counters += 1 if ignored is None else ~ignored
-        return Outcome(observation, outcome[:, 0].copy(), outcome[:, 1] > 0.5, outcome[:, 2] > 0.5)
+        flags = outcome[:, 1:3] > 0.5
+        return Outcome(observation, outcome[:, 0].copy(), flags[:, 0].copy(), flags[:, 1].copy(), outcome[:, 3:])
 
     def rows(self, name: str) -> NDArray:
         """Return a copy of a state buffer, shape (num_envs, size); KeyError if there is none."""
         return read_rows(self._arrays[name], self.num_envs)
+
+    def first(self, name: str) -> list[float]:
+        """Return the values of the first copy in a state buffer, quickly."""
+        return self._arrays[name][0, :, 0].tolist()
 
     def write(self, name: str, rows: NDArray, mask: NDArray[np.bool_] | None = None) -> None:
         """Overwrite a state buffer, for tests, evaluation and curricula; shape (num_envs, size)."""
@@ -109,6 +116,6 @@ class Batch:
 
 
 def _kernels(program: TaskProgram, dtype: str) -> tuple[Kernel, Kernel]:
-    key = f"{model_key(program.model)} {program.task!r} {program.contact_forces}"
+    key = f"{model_key(program.model)} {program.task!r} {program.contact_forces} {program.added_terms()}"
     step = load_kernel(f"environment {key}", program.step_program, dtype)
     return step, load_kernel(f"reset {key}", program.reset_program, dtype)

@@ -51,3 +51,35 @@ def last_action(s: Snapshot) -> SX:
 def feet_in_contact(s: Snapshot) -> SX:
     """Whether each foot is on the ground, 0 or 1, shape (n_feet,)."""
     return ca.vertcat(s.foot_contact)
+
+
+def gait_phase(s: Snapshot) -> SX:
+    """Sine and cosine of the gait's clock, shape (2,)."""
+    return ca.vertcat(ca.sin(s.phase), ca.cos(s.phase))
+
+
+def base_height(s: Snapshot) -> SX:
+    """Height of the base above its standing height [m], shape (1,)."""
+    return s.base_height - s.mechanism.robot.pose.height
+
+
+def torques(s: Snapshot) -> SX:
+    """Motor torques as shares of the joints' largest [-], shape (n_joints,)."""
+    limits = [s.mechanism.robot.body(name).joint.torque for name in s.mechanism.robot.independent]
+    return s.torque / np.array([limit if np.isfinite(limit) else 100.0 for limit in limits])
+
+
+def contact_forces(s: Snapshot) -> SX:
+    """Normal forces on the contacts over the robot's weight [-], shape (n_contacts,)."""
+    weight = -s.mechanism.robot.gravity[2] * s.mechanism.robot.total_mass
+    return s.load / (weight if weight > 0 else 1.0)
+
+
+def rotor_speeds(s: Snapshot) -> SX:
+    """Speeds of the rotors over 100 rad/s, shape (n_rotors,)."""
+    return ca.vertcat(SX(0, 1), *[0.01 * speed for speed in s.rotor_velocities])
+
+
+def parameters(s: Snapshot) -> SX:
+    """The randomised figures of the episode, each scaled to [-1, 1] over its range, shape (n,)."""
+    return s.scaled_parameters

@@ -9,31 +9,30 @@ May know dynamics, sim, compile and the term files; no Gymnasium.
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from functools import cached_property
-from types import ModuleType
 
 import casadi as ca
 import numpy as np
 
-from ce_gym.compile import Buffer, Call, Program
+from ce_gym.compile import Buffer, Call, Program, Repeat
 from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.scene import StepOptions, state_sizes
 from ce_gym.dynamics.spatial import SX
-from ce_gym.envs import metrics, observations, rewards, terminations
 from ce_gym.envs.draws import Draws
+from ce_gym.envs.randomisation import Randomised
 from ce_gym.envs.snapshot import Snapshot
 from ce_gym.envs.tasks import Task
+from ce_gym.envs.terms import find_term, is_added
 from ce_gym.sim.simulator import select_contacts
 from ce_gym.sim.substeps import substeps
 
-Term = Callable[[Snapshot], SX]
-
 OBSERVATION_BOUND = 100.0
 """Observations are clipped here; blocks are of order one, so only a robot about to fail comes near it."""
+HEADING_GAIN = 0.5
+"""Commanded yaw rate for each radian between a robot and the heading it shall have [1/s]."""
 
 
 @dataclass
@@ -44,6 +43,9 @@ class TaskProgram:
         model: The robot at a transmission level.
         task: The task.
         contact_forces: Whether to compute contact forces for recording.
+
+    Raises:
+        ValueError: If the robot lacks what the task needs, or the task names something that does not exist.
     """
 
     model: Model
@@ -51,17 +53,39 @@ class TaskProgram:
     contact_forces: bool = False
 
     def __post_init__(self) -> None:
-        robot = self.model.robot
+        robot, task = self.model.robot, self.task
         if not robot.floating:
             raise ValueError(f"{robot.name} has a fixed base; a task needs a robot with a floating base")
-        self.reward_terms = {name: _term(rewards, "reward", name) for name in self.task.rewards}
-        self.termination_terms = [_term(terminations, "termination", name) for name in self.task.terminations]
-        self.metric_terms = {name: _term(metrics, "metric", name) for name in self.task.metrics}
-        self.observation_terms = {name: _term(observations, "observation", name) for name in self.task.observations}
-        self.contacts = select_contacts(robot, self.task.contacts)
-        self.options = StepOptions(self.task.dt, "position", self.contacts, robot.material, self.task.friction)
-        self.n_joints = len(robot.independent)
-        self.n_feet = sum(contact.group == "foot" for contact in robot.contacts)
+        self.reward_terms = {name: find_term("reward", name) for name in task.rewards}
+        self.termination_terms = [find_term("termination", name) for name in task.terminations]
+        self.metric_terms = {name: find_term("metric", name) for name in task.metrics}
+        self.observation_terms = {name: find_term("observation", name) for name in task.observations}
+        self.critic_terms = {name: find_term("observation", name) for name in task.critic}
+        for name in task.noise:
+            if name not in self.observation_terms:
+                raise ValueError(f"noise={name!r}; expected an observation among {', '.join(self.observation_terms)}")
+        self.contacts = select_contacts(robot, task.contacts)
+        if task.latency[1] > task.n_substeps:
+            raise ValueError(
+                f"latency={task.latency}; expected at most the {task.n_substeps} sub-steps of a control step"
+            )
+        self.randomised = Randomised(robot, task.randomise)
+        self.options = StepOptions(
+            dt=task.dt,
+            control="position" if task.actions == "joint_pd" else "torque",
+            contacts=self.contacts,
+            material=robot.material,
+            friction=task.friction,
+            motors=task.motors,
+            parameters=self.randomised.parameters,
+        )
+        joints = robot.independent
+        self.moved = [i for i, n in enumerate(joints) if any(fnmatch(n, p) for p in task.action_joints)]
+        if not self.moved:
+            raise ValueError(f"action_joints={task.action_joints!r}; expected patterns of joints among {joints}")
+        self.n_joints, self.n_actions = len(joints), len(self.moved)
+        feet = {contact.body for contact in robot.contacts if contact.group == "foot"}
+        self.n_feet = len(feet)
 
     @property
     def control_dt(self) -> float:
@@ -71,18 +95,27 @@ class TaskProgram:
     @cached_property
     def state_sizes(self) -> dict[str, int]:
         """State buffers of one robot, by name."""
+        late = self.task.latency[1] > 0
         sizes = {
             **state_sizes(self.model.mechanism, self.options),
             "diverged": 1,
             "torque": self.n_joints,
-            "action": self.n_joints,
+            "action": self.n_actions,
             "command": 3,
+            "heading": 1 if self.task.heading else 0,
             "clock": 1,
             "air_time": self.n_feet,
             "sums": 1 + len(self.reward_terms) + len(self.metric_terms),
+            "parameters": self.randomised.size,
+            "draw": self.randomised.n_draws,
+            "delay": 1 if late else 0,
+            "target": self.n_joints if late else 0,
+            "contact_forces": 3 * len(self.contacts) if self.contact_forces else 0,
         }
-        sizes |= {"contact_forces": 3 * len(self.contacts)} if self.contact_forces else {}
-        return {name: size for name, size in sizes.items() if size}
+        sizes = {name: size for name, size in sizes.items() if size}
+        if self.task.history > 1:
+            sizes["history"] = (self.task.history - 1) * sum(self._block_sizes(self.observation_terms, sizes).values())
+        return sizes
 
     @property
     def sum_names(self) -> list[str]:
@@ -95,14 +128,32 @@ class TaskProgram:
 
     @cached_property
     def observation_sizes(self) -> dict[str, int]:
-        """Length of each observation block, by name, in order."""
-        s = self._snapshot({name: SX.sym(name, n) for name, n in self.state_sizes.items()})
-        return {name: term(s).numel() for name, term in self.observation_terms.items()}
+        """Length of each block of one observation of the policy, by name, in order."""
+        return self._block_sizes(self.observation_terms, self.state_sizes)
+
+    @cached_property
+    def critic_sizes(self) -> dict[str, int]:
+        """Length of each block of an observation of the critic: the policy's blocks and the privileged ones."""
+        return self._block_sizes(self.observation_terms | self.critic_terms, self.state_sizes)
 
     @property
     def observation_size(self) -> int:
-        """Length of the observation."""
-        return sum(self.observation_sizes.values())
+        """Length of the policy's observation, history included."""
+        return self.task.history * sum(self.observation_sizes.values())
+
+    @property
+    def critic_size(self) -> int:
+        """Length of the critic's observation; 0 if the task gives it none of its own."""
+        return sum(self.critic_sizes.values()) if self.task.critic else 0
+
+    def added_terms(self) -> str:
+        """Return a text that changes with the terms that users have added, for cache keys."""
+        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}
+        s = self._snapshot(self._seen(state | {"previous_action": state["action"]}))
+        kinds = {"reward": self.task.rewards, "observation": (*self.task.observations, *self.task.critic)}
+        kinds |= {"termination": self.task.terminations, "metric": self.task.metrics}
+        added = {name: SX(find_term(k, name)(s)) for k, names in kinds.items() for name in names if is_added(k, name)}
+        return traced("added", state, added).serialize() if added else ""
 
     def step_program(self) -> Program:
         """Return act, physics and assess as one program."""
@@ -110,20 +161,21 @@ class TaskProgram:
         _, scratch, physics = substeps(self.model.mechanism, self.options, self._physics_outputs)
         buffers = [Buffer(name, size, "tiles") for name, size in self.state_sizes.items()]
         buffers += [
-            Buffer("action_in", self.n_joints, "rows_in", "float32"),
-            Buffer("clipped", self.n_joints, "scratch"),
-            Buffer("target", self.n_joints, "scratch"),
-            Buffer("draws", n_draws, "random"),
-            Buffer("observation", self.observation_size, "rows_out", "float32"),
-            Buffer("outcome", 3, "rows_out", "float64"),
+            Buffer("action_in", self.n_actions, "rows_in", "float32"),
+            Buffer("clipped", self.n_actions, "scratch"),
+            *([Buffer("draws", n_draws, "random")] if n_draws else []),
+            Buffer("observation", self.observation_size + self.critic_size, "rows_out", "float32"),
+            Buffer("outcome", 3 + len(self.reward_terms), "rows_out", "float64"),
             *scratch,
         ]
-        calls = (
-            Call(act, ("action_in",), ("clipped", "target")),
-            *physics,
-            Call(assess, tuple(assess.name_in()), self._assess_outputs),
-        )
-        return Program(f"{self.model.robot.name} {self.model.transmission} environment", tuple(buffers), calls)
+        if "delay" in self.state_sizes:
+            buffers += [Buffer("new_target", self.n_joints, "scratch"), Buffer("waited", 1, "scratch")]
+            calls = (Call(act, ("action_in",), ("clipped", "new_target", "waited")), *self._delayed(physics))
+        else:
+            buffers += [Buffer("target", self.n_joints, "scratch")]
+            calls = (Call(act, ("action_in",), ("clipped", "target")), *physics)
+        steps = (*calls, Call(assess, tuple(assess.name_in()), self._assess_outputs))
+        return Program(f"{self.model.robot.name} {self.model.transmission} environment", tuple(buffers), steps)
 
     def reset_program(self) -> Program:
         """Return the program that starts new episodes where `chosen` is 1."""
@@ -132,7 +184,7 @@ class TaskProgram:
         buffers += [
             Buffer("chosen", 1, "tiles"),
             Buffer("draws", n_draws, "random"),
-            Buffer("observation", self.observation_size, "rows_out", "float32"),
+            Buffer("observation", self.observation_size + self.critic_size, "rows_out", "float32"),
         ]
         call = Call(begin, tuple(begin.name_in()), (*self.state_sizes, "observation"))
         name = f"{self.model.robot.name} {self.model.transmission} reset"
@@ -142,25 +194,55 @@ class TaskProgram:
     def _physics_outputs(self) -> tuple[str, ...]:
         return ("torque", "contact_forces") if self.contact_forces else ("torque",)
 
-    _assess_outputs = ("action", "command", "clock", "air_time", "sums", "observation", "outcome")
+    @property
+    def _assess_outputs(self) -> tuple[str, ...]:
+        optional = [name for name in ("heading", "history") if name in self.state_sizes]
+        pushed = ["v"] if self.task.push_period else []
+        return ("action", "command", "clock", "air_time", "sums", *optional, *pushed, "observation", "outcome")
 
     def _snapshot(self, values: dict[str, SX]) -> Snapshot:
-        return Snapshot(self.model.mechanism, values, self.control_dt)
+        return Snapshot(self.model.mechanism, values, self.control_dt, self.task.gait_period)
+
+    def _block_sizes(self, terms: dict, sizes: dict[str, int]) -> dict[str, int]:
+        s = self._snapshot(self._seen({name: SX.sym(name, n) for name, n in sizes.items()}))
+        return {name: SX(term(s)).numel() for name, term in terms.items()}
+
+    def _seen(self, state: dict[str, SX]) -> dict[str, SX]:
+        return state | ({"scaled_parameters": 2 * state["draw"] - 1} if "draw" in state else {})
 
     def _act(self) -> ca.Function:
-        """(action_in) -> clipped action, joint targets."""
-        action = SX.sym("action_in", self.n_joints)
+        """(action_in) -> clipped action, joint targets or torques, and 0 sub-steps waited if actions come late."""
+        action, robot = SX.sym("action_in", self.n_actions), self.model.robot
         clipped = ca.fmax(-1, ca.fmin(1, action))
-        standing = self._snapshot({}).standing_joints
-        target = SX(standing) + self.task.action_scale * clipped
-        return traced("act", {"action_in": action}, {"clipped": clipped, "target": target})
+        if self.task.actions == "joint_pd":
+            target = SX(self._snapshot({}).standing_joints)
+            target[self.moved] += self.task.action_scale * clipped
+        else:
+            target = SX.zeros(self.n_joints)
+            limits = np.array([robot.body(robot.independent[i]).joint.torque for i in self.moved])
+            if not np.isfinite(limits).all():
+                raise ValueError(f"{robot.name}: actions='joint_torque' needs a torque limit (effort) of every joint")
+            target[self.moved] = limits * clipped
+        late = {"waited": SX(0)} if "delay" in self.state_sizes else {}
+        return traced("act", {"action_in": action}, {"clipped": clipped, "target": target} | late)
+
+    def _delayed(self, physics: tuple[Call | Repeat, ...]) -> tuple[Call | Repeat, ...]:
+        """Put before each sub-step the choice between the target of the last action and that of the new one."""
+        waited, delay = SX.sym("waited"), SX.sym("delay")
+        old, new = SX.sym("target", self.n_joints), SX.sym("new_target", self.n_joints)
+        outputs = {"target_next": ca.if_else(waited < delay, old, new), "waited_next": waited + 1}
+        arrive = traced("arrive", {"waited": waited, "delay": delay, "target": old, "new_target": new}, outputs)
+        call = Call(arrive, tuple(arrive.name_in()), ("target", "waited"))
+        arrived = Call(ca.Function("arrived", [new], [new]), ("new_target",), ("target",))
+        steps = [Repeat(step.times, (call, *step.calls)) if isinstance(step, Repeat) else step for step in physics]
+        return (*steps, arrived)
 
     def _assess(self) -> tuple[ca.Function, int]:
-        """State after the sub-steps -> bookkeeping, observation, outcome [reward, terminated, diverged]."""
-        used = ("q", "v", "dependent", "diverged", "torque", "action", "command", "clock", "air_time", "sums")
-        state = {name: SX.sym(name, self.state_sizes[name]) for name in used if name in self.state_sizes}
-        clipped, draws = SX.sym("clipped", self.n_joints), Draws()
-        values = state | {"action": clipped, "previous_action": state["action"]}
+        """State after the sub-steps -> bookkeeping, observation, outcome [reward, terminated, diverged, terms]."""
+        unused = ("anchor", "parameters", "delay", "target", "contact_forces")
+        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items() if name not in unused}
+        clipped, draws = SX.sym("clipped", self.n_actions), Draws()
+        values = self._seen(state | {"action": clipped, "previous_action": state["action"]})
         s = self._snapshot(values)
 
         terms = [self.task.rewards[name] * term(s) * self.control_dt for name, term in self.reward_terms.items()]
@@ -174,21 +256,22 @@ class TaskProgram:
             ca.if_else(s.foot_contact, 0, state["air_time"] + self.control_dt) if self.n_feet else state["air_time"]
         )
         clock = state["clock"] + 1
-        period = max(round(self.task.command_period / self.control_dt), 1)
-        due = ca.fmod(clock, period) < 0.5
-        command = ca.if_else(due, self._new_command(draws), state["command"])
-        seen = self._snapshot(values | {"command": command, "air_time": air_time})
-        outputs = {
-            "action_next": clipped,
-            "command_next": command,
-            "clock_next": clock,
-            "air_time_next": air_time,
-            "sums_next": sums,
-            "observation": self._observation(seen),
-            "outcome": ca.vertcat(reward, terminated, state["diverged"]),
-        }
-        inputs = {**state, "clipped": clipped, "draws": draws.symbols}
-        return traced("assess", inputs, outputs), draws.symbols.numel()
+        fresh = self._new_command(draws)
+        due = self._every(self.task.command_period, clock)
+        after = {name: ca.if_else(due, fresh[name], state[name]) for name in fresh}
+        v = self._pushed(state["v"], clock, draws) if self.task.push_period else state["v"]
+        after = self._steered(values | {"v": v}, after)
+        seen = values | after | {"air_time": air_time, "clock": clock, "v": v}
+        observation, history = self._observation(seen, state.get("history"), draws)
+        outputs = {"action_next": clipped, "command_next": after["command"], "clock_next": clock}
+        outputs |= {"air_time_next": air_time, "sums_next": sums}
+        outputs |= {"heading_next": after["heading"]} if "heading" in after else {}
+        outputs |= {"history_next": history} if "history" in state else {}
+        outputs |= {"v_next": v} if self.task.push_period else {}
+        outputs |= {"observation": observation, "outcome": ca.vertcat(reward, terminated, state["diverged"], *terms)}
+        inputs = {**state, "clipped": clipped}
+        count = draws.symbols.numel()
+        return traced("assess", inputs | ({"draws": draws.symbols} if count else {}), outputs), count
 
     def _begin(self) -> tuple[ca.Function, int]:
         """State, chosen, draws -> state of a new episode where chosen, observation."""
@@ -198,10 +281,21 @@ class TaskProgram:
         fresh["q"], fresh["v"] = self._start(draws)
         if "dependent" in fresh:
             fresh["dependent"] = SX(self.model.guess)
-        fresh["command"] = self._new_command(draws)
+        if "draw" in fresh:
+            fresh["draw"] = ca.vertcat(*[draws.unit() for _ in range(self.randomised.n_draws)])
+            fresh["parameters"] = self.randomised.values(fresh["draw"])
+        if "delay" in fresh:
+            low, high = self.task.latency
+            fresh["delay"] = ca.floor(draws.uniform(low, high + 1))
+            fresh["target"] = SX(self._snapshot({}).standing_joints) * (self.task.actions == "joint_pd")
+        fresh |= self._new_command(draws)
+        fresh |= self._steered(fresh, {name: fresh[name] for name in ("command", "heading") if name in fresh})
         after = {name: ca.if_else(chosen > 0.5, ca.densify(fresh[name]), state[name]) for name in state}
-        seen = self._snapshot(after | {"previous_action": after["action"]})
-        outputs = {f"{name}_next": value for name, value in after.items()} | {"observation": self._observation(seen)}
+        seen = self._seen(after | {"previous_action": after["action"]})
+        observation, history = self._observation(seen, None, draws)
+        if "history" in state:
+            after["history"] = ca.if_else(chosen > 0.5, history, state["history"])
+        outputs = {f"{name}_next": value for name, value in after.items()} | {"observation": observation}
         inputs = {**state, "chosen": chosen, "draws": draws.symbols}
         return traced("begin", inputs, outputs), draws.symbols.numel()
 
@@ -214,27 +308,49 @@ class TaskProgram:
         base = draws.symmetric(6, noise["base_velocity"])
         return q, ca.vertcat(base, draws.symmetric(self.n_joints, noise["joint_velocity"]))
 
-    def _new_command(self, draws: Draws) -> SX:
-        """A command within the task's range, or standing still."""
+    def _every(self, period: float, clock: SX) -> SX:
+        """1 once in a period [s], else 0."""
+        return ca.fmod(clock, max(round(period / self.control_dt), 1)) < 0.5
+
+    def _new_command(self, draws: Draws) -> dict[str, SX]:
+        """A command within the task's range, or standing still; and a heading."""
         standing = draws.unit() < self.task.standing_fraction
-        return ca.if_else(standing, 0, draws.within(self.task.command_range))
+        command = {"command": ca.if_else(standing, 0, draws.within(self.task.command_range))}
+        return command | ({"heading": draws.uniform(-np.pi, np.pi)} if self.task.heading else {})
 
-    def _observation(self, s: Snapshot) -> SX:
-        observation = ca.vertcat(*[term(s) for term in self.observation_terms.values()])
-        return ca.fmax(-OBSERVATION_BOUND, ca.fmin(OBSERVATION_BOUND, observation))
+    def _steered(self, values: dict[str, SX], command: dict[str, SX]) -> dict[str, SX]:
+        """Replace the commanded yaw rate by one that turns the robot to its heading."""
+        if "heading" not in command:
+            return command
+        w, x, y, z = (values["q"][3 + i] for i in range(4))
+        behind = command["heading"] - ca.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        error = ca.atan2(ca.sin(behind), ca.cos(behind))
+        low, high = self.task.command_range[2]
+        rate = ca.fmax(low, ca.fmin(high, HEADING_GAIN * error))
+        moving = ca.sumsqr(command["command"]) > 0
+        return command | {"command": ca.vertcat(command["command"][:2], ca.if_else(moving, rate, 0))}
+
+    def _pushed(self, v: SX, clock: SX, draws: Draws) -> SX:
+        """Now and then change the horizontal velocity of the base, as seen from it, at a stroke."""
+        push = ca.vertcat(SX(3, 1), draws.symmetric(2, self.task.push_speed), SX(v.numel() - 5, 1))
+        return v + ca.if_else(self._every(self.task.push_period, clock), ca.densify(push), 0)
+
+    def _observation(self, values: dict[str, SX], before: SX | None, draws: Draws) -> tuple[SX, SX]:
+        """The policy's observation, noisy and with its history, then the critic's; and the history to keep."""
+        s = self._snapshot(values)
+        blocks = {name: SX(term(s)) for name, term in self.observation_terms.items()}
+        noisy = [b + draws.symmetric(b.numel(), self.task.noise.get(n, 0.0)) if self.task.noise.get(n) else b
+                 for n, b in blocks.items()]  # fmt: skip
+        now = _clipped(ca.vertcat(*noisy))
+        kept = SX(0, 1)
+        if self.task.history > 1:
+            kept = ca.repmat(now, self.task.history - 1, 1) if before is None else before
+        policy = ca.vertcat(now, kept)
+        critic = SX(0, 1)
+        if self.task.critic:
+            critic = _clipped(ca.vertcat(*blocks.values(), *[SX(term(s)) for term in self.critic_terms.values()]))
+        return ca.vertcat(policy, critic), policy[: kept.numel()]
 
 
-def _term(module: ModuleType, kind: str, name: str) -> Term:
-    """Find a term by name.
-
-    Raises:
-        ValueError: If there is none; names those there are.
-    """
-    known = {
-        key: function
-        for key, function in inspect.getmembers(module, inspect.isfunction)
-        if function.__module__ == module.__name__ and not key.startswith("_")
-    }
-    if name not in known:
-        raise ValueError(f"no {kind} term {name!r}; expected one of {', '.join(sorted(known))}")
-    return known[name]
+def _clipped(observation: SX) -> SX:
+    return ca.fmax(-OBSERVATION_BOUND, ca.fmin(OBSERVATION_BOUND, observation))

@@ -96,3 +96,50 @@ def joint_limits(s: Snapshot) -> SX:
 def alive(s: Snapshot) -> SX:
     """1 as long as the episode goes on."""
     return SX(1)
+
+
+def survive(s: Snapshot) -> SX:
+    """1 as long as the episode goes on, under the name of Gymnasium's MuJoCo environments."""
+    return SX(1)
+
+
+def forward(s: Snapshot) -> SX:
+    """Forward speed of the base in its own heading [m/s]."""
+    return s.base_linear_velocity[0]
+
+
+def ctrl(s: Snapshot) -> SX:
+    """Size of the action, squared."""
+    return ca.sumsqr(s.action)
+
+
+def gait(s: Snapshot) -> SX:
+    """How many feet are on the ground and off it when the gait's clock wants them, minus those that are not.
+
+    Feet take turns: the first half of the cycle belongs to every second one. While no motion is commanded all stand.
+    """
+    swing = ca.vertcat(*[ca.sin(s.phase + np.pi * i) > 0 for i in range(s.foot_contact.numel())])
+    wanted = ca.if_else(s.commanded_to_move, 1 - swing, 1)
+    return ca.sum1(1 - 2 * ca.fabs(wanted - s.foot_contact))
+
+
+def foot_slip(s: Snapshot) -> SX:
+    """Horizontal speeds of feet on the ground, squared [(m/s)^2]."""
+    return ca.dot(s.foot_contact, ca.sum1(s.foot_velocities[:2, :] ** 2).T)
+
+
+def foot_clearance(s: Snapshot) -> SX:
+    """How far feet in the air are below 8 cm, times how fast they move, while motion is commanded [m^2/s]."""
+    low = ca.fmax(0, 0.08 - s.foot_heights) ** 2
+    speed = ca.sqrt(ca.sum1(s.foot_velocities[:2, :] ** 2).T + 1e-6)
+    return ca.if_else(s.commanded_to_move, ca.sum1(low * speed), 0)
+
+
+def height(s: Snapshot) -> SX:
+    """How far the base is above its standing height, during the second half of the gait's clock [m]."""
+    return ca.if_else(ca.sin(s.phase) < 0, ca.fmax(0, s.base_height - s.mechanism.robot.pose.height), 0)
+
+
+def flight(s: Snapshot) -> SX:
+    """1 if no foot is on the ground."""
+    return ca.sum1(s.foot_contact) < 0.5

@@ -6,13 +6,14 @@ All arguments are JSON-able, so that a spec survives `to_json`. May know program
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
 from typing import Any, get_args
 
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.batch import Batch
 from ce_gym.envs.program import TaskProgram
+from ce_gym.envs.task_values import checked_value, number
 from ce_gym.envs.tasks import TASKS, Task
 from ce_gym.model.mechanism import Level
 
@@ -23,13 +24,11 @@ def make_batch(
     *,
     num_envs: int,
     transmission: str = "exact",
-    reward_weights: Mapping[str, float] | None = None,
-    command_range: Sequence[Sequence[float]] | None = None,
-    command_period: float | None = None,
-    contacts: str | Sequence[str] | None = None,
     contact_forces: bool = False,
     dtype: str = "float64",
     num_threads: int | None = None,
+    reward_weights: Mapping[str, float] | None = None,
+    **changes: Any,
 ) -> Batch:
     """Build a batch of environments.
 
@@ -38,13 +37,12 @@ def make_batch(
         task: Name of a task.
         num_envs: Number of environments.
         transmission: "exact", "coupled", "armature" or "none".
-        reward_weights: Weights that replace or add to those of the task, by the name of the term; 0 removes a term.
-        command_range: Bounds of forward [m/s], sideways [m/s] and yaw rate [rad/s] commands, three pairs.
-        command_period: Time between new commands [s].
-        contacts: Which contact spheres take part: "all", or names of groups or spheres.
         contact_forces: Whether contact forces are computed, for recording.
         dtype: "float64" or "float32" for physics.
         num_threads: Threads; the number of usable cores if None.
+        reward_weights: Weights that replace or add to those of the task, by the name of the term; 0 removes a term.
+        **changes: Attributes of `Task` that replace those of the task, such as command_range, contacts, actions,
+            noise, history, latency, randomise, push_period or episode_length.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -59,39 +57,31 @@ def make_batch(
     for name, value in (("num_envs", num_envs), ("num_threads", num_threads)):
         if value is not None and (not isinstance(value, int) or value < 1):
             raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
-    chosen = changed_task(
-        TASKS[task],
-        reward_weights=reward_weights,
-        command_range=command_range,
-        command_period=command_period,
-        contacts=contacts,
-    )
-    program = TaskProgram(Model(robot, transmission), chosen, contact_forces)
+    model = Model(robot, transmission)
+    own = {key: value for name, group in model.robot.tasks if name == task for key, value in group}
+    weights = {**dict(own.pop("reward_weights", ())), **(reward_weights or {})}
+    chosen = changed_task(TASKS[task], weights, {**own, **changes})
+    program = TaskProgram(model, chosen, contact_forces)
     return Batch(program, num_envs, dtype, num_threads or len(os.sched_getaffinity(0)))
 
 
-def changed_task(
-    task: Task,
-    *,
-    reward_weights: Mapping[str, float] | None,
-    command_range: Sequence[Sequence[float]] | None,
-    command_period: float | None,
-    contacts: str | Sequence[str] | None,
-) -> Task:
-    """Return a task with some of its figures replaced; None keeps what it has."""
-    changes: dict[str, Any] = {}
-    if reward_weights is not None:
-        weights = {**task.rewards, **{str(k): float(v) for k, v in reward_weights.items()}}
-        changes["rewards"] = {name: weight for name, weight in weights.items() if weight != 0}
-    if command_range is not None:
-        pairs = tuple(tuple(float(x) for x in pair) for pair in command_range)
-        if len(pairs) != 3 or any(len(pair) != 2 or not pair[0] <= pair[1] for pair in pairs):
-            raise ValueError(f"command_range={command_range!r}; expected three pairs (low, high) with low <= high")
-        changes["command_range"] = pairs
-    if command_period is not None:
-        if not command_period > 0:
-            raise ValueError(f"command_period={command_period!r}; expected a positive time in s")
-        changes["command_period"] = float(command_period)
-    if contacts is not None:
-        changes["contacts"] = contacts if isinstance(contacts, str) else tuple(contacts)
-    return replace(task, **changes)
+def changed_task(task: Task, reward_weights: Mapping[str, float], changes: Mapping[str, Any]) -> Task:
+    """Return a task with some of its figures replaced, checked.
+
+    Args:
+        task: A task.
+        reward_weights: Weights that replace or add to its own; 0 removes a term.
+        changes: Other attributes of `Task`; lists, as JSON has them, count as tuples, and None as no change.
+
+    Raises:
+        ValueError: One line that names the argument, its value and what was expected.
+    """
+    weights = {**task.rewards, **{str(k): number("reward_weights", v) for k, v in reward_weights.items()}}
+    given = {"rewards": {name: weight for name, weight in weights.items() if weight != 0}}
+    known = [f.name for f in fields(Task) if f.name not in ("rewards",)]
+    for name, value in changes.items():
+        if name not in known:
+            raise ValueError(f"unknown argument {name!r}; expected one of {', '.join(known)}")
+        if value is not None:
+            given[name] = checked_value(name, value, getattr(task, name))
+    return replace(task, **given)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from ce_gym.envs.program import OBSERVATION_BOUND
+from ce_gym.envs.program import OBSERVATION_BOUND, TaskProgram
 from ce_gym.envs.setup import make_batch
 from ce_gym.envs.shell import BatchShell
 
@@ -19,21 +20,27 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
     """One robot and one task.
 
     Observations and actions are float32 vectors; `observation_structure` names the blocks of the observation. `info`
-    holds `diverged`, whether the simulation failed numerically: the episode is then truncated, at the last good state.
+    holds `diverged`, whether the simulation failed numerically: the episode is then truncated, at the last good state;
+    `reward_<name>` for each reward term; and, as in Gymnasium's MuJoCo environments, `x_position`, `y_position`,
+    `distance_from_origin` [m], `x_velocity` and `y_velocity` [m/s] of the base in the world.
 
     Args:
         robot: Name of a robot that ships with the package, or a path to a robot file.
         task: Name of a task.
+        obs_mode: "vector", or "dict" for `{"policy": ..., "critic": ...}`, where the critic may see more.
         **kwargs: See `ce_gym.envs.setup.make_batch`.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own declaration)
 
-    def __init__(self, robot: str = "mini_cheetah", task: str = "velocity", **kwargs: Any) -> None:
-        EzPickle.__init__(self, robot, task, **kwargs)
+    def __init__(
+        self, robot: str = "mini_cheetah", task: str = "velocity", *, obs_mode: str = "vector", **kwargs: Any
+    ) -> None:
+        EzPickle.__init__(self, robot, task, obs_mode=obs_mode, **kwargs)
         self.batch = make_batch(robot, task, num_envs=1, **kwargs)
         self.model = self.batch.program.model
-        self.observation_space, self.action_space = spaces(self.batch.observation_size, self.batch.program.n_joints)
+        self.observation_space, self.action_space = spaces(self.batch.program, obs_mode)
+        self._names = [f"reward_{name}" for name in self.batch.program.reward_terms]
         self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
         self.render_mode = None
         self._seeded = False
@@ -47,7 +54,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
             key = seed if seed is not None else self.np_random.integers(2**63)
             self.batch.seed(np.array([key], np.uint64))
             self._seeded = True
-        return self.batch.reset(np.ones(1, bool))[0], {"diverged": False}
+        return self._shown(self.batch.reset(np.ones(1, bool)))[0], {"diverged": False, **self._whereabouts()}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Carry out one control step; see `gymnasium.Env.step`.
@@ -55,25 +62,56 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         Raises:
             ValueError: If the action has the wrong shape or is not finite.
         """
-        outcome = self.batch.step(checked_action(action, (1, self.batch.program.n_joints)))
+        outcome = self.batch.step(checked_action(action, (1, self.batch.program.n_actions)))
         diverged = bool(outcome.diverged[0])
-        return (
-            outcome.observation[0],
-            float(outcome.reward[0]),
-            bool(outcome.terminated[0]),
-            diverged,
-            {"diverged": diverged},
-        )
+        info = {"diverged": diverged, **dict(zip(self._names, outcome.terms[0].tolist(), strict=True))}
+        info |= self._whereabouts()
+        observation = self._shown(outcome.observation[0])
+        return observation, float(outcome.reward[0]), bool(outcome.terminated[0]), diverged, info
+
+    def _shown(self, rows: NDArray[np.float32]) -> Any:
+        return shown(rows, self.batch.program, self.observation_space)
+
+    def _whereabouts(self) -> dict[str, float]:
+        q, v = self.batch.first("q"), self.batch.first("v")
+        (x, y), (w, i, j, k), (a, b, c) = q[:2], q[3:7], v[3:6]
+        return {
+            "x_position": x,
+            "y_position": y,
+            "distance_from_origin": math.hypot(x, y),
+            "x_velocity": a * (1 - 2 * (j * j + k * k)) + 2 * b * (i * j - w * k) + 2 * c * (i * k + w * j),
+            "y_velocity": 2 * a * (i * j + w * k) + b * (1 - 2 * (i * i + k * k)) + 2 * c * (j * k - w * i),
+        }
 
     def state(self) -> dict[str, NDArray]:
         """Return what a recorder needs: q, v, command and, if computed, contact_forces (n_contacts, 3)."""
         return {name: rows[0] for name, rows in recorded_state(self.batch).items()}
 
 
-def spaces(n_observations: int, n_actions: int) -> tuple[Any, Any]:
-    """Return observation and action space of one robot, both `Box`."""
+def spaces(program: TaskProgram, obs_mode: str) -> tuple[Any, Any]:
+    """Return observation and action space of one robot.
+
+    Raises:
+        ValueError: If the mode does not exist.
+    """
+    if obs_mode not in ("vector", "dict"):
+        raise ValueError(f"obs_mode={obs_mode!r}; expected 'vector' or 'dict'")
     bound = OBSERVATION_BOUND
-    return Box(-bound, bound, (n_observations,), np.float32), Box(-1.0, 1.0, (n_actions,), np.float32)
+    policy = Box(-bound, bound, (program.observation_size,), np.float32)
+    actions = Box(-1.0, 1.0, (program.n_actions,), np.float32)
+    if obs_mode == "vector":
+        return policy, actions
+    critic = Box(-bound, bound, (program.critic_size or program.observation_size,), np.float32)
+    return Dict({"policy": policy, "critic": critic}), actions
+
+
+def shown(rows: NDArray[np.float32], program: TaskProgram, space: Any) -> Any:
+    """Return observation rows (..., n_obs) as a space has them: the policy's part, or a dictionary of both."""
+    policy = rows[..., : program.observation_size]
+    if not isinstance(space, Dict):
+        return policy if program.critic_size == 0 else np.ascontiguousarray(policy)
+    critic = rows[..., program.observation_size :] if program.critic_size else policy
+    return {"policy": np.ascontiguousarray(policy), "critic": critic.copy()}
 
 
 def checked_action(action: Any, shape: tuple[int, int]) -> NDArray[np.float32]:

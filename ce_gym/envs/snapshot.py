@@ -12,6 +12,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from ce_gym.dynamics.functions import spanning_coordinates
 from ce_gym.dynamics.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.dynamics.spatial import SX
 from ce_gym.model.mechanism import Mechanism
@@ -22,12 +23,17 @@ class Snapshot:
 
     Args:
         mechanism: The robot at a transmission level.
-        values: Expressions of the state buffers, by name: q, v, command, action, previous_action, torque, air_time.
+        values: Expressions of the state buffers, by name: q, v, command, action, previous_action, torque,
+            air_time, clock, load, scaled_parameters.
         control_dt: Length of a control step [s].
+        gait_period: Time of one cycle of the gait's clock [s].
     """
 
-    def __init__(self, mechanism: Mechanism, values: Mapping[str, SX], control_dt: float) -> None:
+    def __init__(
+        self, mechanism: Mechanism, values: Mapping[str, SX], control_dt: float, gait_period: float = 1.0
+    ) -> None:
         self.mechanism, self.control_dt, self._values = mechanism, control_dt, values
+        self._gait_period = gait_period
         robot = mechanism.robot
         self._n_joints = len(robot.independent)
         pose = dict(robot.pose.joints)
@@ -69,6 +75,21 @@ class Snapshot:
         return self._values["air_time"]
 
     @property
+    def load(self) -> SX:
+        """Normal force on each contact in the last sub-step [N], shape (n_contacts,)."""
+        return self._values["load"]
+
+    @property
+    def scaled_parameters(self) -> SX:
+        """The randomised figures of the episode, each in [-1, 1], shape (n,)."""
+        return self._values.get("scaled_parameters", SX(0, 1))
+
+    @property
+    def phase(self) -> SX:
+        """Where the gait's clock is [rad]; it starts at 0 with the episode."""
+        return (2 * np.pi * self.control_dt / self._gait_period) * self._values["clock"]
+
+    @property
     def joint_positions(self) -> SX:
         """Independent joint positions [rad], shape (n_joints,)."""
         return self.q[self.q.shape[0] - self._n_joints :]
@@ -103,19 +124,55 @@ class Snapshot:
         """Poses and velocities of all bodies."""
         return outward_velocity_pass(self.mechanism, self.q, self.v, self._values.get("dependent"))
 
-    def touching(self, group: str) -> SX:
-        """Whether each contact sphere of a group is on the ground, 0 or 1, shape (n,)."""
-        heights = [SX(0, 1)]
+    @property
+    def rotor_velocities(self) -> list[SX]:
+        """Speed of each rotor [rad/s]."""
+        speeds = spanning_coordinates(self.mechanism, self.kinematics)[1]
+        return [speeds[rotor.name] for rotor in self.mechanism.robot.rotors()]
+
+    def lowest_points(self, group: str) -> list[tuple[str, SX, SX]]:
+        """Return body, height above the ground [m] and velocity (3,) [m/s] of each contact sphere of a group."""
+        points = []
         for sphere in self.mechanism.robot.contacts:
             if sphere.group == group:
-                centre = self.kinematics.bodies[sphere.body].point_position(constant(np.array(sphere.position)))
-                heights.append(centre[2] - sphere.radius)
-        return ca.vertcat(*heights) < 0
+                body = self.kinematics.bodies[sphere.body]
+                centre = constant(np.array(sphere.position))
+                velocity = body.R @ body.point_velocity(centre)
+                points.append((sphere.body, body.point_position(centre)[2] - sphere.radius, velocity))
+        return points
+
+    def touching(self, group: str) -> SX:
+        """Whether each contact sphere of a group is on the ground, 0 or 1, shape (n,)."""
+        return ca.vertcat(SX(0, 1), *[height for _, height, _ in self.lowest_points(group)]) < 0
+
+    @cached_property
+    def _feet(self) -> dict[str, list[tuple[SX, SX]]]:
+        """Height and velocity of the spheres of each foot; a foot is a body with spheres of the group "foot"."""
+        feet: dict[str, list[tuple[SX, SX]]] = {}
+        for body, height, velocity in self.lowest_points("foot"):
+            feet.setdefault(body, []).append((height, velocity))
+        return feet
+
+    @cached_property
+    def foot_heights(self) -> SX:
+        """Height of the lowest point of each foot above the ground [m], shape (n_feet,)."""
+        lowest = []
+        for spheres in self._feet.values():
+            height = spheres[0][0]
+            for other, _ in spheres[1:]:
+                height = ca.fmin(height, other)
+            lowest.append(height)
+        return ca.vertcat(SX(0, 1), *lowest)
+
+    @cached_property
+    def foot_velocities(self) -> SX:
+        """Mean velocity of the spheres of each foot, world axes [m/s], shape (3, n_feet)."""
+        return ca.horzcat(SX(3, 0), *[sum(v for _, v in spheres) / len(spheres) for spheres in self._feet.values()])
 
     @cached_property
     def foot_contact(self) -> SX:
         """Whether each foot is on the ground, 0 or 1, shape (n_feet,)."""
-        return self.touching("foot")
+        return self.foot_heights < 0
 
     @cached_property
     def landed(self) -> SX:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ce_gym.envs.setup import make_batch
 from ce_gym.envs.shell import BatchShell
-from ce_gym.envs.single import checked_action, recorded_state, spaces
+from ce_gym.envs.single import checked_action, recorded_state, shown, spaces
 
 Observations = NDArray[np.float32]
 
@@ -23,9 +23,10 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
 
     Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit,
     whatever the size of the batch and the number of threads. `infos` holds `diverged`, bool (num_envs,): environments
-    whose simulation failed numerically; they are truncated at their last good state and reset alone. Where an episode
-    has ended, `infos["episode_terms"]` has its length, its return, the sum of every reward term and the mean of every
-    metric (see `Task`).
+    whose simulation failed numerically; they are truncated at their last good state and reset alone; and
+    `reward_terms`, the weighted terms of the rewards by name, each (num_envs,). Where an episode has ended,
+    `infos["episode_terms"]` has its length, its return, the sum of every reward term and the mean of every metric (see
+    `Task`).
 
     Args:
         num_envs: Number of environments.
@@ -34,6 +35,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
             "Disabled", see `gymnasium.vector.AutoresetMode`.
         robot: Name of a robot that ships with the package, or a path to a robot file.
         task: Name of a task.
+        obs_mode: "vector", or "dict" for `{"policy": ..., "critic": ...}`, where the critic may see more.
         **kwargs: See `ce_gym.envs.setup.make_batch`.
 
     Raises:
@@ -50,6 +52,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         robot: str = "mini_cheetah",
         task: str = "velocity",
+        obs_mode: str = "vector",
         **kwargs: Any,
     ) -> None:
         self.autoreset_mode = as_autoreset_mode(autoreset_mode)
@@ -63,7 +66,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
             "autoreset_mode": self.autoreset_mode,
             "render_fps": round(1 / program.control_dt),
         }
-        self.single_observation_space, self.single_action_space = spaces(self.batch.observation_size, program.n_joints)
+        self.single_observation_space, self.single_action_space = spaces(program, obs_mode)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.render_mode = None
@@ -91,7 +94,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         self._observation = np.where(mask[:, None], fresh, self._observation)
         self._elapsed[mask] = 0
         self._finished[mask] = False
-        return self._observation.copy(), {"diverged": np.zeros(self.num_envs, bool)}
+        return self._shown(self._observation), {"diverged": np.zeros(self.num_envs, bool)}
 
     def step(
         self, actions: NDArray[np.float32]
@@ -102,7 +105,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
             ValueError: If the actions have the wrong shape or are not finite.
             gymnasium.error.ResetNeeded: In "Disabled" mode, if a finished environment has not been reset.
         """
-        rows = checked_action(actions, (self.num_envs, self.batch.program.n_joints))
+        rows = checked_action(actions, (self.num_envs, self.batch.program.n_actions))
         resetting = self._finished
         some_reset = bool(resetting.any())
         if some_reset and self.autoreset_mode == AutoresetMode.DISABLED:
@@ -113,7 +116,8 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         self._elapsed += 1
         truncated = (self._elapsed >= self.max_episode_steps) | outcome.diverged
         terminated, reward, observation = outcome.terminated, outcome.reward, outcome.observation
-        infos: dict[str, Any] = {"diverged": outcome.diverged}
+        terms = dict(zip(self.batch.program.reward_terms, outcome.terms.T, strict=True))
+        infos: dict[str, Any] = {"diverged": outcome.diverged, "reward_terms": terms}
         if some_reset:  # next-step mode: these environments ignore the action and show the first observation instead
             fresh = self.batch.reset(resetting)
             observation[resetting] = fresh[resetting]
@@ -126,7 +130,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
             infos["episode_terms"] = self._episode_terms(done)
             infos["_episode_terms"] = done
             if self.autoreset_mode == AutoresetMode.SAME_STEP:
-                infos["final_obs"], infos["_final_obs"] = observation.copy(), done.copy()
+                infos["final_obs"], infos["_final_obs"] = self._shown(observation), done.copy()
                 infos["final_info"], infos["_final_info"] = {"diverged": outcome.diverged.copy()}, done.copy()
                 fresh = self.batch.reset(done)
                 observation[done] = fresh[done]
@@ -134,7 +138,11 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
                 done = np.zeros(self.num_envs, bool)
         self._finished = done
         self._observation = observation
-        return observation.copy(), reward, terminated, truncated, infos
+        return self._shown(observation), reward, terminated, truncated, infos
+
+    def _shown(self, rows: NDArray[np.float32]) -> Any:
+        """Return observations as the space has them, fresh arrays."""
+        return shown(rows.copy(), self.batch.program, self.single_observation_space)
 
     def state(self) -> dict[str, NDArray]:
         """Return what a recorder needs: q, v, command and, if computed, contact_forces (num_envs, n_contacts, 3)."""

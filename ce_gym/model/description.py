@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 Vec3 = tuple[float, float, float]
 Mat3 = tuple[Vec3, Vec3, Vec3]
@@ -318,6 +318,7 @@ class Robot:
         assembly: Pairs (body, angle) for dependent joints: where they are, roughly, in the standing pose. Chooses among
             the ways in which closed loops can be assembled; those not named are near zero [rad or m].
         gravity: Acceleration of free fall in the world frame [m/s^2].
+        tasks: For each task that wants something else on this robot, pairs (name of a figure of the task, value).
         source: The file it was read from, for messages.
         notes: Facts a user should know, such as repaired figures.
     """
@@ -333,6 +334,7 @@ class Robot:
     gains: Gains = Gains()
     assembly: tuple[tuple[str, float], ...] = ()
     gravity: Vec3 = (0.0, 0.0, -9.81)
+    tasks: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()
     source: str = field(default="", compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
 

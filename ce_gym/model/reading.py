@@ -137,6 +137,10 @@ class Section:
             raise bad(self.file, self.key(key), value, f"a list of {count} numbers")
         return tuple(finite(self.file, f"{self.key(key)}[{i}]", item) for i, item in enumerate(value))
 
+    def items(self) -> dict[str, Any]:
+        """Return the whole section as it is."""
+        return self.data
+
     def numbers(self) -> tuple[tuple[str, float], ...]:
         """Return all pairs of a mapping from names to finite numbers."""
         return tuple((key, self.number(key)) for key in self.data)
@@ -165,3 +169,10 @@ def finite(file: str, key: str, value: object) -> float:
         except OverflowError:  # an integer beyond the range of floats
             value = "a number with hundreds of digits"
     raise bad(file, key, value, "a finite number")
+
+
+def frozen(value: Any) -> Any:
+    """Return nested lists and dictionaries as tuples, dictionaries as tuples of pairs, so that they can be hashed."""
+    if isinstance(value, dict):
+        return tuple((str(key), frozen(item)) for key, item in value.items())
+    return tuple(frozen(item) for item in value) if isinstance(value, list) else value

@@ -26,14 +26,14 @@ from ce_gym.model.description import (
 )
 from ce_gym.model.errors import bad
 from ce_gym.model.placement import compose, rotation_from_rpy, symmetric, transform_point, vec3
-from ce_gym.model.reading import Section, finite, read_yaml
+from ce_gym.model.reading import Section, finite, frozen, read_yaml
 from ce_gym.model.urdf import Base, Frame, read_urdf
 from ce_gym.model.urdf_elements import unit_axis
 from ce_gym.model.yaml_constraints import coefficients, frame_named, read_constraints
 
 _KEYS = (
     *("name", "urdf", "base", "sources", "notes", "gravity"),
-    *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains"),
+    *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
 )
 _ROTOR_KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
 
@@ -74,6 +74,7 @@ def robot_from_yaml(path: Path) -> Robot:
         gains=_gains(file.section("gains"), independent),
         assembly=file.section("assembly").numbers(),
         gravity=vec3(file.vector("gravity", 3, (0.0, 0.0, -9.81))),
+        tasks=tuple((name, frozen(task.items())) for name, task in file.section("tasks").sections()),
         source=str(path),
         notes=(*tree.notes, *file.texts("notes")),
     )

@@ -275,7 +275,7 @@ def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, .
 
 def model_key(model: Model) -> str:
     """Return a text that is equal for equal models, for cache keys; where a robot was read from does not matter."""
-    figures = replace(model.robot, source="", notes=())
+    figures = replace(model.robot, source="", notes=(), tasks=())
     functions = [tie for tie in figures.constraints if isinstance(tie, FunctionConstraint)]
     traced = [
         model.casadi_function("loops").serialize() for _ in functions[:1]

@@ -1,0 +1,172 @@
+"""What a task can be told: actions, latency, noise, history, randomisation, pushes, heading, terms of one's own."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+import ce_gym
+
+VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
+
+
+def make(n: int = 4, **arguments):
+    envs = gymnasium.make_vec(VELOCITY, num_envs=n, autoreset_mode="SameStep", **arguments)
+    envs.reset(seed=0)
+    return envs
+
+
+def zeros(envs) -> np.ndarray:
+    return np.zeros(envs.action_space.shape, np.float32)
+
+
+def test_a_term_of_ones_own():
+    @ce_gym.reward
+    def twice_the_height(s):
+        return 2 * s.base_height
+
+    envs = make(reward_weights={"twice_the_height": 3.0})
+    _, _, _, _, infos = envs.step(zeros(envs))
+    expected = 3.0 * 2 * envs.state()["q"][:, 2] * envs.dt
+    np.testing.assert_allclose(infos["reward_terms"]["twice_the_height"], expected, rtol=1e-12)
+
+    def other(s):
+        return -s.base_height
+
+    other.__name__ = "twice_the_height"
+    ce_gym.reward(other)  # another function under the same name is another program
+    changed = make(reward_weights={"twice_the_height": 3.0})
+    _, _, _, _, infos = changed.step(zeros(changed))
+    np.testing.assert_allclose(infos["reward_terms"]["twice_the_height"], -expected / 2, rtol=1e-12)
+    with pytest.raises(ValueError, match="the package has one of this name"):
+
+        @ce_gym.reward
+        def torques(s):
+            return 0
+
+
+def test_joint_torques_as_actions():
+    envs = make(actions="joint_torque", contacts=(), reset_noise={"joint_position": 0.0})
+    limits = np.array([envs.model.robot.body(name).joint.torque for name in envs.model.joint_links])
+    envs.step(zeros(envs) + 0.5)
+    np.testing.assert_allclose(envs.batch.rows("torque"), np.tile(0.5 * limits, (4, 1)))
+
+
+def test_only_some_joints_act():
+    envs = make(action_joints=["*knee*"])
+    assert envs.single_action_space.shape == (4,)
+    envs.step(zeros(envs) + 1.0)
+    names = envs.model.joint_links
+    torque = envs.batch.rows("torque")
+    still = [i for i, name in enumerate(names) if "knee" not in name]
+    assert np.abs(torque[:, [i for i in range(12) if i not in still]]).min() > np.abs(torque[:, still]).mean()
+
+
+def test_late_actions():
+    """A delay of all sub-steps is the action of the step before; of none, the present one."""
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, 4, 12)).astype(np.float32)
+    plain, late, punctual = make(), make(latency=(4, 4)), make(latency=(0, 0))
+    held = zeros(plain)
+    for action in actions:
+        late.step(action)
+        plain.step(held)
+        held = action
+        np.testing.assert_allclose(late.state()["q"], plain.state()["q"], atol=1e-12)
+    assert "delay" not in punctual.batch.program.state_sizes
+    drawn = make(256, latency=(0, 3)).batch.rows("delay")[:, 0]
+    assert set(drawn) == {0.0, 1.0, 2.0, 3.0}
+
+
+def test_history_shows_the_newest_first():
+    envs = make(history=3)
+    size = sum(envs.observation_structure.values())
+    assert envs.single_observation_space.shape == (3 * size,)
+    first, _ = envs.reset(seed=1)
+    np.testing.assert_array_equal(first[:, :size], first[:, 2 * size :])
+    second, *_ = envs.step(zeros(envs))
+    third, *_ = envs.step(zeros(envs))
+    np.testing.assert_array_equal(third[:, size : 2 * size], second[:, :size])
+    np.testing.assert_array_equal(third[:, 2 * size :], first[:, :size])
+
+
+def test_noise_is_for_the_policy_only():
+    arguments = {"critic": ["contact_forces", "rotor_speeds", "torques"], "obs_mode": "dict"}
+    clean, noisy = make(512, **arguments), make(512, noise={"joint_positions": 0.05}, **arguments)
+    a, *_ = clean.step(zeros(clean))
+    b, *_ = noisy.step(zeros(noisy))
+    structure = clean.observation_structure
+    start = sum(n for name, n in list(structure.items())[: list(structure).index("joint_positions")])
+    difference = b["policy"] - a["policy"]
+    joints = difference[:, start : start + 12]
+    assert np.abs(joints).max() <= 0.05 + 1e-6
+    assert np.std(joints) == pytest.approx(0.05 / np.sqrt(3), rel=0.05)
+    assert np.abs(np.delete(difference, np.arange(start, start + 12), axis=1)).max() == 0
+    np.testing.assert_array_equal(a["critic"], b["critic"])
+    np.testing.assert_array_equal(a["critic"][:, : sum(structure.values())], a["policy"])
+    assert a["critic"].shape[1] == sum(structure.values()) + 8 + 12 + 12
+    assert noisy.observation_space.contains(b)
+
+
+def test_randomised_figures_change_the_motion_and_are_seen_by_the_critic():
+    ranges = {"friction": (0.3, 1.2), "added_mass": (-1.0, 3.0), "com_shift": (-0.03, 0.03), "kp": (0.8, 1.2)}
+    ranges |= {"motor_strength": (0.9, 1.1), "rotor_inertia": (0.5, 2.0)}
+    envs = make(1024, randomise=ranges, critic=["parameters"], obs_mode="dict")
+    values = envs.batch.rows("parameters")
+    assert values.shape == (1024, 1 + 1 + 3 + 12 + 1 + 1)
+    assert 0.3 <= values[:, 0].min() < 0.35
+    assert 1.15 < values[:, 0].max() <= 1.2
+    np.testing.assert_allclose(values.mean(0)[:5], [0.75, 1.0, 0, 0, 0], atol=0.1)
+    observation, *_ = envs.step(zeros(envs))
+    seen = observation["critic"][:, -values.shape[1] :]
+    np.testing.assert_allclose(seen[:, 0], (values[:, 0] - 0.75) / 0.45, atol=1e-6)
+    before = values.copy()
+    envs.reset(options={"reset_mask": np.arange(1024) < 10})
+    changed = (envs.batch.rows("parameters") != before).any(1)
+    assert changed[:10].all()
+    assert not changed[10:].any()
+    with pytest.raises(ValueError, match="randomise='colour'"):
+        make(randomise={"colour": (0, 1)})
+
+
+def test_pushes_come_on_time():
+    calm, pushed = make(64), make(64, push_period=0.1, push_speed=1.0)
+    for step in range(1, 11):
+        calm.step(zeros(calm))
+        pushed.step(zeros(pushed))
+        difference = pushed.state()["v"] - calm.state()["v"]
+        assert (np.abs(difference).max() > 0) == (step >= 5)
+        if step == 5:
+            assert np.abs(difference[:, [0, 1, 2, 5]]).max() == 0
+            assert 0.8 < np.abs(difference[:, 3:5]).max() <= 1.0
+
+
+def test_headings_are_turned_to():
+    envs = make(256, heading=True, standing_fraction=0.0)
+    observation, *_ = envs.step(zeros(envs))
+    state, heading = envs.state(), envs.batch.rows("heading")[:, 0]
+    w, x, y, z = state["q"][:, 3:7].T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    error = np.angle(np.exp(1j * (heading - yaw)))
+    np.testing.assert_allclose(state["command"][:, 2], np.clip(0.5 * error, -1, 1), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"colour": 3}, "unknown argument 'colour'"),
+        ({"actions": "telepathy"}, "actions='telepathy'; expected 'joint_pd'"),
+        ({"history": 0}, "history=0; expected a whole number"),
+        ({"latency": (2, 1)}, "latency=.*; expected a pair"),
+        ({"noise": {"smell": 1.0}}, "noise='smell'; expected an observation"),
+        ({"action_joints": ["*wing*"]}, "action_joints=.*; expected patterns"),
+        ({"command_range": ((0, 1),)}, "command_range=.*; expected three pairs"),
+        ({"push_period": -1}, "push_period=-1; expected 0 or more"),
+        ({"heading": 1}, "heading=1; expected true or false"),
+        ({"reward_weights": {"torques": "much"}}, "reward_weights='much'; expected a finite number"),
+        ({"obs_mode": "image"}, "obs_mode='image'"),
+    ],
+)
+def test_bad_arguments(arguments: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        make(**arguments)
