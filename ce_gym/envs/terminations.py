@@ -15,6 +15,11 @@ def torso_contact(s: Snapshot) -> SX:
     return ca.sum1(s.touching("torso")) > 0
 
 
+def fallen(s: Snapshot) -> SX:
+    """The base is lower than 60 % of its standing height."""
+    return s.base_height < 0.6 * s.mechanism.robot.pose.height
+
+
 def tilt(s: Snapshot) -> SX:
     """The base leans by more than 70 degrees."""
     return s.up[2] < math.cos(math.radians(70))

@@ -143,7 +143,7 @@ def test_pushes_come_on_time():
 
 def test_headings_are_turned_to():
     envs = make(256, heading=True, standing_fraction=0.0)
-    observation, *_ = envs.step(zeros(envs))
+    envs.step(zeros(envs))
     state, heading = envs.state(), envs.batch.rows("heading")[:, 0]
     w, x, y, z = state["q"][:, 3:7].T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
