@@ -10,12 +10,14 @@ from ce_gym.dynamics.model import Model
 from ce_gym.envs.custom import register_robot
 from ce_gym.envs.registration import environment_ids, register_environments
 from ce_gym.envs.terms import metric, observation, reward, termination
-from ce_gym.model import Robot, RobotError, load_robot, robots
+from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
 from ce_gym.sim.simulator import Simulator
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "InertiaWarning",
+    "LossyImportWarning",
     "Model",
     "Robot",
     "RobotError",

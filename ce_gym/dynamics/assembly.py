@@ -92,12 +92,19 @@ class Assembler:
         Raises:
             RobotError: The loops do not close, or the independent joints do not determine the others.
         """
-        q, gap = self._close(self._start(), self.dependent)
+        start = self._start()
+        if not all(np.isfinite(x).all() for x in self._all(start)):
+            raise self._error("is not a number at the standing pose: expected `pose` and `assembly` where it is one")
+        q, gap = self._close(start, self.dependent)
         closed = gap < CLOSED
         rows = self._independent_rows(q if closed else self._close(q, list(range(self.n)))[0])
+        if not rows:
+            raise self._error("says nothing that joints and linear constraints do not: expected it left out")
         count = self.n - len(self.A) - len(rows)
         if len(self.independent) != count:
             raise self._error(f"has {len(self.independent)} independent joints: expected {count} of them")
+        if count == 0:
+            raise self._error("leaves its joints no freedom: expected fewer constraints")
         if not closed:
             raise self._error(
                 f"does not close at the standing pose, gap {gap:.2g}: expected `pose` and `assembly` near"
@@ -133,6 +140,8 @@ class Assembler:
         q = q.copy()
         for _ in range(200):
             phi, K = self._all(q)
+            if not (np.isfinite(phi).all() and np.isfinite(K).all()):
+                return q, np.inf
             if np.abs(phi).max() < 1e-15:
                 break
             step = -np.linalg.lstsq(K[:, free], phi, rcond=1e-10)[0]
@@ -162,7 +171,7 @@ class Assembler:
         K = self._all(q)[1][[*range(len(self.A)), *(len(self.A) + row for row in rows)]]
         K = K / np.abs(K).max(axis=1, keepdims=True).clip(1e-300)
         values = np.linalg.svd(K[:, self.dependent], compute_uv=False)
-        if values[-1] < SINGULAR * values[0]:
+        if values[-1] <= SINGULAR * values[0]:
             names = ", ".join(self.cluster.bodies[i] for i in self.dependent)
             chosen = ", ".join(self.cluster.independent)
             expected = f"expected independent joints that determine {names} at the standing pose, unlike {chosen}"

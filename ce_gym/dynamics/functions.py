@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 import numpy as np
 
+from ce_gym.dynamics.assembly import linear_rows, nonlinear_rows
 from ce_gym.dynamics.ce_aba import (
     BodyTerms,
     JointTerms,
@@ -18,8 +19,8 @@ from ce_gym.dynamics.ce_aba import (
     inward_inertia_pass,
     outward_acceleration_pass,
 )
-from ce_gym.dynamics.ce_rnea import inverse_dynamics
-from ce_gym.dynamics.closure import reference_guess
+from ce_gym.dynamics.ce_rnea import inverse_dynamics, outward_acceleration
+from ce_gym.dynamics.closure import closures, reference_guess
 from ce_gym.dynamics.constraints import ClusterCoordinates
 from ce_gym.dynamics.kinematics import Kinematics, constant, is_free, outward_velocity_pass
 from ce_gym.dynamics.residuals import gap as constraint_gap
@@ -124,6 +125,32 @@ def _spanning_jacobian(mechanism: Mechanism) -> ca.Function:
     return _function("spanning_jacobian", guess, {"q": q}, {"G": G})
 
 
+def _implicit_constraint(mechanism: Mechanism) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
+    order = [body.name for body in mechanism.robot.bodies if body.joint.type != "free"]
+    base = 6 if mechanism.robot.floating else 0
+    jacobians, biases = [SX(0, base + len(order))], [SX(0, 1)]
+    for cluster, closure, coordinates in zip(
+        mechanism.tree.clusters, closures(mechanism), kinematics.coordinates, strict=True
+    ):
+        if coordinates is None:
+            continue
+        at, speed = SX.sym("q", len(cluster.bodies)), SX.sym("qd", len(cluster.bodies))
+        phi = constant(linear_rows(cluster)[0]) @ at
+        if closure is not None:
+            phi = ca.vertcat(phi, nonlinear_rows(mechanism.robot, cluster, at)[list(closure.assembly.rows)])
+        K = ca.jacobian(phi, at)
+        rows = ca.Function("rows", [at, speed], [K, -ca.jtimes(K @ speed, at, speed)])
+        here, bias = rows(coordinates.q, coordinates.qd)
+        spread = SX(here.shape[0], base + len(order))
+        spread[:, [base + order.index(name) for name in cluster.bodies]] = here
+        jacobians.append(spread)
+        biases.append(bias)
+    outputs = {"K": ca.vertcat(*jacobians), "k": ca.vertcat(*biases)}
+    return _function("implicit_constraint", guess, {"q": q, "v": v}, outputs)
+
+
 def _loops(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinematics = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
@@ -162,6 +189,42 @@ def _contact_points(mechanism: Mechanism) -> ca.Function:
         velocities.append(body.R @ body.point_velocity(r))
     outputs = {"positions": ca.horzcat(*positions), "velocities": ca.horzcat(*velocities)}
     return _function("contact_points", guess, {"q": q, "v": v}, outputs)
+
+
+def _body_velocities(mechanism: Mechanism) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
+    _, rates = spanning_coordinates(mechanism, kinematics)
+    angular, linear = [], []
+    for body in mechanism.robot.bodies:
+        if body.name in kinematics.bodies:
+            state = kinematics.bodies[body.name]
+            w, origin = state.R @ state.v[:3], state.R @ state.v[3:]
+        else:  # a rotor that is no body of the recursion turns about an axis of its carrier
+            axis = constant(np.array(body.placement.rotation) @ np.array(body.joint.axis)) * rates[body.name]
+            w, origin = axis, SX(3, 1)
+            if body.parent is not None:
+                carrier = kinematics.bodies[body.parent]
+                w = carrier.R @ (carrier.v[:3] + axis)
+                origin = carrier.R @ carrier.point_velocity(constant(np.array(body.placement.position)))
+        angular.append(w)
+        linear.append(origin)
+    outputs = {"angular": ca.horzcat(*angular), "linear": ca.horzcat(*linear)}
+    return _function("body_velocities", guess, {"q": q, "v": v}, outputs)
+
+
+def _contact_accelerations(mechanism: Mechanism) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    vdot = SX.sym("vdot", v.shape[0])
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
+    a_bodies, _ = outward_acceleration(mechanism, kinematics, vdot)
+    gravity, accelerations = gravity_acceleration(mechanism), [SX(3, 0)]
+    for contact in mechanism.robot.contacts:
+        body, a, r = kinematics.bodies[contact.body], a_bodies[contact.body], constant(np.array(contact.position))
+        in_body_axes = a[3:] + cross(a[:3], r) + cross(body.v[:3], cross(body.v[:3], r))
+        accelerations.append(body.R @ in_body_axes + gravity)
+    outputs = {"accelerations": ca.horzcat(*accelerations)}
+    return _function("contact_accelerations", guess, {"q": q, "v": v, "vdot": vdot}, outputs)
 
 
 def _energy(mechanism: Mechanism) -> ca.Function:
@@ -260,8 +323,11 @@ FUNCTIONS: dict[str, Callable[[Mechanism], ca.Function]] = {
     "spanning": _spanning,
     "spanning_acceleration": _spanning_acceleration,
     "spanning_jacobian": _spanning_jacobian,
+    "implicit_constraint": _implicit_constraint,
     "loops": _loops,
     "body_poses": _body_poses,
+    "body_velocities": _body_velocities,
     "contact_points": _contact_points,
+    "contact_accelerations": _contact_accelerations,
     "energy": _energy,
 }

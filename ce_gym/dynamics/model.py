@@ -15,16 +15,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.dynamics.closure import closures, reference_guess
+from ce_gym.dynamics.batched import evaluate
+from ce_gym.dynamics.closure import closures, loop_report, reference_guess
+from ce_gym.dynamics.continuation import follow
 from ce_gym.dynamics.functions import FUNCTIONS
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
 from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
-
-CONTINUATION_STEPS = 16
-"""Steps in which dependent joints are followed from the reference pose to a configuration."""
 
 
 class Model:
@@ -122,9 +121,11 @@ class Model:
 
         Args:
             name: "forward_dynamics" (q, v, tau) -> vdot; "inverse_dynamics" (q, v, vdot) -> tau; "mass_matrix" q -> M;
-                "bias_force" (q, v) -> tau at vdot = 0; "spanning" (q, v) -> (q_span, v_span); "body_poses" q ->
-                positions (3, n), rotations (3, 3 n); "contact_points" (q, v) -> positions (3, n), velocities (3, n);
-                "energy" (q, v) -> kinetic, potential.
+                "bias_force" (q, v) -> tau at vdot = 0; "spanning" (q, v) -> (q_span, v_span); "implicit_constraint"
+                (q, v) -> (K, k); "body_poses" q -> positions (3, n), rotations (3, 3 n); "body_velocities" (q, v) ->
+                angular (3, n), linear (3, n); "contact_points" (q, v) -> positions (3, n), velocities (3, n);
+                "contact_accelerations" (q, v, vdot) -> accelerations (3, n); "energy" (q, v) -> kinetic, potential.
+                Robots with loops that no formula closes have one input more, see `dependent_guess`.
 
         Raises:
             KeyError: If there is no such quantity.
@@ -213,6 +214,47 @@ class Model:
         """Return accelerations of every joint, in the order of `spanning` velocities, shape (..., nv_span)."""
         return self._evaluate("spanning_acceleration", q, v, vdot)[0][..., 0]
 
+    def explicit_constraint(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+        """Return `G` and `g`, which give the motion of every joint: `v_span = G v`, `vdot_span = G vdot + g`.
+
+        Args:
+            q: Positions, shape (..., nq).
+            v: Velocities, shape (..., nv).
+
+        Returns:
+            `G`, shape (..., nv_span, nv), and `g`, shape (..., nv_span), rows in the order of `spanning` velocities.
+
+        Raises:
+            ValueError: If a shape is wrong, or a loop does not close at `q`.
+
+        Source: arXiv:2311.13732, explicit constraints; the base's six velocities have ones in `G` and zeros in `g`.
+        """
+        g = self.spanning_acceleration(q, v, np.zeros(self.nv))
+        G = self._evaluate("spanning_jacobian", q)[0]
+        return np.broadcast_to(G, (*g.shape[:-1], *G.shape[-2:])), g
+
+    def implicit_constraint(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+        """Return `K` and `k`, which say what ties the joints: `K v_span = 0`, `K vdot_span = k`.
+
+        One row for each tie that is not implied by the others, cluster by cluster, linear ties of a cluster first:
+        away from singularities `K` has full rank, and its null space is the column space of `G`.
+
+        Args:
+            q: Positions, shape (..., nq).
+            v: Velocities, shape (..., nv).
+
+        Returns:
+            `K`, shape (..., nv_span - nv, nv_span), and `k`, shape (..., nv_span - nv), columns in the order of
+            `spanning` velocities. Rows of loops are in metres or without unit, of rods in square metres.
+
+        Raises:
+            ValueError: If a shape is wrong, or a loop does not close at `q`.
+
+        Source: arXiv:2311.13732, implicit constraints `phi(q_span) = 0`.
+        """
+        K, k = self._evaluate("implicit_constraint", q, v)
+        return K, k[..., 0]
+
     def actuator_matrix(self, q: ArrayLike, actuated: Sequence[str] | None = None) -> Array:
         """Return `W`, shape (..., n, nv), that takes efforts of actuators to generalised forces, `tau = W^T effort`.
 
@@ -265,18 +307,14 @@ class Model:
         q = np.asarray(q, dtype=float)
         if q.ndim == 0 or q.shape[-1] != self.nq:
             raise ValueError(f"q has shape {q.shape}; expected (..., {self.nq})")
-        loops, start = self.casadi_function("loops"), self.standing_q
         flat = q.reshape(-1, self.nq)
-        guess = np.tile(self.guess, (len(flat), 1))
-        shares = [*np.linspace(0.0, 1.0, CONTINUATION_STEPS + 1)[1:], 1.0]  # twice at the end, to the last digit
-        for share in shares if guess.size else ():
-            here = flat + (1.0 - share) * (start - flat)
-            found, gap, nearness = (np.array(out.full()) for out in loops.map(len(flat)).call([here.T, guess.T]))
-            guess = found.T
-            if not nearness.min() > 0.0:
-                raise ValueError(f"the loops of {self.robot.name} pass a singularity on the way to this q")
-        if guess.size and not gap.max() < 1e-9:
-            raise ValueError(f"the loops of {self.robot.name} do not close at this q: gap {gap.max():.2g}")
+        if self.guess.size == 0 or len(flat) == 0:
+            return np.zeros((*q.shape[:-1], len(self.guess)))
+        guess, gap, nearness = follow(self.casadi_function("loops"), self.standing_q, self.guess, flat)
+        if not nearness > 0.0:
+            raise ValueError(f"the loops of {self.robot.name} pass a singularity on the way to this q")
+        if not gap < 1e-9:
+            raise ValueError(f"the loops of {self.robot.name} do not close at this q: gap {gap:.2g}")
         return guess.reshape(*q.shape[:-1], len(self.guess))
 
     def body_poses(self, q: ArrayLike) -> tuple[Array, Array]:
@@ -290,10 +328,26 @@ class Model:
         stacked = rotations.reshape(*rotations.shape[:-1], n, 3)  # (..., row, body, column)
         return np.swapaxes(positions, -1, -2), np.moveaxis(stacked, -2, -3)
 
+    def body_velocities(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+        """Return how all bodies move, in the order of `body_names`.
+
+        Returns:
+            Angular velocities [rad/s] and velocities of the origins [m/s], world axes, each shape (..., n, 3).
+        """
+        angular, linear = self._evaluate("body_velocities", q, v)
+        return np.swapaxes(angular, -1, -2), np.swapaxes(linear, -1, -2)
+
     def contact_points(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Return centres [m] and velocities [m/s] of the contact spheres in the world, each shape (..., n, 3)."""
         position, velocity = self._evaluate("contact_points", q, v)
         return np.swapaxes(position, -1, -2), np.swapaxes(velocity, -1, -2)
+
+    def contact_accelerations(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
+        """Return the accelerations of the centres of the contact spheres in the world, shape (..., n, 3) [m/s^2].
+
+        Second derivatives of their positions, for the acceleration `vdot` (..., nv): a robot at rest has none.
+        """
+        return np.swapaxes(self._evaluate("contact_accelerations", q, v, vdot)[0], -1, -2)
 
     def energy(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Return kinetic and potential energy [J], each shape (...)."""
@@ -302,16 +356,7 @@ class Model:
 
     def loop_report(self) -> str:
         """Return one line for each cluster with closed loops: how it is solved and how well it is conditioned."""
-        lines = []
-        for cluster, closure in zip(self.cluster_tree.clusters, closures(self.mechanism), strict=True):
-            if closure is not None:
-                found = sum(len(block.unknowns) for block in closure.blocks if block.formula is not None)
-                lines.append(
-                    f"loops of {', '.join(tie.name for tie in cluster.constraints)}: {found} joints by formula, "
-                    f"{len(closure.guessed)} by iteration, {closure.assembly.dropped} redundant rows dropped, "
-                    f"condition number {closure.assembly.condition:.3g} for {', '.join(cluster.independent)}"
-                )
-        return "\n".join(lines)
+        return loop_report(self.mechanism)
 
     def describe(self) -> str:
         """Return a readable account of the robot: figures, and its cluster tree as text."""
@@ -329,32 +374,13 @@ class Model:
         return "\n".join(lines)
 
     def _evaluate(self, name: str, *arguments: ArrayLike) -> list[Array]:
-        """Evaluate a traced function on arrays that share leading batch dimensions; outputs (..., rows, columns)."""
+        """Evaluate a traced quantity on arrays that share leading batch dimensions; outputs (..., rows, columns)."""
         function = self.casadi_function(name)
         arrays = [np.asarray(a, dtype=float) for a in arguments]
         if "guess" in function.name_in():
             arrays.append(self.dependent_guess(arrays[0]))
-        for i, a in enumerate(arrays):
-            if a.ndim == 0 or a.shape[-1] != function.size1_in(i):
-                raise ValueError(
-                    f"{name}: {function.name_in(i)} has shape {a.shape}; expected (..., {function.size1_in(i)})"
-                )
-        batch = np.broadcast_shapes(*[a.shape[:-1] for a in arrays])
-        count = int(np.prod(batch))
-        flat = [np.broadcast_to(a, (*batch, a.shape[-1])).reshape(count, a.shape[-1]).T for a in arrays]
-        if count == 0:
-            return [np.zeros((*batch, *function.size_out(i))) for i in range(function.n_out())]
-        outputs = function.call([ca.DM(a) for a in flat]) if count == 1 else function.map(count).call(flat)
-        results = []
-        for i, output in enumerate(outputs):
-            rows, columns = function.size_out(i)
-            value = np.asarray(ca.DM(output).full()).reshape(rows, count, columns)
-            if (
-                self._has_loops
-                and name != "loops"
-                and np.isnan(value).any()
-                and not any(np.isnan(a).any() for a in flat)
-            ):
-                raise ValueError(f"{name}: the loops of {self.robot.name} cannot be closed at this q")
-            results.append(np.moveaxis(value, 1, 0).reshape(*batch, rows, columns))
+        results = evaluate(function, arrays)
+        unusable, given = any(np.isnan(r).any() for r in results), not any(np.isnan(a).any() for a in arrays)
+        if self._has_loops and name != "loops" and unusable and given:
+            raise ValueError(f"{name}: the loops of {self.robot.name} cannot be closed at this q")
         return results

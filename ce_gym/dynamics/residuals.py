@@ -24,7 +24,7 @@ from ce_gym.model.description import (
     RodConstraint,
     Vec3,
 )
-from ce_gym.model.errors import RobotError
+from ce_gym.model.errors import RobotError, shown
 from ce_gym.model.mechanism import snapped
 
 Angles = Mapping[str, SX]
@@ -50,7 +50,7 @@ def residual(robot: Robot, constraint: Constraint, angles: Angles) -> SX:
         return _rod(robot, constraint, angles)
     if isinstance(constraint, LoopConstraint):
         return _loop(robot, constraint, angles)
-    return _function(constraint, angles)
+    return _function(robot, constraint, angles)
 
 
 def gap(robot: Robot, constraint: Constraint, angles: Angles) -> SX:
@@ -121,14 +121,20 @@ def _loop(robot: Robot, loop: LoopConstraint, angles: Angles) -> SX:
     return ca.vertcat(gap, tilt)
 
 
-def _function(constraint: FunctionConstraint, angles: Angles) -> SX:
+def _function(robot: Robot, constraint: FunctionConstraint, angles: Angles) -> SX:
+    key = f"{robot.source or robot.name}: constraint {constraint.name!r}: function {constraint.function!r}"
     function = constraint_function(constraint.function)
-    values = list(function([angles[body] for body in constraint.arguments]))
+    try:
+        values = list(function([angles[body] for body in constraint.arguments]))
+    except Exception as error:  # whatever users' own code raises
+        reason = str(error).strip().split("\n")[0]
+        raise RobotError(f"{key} fails with {type(error).__name__}: {reason}") from None
+    for value in values:
+        if not isinstance(value, SX | ca.DM | float | int) or SX(value).numel() != 1:
+            raise RobotError(f"{key} returned {shown(value)}: expected numbers and expressions, one for each row")
     if constraint.dependent and len(values) != len(constraint.dependent):
-        raise RobotError(
-            f"constraint {constraint.name!r}: function {constraint.function!r} returned {len(values)} values: "
-            f"expected {len(constraint.dependent)}, one for each dependent body"
-        )
+        expected = f"expected {len(constraint.dependent)}, one for each dependent body"
+        raise RobotError(f"{key} returned {len(values)} values: {expected}")
     explicit = [angles[body] for body in constraint.dependent]
     return ca.vertcat(*[q - value for q, value in zip(explicit, values, strict=True)] if explicit else values)
 

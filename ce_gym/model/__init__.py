@@ -25,7 +25,7 @@ from ce_gym.model.description import (
     Shape,
     Vec3,
 )
-from ce_gym.model.errors import InertiaWarning, RobotError
+from ce_gym.model.errors import InertiaWarning, LossyImportWarning, RobotError
 from ce_gym.model.load import assets_folder, load_robot, robots
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "Joint",
     "LinearConstraint",
     "LoopConstraint",
+    "LossyImportWarning",
     "Mat3",
     "Motor",
     "Placement",

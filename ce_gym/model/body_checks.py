@@ -39,7 +39,7 @@ def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
 def _check_joint(file: str, where: str, joint: Joint) -> None:
     if joint.type not in ("revolute", "prismatic"):
         raise bad(file, f"{where} joint type", joint.type, "free, revolute or prismatic")
-    if not math.isclose(math.hypot(*joint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
+    if len(joint.axis) != 3 or not math.isclose(math.hypot(*joint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
         raise bad(file, f"{where} joint axis", joint.axis, "a unit axis")
     lower, upper = joint.position
     if not lower <= upper:
@@ -71,3 +71,14 @@ def violates_triangle_inequality(body: Body) -> bool:
     """Whether one principal moment exceeds the sum of the others, which no distribution of mass can do."""
     small, middle, large = np.linalg.eigvalsh(np.array(body.inertial.inertia))
     return bool(large > (small + middle) * (1.0 + RELATIVE_TOLERANCE))
+
+
+def moves_inertia(body: Body) -> bool:
+    """Whether every motion of its own joint moves some inertia of a body."""
+    inertia, axis = np.array(body.inertial.inertia), np.array(body.joint.axis)
+    if body.joint.type == "free":
+        return bool(body.inertial.mass > 0.0 and np.linalg.matrix_rank(inertia) == 3)
+    if body.joint.type == "prismatic":
+        return body.inertial.mass > 0.0
+    offset = np.cross(axis, np.array(body.inertial.com))
+    return bool(axis @ inertia @ axis + body.inertial.mass * (offset @ offset) > 0.0)

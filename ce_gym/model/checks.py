@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from ce_gym.model.body_checks import check_body, check_finite, violates_triangle_inequality
+from ce_gym.model.body_checks import check_body, check_finite, moves_inertia, violates_triangle_inequality
 from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.constraint_checks import check_constraint
 from ce_gym.model.description import LinearConstraint, Robot
@@ -35,6 +35,7 @@ def check_robot(robot: Robot) -> None:
         check_body(body, file, may_be_massless=body.name in supported and body.joint.type != "free")
     _check_constraints(robot, file)
     _check_independent(robot, file)
+    _check_something_moves(robot, file)
     _check_contacts(robot, file)
     _check_motors(robot, file)
     _check_pose_and_gains(robot, file)
@@ -103,6 +104,15 @@ def _check_determined(cluster: Cluster, file: str) -> None:
         raise bad(file, key, cluster.independent, f"joints that determine {', '.join(dependent)}; these do not")
 
 
+def _check_something_moves(robot: Robot, file: str) -> None:
+    """The joint of a body that carries nothing and is tied to nothing must move some inertia."""
+    tied = {name for constraint in robot.constraints for name in constraint.bodies}
+    for body in robot.bodies:
+        if body.name not in tied | {other.parent for other in robot.bodies} and not moves_inertia(body):
+            expected = "a mass or an inertia that its joint moves"
+            raise bad(file, f"{body.kind} {body.name!r} inertia", body.inertial.inertia, expected)
+
+
 def _check_contacts(robot: Robot, file: str) -> None:
     _check_unique(file, "contact name", [contact.name for contact in robot.contacts])
     names = [body.name for body in robot.bodies]
@@ -110,6 +120,8 @@ def _check_contacts(robot: Robot, file: str) -> None:
         key = f"contacts.{contact.name}"
         if contact.body not in names:
             raise unknown(file, f"{key}.body", contact.body, names, "the name of a body")
+        if robot.body(contact.body).kind == "rotor":
+            raise bad(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
         check_finite(file, f"{key}.position", contact.position)
         if not 0.0 <= contact.radius < math.inf:
             raise bad(file, f"{key}.radius", contact.radius, "0 or more [m]")

@@ -158,7 +158,7 @@ def _cluster(
 ) -> Cluster:
     members = [body for body in robot.bodies if body.name in group]
     free = [body.name for body in members if body.joint.type == "free"]
-    if free and len(group) > 1:
+    if free and ties:
         names = ", ".join(constraint.name for constraint in ties)
         expected = f"a tie that does not reach across the free joint of {free[0]}"
         raise bad(robot.source or robot.name, f"constraint {names}", tuple(group), expected)

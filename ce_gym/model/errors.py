@@ -24,6 +24,10 @@ class InertiaWarning(UserWarning):
     """A published inertia that no rigid body can have; it is kept as published."""
 
 
+class LossyImportWarning(UserWarning):
+    """A file says things that a `Robot` cannot; the message lists them all."""
+
+
 def bad(file: str, key: str, value: object, expected: str) -> RobotError:
     """Return the error for one bad value: file, key, value, and what was expected.
 

@@ -24,11 +24,12 @@ import numpy as np
 
 from ce_gym.model.checks import check_robot
 from ce_gym.model.description import Pose, Robot
+from ce_gym.model.errors import LossyImportWarning
 from ce_gym.model.mjcf_actuators import read_actuators
 from ce_gym.model.mjcf_bodies import MjcfTree, read_bodies, shapes
 from ce_gym.model.mjcf_contacts import read_contacts
 from ce_gym.model.mjcf_rotors import add_rotors
-from ce_gym.model.mjcf_source import LossyImportWarning, MjcfSource, read_mjcf
+from ce_gym.model.mjcf_source import MjcfSource, read_mjcf
 from ce_gym.model.mjcf_ties import choose_independent, locked_joints, read_constraints
 from ce_gym.model.placement import vec3
 from ce_gym.model.rotor_rule import with_rotors
@@ -61,8 +62,8 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
     gains = read_actuators(source, tree, independent)
     contacts, material = read_contacts(source, tree)
     _add_shapes(source, tree)
-    dependent = [body for body in tree.moved_by.values() if body not in independent]
-    tree.bodies[:] = with_rotors(tree.bodies, constraints, dependent)
+    links = {*independent, *(contact.body for contact in contacts)}  # what touches the ground spins outside
+    tree.bodies[:] = with_rotors(tree.bodies, constraints, [b for b in tree.moved_by.values() if b not in links])
     gears = add_rotors(source, tree, gear_ratios or {})
     pose, assembly = _pose(source, tree, independent)
     robot = Robot(

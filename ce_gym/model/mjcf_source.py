@@ -33,10 +33,6 @@ _FIGURES = (
 )
 
 
-class LossyImportWarning(UserWarning):
-    """A file says things that a `Robot` cannot; the message lists them all."""
-
-
 @dataclass
 class MjcfSource:
     """A compiled file, and what has been found in it that cannot be represented.

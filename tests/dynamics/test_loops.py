@@ -1,4 +1,4 @@
-"""Closed loops, rods and users' constraints: against a dense solve, against physics, and when they are wrong."""
+"""Closed loops, rods and users' constraints: against physics, and when they are wrong. Dense solves: test_dense.py."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from linkages import four_bar, link, rod_leg, spatial_four_bar
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.closure import closures
 from ce_gym.dynamics.integration import advance
-from ce_gym.dynamics.residuals import residual
 from ce_gym.dynamics.spatial import SX
 from ce_gym.model import (
     FunctionConstraint,
-    Gains,
     LinearConstraint,
     LoopConstraint,
     Pose,
@@ -52,50 +50,6 @@ def states(model: Model, count: int = 10) -> tuple[np.ndarray, np.ndarray]:
         q[:, 3:7] = rng.normal(size=(count, 4))
         q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
     return q, rng.normal(0, 2, (count, model.nv))
-
-
-def without_constraints(robot: Robot) -> Model:
-    """The spanning tree: every joint free. Constraints are then imposed from outside."""
-    joints = tuple(body.name for body in robot.bodies if body.joint.type != "free")
-    nothing = {"constraints": (), "pose": Pose(), "assembly": (), "gains": Gains()}
-    return Model(replace(robot, independent=joints, **nothing))
-
-
-def constraint_rows(robot: Robot, joints: tuple[str, ...]) -> ca.Function:
-    """All constraints, redundant rows too, and their second derivative along a velocity."""
-    q, v = SX.sym("q", len(joints)), SX.sym("v", len(joints))
-    angles = dict(zip(joints, ca.vertsplit(q), strict=True))
-    phi = ca.vertcat(*[residual(robot, tie, angles) for tie in robot.constraints])
-    K = ca.jacobian(phi, q)
-    return ca.Function("rows", [q, v], [phi, K, -ca.jtimes(K @ v, q, v)])
-
-
-def test_against_a_dense_solve(model: Model):
-    """The spanning tree with all constraint rows: accelerations that meet the rows, and no force along what is free."""
-    tree, robot = without_constraints(model.robot), model.robot
-    rows = constraint_rows(robot, tree.joint_links)
-    base_q, base_v = (7, 6) if robot.floating else (0, 0)
-    for q, v in zip(*states(model), strict=True):
-        tau = np.random.default_rng(6).normal(0, 5, model.nv)
-        vdot = model.forward_dynamics(q, v, tau)
-        q_span, v_span = model.spanning(q, v)
-        phi, K, k = (np.array(x.full()) for x in rows(q_span[base_q:], v_span[base_v:]))
-        assert np.abs(phi).max() < 1e-12
-        K = np.hstack([np.zeros((len(K), base_v)), K])
-        assert np.abs(K @ v_span).max() < 1e-10
-        independent = [base_v + tree.joint_links.index(name) for name in model.joint_links]
-        tau_span = np.zeros(tree.nv)
-        tau_span[[*range(base_v), *independent]] = tau
-        M, bias = tree.mass_matrix(q_span), tree.bias_force(q_span, v_span)
-        scale = np.linalg.norm(K, axis=1, keepdims=True).clip(1e-9)
-        K, k = K / scale, k / scale
-        met = np.linalg.lstsq(K, k[:, 0], rcond=1e-10)[0]
-        _, singular, right = np.linalg.svd(K)
-        free = right[int((singular > 1e-10).sum()) :].T
-        assert free.shape[1] == model.nv
-        solution = met + free @ np.linalg.solve(free.T @ M @ free, free.T @ (tau_span - bias - M @ met))
-        ours = model.spanning_acceleration(q, v, vdot)
-        assert np.abs(ours - solution[: tree.nv]).max() <= 1e-9 * max(1.0, np.abs(ours).max())
 
 
 def test_inverse_dynamics_undoes_forward_dynamics(model: Model):
@@ -298,6 +252,11 @@ def test_functions_from_python():
     assert v_span[2] == pytest.approx(-2.0 * (1 + 0.5 * np.cos(0.8)))
     vdot = explicit.forward_dynamics(q, v, tau)
     np.testing.assert_allclose(implicit.forward_dynamics(q, v, tau), vdot, rtol=1e-12)
+    for model in (explicit, implicit):
+        (G, g), (K, k) = model.explicit_constraint(q, v), model.implicit_constraint(q, v)
+        np.testing.assert_allclose(K @ G, np.zeros((1, 2)), atol=1e-14)
+        np.testing.assert_allclose(K @ g, k, rtol=1e-12)
+        assert abs(k[0]) > 0.5
     assert explicit.guess.size == implicit.guess.size == 0
     assert backwards.guess.size == 1  # q + sin(q) / 2 = y has no formula
     q_b, v_b = backwards.from_spanning(q_span, v_span)

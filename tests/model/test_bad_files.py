@@ -125,6 +125,10 @@ MJCF = {
         ),
         ["does not close at the standing pose"],
     ),
+    "base held": (
+        mjcf(body("a", "<freejoint/>"), '<equality><connect body1="a" anchor="0 0 0"/></equality>'),
+        ["constraint equality0", "('a',)", "free joint of a"],
+    ),
     "gear": (mjcf(rest='<actuator><motor joint="j" gear="inf"/></actuator>'), ["actuator_gear", "inf", "finite"]),
     "gain": (mjcf(rest='<actuator><position joint="j" kp="-5"/></actuator>'), ["gains.kp.b", "-5.0", "0 or more"]),
     "keyframe": (mjcf(rest='<keyframe><key qpos="1 2 3"/></keyframe>'), ["MuJoCo refuses", "invalid qpos size"]),
@@ -251,6 +255,18 @@ YAML_LOOPS = {
     "one body": (ROD.format(THERE, END.format("shank", "[0, 0, 1]"), 1), ["constraint 't'", "two different bodies"]),
     "both joints tied": (ROD.format(HERE, THERE, 0.4), ["expected"]),
     "out of reach": (ROD.format(HERE, THERE, 9), ["expected"]),
+    "base held by a joint": (
+        "{name: t, type: loop, joint: ball, first: {body: trunk}, second: {body: world}}",
+        ["constraint t", "('trunk',)", "free joint of trunk"],
+    ),
+    "base held by a rod": (
+        ROD.format(HERE, END.format("world", "[0, 0, 0]"), 1),
+        ["constraint t", "('trunk',)", "free joint of trunk"],
+    ),
+    "no loop": (
+        "{name: t, type: loop, joint: ball, first: {body: trunk}, second: {body: thigh}}",
+        ["says nothing that joints", "expected it left out"],
+    ),
     "screw joint": ("{name: t, type: loop, joint: screw}", ["constraints[0].joint", "'screw'", "revolute, ball"]),
     "axis of a ball": ("{name: t, type: loop, joint: ball, axis: [0, 0, 1]}", ["constraints[0].axis", "no axis"]),
     "axis 0": ("{name: t, type: loop, joint: revolute, axis: [0, 0, 0]}", ["constraints[0].axis", "other than 0"]),

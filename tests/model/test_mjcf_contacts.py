@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from mjcf_files import ANKLE, CHAIN, GEOMS, RODS, ROUGH, mjcf
 
-from ce_gym.model import load_robot
+from ce_gym.dynamics import Model
+from ce_gym.model import LossyImportWarning, load_robot
 
 pytest.importorskip("mujoco")
-from ce_gym.model.mjcf_source import LossyImportWarning
 
 
 def test_contacts_actuators_pose_and_looks(write):
@@ -57,6 +57,18 @@ def test_only_what_mujoco_lets_touch_the_ground_is_a_contact(write, mask, rest, 
     geoms = GEOMS.replace('name="shin"', f'name="shin" {mask}')
     robot = load_robot(write(f"<mujoco>{geoms}{rest}</mujoco>"))
     assert {sphere.name for sphere in robot.contacts if sphere.body == "leg"} == touching
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_what_touches_the_ground_is_no_rotor(write):
+    """A wheel that is coupled to another is tied and symmetric as rotors are, but it is outside."""
+    wheel = '<body name="{0}"><joint name="{0}"/><geom type="sphere" size=".1"/></body>'
+    world = f'<geom type="plane" size="1 1 1"/>{wheel.format("left")}{wheel.format("right")}'
+    tie = '<equality><joint joint1="left" joint2="right" polycoef="0 1 0 0 0"/></equality>'
+    robot = load_robot(write(f"<mujoco><worldbody>{world}</worldbody>{tie}</mujoco>"))
+    assert [body.kind for body in robot.bodies] == ["link", "link"]
+    assert len(robot.contacts) == 2
+    assert Model(robot).contact_points([0.1], [2.0])[0].shape == (2, 3)
 
 
 def test_physics_that_the_file_switches_off(write):

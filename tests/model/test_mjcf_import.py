@@ -9,17 +9,16 @@ import pytest
 from mjcf_files import ANKLE, BARS, CHAIN, CONNECT, RODS, SEVEN, lump, mjcf
 
 from ce_gym.dynamics import Model
-from ce_gym.model import LinearConstraint, LoopConstraint, RobotError, RodConstraint, load_robot
+from ce_gym.model import LinearConstraint, LoopConstraint, LossyImportWarning, RobotError, RodConstraint, load_robot
 from ce_gym.model.mjcf_export import to_mjcf
 
 mujoco = pytest.importorskip("mujoco")
 from ce_gym.model.mjcf_import import robot_from_mjcf  # noqa: E402
-from ce_gym.model.mjcf_source import LossyImportWarning  # noqa: E402
 
 TOLERANCE = 1e-9
 pytestmark = [
     pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning"),
-    pytest.mark.filterwarnings("error::ce_gym.model.mjcf_source.LossyImportWarning"),
+    pytest.mark.filterwarnings("error::ce_gym.LossyImportWarning"),
 ]
 
 

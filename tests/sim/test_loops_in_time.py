@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
-from ce_gym.model import Robot, load_robot
+from ce_gym.model import Robot, load_robot, robots
 from ce_gym.sim.simulator import Simulator
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "dynamics"))  # for linkages.py
+sys.path.insert(0, str(Path(__file__).parents[1] / "dynamics"))  # for dense.py and linkages.py
+from dense import Dense
 from linkages import spatial_four_bar
+
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.InertiaWarning")
 
 DT = 0.005
 
@@ -27,8 +30,14 @@ def turning(torque: float = 20.0) -> Robot:
     return replace(robot, bodies=(crank, *rest))
 
 
-ROBOTS = {name: lambda name=name: load_robot(name) for name in ("four_bar", "six_bar", "planar_leg_linkage", "tello")}
+LOOPS = ("four_bar", "six_bar", "planar_leg_linkage", "tello", "tello_with_arms")
+ROBOTS = {name: lambda name=name: load_robot(name) for name in LOOPS}
 ROBOTS["spatial four-bar"] = turning
+
+
+def test_every_robot_with_loops_is_here():
+    loops = {name for name in robots() if Model(name).loop_report()}
+    assert loops == set(LOOPS)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -46,6 +55,9 @@ def test_loops_stay_closed_for_a_minute(name: str):
     assert np.abs(simulator.q - start).max() > 0.1  # it did move
     if len(model.guess):
         assert np.abs(simulator.q - start).max() > 2 * np.pi  # all the way round
+        return
+    for q_span, v_span in zip(*model.spanning(simulator.q, simulator.v), strict=True):  # seen without our kinematics
+        assert np.abs(Dense(model.robot, q_span, v_span).constraints()[0]).max() <= 1e-10
 
 
 def test_iterations_follow_a_fast_crank():
