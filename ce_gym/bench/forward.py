@@ -6,8 +6,6 @@ Knows the compiler's public names, models and MuJoCo (whose compiled modules car
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import mujoco
 import numpy as np
 
@@ -16,13 +14,6 @@ from ce_gym.bench.timing import Competitor
 from ce_gym.compile import Buffer, Call, Kernel, Program, aligned_zeros, lane_count, load_kernel
 from ce_gym.dynamics.model import Model
 from ce_gym.model.description import Robot
-
-
-def competitors(robot: Robot, levels: Iterable[str], dtypes: Iterable[str], num_envs: int) -> dict[str, Competitor]:
-    """Return what to time, by name; one unit of work is the acceleration of one robot."""
-    levels, dtypes = list(levels), list(dtypes)
-    ours = {f"ce_gym {level} {dtype}": _ours(robot, level, dtype, num_envs) for level in levels for dtype in dtypes}
-    return ours | {f"MuJoCo {level} (mj_forward)": _mujoco(robot, level, 256) for level in levels}
 
 
 def kernel(robot: Robot, level: str, dtype: str) -> Kernel:
@@ -40,16 +31,17 @@ def kernel(robot: Robot, level: str, dtype: str) -> Kernel:
 
 
 def random_states(model: Model, num_envs: int) -> dict[str, np.ndarray]:
-    """Return random positions, velocities and forces, shapes (num_envs, nq or nv)."""
+    """Return positions around the standing pose, random velocities and forces, shapes (num_envs, nq or nv)."""
     rng = np.random.default_rng(0)
-    q = rng.uniform(-1.0, 1.0, (num_envs, model.nq))
+    q = model.standing_q + rng.uniform(-0.3, 0.3, (num_envs, model.nq))  # loops can still be assembled
     if model.robot.floating:
         q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
     shape = (num_envs, model.nv)
     return {"q": q, "v": rng.uniform(-2.0, 2.0, shape), "tau": rng.uniform(-10.0, 10.0, shape), "vdot": np.zeros(shape)}
 
 
-def _ours(robot: Robot, level: str, dtype: str, num_envs: int) -> Competitor:
+def ours(robot: Robot, level: str, dtype: str, num_envs: int, num_threads: int = 1) -> Competitor:
+    """Return our kernel on random states as something to time; one unit of work is the acceleration of one robot."""
     compiled, lanes = kernel(robot, level, dtype), lane_count(dtype)
     num_envs = -(-num_envs // lanes) * lanes
     arrays = {}
@@ -57,13 +49,23 @@ def _ours(robot: Robot, level: str, dtype: str, num_envs: int) -> Competitor:
         arrays[name] = aligned_zeros((num_envs // lanes, rows.shape[1], lanes), dtype)
         arrays[name][:] = rows.reshape(-1, lanes, rows.shape[1]).swapaxes(1, 2)
     repeats = 8
-    return Competitor(lambda: [compiled(arrays, num_envs) for _ in range(repeats)], num_envs * repeats)
+
+    def run() -> None:
+        for _ in range(repeats):
+            compiled(arrays, num_envs, num_threads=num_threads)
+
+    return Competitor(run, num_envs * repeats)
 
 
-def _mujoco(robot: Robot, level: str, repeats: int) -> Competitor:
+def mujoco_forward(robot: Robot, level: str, repeats: int = 256) -> Competitor:
+    """Return `mj_forward` in the standing pose; one unit of work is one call.
+
+    Raises:
+        RobotError: If MJCF cannot say what the robot is at this level.
+    """
     model = mujoco_peer.load(robot, level)
-    off = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_SENSOR
-    model.opt.disableflags |= off if level != "exact" else mujoco.mjtDisableBit.mjDSBL_CONTACT
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT if model.neq else mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.opt.disableflags |= off | mujoco.mjtDisableBit.mjDSBL_SENSOR
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
 

@@ -142,21 +142,25 @@ def forward_dynamics(model: mujoco.MjModel, robot: Robot, q: Array, v: Array, ta
 
 @dataclass
 class Batch:
-    """Robots that MuJoCo rolls out one after another on the calling thread, with `mujoco.rollout`.
+    """Robots that MuJoCo rolls out with `mujoco.rollout`, one after another on each thread.
 
     Attributes:
         model: Compiled model.
         num_envs: Robots.
+        num_threads: Threads; 1 is the calling one.
         states: Full physics states, shape (num_envs, n_state).
     """
 
     model: mujoco.MjModel
     num_envs: int
+    num_threads: int = 1
     states: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        self.data = mujoco.MjData(self.model)
-        self.pool = rollout.Rollout(nthread=0)
+        workers = self.num_threads if self.num_threads > 1 else 0
+        self.datas = [mujoco.MjData(self.model) for _ in range(self.num_threads)]
+        self.data = self.datas[0]
+        self.pool = rollout.Rollout(nthread=workers)
         self.reset()
 
     def reset(self) -> None:
@@ -178,7 +182,7 @@ class Batch:
             States after every step, shape (num_envs, n_steps, n_state).
         """
         n_steps = control.shape[1]
-        states, _ = self.pool.rollout(self.model, self.data, self.states, control, nstep=n_steps, state=out)
+        states, _ = self.pool.rollout(self.model, self.datas, self.states, control, nstep=n_steps, state=out)
         return np.asarray(states)
 
     def split(self, states: Array) -> tuple[Array, Array]:

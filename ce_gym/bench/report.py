@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from ce_gym.bench import machine
 
@@ -35,6 +37,19 @@ class Table:
             return "  ".join(aligned).rstrip()
 
         return "\n".join([self.title, "", line(list(self.columns)), line(["-" * w for w in widths]), *map(line, cells)])
+
+    def as_markdown(self) -> str:
+        """Return the table in Markdown, under its title."""
+        cells = [list(self.columns), ["---"] * len(self.columns)]
+        cells += [[cell_text(cell) for cell in row] for row in self.rows]
+        return "\n".join([f"{self.title}:", "", *(f"| {' | '.join(row)} |" for row in cells)])
+
+    def write_csv(self, path: Path) -> None:
+        """Write columns and rows; None becomes an empty cell."""
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(self.columns)
+            writer.writerows(self.rows)
 
 
 @dataclass(frozen=True)

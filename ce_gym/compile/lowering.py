@@ -1,7 +1,8 @@
 """One CasADi SX function as straight-line vector code.
 
-Knows CasADi's instruction list and the vector builder. The list is walked once; work registers are SSA values in a
-Python list. Loads are emitted at first use and stores at the very end, so outputs may share their memory with inputs.
+Knows CasADi's instruction list and the vector builder. Every instruction becomes one value, in the order that
+`ordering` chooses. Loads are emitted at first use and stores at the very end, so outputs may share their memory with
+inputs.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable, Sequence
 import casadi
 
 from ce_gym.compile import math as vector_math
+from ce_gym.compile.ordering import operands_of, ordered
 from ce_gym.compile.vector import Value, VectorBuilder
 
 
@@ -33,22 +35,31 @@ def lower_function(
     places = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
     results = [[v.const(0.0)] * function.numel_out(i) for i in range(function.n_out())]
     loaded: dict[tuple[int, int], Value] = {}
+    values: dict[int, Value] = {}
+
+    def value(k: int) -> Value:
+        """Result of instruction k: done already, or an input or a constant met for the first time."""
+        if k not in values:
+            if function.instruction_id(k) == casadi.OP_CONST:
+                values[k] = lowering.constant(function.instruction_constant(k))
+            else:
+                which, nonzero = function.instruction_input(k)
+                place = which, loads[which][nonzero]
+                if place not in loaded:
+                    loaded[place] = v.load(inputs[which], place[1])
+                values[k] = loaded[place]
+        return values[k]
+
+    operands = operands_of(function)
+    for k in ordered(function, operands):
+        values[k] = lowering.operation(k, [value(a) for a in operands[k]])
     for k in range(function.n_instructions()):
-        op = function.instruction_id(k)
-        if op == casadi.OP_INPUT:
-            which, nonzero = function.instruction_input(k)
-            position = loads[which][nonzero]
-            if (which, position) not in loaded:
-                loaded[which, position] = v.load(inputs[which], position)
-            lowering.registers[function.instruction_output(k)[0]] = loaded[which, position]
-        elif op == casadi.OP_OUTPUT:
+        if function.instruction_id(k) == casadi.OP_OUTPUT:
             which, nonzero = function.instruction_output(k)
-            results[which][places[which][nonzero]] = lowering.registers[function.instruction_input(k)[0]]
-        else:
-            lowering.operation(k, op)
-    for pointer, values in zip(outputs, results, strict=True):
-        for position, value in enumerate(values):
-            v.store(value, pointer, position)
+            results[which][places[which][nonzero]] = value(operands[k][0])
+    for pointer, stored in zip(outputs, results, strict=True):
+        for position, result in enumerate(stored):
+            v.store(result, pointer, position)
 
 
 def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:
@@ -58,31 +69,30 @@ def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:
 
 
 class _Lowering:
-    """The registers of one walk and what is remembered about the values in them."""
+    """Emits operations and remembers what else is known about their results."""
 
     def __init__(self, v: VectorBuilder, function: casadi.Function):
         self.v = v
         self.function = function
-        self.registers: list[Value] = [v.const(0.0)] * function.sz_w()
         self.masks: dict[Value, Value] = {}
         self.numbers: dict[Value, float] = {}
         self.sines: dict[Value, tuple[Value, Value]] = {}
 
-    def operation(self, k: int, op: int) -> None:
-        """Emit instruction k, an arithmetic operation or a constant."""
-        target = self.function.instruction_output(k)[0]
-        if op == casadi.OP_CONST:
-            number = self.function.instruction_constant(k)
-            self.registers[target] = self.v.const(number)
-            self.numbers[self.registers[target]] = number
-            return
+    def constant(self, number: float) -> Value:
+        """A constant; the number is remembered for those who need it."""
+        value = self.v.const(number)
+        self.numbers[value] = number
+        return value
+
+    def operation(self, k: int, operands: Sequence[Value]) -> Value:
+        """Emit instruction k, an arithmetic operation."""
+        op = self.function.instruction_id(k)
         if op not in OPERATIONS:
             raise NotImplementedError(
                 f"function {self.function.name()!r}, instruction {k}: {_name_of(op)} has no vector form; "
                 f"expected one of {', '.join(sorted(map(_name_of, OPERATIONS)))}"
             )
-        operands = [self.registers[i] for i in self.function.instruction_input(k)]
-        self.registers[target] = OPERATIONS[op](self, *operands)
+        return OPERATIONS[op](self, *operands)
 
     def sin_cos(self, x: Value) -> tuple[Value, Value]:
         """Both at once: the argument is reduced once however many sines and cosines are taken of it."""

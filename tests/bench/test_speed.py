@@ -1,0 +1,133 @@
+"""The parts of the speed benchmark: what is counted, who is compared, and that peers simulate the same robot."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ce_gym.bench.report import Table
+from ce_gym.model import RobotError, load_robot
+
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+X, Y = ca.SX.sym("x"), ca.SX.sym("y")
+
+
+@pytest.mark.parametrize(
+    ("expression", "expected"),
+    [(X * Y + 2, 2), (X / Y - ca.sqrt(X), 3), (ca.fmax(X, -Y), 0), (X**2 + X**2, 2), (ca.fabs(X) * Y, 1)],
+)
+def test_floating_point_operations_are_counted(expression, expected):
+    from ce_gym.compile.counting import floating_point_operations
+
+    function = ca.Function("f", [X, Y], [expression])
+    assert floating_point_operations(function) == expected
+    assert floating_point_operations(function, "float32") == expected
+
+
+def test_polynomials_count_and_are_shorter_in_single_precision():
+    from ce_gym.compile.counting import floating_point_operations
+
+    turn = ca.Function("turn", [X], [ca.sin(X), ca.cos(X)])
+    # reduction: 4 multiply-adds, 1 difference; 2 products; polynomials of 6 (3) coefficients and 3 multiply-adds
+    assert floating_point_operations(turn) == 2 * 4 + 1 + 2 + 2 * (5 + 5 + 3)
+    assert floating_point_operations(turn, "float32") == 2 * 4 + 1 + 2 + 2 * (2 + 2 + 3)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_the_peak_is_of_multiply_adds_that_are_done(dtype):
+    from ce_gym.bench import peak
+    from ce_gym.compile import aligned_zeros, lane_count
+
+    arrays = {name: aligned_zeros((1, n, lane_count(dtype)), dtype) for name, n in (("x", peak.CHAINS), ("factor", 2))}
+    arrays["x"][:] = np.random.default_rng(0).uniform(-1e9, 1e9, arrays["x"].shape)
+    arrays["factor"][:] = 0.5
+    expected = peak.links(arrays["x"].astype(float))
+    peak._kernel(dtype)(arrays, lane_count(dtype), repeats={"times": 1})
+    np.testing.assert_allclose(arrays["x"], expected, rtol=1e-6)
+    assert peak.competitor(dtype, 2).work == 2 * 2 * peak.CHAINS * peak.LINKS * peak.REPEATS * lane_count(dtype)
+
+
+@pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid", "jvrc1", "four_bar", "planar_leg_linkage"])
+def test_pinocchio_has_the_same_dynamics(name):
+    pytest.importorskip("pinocchio")
+    from ce_gym.bench import pinocchio_peer
+    from ce_gym.dynamics.model import Model
+
+    robot, rng = load_robot(name), np.random.default_rng(3)
+    model, peer = Model(robot, "armature"), pinocchio_peer.load(robot)
+    q, tau = model.standing_q.copy(), rng.uniform(-5, 5, model.nv)
+    v = np.zeros(model.nv)
+    if not len(peer.loops):
+        q[-len(robot.independent) :] += rng.uniform(-0.5, 0.5, len(robot.independent))
+        v = rng.uniform(-2, 2, model.nv)
+    if robot.floating:
+        q[3:7] = rng.normal(size=4)
+        q[3:7] /= np.linalg.norm(q[3:7])
+    expected = model.forward_dynamics(q, v, tau)
+    methods = peer.methods()
+    assert set(methods) == ({"constraintDynamics", "lcaba"} if len(peer.loops) else {"aba", "crba + rnea"})
+    for method in methods.values():
+        theirs = np.asarray(method(peer.positions(q), peer.velocities(v), peer.velocities(tau)))
+        np.testing.assert_allclose(peer.accelerations(theirs), expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+
+
+def test_pinocchio_says_what_it_cannot():
+    pytest.importorskip("pinocchio")
+    from ce_gym.bench import pinocchio_peer
+
+    with pytest.raises(RobotError, match="tello: constraint 'left-hip-rod-1' is none of Pinocchio's") as caught:
+        pinocchio_peer.load(load_robot("tello"))
+    assert "\n" not in str(caught.value)
+
+
+def test_mujoco_on_two_threads_is_mujoco_on_one():
+    pytest.importorskip("mujoco")
+    from ce_gym.bench import speed, stand, stepping
+
+    robot = speed.bare(load_robot("mini_cheetah"), "foot")
+    control = np.repeat(stand.targets(robot, 6, 1, seed=0), 3, axis=1)
+    one, two = (stepping.mujoco_batch(robot, "armature", 6, n, 0.005).trajectory(control) for n in (1, 2))
+    assert one.shape[:2] == (6, 3)
+    np.testing.assert_array_equal(one, two)
+
+
+def test_every_figure_of_a_small_robot(tmp_path):
+    pytest.importorskip("mujoco")
+    from ce_gym.bench import speed_batch, speed_robots
+
+    robot = load_robot("four_bar")
+    measured = speed_robots.measure(robot, "exact", num_envs=16, dt=0.005, rounds=1)
+    assert not measured.skipped
+    assert measured.operations > 100
+    assert 4 * 2 <= measured.bytes_per_robot["float32"] < measured.bytes_per_robot["float64"] < 1000
+    times = speed_robots.time_table([measured])
+    assert all(isinstance(cell, float) and cell > 0 for cell in times.rows[0][2:])
+    work = speed_robots.work_table([measured], {"float64": 1e11, "float32": 2e11})
+    assert 0 < work.rows[0][4] < 100
+
+    batches = speed_batch.measure(robot, (1, 16), 0.005, 1)
+    assert [row[0] for row in batches.rows] == [1, 16]
+    assert {"ours, float64, one core", "MuJoCo, armature, one core"} <= set(batches.columns)
+    batches.write_csv(tmp_path / "batch.csv")
+    assert len((tmp_path / "batch.csv").read_text().splitlines()) == 3
+    pytest.importorskip("matplotlib")
+    assert speed_batch.draw(batches, tmp_path).stat().st_size > 10_000
+
+
+def test_a_peer_that_cannot_is_named(monkeypatch):
+    pytest.importorskip("mujoco")
+    from ce_gym.bench import speed_robots, stepping
+
+    def refuse(*_):
+        raise RobotError("four_bar: no way to say it")
+
+    monkeypatch.setattr(stepping, "mujoco_batch", refuse)
+    measured = speed_robots.measure(load_robot("four_bar"), "exact", num_envs=16, dt=0.005, rounds=1)
+    assert measured.skipped == ["MuJoCo, four_bar exact: four_bar: no way to say it"]
+    assert speed_robots.time_table([measured]).rows[0][-3:] == (None, None, None)
+
+
+def test_tables_in_markdown_and_csv(tmp_path):
+    table = Table("Times", ("robot", "us"), (("a", 0.123456), ("b", None)))
+    assert table.as_markdown().splitlines()[2:] == ["| robot | us |", "| --- | --- |", "| a | 0.1235 |", "| b |  |"]
+    table.write_csv(tmp_path / "t.csv")
+    assert (tmp_path / "t.csv").read_text() == "robot,us\na,0.123456\nb,\n"
