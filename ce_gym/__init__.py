@@ -3,7 +3,8 @@
     import gymnasium, ce_gym
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0")
 
-`load_robot` reads a robot, `Model` is its dynamics at a transmission level, `Simulator` steps thousands of copies.
+`load_robot` reads a robot, `Model` is its dynamics at a transmission level, `Simulator` steps thousands of copies,
+`Terrain` is ground for it that is not flat.
 """
 
 from ce_gym.dynamics.model import Model
@@ -12,6 +13,7 @@ from ce_gym.envs.registration import environment_ids, register_environments
 from ce_gym.envs.terms import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
 from ce_gym.sim.simulator import Simulator
+from ce_gym.sim.terrain import Terrain
 
 __version__ = "0.1.0"
 
@@ -22,6 +24,7 @@ __all__ = [
     "Robot",
     "RobotError",
     "Simulator",
+    "Terrain",
     "environment_ids",
     "load_robot",
     "metric",

@@ -14,11 +14,15 @@ from ce_gym.compile.program import Buffer
 from ce_gym.compile.threads import MemoryPool, run_chunks
 
 MachineCode = Callable[[int, int, int, int, int, int], None]
-"""Takes the addresses of the table, the repeat counts and scratch memory, then first tile, end tile, environments."""
+"""Takes the addresses of the list of arrays, the repeat counts, scratch memory; first tile, end tile, environments."""
 
 KEYS, COUNTERS = np.dtype(np.uint64), np.dtype(np.int64)
 WORD = 8
 """Bytes of an address or a count."""
+LARGEST_TABLE = 2**31 - 1
+"""Most entries of a table: places in it are 32-bit integers."""
+LONGEST_SIDE = 2**23
+"""Most rows or columns of a table: half places along it are exact in single precision."""
 
 
 class Kernel:
@@ -41,11 +45,11 @@ class Kernel:
         self._run = run
         self._is_random = layout.is_random
         self._arguments = [
-            (b.name, b.kind == "tiles", b.size, np.dtype(b.dtype or layout.dtype), b.name in layout.written)
+            (b.name, b.kind, b.size, np.dtype(b.dtype or layout.dtype), b.name in layout.written)
             for b in layout.arguments
         ]
-        self._n_addresses = len(self._arguments) + 2 * self._is_random
-        self._tables = MemoryPool(self._n_addresses + len(self.repeats))
+        self._n_words = layout.counts
+        self._tables = MemoryPool(self._n_words + len(self.repeats))
         self._scratch = MemoryPool(layout.scratch_bytes // WORD)
         self._known: dict[str, tuple[weakref.ref[np.ndarray], int]] = {}
 
@@ -61,8 +65,9 @@ class Kernel:
         """Run the program on every tile.
 
         Args:
-            arrays: one for each `tiles` buffer, shape (n_tiles, size, lanes), and each `rows_*` buffer, shape
-                (num_envs, size); others are ignored. Those that the program writes are changed in place.
+            arrays: one for each `tiles` buffer, shape (n_tiles, size, lanes), each `rows_*` buffer, shape
+                (num_envs, size), and each table, shape (rows, columns); others are ignored. Those that the program
+                writes are changed in place.
             num_envs: environments; the last tile may be padded.
             repeats: a number for each of `self.repeats`.
             keys: uint64, shape (num_envs,), if the program draws random numbers.
@@ -83,7 +88,7 @@ class Kernel:
         block = self._tables.take()
         table, address = block
         table[: len(words)] = words
-        counts = address + WORD * self._n_addresses
+        counts = address + WORD * self._n_words
 
         def work(first_tile: int, end_tile: int) -> None:
             scratch = self._scratch.take()
@@ -94,18 +99,31 @@ class Kernel:
         self._tables.give(block)
 
     def _addresses(self, arrays: Mapping[str, np.ndarray], num_envs: int, n_tiles: int) -> list[int]:
-        """Addresses of all arrays, in the order of the table."""
-        addresses = []
-        for name, is_tiles, size, dtype, written in self._arguments:
+        """Addresses of all arrays, then the shapes of tables, in the order of the layout."""
+        addresses, shapes = [], []
+        for name, kind, size, dtype, written in self._arguments:
             array = arrays.get(name)
-            shape = (n_tiles, size, self.lanes) if is_tiles else (num_envs, size)
+            if kind == "table":
+                shape = self._table_shape(name, array)
+                shapes += shape
+            else:
+                shape = (n_tiles, size, self.lanes) if kind == "tiles" else (num_envs, size)
             address = self._address(name, array, shape, dtype)
-            if is_tiles and address % ALIGNMENT:
+            if kind == "tiles" and address % ALIGNMENT:
                 raise ValueError(f"kernel {self.name!r}: array {name!r} is not aligned; make it with aligned_zeros")
             if written and not arrays[name].flags.writeable:
                 raise ValueError(f"kernel {self.name!r}: array {name!r} is read-only, expected a writeable one")
             addresses.append(address)
-        return addresses
+        return addresses + shapes
+
+    def _table_shape(self, name: str, array: object) -> tuple[int, ...]:
+        """Rows and columns of a table."""
+        shape = array.shape if isinstance(array, np.ndarray) else ()
+        if len(shape) != 2 or not all(3 <= n <= LONGEST_SIDE for n in shape) or np.prod(shape) > LARGEST_TABLE:
+            got = shape if isinstance(array, np.ndarray) else "nothing" if array is None else type(array).__name__
+            expected = f"(rows, columns), 3 to {LONGEST_SIDE} of each and at most {LARGEST_TABLE} entries"
+            raise ValueError(f"kernel {self.name!r}: table {name!r} is {got}, expected {expected}")
+        return shape
 
     def _address(self, name: str, array: object, shape: tuple[int, ...], dtype: np.dtype) -> int:
         """Address of an array that is as it should be."""

@@ -33,8 +33,24 @@ class Layout:
 
     @cached_property
     def arguments(self) -> tuple[Buffer, ...]:
-        """Buffers whose arrays the caller passes, in the order of their addresses; keys and counters follow them."""
-        return tuple(b for b in self.buffers if b.kind in ("tiles", "rows_in", "rows_out"))
+        """Buffers whose arrays the caller passes, in the order of their addresses; shapes of tables follow them."""
+        return tuple(b for b in self.buffers if b.kind in ("tiles", "rows_in", "rows_out", "table"))
+
+    @cached_property
+    def shapes(self) -> dict[str, int]:
+        """Place of the number of rows of each table among the addresses; the number of columns is next to it."""
+        tables = [b.name for b in self.arguments if b.kind == "table"]
+        return {name: len(self.arguments) + 2 * i for i, name in enumerate(tables)}
+
+    @property
+    def keys(self) -> int:
+        """Place of the address of the keys among the addresses; that of the counters is next to it."""
+        return len(self.arguments) + 2 * len(self.shapes)
+
+    @property
+    def counts(self) -> int:
+        """Number of words before the repeat counts."""
+        return self.keys + 2 * self.is_random
 
     @cached_property
     def is_random(self) -> bool:

@@ -1,17 +1,18 @@
-"""What a kernel is made of: buffers, and calls of SX functions that read and write them. Data and its checks only.
+"""What a kernel is made of: buffers, and steps that read and write them: calls of SX functions and table look-ups.
 
+Data and its checks only.
 Knows casadi's Function by its interface and nothing of LLVM, files or physics.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 if TYPE_CHECKING:
     import casadi
 
-BufferKind = Literal["tiles", "rows_in", "rows_out", "scratch", "random"]
+BufferKind = Literal["tiles", "rows_in", "rows_out", "scratch", "random", "table"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Buffer:
 
     Attributes:
         name: how calls and callers refer to it.
-        size: values per lane.
+        size: values per lane; 0 for a table.
         kind: who owns it and how it is laid out:
 
             * `tiles`: array (n_tiles, size, lanes) of the kernel's dtype, owned by the caller, changed in place.
@@ -30,6 +31,8 @@ class Buffer:
             * `scratch`: passes values from one call to the next within a tile; the kernel owns it.
             * `random`: uniform numbers in [0, 1), new in every tile: draw i of a lane is a function of the lane's key,
               its counter and i, and of nothing else.
+            * `table`: array (rows, columns) of the kernel's dtype, at least 3 by 3, that all lanes share and only a
+              `Lookup` reads; its shape is known when the kernel is called.
         dtype: of a `rows_*` array, `float32` or `float64`; empty means the kernel's own.
     """
 
@@ -58,8 +61,38 @@ class Call:
 
 
 @dataclass(frozen=True)
+class Lookup:
+    """A smooth surface over a table, looked up at points of every lane; see `ce_gym.compile.lookup` for the surface.
+
+    Attributes:
+        table: a `table` buffer. Entry (i, j) belongs to the place `x = x0 + i cell`, `y = y0 + j cell`.
+        frame: buffer of size 3 with each lane's `x0`, `y0` and `cell`.
+        points: buffer of size 2 n: x and y of point after point.
+        output: buffer of size 3 n, another one: value and its slopes along x and y, point after point.
+    """
+
+    table: str
+    frame: str
+    points: str
+    output: str
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Buffers with values per lane that it reads."""
+        return (self.frame, self.points)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Buffers that it writes."""
+        return (self.output,)
+
+
+Step: TypeAlias = Call | Lookup
+
+
+@dataclass(frozen=True)
 class Repeat:
-    """Calls made in order, several times over.
+    """Steps made in order, several times over.
 
     Attributes:
         times: name of a run-time integer.
@@ -67,28 +100,28 @@ class Repeat:
     """
 
     times: str
-    calls: tuple[Call, ...]
+    calls: tuple[Step, ...]
 
 
 @dataclass(frozen=True)
 class Program:
-    """Calls made in order on every tile.
+    """Steps made in order on every tile.
 
     Attributes:
         name: for people, `mini_cheetah exact environment`.
-        buffers: all buffers the calls mention.
-        steps: calls and repeated calls, in the order of execution.
+        buffers: all buffers the steps mention.
+        steps: calls, look-ups and repeated ones, in the order of execution.
         skip_unless: a `tiles` buffer of size 1; a tile whose lanes are all zero there is left alone entirely.
     """
 
     name: str
     buffers: tuple[Buffer, ...]
-    steps: tuple[Call | Repeat, ...]
+    steps: tuple[Step | Repeat, ...]
     skip_unless: str = ""
 
     @property
-    def calls(self) -> tuple[Call, ...]:
-        """All calls, repeated or not, each once."""
+    def calls(self) -> tuple[Step, ...]:
+        """All calls and look-ups, repeated or not, each once."""
         return tuple(c for step in self.steps for c in (step.calls if isinstance(step, Repeat) else (step,)))
 
 
@@ -105,11 +138,16 @@ def check_program(program: Program) -> None:
         _check_buffer(program.name, buffer)
     written = {b.name for b in program.buffers if b.kind in ("tiles", "rows_in", "random")}
     for number, call in enumerate(program.calls):
-        place = f"program {program.name!r}: call {number} ({call.function.name()})"
-        _check_call(place, call, buffers)
-        if call.only_if:
-            _check_flag(f"{place}: only_if", buffers.get(call.only_if))
-        read = (*call.inputs, *([call.only_if] if call.only_if else []))
+        read = call.inputs
+        if isinstance(call, Lookup):
+            place = f"program {program.name!r}: call {number} (look-up in {call.table!r})"
+            _check_lookup(place, call, buffers)
+        else:
+            place = f"program {program.name!r}: call {number} ({call.function.name()})"
+            _check_call(place, call, buffers)
+            if call.only_if:
+                _check_flag(f"{place}: only_if", buffers.get(call.only_if))
+                read = (*read, call.only_if)
         if unset := [name for name in read if name not in written]:
             raise ValueError(f"{place}: reads {unset[0]!r}, expected an earlier call to write it first")
         written.update(call.outputs)
@@ -128,7 +166,9 @@ def _check_buffer(program: str, buffer: Buffer) -> None:
     place = f"program {program!r}: buffer {buffer.name!r}"
     if buffer.kind not in get_args(BufferKind):
         raise ValueError(f"{place}: kind {buffer.kind!r}, expected one of {', '.join(get_args(BufferKind))}")
-    if buffer.size < 1:
+    if buffer.kind == "table" and buffer.size != 0:
+        raise ValueError(f"{place}: size {buffer.size}, expected 0 for a table")
+    if buffer.kind != "table" and buffer.size < 1:
         raise ValueError(f"{place}: size {buffer.size}, expected at least 1")
     allowed = ("", "float32", "float64") if buffer.kind.startswith("rows") else ("",)
     if buffer.dtype not in allowed:
@@ -149,8 +189,29 @@ def _check_call(place: str, call: Call, buffers: dict[str, Buffer]) -> None:
         if len(names) != count:
             raise ValueError(f"{place}: {len(names)} {side} buffers, expected {count}")
         for position, name in enumerate(names):
-            if name not in buffers:
-                raise ValueError(f"{place}: {side} buffer {name!r} is not among the program's buffers")
+            _check_lanes(f"{place}: {side}", name, buffers)
             if buffers[name].size != numel(position):
                 expected = f"{numel(position)} as {side} {position} of the function"
                 raise ValueError(f"{place}: buffer {name!r} has size {buffers[name].size}, expected {expected}")
+
+
+def _check_lookup(place: str, lookup: Lookup, buffers: dict[str, Buffer]) -> None:
+    table = buffers.get(lookup.table)
+    if table is None or table.kind != "table":
+        raise ValueError(f"{place}: expected the name of a table buffer")
+    for side, name in (("frame", lookup.frame), ("points", lookup.points), ("output", lookup.output)):
+        _check_lanes(f"{place}: {side}", name, buffers)
+    if lookup.output in lookup.inputs:
+        raise ValueError(f"{place}: output {lookup.output!r} is an input too, expected another buffer")
+    n = buffers[lookup.points].size // 2
+    sizes = (("frame", lookup.frame, 3), ("points", lookup.points, 2 * n), ("output", lookup.output, 3 * n))
+    for side, name, size in sizes:
+        if buffers[name].size != size:
+            raise ValueError(f"{place}: {side} buffer {name!r} has size {buffers[name].size}, expected {size}")
+
+
+def _check_lanes(place: str, name: str, buffers: dict[str, Buffer]) -> None:
+    if name not in buffers:
+        raise ValueError(f"{place} buffer {name!r} is not among the program's buffers")
+    if buffers[name].kind == "table":
+        raise ValueError(f"{place} buffer {name!r} is a table, expected one with values per lane")

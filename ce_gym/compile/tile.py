@@ -1,4 +1,4 @@
-"""Everything that is done to one tile, as LLVM code: skip test, rows to lanes, random numbers, calls, lanes to rows.
+"""Everything that is done to one tile, as LLVM code: skip test, rows to lanes, random numbers, steps, lanes to rows.
 
 Knows a `Program` and llvmlite's builder; knows neither numba nor files.
 """
@@ -13,10 +13,11 @@ from llvmlite import ir
 
 from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.layout import Layout
+from ce_gym.compile.lookup import Table, emit_lookup
 from ce_gym.compile.lowering import lower_function
-from ce_gym.compile.program import Buffer, Call, Program, Repeat
+from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step
 from ce_gym.compile.random import emit_uniform
-from ce_gym.compile.vector import Builder, Value, VectorBuilder
+from ce_gym.compile.vector import Builder, Value, VectorBuilder, loop
 
 INT = ir.IntType(64)
 FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
@@ -53,7 +54,7 @@ class _TileWork:
         self.first_env = builder.mul(tile, INT(self.vectors.lanes))
         remaining = builder.sub(num_envs, self.first_env)
         self.valid_lanes = self._smaller(remaining, INT(self.vectors.lanes))
-        self.lanes = {b.name: self._lanes_of(b, scratch, tile) for b in program.buffers}
+        self.lanes = {b.name: self._lanes_of(b, scratch, tile) for b in program.buffers if b.kind != "table"}
         self.bodies: dict[casadi.Function, ir.Function] = {}
 
     def any_lane(self, name: str) -> Value:
@@ -75,9 +76,9 @@ class _TileWork:
             if isinstance(step, Repeat):
                 with self._repeated(step.times):
                     for call in step.calls:
-                        self._call(call)
+                        self._step(call)
             else:
-                self._call(step)
+                self._step(step)
         for buffer in kinds["rows_out"]:
             self._lanes_to_rows(buffer)
 
@@ -100,7 +101,7 @@ class _TileWork:
     def _rows_to_lanes(self, buffer: Buffer) -> None:
         """Copy this tile's rows to lanes; lanes past the last environment repeat its row."""
         b = self.builder
-        with _loop(b, INT(self.vectors.lanes), "lane") as lane:
+        with loop(b, INT(self.vectors.lanes), "lane") as lane:
             row = self._smaller(b.add(self.first_env, lane), self.last_env)
             with self._elements(buffer, row, lane) as (row_element, lane_element):
                 b.store(_convert(b, b.load(row_element), FLOATS[self.layout.dtype]), lane_element)
@@ -108,7 +109,7 @@ class _TileWork:
     def _lanes_to_rows(self, buffer: Buffer) -> None:
         """Copy the lanes of real environments to their rows."""
         b = self.builder
-        with _loop(b, self.valid_lanes, "lane") as lane:
+        with loop(b, self.valid_lanes, "lane") as lane:
             row = b.add(self.first_env, lane)
             with self._elements(buffer, row, lane) as (row_element, lane_element):
                 b.store(_convert(b, b.load(lane_element), FLOATS[buffer.dtype or self.layout.dtype]), row_element)
@@ -121,14 +122,13 @@ class _TileWork:
         rows = b.inttoptr(self._array(buffer), row_type.as_pointer())
         lanes = b.bitcast(self.lanes[buffer.name], FLOATS[self.layout.dtype].as_pointer())
         row_start = b.mul(row, INT(buffer.size))
-        with _loop(b, INT(buffer.size), "value") as value:
+        with loop(b, INT(buffer.size), "value") as value:
             in_lanes = b.add(b.mul(value, INT(self.vectors.lanes)), lane)
             yield b.gep(rows, [b.add(row_start, value)]), b.gep(lanes, [in_lanes])
 
     def _fill_random(self, buffers: list[Buffer]) -> None:
         """Draw the numbers of all random buffers from each lane's key and counter."""
-        first = len(self.layout.arguments)
-        keys, counters = (self._words(self._address(first + i)) for i in range(2))
+        keys, counters = (self._words(self._address(self.layout.keys + i)) for i in range(2))
         emit_uniform(self.vectors, keys, counters, [(self.lanes[b.name], b.size) for b in buffers])
 
     def _words(self, address: Value) -> Value:
@@ -145,8 +145,22 @@ class _TileWork:
     def _repeated(self, times: str) -> Iterator[None]:
         """What is built inside `with` is done as often as a run-time integer says."""
         count = self.builder.load(self.builder.gep(self.repeats, [INT(self.layout.repeats.index(times))]))
-        with _loop(self.builder, count, "repeat"):
+        with loop(self.builder, count, "repeat"):
             yield
+
+    def _step(self, step: Step) -> None:
+        if isinstance(step, Lookup):
+            self._look_up(step)
+        else:
+            self._call(step)
+
+    def _look_up(self, lookup: Lookup) -> None:
+        """Look up the surface over a table at every point."""
+        buffers = {b.name: b for b in self.layout.buffers}
+        rows = self.layout.shapes[lookup.table]
+        table = Table(self._array(buffers[lookup.table]), self._address(rows), self._address(rows + 1))
+        frame, points, output = self.lanes[lookup.frame], self.lanes[lookup.points], self.lanes[lookup.output]
+        emit_lookup(self.vectors, table, frame, points, output, buffers[lookup.points].size // 2)
 
     def _call(self, call: Call) -> None:
         """Call one lowered function, if it is needed."""
@@ -181,20 +195,3 @@ def _convert(builder: Builder, value: Value, to: ir.Type) -> Value:
     if value.type == to:
         return value
     return builder.fpext(value, to) if to == FLOATS["float64"] else builder.fptrunc(value, to)
-
-
-@contextmanager
-def _loop(builder: Builder, count: Value, name: str) -> Iterator[Value]:
-    """Emit what is built inside `with` as a loop over 0 <= index < count."""
-    before = builder.block
-    head, body, end = (builder.append_basic_block(f"{name}_{part}") for part in ("head", "body", "end"))
-    builder.branch(head)
-    builder.position_at_end(head)
-    index = builder.phi(INT, name)
-    index.add_incoming(INT(0), before)
-    builder.cbranch(builder.icmp_signed("<", index, count), body, end)
-    builder.position_at_end(body)
-    yield index
-    index.add_incoming(builder.add(index, INT(1)), builder.block)
-    builder.branch(head)
-    builder.position_at_end(end)

@@ -4,6 +4,8 @@ Knows llvmlite's IR classes. llvmlite cannot declare vector intrinsics, so they 
 their mangled names.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -53,6 +55,13 @@ class VectorBuilder:
     def int_const(self, number: int) -> ir.Constant:
         """The same integer in every lane."""
         return ir.Constant(self.int_type, [number] * self.lanes)
+
+    def splat(self, scalar: Value) -> Value:
+        """A number known at run time in every lane; float or integer."""
+        vector = ir.VectorType(scalar.type, self.lanes)
+        first = self.builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.IntType(32)(0))
+        lanes = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
+        return self.builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), lanes)
 
     def add(self, a: Value, b: Value) -> Value:
         """Sum."""
@@ -124,3 +133,20 @@ class VectorBuilder:
     def element(self, base: Value, index: int) -> Value:
         """Address of vector `index`."""
         return self.builder.gep(base, [ir.Constant(ir.IntType(64), index)], inbounds=True)
+
+
+@contextmanager
+def loop(builder: Builder, count: Value, name: str) -> Iterator[Value]:
+    """Emit what is built inside `with` as a loop over 0 <= index < count."""
+    word, before = ir.IntType(64), builder.block
+    head, body, end = (builder.append_basic_block(f"{name}_{part}") for part in ("head", "body", "end"))
+    builder.branch(head)
+    builder.position_at_end(head)
+    index = builder.phi(word, name)
+    index.add_incoming(word(0), before)
+    builder.cbranch(builder.icmp_signed("<", index, count), body, end)
+    builder.position_at_end(body)
+    yield index
+    index.add_incoming(builder.add(index, word(1)), builder.block)
+    builder.branch(head)
+    builder.position_at_end(end)

@@ -18,7 +18,7 @@ from ce_gym.dynamics.functions import guessed_coordinates
 from ce_gym.dynamics.integration import between, turned_by
 from ce_gym.dynamics.scene import Scene, State
 from ce_gym.dynamics.spatial import SX, cross, quaternion_product, quaternion_to_rotation
-from ce_gym.dynamics.step import Solved, Stepped, implicit_step, solve, stacked
+from ce_gym.dynamics.step import Solved, Stepped, implicit_step, looked_up_from, solve, stacked
 
 
 class Method(Protocol):
@@ -60,7 +60,7 @@ class Extrapolated:
         """Advance one robot by `dt` [s]; the error estimate is the distance of the two results in `v`."""
         coarse = implicit_step(scene, state, target, dt)
         half = implicit_step(scene, state, target, dt / 2)
-        fine = implicit_step(scene, half.state, target, dt / 2)
+        fine = implicit_step(looked_up_from(scene, coarse.solved.kinematics), half.state, target, dt / 2)
         floating = scene.mechanism.robot.floating
         fine.state.q, fine.state.v = beyond(coarse.state, fine.state, floating)
         fine.error = ca.norm_2(fine.state.v - coarse.state.v) / 2
@@ -110,7 +110,8 @@ class RungeKutta:
             if first is not None:
                 here.dependent = guessed_coordinates(first.kinematics, first.vdot, dt * sum(row))
             solved = solve(scene, here, target, 0.0, SX(6, len(scene.options.contacts)))
-            first = first or solved
+            if first is None:
+                first, scene = solved, looked_up_from(scene, solved.kinematics)
             rates.append(_rate(here, solved, floating))
         end = start + dt * sum((w * rate for w, rate in zip(self.b, rates, strict=True) if w), SX(0))
         after = _from_flat(end, state, floating)

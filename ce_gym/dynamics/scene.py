@@ -55,12 +55,15 @@ class Scene:
         figures: Contact, gains and motor strength.
         ground: Height [m] and slopes dz/dx, dz/dy of the ground under each contact, shape (3, n_contacts); not used on
             flat ground.
+        looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_contacts);
+            empty if that is where they are.
     """
 
     mechanism: Mechanism
     options: StepOptions
     figures: Figures
     ground: SX
+    looked_up: SX = field(default_factory=SX)
 
 
 def make_scene(mechanism: Mechanism, options: StepOptions, parameters: SX, ground: SX) -> Scene:

@@ -7,7 +7,7 @@ the moment. May know everything in this room but the methods that are made of su
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -24,8 +24,9 @@ from ce_gym.dynamics.contact import Contact, ContactResponse, touch_ground
 from ce_gym.dynamics.functions import guessed_coordinates
 from ce_gym.dynamics.integration import advance
 from ce_gym.dynamics.kinematics import Kinematics, constant, outward_velocity_pass
-from ce_gym.dynamics.scene import Scene, State
+from ce_gym.dynamics.scene import Scene, State, StepOptions
 from ce_gym.dynamics.spatial import SX
+from ce_gym.model.description import ContactSphere
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -142,18 +143,39 @@ def implicit_step(scene: Scene, state: State, target: SX, dt: float) -> Stepped:
 
 def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:
     """Place every contact sphere of the scene against the ground."""
-    spheres = {contact.name: contact for contact in scene.mechanism.robot.contacts}
     contacts = []
-    for i, sphere in enumerate(spheres[name] for name in scene.options.contacts):
+    for i, sphere in enumerate(contact_spheres(scene.mechanism, scene.options)):
         body, position = kinematics.bodies[sphere.body], constant(np.array(sphere.position))
         height, normal = SX(0), constant(np.array([0.0, 0.0, 1.0]))
         if scene.options.ground == "field":
             height, slope = scene.ground[0, i], scene.ground[1:, i]
+            if scene.looked_up.numel():
+                height += ca.dot(slope, body.point_position(position)[:2] - scene.looked_up[:, i])
             normal = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
         touch = touch_ground(body, position, sphere.radius, height, normal, state.load[i], anchor)
         contacts.append(Contact(sphere.body, touch, scene.figures.compliance, dt))
     return contacts
+
+
+def contact_spheres(mechanism: Mechanism, options: StepOptions) -> list[ContactSphere]:
+    """Return the contact spheres of a scene."""
+    spheres = {contact.name: contact for contact in mechanism.robot.contacts}
+    return [spheres[name] for name in options.contacts]
+
+
+def contact_places(mechanism: Mechanism, options: StepOptions, kinematics: Kinematics) -> SX:
+    """Return x and y of the centre of every contact sphere of a scene [m], shape (2, n_contacts)."""
+    places = [
+        kinematics.bodies[sphere.body].point_position(constant(np.array(sphere.position)))[:2]
+        for sphere in contact_spheres(mechanism, options)
+    ]
+    return ca.horzcat(SX(2, 0), *places)
+
+
+def looked_up_from(scene: Scene, kinematics: Kinematics) -> Scene:
+    """Return a scene whose ground is known around the contacts as they are, for use when they have moved on."""
+    return replace(scene, looked_up=contact_places(scene.mechanism, scene.options, kinematics))
 
 
 def on_coordinates(mechanism: Mechanism, force: JointForce) -> JointTerms:

@@ -1,5 +1,6 @@
 """Many robots stepped together: state arrays and compiled kernels."""
 
 from ce_gym.sim.simulator import Simulator
+from ce_gym.sim.terrain import Terrain
 
-__all__ = ["Simulator"]
+__all__ = ["Simulator", "Terrain"]

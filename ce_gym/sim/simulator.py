@@ -20,7 +20,8 @@ from ce_gym.dynamics.parameters import parameter_defaults
 from ce_gym.dynamics.scene import Control, Friction, Motors, StepOptions
 from ce_gym.dynamics.trace import OUTPUTS
 from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
-from ce_gym.sim.substeps import substeps
+from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
+from ce_gym.sim.terrain import Terrain
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
 
@@ -46,6 +47,7 @@ class Simulator:
         motors: "ideal" for the joints' torque limits; "limited" for torque, torque-speed line and friction of the
             motors themselves.
         parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
+        terrain: The ground; the plane z = 0 if None, which is faster.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -67,6 +69,7 @@ class Simulator:
         friction: str = "tangent",
         motors: str = "ideal",
         parameters: Sequence[str] = (),
+        terrain: Terrain | None = None,
     ) -> None:
         _check("num_envs", num_envs, num_envs >= 1, "at least 1")
         _check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
@@ -78,7 +81,9 @@ class Simulator:
         _choice("motors", motors, get_args(Motors))
         for name in outputs:
             _choice("outputs", name, tuple(OUTPUTS))
-        self.model, self.num_envs, self.dt = model, num_envs, dt
+        if terrain is not None and not isinstance(terrain, Terrain):
+            _check("terrain", terrain, False, "a Terrain or None")
+        self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
         self.dtype, self.num_threads = dtype, num_threads
         self.contact_names = select_contacts(model.robot, contacts)
         self.options = StepOptions(
@@ -89,6 +94,7 @@ class Simulator:
             friction=friction,  # type: ignore[arg-type]
             method=method,
             motors=motors,  # type: ignore[arg-type]
+            ground="field" if terrain is not None and self.contact_names else "flat",
             parameters=tuple(parameters),
         )
         defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
@@ -102,15 +108,22 @@ class Simulator:
         self._columns = {name: slice(*ends[i : i + 2]) for i, name in enumerate(defaults)}
         if defaults:
             write_rows(self._arrays["parameters"], np.concatenate(list(defaults.values())))
+        self._tables: dict[str, NDArray] = {}
+        if terrain is not None and FRAME in self._arrays:
+            self._tables[HEIGHTS] = terrain.heights.astype(dtype)
+            write_rows(self._arrays[FRAME], [*terrain.origin, terrain.cell])
         self.reset()
 
     def reset(self, mask: ArrayLike | None = None) -> None:
-        """Put robots at rest into the standing pose.
+        """Put robots at rest into the standing pose, on terrain as high as their contacts need.
 
         Args:
             mask: Which robots, bool, shape (num_envs,); all of them if None.
         """
-        self.set_state(self.model.standing_q, np.zeros(self.model.nv), mask)
+        q = self.model.standing_q.copy()
+        if self.model.robot.floating and self.contact_names:
+            q[2] += self._lift(q)
+        self.set_state(q, np.zeros(self.model.nv), mask)
 
     def set_state(self, q: ArrayLike, v: ArrayLike, mask: ArrayLike | None = None) -> None:
         """Set positions and velocities, and clear divergence.
@@ -159,7 +172,7 @@ class Simulator:
             raise ValueError(f"target has shape {rows.shape}; expected ({n},) or ({self.num_envs}, {n})")
         rows = np.ascontiguousarray(np.broadcast_to(rows, (self.num_envs, n)))
         self._kernel(
-            self._arrays | {"target": rows},
+            self._arrays | self._tables | {"target": rows},
             self.num_envs,
             repeats={"n_substeps": n_substeps},
             num_threads=self.num_threads,
@@ -245,10 +258,27 @@ class Simulator:
 
     def _resting_load(self, q: ArrayLike) -> NDArray:
         """Return the springs' forces on the contacts [N], shape (..., n_contacts): what friction has to go by."""
+        radius, _, above, cosine = self._above_ground(q)
+        return self.options.material.stiffness * np.maximum(radius - cosine * above, 0)
+
+    def _lift(self, q: ArrayLike) -> float:
+        """Return how far to raise a robot for no contact to be deeper in the terrain than it is in flat ground [m]."""
+        radius, z, above, cosine = self._above_ground(q)
+        return float((np.minimum(z, radius) / cosine - above).max()) if self.terrain is not None else 0.0
+
+    def _above_ground(self, q: ArrayLike) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return how the contact spheres are placed above the ground under their centres.
+
+        Returns:
+            Radius, height of the centre in the world and above the ground [m], and cosine of the ground's slope, all of
+            shape (..., n_contacts).
+        """
         chosen = [self.model.contact_names.index(name) for name in self.contact_names]
         radius = np.array([self.model.robot.contacts[i].radius for i in chosen])
-        centres, _ = self.model.contact_points(q, np.zeros(self.model.nv))
-        return self.options.material.stiffness * np.maximum(radius - centres[..., chosen, 2], 0)
+        centres = self.model.contact_points(q, np.zeros(self.model.nv))[0][..., chosen, :]
+        x, y, z = np.moveaxis(centres, -1, 0)
+        ground = self.terrain.at(x, y) if self.terrain is not None else np.zeros((*x.shape, 3))
+        return radius, z, z - ground[..., 0], 1 / np.sqrt(1 + np.square(ground[..., 1:]).sum(-1))
 
     def _read(self, name: str) -> NDArray:
         if name not in self._arrays:
@@ -294,11 +324,11 @@ def load_step_kernel(model: Model, options: StepOptions, outputs: tuple[str, ...
     """
 
     def build() -> Program:
-        sizes, scratch, steps = substeps(model.mechanism, options, outputs)
+        sizes, further, steps = substeps(model.mechanism, options, outputs)
         joints = sizes.pop("target", 0)
         buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()]
         buffers += [Buffer("target", joints, "rows_in")] if joints else []
-        return Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + scratch), steps)
+        return Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps)
 
     return load_kernel(f"step {model_key(model)} {options!r} {outputs!r}", build, dtype)
 
