@@ -71,7 +71,8 @@ class Touch:
         point: The sphere's lowest point, in the body frame [m], shape (3,).
         depth: How far it is in the ground [m].
         velocity: Of the point [m/s], shape (3,).
-        bias: Its acceleration for a body that does not accelerate, `omega x (omega x r)` [m/s^2], shape (3,).
+        bias: Its acceleration for a body that does not accelerate, `omega x (omega x c)` [m/s^2], shape (3,). It is the
+            centre `c` that counts: as the sphere rolls, other points of it become the lowest, all below the centre.
         load: Its normal force over the last step [N].
         anchor: Deflection of the bristle, shape (3,) [m].
     """
@@ -143,7 +144,7 @@ def touch_ground(body: BodyState, position: SX, radius: float, height: SX, norma
     deflection = SX(3, 1)
     if anchor.numel():  # in the tangent plane: the normal has no part in it
         deflection = body.R.T @ ca.vertcat(anchor, -ca.dot(normal[:2], anchor) / normal[2])
-    return Touch(n, point, depth, velocity, cross(w, cross(w, point)), load, deflection)
+    return Touch(n, point, depth, velocity, cross(w, cross(w, position)), load, deflection)
 
 
 def normal_law(touch: Touch, compliance: Compliance, dt: float) -> tuple[SX, SX]:

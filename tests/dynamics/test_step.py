@@ -88,7 +88,8 @@ def contact_parts(model: Model, sphere: ContactSphere, q, v, dt: float, material
     """World-frame J, Jdot v, force at zero acceleration and effective damping of one sphere, by numpy."""
     lowest = sphere_bottom(model, sphere, q)
     world_point, J = point_jacobian(model, sphere.body, lowest, q)
-    Jdot_v = point_bias(model, sphere.body, lowest, q, v)
+    turning = spin(model, sphere, q, v)  # the lowest point is not one of the body: it stays below the centre
+    Jdot_v = point_bias(model, sphere.body, lowest, q, v) + turning @ turning @ [0.0, 0.0, sphere.radius]
     velocity, n = J @ v, np.array([0.0, 0.0, 1.0])
     depth, k, up = -world_point[2], material.stiffness, velocity[2]
     if material.dissipation is None:
@@ -105,6 +106,13 @@ def contact_parts(model: Model, sphere: ContactSphere, q, v, dt: float, material
     share = min(1.0, cone / np.linalg.norm(trial))
     C = normal_slope * np.outer(n, n) + share * slope * (np.eye(3) - np.outer(n, n))
     return J, Jdot_v, push * n - share * trial, C
+
+
+def spin(model: Model, sphere: ContactSphere, q, v) -> np.ndarray:
+    """The matrix of `omega x` of a sphere's body, world axes."""
+    R = model.body_poses(q)[1][model.body_names.index(sphere.body)]
+    velocities = [point_on(model, sphere.body, sphere.position + R.T @ e)(q, v)[1].full().ravel() for e in np.eye(3)]
+    return np.array(velocities).T - point_on(model, sphere.body, sphere.position)(q, v)[1].full()
 
 
 def sphere_bottom(model: Model, sphere: ContactSphere, q) -> np.ndarray:
@@ -238,3 +246,17 @@ def test_what_is_not_asked_for_costs_nothing():
 
 def test_robot_type(robot: Robot):
     assert step_function(Model(robot).mechanism, StepOptions(0.001, control="torque")).n_out() == 3
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+def test_a_rolling_ball_weighs_what_it_weighs(speed: float):
+    """Its material point at the ground accelerates upwards; where it touches does not."""
+    ball = Body("ball", "link", None, Placement(), Joint("free"), Inertial(2.0, (0.0, 0.0, 0.0), np.eye(3) * 0.008))
+    contacts = (ContactSphere("ball", "ball", (0.0, 0.0, 0.0), 0.1),)
+    model = Model(Robot("ball", (ball,), contacts=contacts, material=ContactMaterial(5e4, 500.0, 0.8)))
+    step = stepper(model, 0.004)
+    q = np.array([0.0, 0.0, 0.1 - 2 * 9.81 / 5e4, 1.0, 0.0, 0.0, 0.0])
+    v = np.array([0.0, speed / 0.1, 0.0, speed, 0.0, 0.0])
+    for _ in range(100):
+        q, v, _, _, force = step(q, v, np.zeros(0))
+        assert force == pytest.approx([0.0, 0.0, 2.0 * 9.81], abs=1e-6)
