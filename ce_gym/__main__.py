@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
 
   python -m ce_gym list                  robots and environments
   python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
+  python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
   python -m ce_gym view walk.npz         write a recorded rollout as one HTML file (or --live)
   python -m ce_gym bench                 benchmarks
 
@@ -62,10 +64,11 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     list_ = commands.add_parser("list", help="robots and environments")
     list_.set_defaults(run=_list)
-    inspect = commands.add_parser("inspect", help="what a robot is made of")
-    inspect.add_argument("robot", metavar="NAME", help="name of a robot, or path of its file")
+    inspect = commands.add_parser("inspect", help="what a robot is made of, or what an environment costs")
+    inspect.add_argument("name", metavar="NAME", help="name of a robot, path of its file, or id of an environment")
     inspect.add_argument("--transmission", default="exact", help="exact (default), coupled, armature or none")
-    inspect.add_argument("--no-errors", action="store_true", help="do not compare the levels in random states")
+    inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")
+    inspect.add_argument("--no-timing", action="store_true", help="environment: count instructions, compile nothing")
     inspect.set_defaults(run=_inspect)
     add_view_command(commands)
     commands.add_parser("bench", help="benchmarks")
@@ -85,9 +88,22 @@ def _inspect(args: argparse.Namespace) -> int:
     from ce_gym.dynamics import Model
     from ce_gym.dynamics.report_text import transmission_report
 
-    model = Model(args.robot, transmission=args.transmission)
+    if re.fullmatch(r"ce_gym/.*-v\d+", args.name):
+        return _inspect_environment(args)
+    model = Model(args.name, transmission=args.transmission)
     print(f"{model.describe()}\n", flush=True)
     print(transmission_report(model, states=0) if args.no_errors else transmission_report(model))
+    return 0
+
+
+def _inspect_environment(args: argparse.Namespace) -> int:
+    from ce_gym import environment_ids
+    from ce_gym.envs.scene_text import scene_report
+    from ce_gym.model import RobotError
+
+    if args.name not in environment_ids():
+        raise RobotError(f"environment {args.name!r}: expected one of {', '.join(environment_ids())}")
+    print(scene_report(args.name, timing=not args.no_timing))
     return 0
 
 

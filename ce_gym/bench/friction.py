@@ -17,6 +17,7 @@ import numpy as np
 from ce_gym.bench.report import Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot, load_robot
+from ce_gym.model.description import Mat3
 from ce_gym.sim import Simulator
 
 MASS, SIZE, MU, G = 10.0, (0.2, 0.2, 0.1), 0.5, 9.81
@@ -45,7 +46,7 @@ def block(material: ContactMaterial) -> Robot:
     """Return a free box with a contact point at each lower corner."""
     a, b, c = SIZE
     inertia = np.diag([b * b + c * c, a * a + c * c, a * a + b * b]) * MASS / 12
-    tensor = tuple(tuple(float(x) for x in row) for row in inertia)
+    tensor: Mat3 = tuple(tuple(float(x) for x in row) for row in inertia)  # type: ignore[assignment]
     body = Body("block", "link", None, Placement(), Joint("free"), Inertial(MASS, (0.0, 0.0, c / 2), tensor))
     corners = [(x * a / 2, y * b / 2, 0.0) for x, y in product((1, -1), repeat=2)]
     spheres = tuple(ContactSphere(f"corner_{i}", "block", corner, 0.0) for i, corner in enumerate(corners))

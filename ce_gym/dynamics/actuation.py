@@ -93,18 +93,14 @@ def _through_motors(asked: JointForce, W: SX, speed: SX, motors: list[Motor], st
     """Share joint torques out to motors, limit each, take its friction off, and carry the sum back to the joints."""
     to_motors = _effort_matrix(W)
     tau, slope = to_motors @ asked.tau, to_motors @ asked.slope @ to_motors.T
-    free = SX.eye(len(motors))
-    friction, friction_slope = SX(len(motors), 1), SX(len(motors), 1)
+    free, own = SX.eye(len(motors)), SX(len(motors), len(motors))
     for i, motor in enumerate(motors):
-        low, high = _available_torque(motor, speed[i])
-        if math.isfinite(motor.torque):
-            low, high = low * strength, high * strength
-            free[i, i] = ca.logic_and(tau[i] < high, tau[i] > low)
-            tau[i] = ca.fmax(low, ca.fmin(high, tau[i]))
+        if math.isfinite(motor.torque) or math.isfinite(motor.velocity):
+            tau[i], free[i, i], own[i, i] = _limited(motor, tau[i], speed[i], strength, dt)
         drag = motor.damping + (motor.friction / ca.sqrt(speed[i] ** 2 + COULOMB_SPEED**2) if motor.friction else 0)
-        friction[i], friction_slope[i] = drag * speed[i], dt * drag
-    slope = free @ slope @ free + ca.diag(friction_slope)  # a saturated motor does not answer to speed
-    return JointForce(W.T @ (tau - friction), W.T @ slope @ W)
+        tau[i] -= drag * speed[i]
+        own[i, i] += dt * drag
+    return JointForce(W.T @ tau, W.T @ (free @ slope @ free + own) @ W)
 
 
 def _effort_matrix(W: SX) -> SX:
@@ -115,19 +111,26 @@ def _effort_matrix(W: SX) -> SX:
     return W @ ca.inv(W.T @ W) if n > d else ca.inv(W @ W.T) @ W
 
 
-def _available_torque(motor: Motor, speed: SX) -> tuple[SX, SX]:
-    """Return the torques between which a motor can choose at a speed of its rotor [N m].
+def _limited(motor: Motor, tau: SX, speed: SX, strength: SX, dt: float) -> tuple[SX, SX, SX]:
+    """Return the torque that a motor can give of what it is asked for [N m], and how it answers to its acceleration.
 
-    On the torque-speed line the voltage allows `stall (1 - speed / velocity)` forwards, and likewise backwards; the
-    current, at most `torque`.
+    The current allows `torque`; the voltage `stall (1 - speed / velocity)` forwards and `stall (1 + speed / velocity)`
+    backwards, the torque-speed line, but never makes a motor brake. A motor on the line is taken along it to the speed
+    at the end of the step, or it would overshoot its no-load speed wherever a step is long.
+
+    Returns:
+        The torque; 1 if it is what was asked for, else 0; and the slope of the line if the motor is on it [kg m^2].
     """
-    limit = motor.torque
-    if math.isinf(limit) or math.isinf(motor.velocity):
-        return SX(-limit), SX(limit)
-    stall = limit if motor.stall is None else motor.stall
-    forwards = stall * (1 - speed / motor.velocity)
-    backwards = stall * (1 + speed / motor.velocity)
-    return -ca.fmax(0, ca.fmin(limit, backwards)), ca.fmax(0, ca.fmin(limit, forwards))
+    limit = strength * motor.torque if math.isfinite(motor.torque) else SX(math.inf)
+    stall = strength * (motor.torque if motor.stall is None else motor.stall)
+    if math.isinf(motor.velocity) or math.isinf(motor.torque if motor.stall is None else motor.stall):
+        return ca.fmax(-limit, ca.fmin(limit, tau)), ca.fabs(tau) <= limit, SX(0)
+    forwards, backwards = stall * (1 - speed / motor.velocity), stall * (1 + speed / motor.velocity)
+    high, low = ca.fmax(0, ca.fmin(limit, forwards)), -ca.fmax(0, ca.fmin(limit, backwards))
+    given = ca.fmax(low, ca.fmin(high, tau))
+    line = ca.if_else(tau > 0, forwards, backwards)
+    on_line = ca.logic_and(given != tau, ca.logic_and(line > 0, line <= limit))
+    return given, given == tau, ca.if_else(on_line, dt * stall / motor.velocity, 0)
 
 
 def passive_forces(robot: Robot, y: SX, yd: SX, dt: float) -> JointForce:

@@ -24,6 +24,8 @@ SINGULAR = 1e-3
 """A robot whose loops are nearer than this to a singularity (see `Model.nearness`) has diverged."""
 SANE_SPEED = 1e4
 """A robot any of whose velocities is beyond this, or not a number, has diverged [rad/s or m/s]."""
+SANE_DISTANCE = 1e6
+"""A robot any of whose positions is beyond this, or not a number, has diverged [rad or m]."""
 
 
 def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
@@ -92,7 +94,8 @@ class _Given:
     def results(self, stepped: Stepped, outputs: tuple[str, ...]) -> dict[str, SX]:
         """State after the step, or as it was if the robot has diverged now or before, and outputs."""
         after = stepped.state
-        sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, self.diverged < 0.5)  # false if it is not a number
+        sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, self.diverged < 0.5)  # false if it is not a number:
+        sane = ca.logic_and(sane, ca.sumsqr(after.q) < SANE_DISTANCE**2)  # not all positions act on velocities
         if any(closures(self.mechanism)):
             sane = ca.logic_and(sane, loops_close(self.mechanism, stepped.solved.kinematics, after))
         results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in self.state.items()}

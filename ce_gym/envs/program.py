@@ -12,11 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import cached_property
+from typing import Literal
 
 import casadi as ca
 import numpy as np
 
-from ce_gym.compile import Buffer, Call, Program, Repeat
+from ce_gym.compile import Buffer, Call, Program, Repeat, Step
 from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.scene import StepOptions, state_sizes
@@ -190,6 +191,10 @@ class TaskProgram:
         name = f"{self.model.robot.name} {self.model.transmission} reset"
         return Program(name, tuple(buffers), (call,), skip_unless="chosen")
 
+    def function(self, name: Literal["act", "assess", "begin"]) -> ca.Function:
+        """Trace what is done once in an environment step, before and after its sub-steps, or in a reset."""
+        return {"act": self._act, "assess": lambda: self._assess()[0], "begin": lambda: self._begin()[0]}[name]()
+
     @property
     def _physics_outputs(self) -> tuple[str, ...]:
         return ("torque", "contact_forces") if self.contact_forces else ("torque",)
@@ -226,7 +231,7 @@ class TaskProgram:
         late = {"waited": SX(0)} if "delay" in self.state_sizes else {}
         return traced("act", {"action_in": action}, {"clipped": clipped, "target": target} | late)
 
-    def _delayed(self, physics: tuple[Call | Repeat, ...]) -> tuple[Call | Repeat, ...]:
+    def _delayed(self, physics: tuple[Step | Repeat, ...]) -> tuple[Step | Repeat, ...]:
         """Put before each sub-step the choice between the target of the last action and that of the new one."""
         waited, delay = SX.sym("waited"), SX.sym("delay")
         old, new = SX.sym("target", self.n_joints), SX.sym("new_target", self.n_joints)

@@ -24,6 +24,9 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
     `reward_<name>` for each reward term; and, as in Gymnasium's MuJoCo environments, `x_position`, `y_position`,
     `distance_from_origin` [m], `x_velocity` and `y_velocity` [m/s] of the base in the world.
 
+    Attributes:
+        n_diverged: How many episodes have ended so far because the simulation failed.
+
     Args:
         robot: Name of a robot that ships with the package, or a path to a robot file.
         task: Name of a task.
@@ -43,6 +46,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         self._names = [f"reward_{name}" for name in self.batch.program.reward_terms]
         self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
         self.render_mode = None
+        self.n_diverged = 0
         self._seeded = False
 
     def reset(
@@ -64,6 +68,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         """
         outcome = self.batch.step(checked_action(action, (1, self.batch.program.n_actions)))
         diverged = bool(outcome.diverged[0])
+        self.n_diverged += diverged
         info = {"diverged": diverged, **dict(zip(self._names, outcome.terms[0].tolist(), strict=True))}
         info |= self._whereabouts()
         observation = self._shown(outcome.observation[0])

@@ -28,6 +28,9 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
     `infos["episode_terms"]` has its length, its return, the sum of every reward term and the mean of every metric (see
     `Task`).
 
+    Attributes:
+        n_diverged: How many episodes have ended so far because the simulation failed.
+
     Args:
         num_envs: Number of environments.
         max_episode_steps: Control steps until time is up; the task's own if None.
@@ -70,6 +73,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.render_mode = None
+        self.n_diverged = 0
         self._elapsed = np.zeros(num_envs, np.int64)
         self._finished = np.zeros(num_envs, bool)
         self._observation = np.zeros((num_envs, self.batch.observation_size), np.float32)
@@ -125,6 +129,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
             for flags in (terminated, truncated, outcome.diverged):
                 flags[resetting] = False
             self._elapsed[resetting] = 0
+        self.n_diverged += int(outcome.diverged.sum())
         done = terminated | truncated
         if done.any():
             infos["episode_terms"] = self._episode_terms(done)

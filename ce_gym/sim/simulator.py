@@ -20,7 +20,8 @@ from ce_gym.dynamics.parameters import parameter_defaults
 from ce_gym.dynamics.scene import Control, Friction, Motors, StepOptions
 from ce_gym.dynamics.trace import OUTPUTS
 from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
-from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
+from ce_gym.sim.retry import Retry
+from ce_gym.sim.substeps import FRAME, HEIGHTS, TIMES, substeps
 from ce_gym.sim.terrain import Terrain
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
@@ -48,6 +49,11 @@ class Simulator:
             motors themselves.
         parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
         terrain: The ground; the plane z = 0 if None, which is faster.
+        retry: How often the step is halved for a robot that diverges: it alone is taken back to where it was when
+            `step` was called and stepped again. 0, the default, costs nothing; otherwise each call copies the state.
+
+    Attributes:
+        n_retried: How many times a robot has been stepped again.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -70,10 +76,12 @@ class Simulator:
         motors: str = "ideal",
         parameters: Sequence[str] = (),
         terrain: Terrain | None = None,
+        retry: int = 0,
     ) -> None:
         _check("num_envs", num_envs, num_envs >= 1, "at least 1")
         _check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
         _check("num_threads", num_threads, num_threads >= 1, "at least 1")
+        _check("retry", retry, 0 <= retry <= 10, "between 0 and 10 halvings of the step")
         _choice("dtype", dtype, ("float64", "float32"))
         _choice("control", control, get_args(Control))
         _choice("method", method, tuple(METHODS))
@@ -98,7 +106,12 @@ class Simulator:
             parameters=tuple(parameters),
         )
         defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
-        self._kernel = load_step_kernel(model, self.options, tuple(name for name in OUTPUTS if name in outputs), dtype)
+        asked = tuple(name for name in OUTPUTS if name in outputs)
+        self._kernel = load_step_kernel(model, self.options, asked, dtype)
+        self._retry = Retry(
+            retry, lambda parts: load_step_kernel(model, replace(self.options, dt=dt / parts), asked, dtype)
+        )
+        self.n_retried = self._n_cleared = 0
         self._arrays = {
             name: tiles(num_envs, buffer.size, dtype)
             for name, buffer in self._kernel.buffers.items()
@@ -136,9 +149,7 @@ class Simulator:
         Raises:
             ValueError: If a shape is wrong, a number is not finite, or a loop does not close.
         """
-        chosen = None if mask is None else np.asarray(mask, dtype=bool)
-        if chosen is not None and chosen.shape != (self.num_envs,):
-            raise ValueError(f"mask has shape {chosen.shape}; expected ({self.num_envs},)")
+        chosen = self._chosen(mask)
         for name, value, size in (("q", q, self.model.nq), ("v", v, self.model.nv)):
             value = np.asarray(value, dtype=float)
             if value.shape not in ((size,), (self.num_envs, size)):
@@ -146,6 +157,7 @@ class Simulator:
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} holds a number that is not finite")
             write_rows(self._arrays[name], np.broadcast_to(value, (self.num_envs, size)), chosen)
+        self._n_cleared += int(self.diverged[slice(None) if chosen is None else chosen].sum())
         zeros = {name: np.zeros(self._arrays[name].shape[1]) for name in ("anchor", "diverged") if name in self._arrays}
         if self.contact_names:
             zeros["load"] = self._resting_load(q)
@@ -171,12 +183,11 @@ class Simulator:
         if rows.shape not in ((n,), (self.num_envs, n)):
             raise ValueError(f"target has shape {rows.shape}; expected ({n},) or ({self.num_envs}, {n})")
         rows = np.ascontiguousarray(np.broadcast_to(rows, (self.num_envs, n)))
-        self._kernel(
-            self._arrays | self._tables | {"target": rows},
-            self.num_envs,
-            repeats={"n_substeps": n_substeps},
-            num_threads=self.num_threads,
-        )
+        given, repeats = {"target": rows}, {TIMES: n_substeps}
+        before = {name: array.copy() for name, array in self._arrays.items()} if self._retry.halvings else {}
+        self._kernel(self._arrays | self._tables | given, self.num_envs, repeats=repeats, num_threads=self.num_threads)
+        if before:
+            self.n_retried += self._retry(before, self._arrays, self.num_envs, given, self._tables, n_substeps)
 
     def set_parameter(self, name: str, value: ArrayLike, mask: ArrayLike | None = None) -> None:
         """Set a figure that was declared in `parameters`.
@@ -202,7 +213,7 @@ class Simulator:
         if new.shape not in ((), (size,), (self.num_envs, size)) or not np.isfinite(new).all():
             raise ValueError(f"{name} has shape {new.shape}; expected ({size},) or ({self.num_envs}, {size}), finite")
         rows[:, columns] = new
-        write_rows(self._arrays["parameters"], rows, None if mask is None else np.asarray(mask, dtype=bool))
+        write_rows(self._arrays["parameters"], rows, self._chosen(mask))
 
     @property
     def q(self) -> NDArray:
@@ -218,6 +229,11 @@ class Simulator:
     def diverged(self) -> NDArray[np.bool_]:
         """Robots whose state went out of bounds; they stay frozen at their last good state, shape (num_envs,)."""
         return self._read("diverged")[:, 0] > 0.5
+
+    @property
+    def n_diverged(self) -> int:
+        """How many robots have been frozen so far, those that have been reset since included."""
+        return self._n_cleared + int(self.diverged.sum())
 
     @property
     def torque(self) -> NDArray:
@@ -256,10 +272,19 @@ class Simulator:
         """Distance from a singularity, see `Model.nearness`, start of the last sub-step, shape (num_envs,)."""
         return self._read("nearness")[:, 0]
 
+    def _chosen(self, mask: ArrayLike | None) -> NDArray[np.bool_] | None:
+        chosen = None if mask is None else np.asarray(mask, dtype=bool)
+        if chosen is not None and chosen.shape != (self.num_envs,):
+            raise ValueError(f"mask has shape {chosen.shape}; expected ({self.num_envs},)")
+        return chosen
+
     def _resting_load(self, q: ArrayLike) -> NDArray:
         """Return the springs' forces on the contacts [N], shape (..., n_contacts): what friction has to go by."""
         radius, _, above, cosine = self._above_ground(q)
-        return self.options.material.stiffness * np.maximum(radius - cosine * above, 0)
+        stiffness: float | NDArray = self.options.material.stiffness
+        if "stiffness" in self._columns:
+            stiffness = read_rows(self._arrays["parameters"], self.num_envs)[:, self._columns["stiffness"]]
+        return stiffness * np.maximum(radius - cosine * above, 0)
 
     def _lift(self, q: ArrayLike) -> float:
         """Return how far to raise a robot for no contact to be deeper in the terrain than it is in flat ground [m]."""

@@ -224,10 +224,11 @@ def test_stock_vector_wrappers():
     assert np.isfinite(observation).all()
 
 
-def test_a_diverged_environment_is_flagged_and_reset_alone():
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_a_diverged_environment_is_flagged_counted_and_reset_alone(mode: str):
     actions = random_actions(6, 20)
-    clean = gymnasium.make_vec(VELOCITY, num_envs=20, autoreset_mode="SameStep")
-    envs = gymnasium.make_vec(VELOCITY, num_envs=20, autoreset_mode="SameStep")
+    clean = gymnasium.make_vec(VELOCITY, num_envs=20, autoreset_mode=mode)
+    envs = gymnasium.make_vec(VELOCITY, num_envs=20, autoreset_mode=mode)
     for e in (clean, envs):
         e.reset(seed=0)
     bad = envs.unwrapped.batch.rows("v")
@@ -241,6 +242,8 @@ def test_a_diverged_environment_is_flagged_and_reset_alone():
         assert np.isfinite(ours[0]).all()
         assert ours[4]["diverged"].tolist() == [k == 0 and i == 13 for i in range(20)]
         assert ours[3][13] == (k == 0)
+    assert envs.unwrapped.n_diverged == 1
+    assert clean.unwrapped.n_diverged == 0
 
 
 def test_divergence_is_a_truncation_even_if_the_robot_has_fallen():

@@ -1,0 +1,160 @@
+"""The scene report: its lines add up, and what it says of a feature is what happens when the feature is there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gymnasium
+import pytest
+
+import ce_gym
+from ce_gym.__main__ import main
+from ce_gym.dynamics import Model
+from ce_gym.dynamics.trace import attempt_function, step_function
+from ce_gym.envs.program import TaskProgram
+from ce_gym.envs.scene_report import SceneReport, SubStep, layers, left_out, report_scene
+from ce_gym.envs.scene_text import as_text
+from ce_gym.envs.scene_timing import SceneTimes
+from ce_gym.envs.tasks import VELOCITY
+from ce_gym.model import ContactMaterial
+
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+
+ENVIRONMENT = "ce_gym/MiniCheetahVelocity-v0"
+
+
+@pytest.fixture(scope="module")
+def report() -> SceneReport:
+    return report_scene(ENVIRONMENT)
+
+
+def always(program: TaskProgram) -> dict[str, int]:
+    """Instructions of every function of the environment's kernel that runs whatever the robots do, by name."""
+    return {call.function.name(): call.function.n_instructions() for call in program.step_program().calls}
+
+
+def test_lines_add_up_to_the_kernel(report: SceneReport):
+    """The calls of the very program that an environment is compiled from."""
+    counts, n = always(report.program), report.program.task.n_substeps
+    assert report.sub_step == counts["attempt"] + counts["keep"]
+    assert report.env_step == n * report.sub_step + counts["act"] + counts["assess"]
+    assert sum(group.instructions for group in report.groups) == counts["act"] + counts["assess"]
+    assert {item.name: item.instructions for item in report.sometimes} == {
+        "second attempt at a sub-step": counts["attempt"],
+        "reset": report.program.reset_program().calls[0].function.n_instructions(),
+    }
+
+
+def test_every_term_of_the_task_has_a_line(report: SceneReport):
+    task = report.program.task
+    terms = [item.name for item in report.once[2:]]
+    assert terms == [*task.terminations, *task.metrics, *task.rewards, *task.observations]
+    assert all(item.instructions > 0 for item in report.once)
+
+
+def test_layers_are_what_is_compiled_in(report: SceneReport):
+    names = [item.name for item in report.layers]
+    assert names[:3] == ["kinematics", "inertias and accelerations", "integration and checks"]
+    assert {"rotors", "contact", "joint stops", "outputs"} <= set(names)
+    assert not {"limited motors", "ground field", "parameters", "method"} & set(names), "they are left out"
+    assert all(item.instructions > 0 for item in report.layers)
+    rotors = next(item.instructions for item in report.layers if item.name == "rotors")
+    assert 0 < rotors < 0.02 * report.sub_step
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("parameter 'gravity'", {"parameters": ("gravity",)}),
+        ("parameter 'com_shift:Floating Base'", {"parameters": ("com_shift:Floating Base",)}),
+        ("motors='limited'", {"motors": "limited"}),
+        ("dissipation of the material", {"material": ContactMaterial(dissipation=1.0)}),
+    ],
+)
+def test_a_left_out_feature_costs_what_it_adds_when_it_is_there(report: SceneReport, name: str, change: dict):
+    mechanism, options = report.program.model.mechanism, report.program.options
+    without, with_it = (
+        attempt_function(mechanism, o, ("torque",)).n_instructions() for o in (options, replace(options, **change))
+    )
+    assert cost(report, name) == with_it - without > 0
+
+
+def test_a_field_costs_its_look_up_too(report: SceneReport):
+    mechanism, options = report.program.model.mechanism, report.program.options
+    without, with_it = (
+        attempt_function(mechanism, o, ("torque",)).n_instructions()
+        for o in (options, replace(options, ground="field"))
+    )
+    assert cost(report, "ground='field'") > with_it - without > 0
+
+
+def cost(report: SceneReport, name: str) -> int:
+    return next(item.instructions for item in report.left_out if item.name == name)
+
+
+def test_methods_and_friction_count_every_call(report: SceneReport):
+    """Alternatives change which calls there are: `keep` goes where no attempt is made twice."""
+    mechanism, options = report.program.model.mechanism, report.program.options
+    for name, change in (
+        ("friction='secant' instead", {"friction": "secant"}),
+        ("method='rk4' instead", {"method": "rk4"}),
+    ):
+        count = step_function(mechanism, replace(options, **change), ("torque",)).n_instructions()
+        assert cost(report, name) == count - report.sub_step
+
+
+def test_a_term_costs_what_it_adds_when_it_is_there(report: SceneReport):
+    model, before = report.program.model, always(report.program)["assess"]
+    for field, term in (("rewards", "joint_limits"), ("observations", "feet_in_contact")):
+        more = {**VELOCITY.rewards, term: 0.5} if field == "rewards" else (*VELOCITY.observations, term)
+        after = always(TaskProgram(model, replace(VELOCITY, **{field: more})))["assess"]
+        (line,) = (item for item in report.terms_left_out if item.name == term)
+        assert line.instructions == after - before > 0
+
+
+def test_what_is_enabled_is_a_layer_and_no_longer_left_out(report: SceneReport):
+    program = report.program
+    options = replace(program.options, contacts=(), motors="limited", parameters=("friction", "kp"), method="rk4")
+    whole = SubStep(Model("mini_cheetah", "none"), options, ("torque",))
+    running = {name: total for name, total, _ in layers(whole)}
+    assert running["outputs"] == step_function(whole.model.mechanism, options, ("torque",)).n_instructions()
+    assert running["method"] > 3 * running["limited motors"] > 3 * running["joint stops"]
+    assert running["rotors"] == running["joint stops"], "this level has none"
+    missing = [name for name, _ in left_out(whole)]
+    assert not {"motors='limited'", "parameter 'kp'", "method='rk4' instead", "transmission='none' instead"} & set(
+        missing
+    )
+    assert {"method='euler' instead", "parameter 'kd'", "output 'power'", "contacts of group 'foot'"} <= set(missing)
+
+
+def test_text_holds_the_figures(report: SceneReport):
+    text = as_text(report)
+    for number in (report.sub_step, report.env_step, cost(report, "motors='limited'")):
+        assert f" {number}\n" in text
+    assert " ns\n" not in text
+    items = (*report.layers, *report.groups, *report.sometimes, *report.left_out)
+    times = SceneTimes(123.0, 4567.8, {(item.group, item.name): 1.25 for item in items})
+    text = as_text(report, times)
+    assert " ns\n" in text
+    for number in ("123.0", "492.0", "4567.8", "1.2"):
+        assert f" {number}\n" in text
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_command(capsys, monkeypatch):
+    asked = []
+    monkeypatch.setattr("ce_gym.envs.scene_text.scene_report", lambda *a, **k: asked.append((a, k)) or "report")
+    assert main(["inspect", ENVIRONMENT, "--no-timing"]) == 0
+    assert asked == [((ENVIRONMENT,), {"timing": False})]
+    assert main(["inspect", "ce_gym/NoSuchRobot-v0"]) == 2
+    error = capsys.readouterr().err
+    assert "ce_gym/NoSuchRobot-v0" in error
+    assert ENVIRONMENT in error
+    assert error.count("\n") == 1
+
+
+def test_only_environments_of_this_package():
+    assert "CartPole-v1" in gymnasium.registry
+    for name in ("CartPole-v1", "ce_gym/NoSuchRobot-v0"):
+        with pytest.raises(ValueError, match=r"is not registered; `python -m ce_gym list`"):
+            ce_gym.scene_report(name)
