@@ -22,7 +22,7 @@ class StepOptions:
     """What a scene consists of and how it is stepped.
 
     Attributes:
-        dt: Length of the step [s].
+        dt: Length of the step [s]; None makes it an input of the traced step.
         control: "position" for joint targets [rad or m] through the robot's gains, "torque" for joint torques.
         contacts: Names of the contact spheres that can touch the ground.
         material: Compliance and friction of the contacts.
@@ -34,7 +34,7 @@ class StepOptions:
         parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
     """
 
-    dt: float
+    dt: float | None
     control: Control = "position"
     contacts: tuple[str, ...] = ()
     material: ContactMaterial = field(default_factory=ContactMaterial)

@@ -38,11 +38,12 @@ def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str
 
     Returns:
         Function (*state, diverged, *given) -> (*state, diverged, *outputs): `state` are the parts of `State` that the
-        scene has; `given` is `target` if there are joints, `parameters` if any are declared, and `ground` on a field.
+        scene has; `given` is `target` if there are joints, `parameters` if any are declared, `ground` on a field, and
+        `dt` if the options leave it open.
     """
     given = _Given(mechanism, options)
     method = METHODS[options.method]
-    stepped = method.step(given.scene, given.state, given.target, options.dt)
+    stepped = method.step(given.scene, given.state, given.target, given.dt)
     return traced("step", given.inputs(), given.results(stepped, outputs))
 
 
@@ -54,7 +55,7 @@ def attempt_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[
         `step_function`; hints are zero at first, shape (6 n_contacts,).
     """
     given, hints = _Given(mechanism, options), SX.sym("hints", 6, len(options.contacts))
-    stepped = attempt(given.scene, given.state, given.target, options.dt, hints)
+    stepped = attempt(given.scene, given.state, given.target, given.dt, hints)
     results = given.results(stepped, outputs)
     kept = {name: results.pop(name) for name in list(results) if name.endswith("_next")}
     kept |= {"hints_next": ca.vec(stepped.hints), "misjudged": stepped.misjudged}
@@ -84,11 +85,13 @@ class _Given:
         defaults = parameter_defaults(robot, options.material, options.parameters)
         self.parameters = SX.sym("parameters", sum(len(default) for default in defaults.values()))
         self.ground = SX.sym("ground", 3, n if options.ground == "field" else 0)
+        self.dt: float = SX.sym("dt") if options.dt is None else options.dt  # type: ignore[assignment]  # used as one
         self.scene = make_scene(mechanism, options, self.parameters, self.ground)
 
     def inputs(self) -> dict[str, SX]:
         given = {"target": self.target, "parameters": self.parameters, "ground": ca.vec(self.ground)}
         given = {name: value for name, value in given.items() if value.numel()}
+        given |= {"dt": self.dt} if isinstance(self.dt, SX) else {}
         return dict(self.state.items()) | {"diverged": self.diverged} | given
 
     def results(self, stepped: Stepped, outputs: tuple[str, ...]) -> dict[str, SX]:

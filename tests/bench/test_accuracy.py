@@ -1,0 +1,136 @@
+"""The accuracy benchmark on short scenes: that its references agree, what it times, and what it concludes."""
+
+import argparse
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from ce_gym import Model, Simulator
+from ce_gym.bench import accuracy, accuracy_contact, accuracy_coulomb, accuracy_curves, accuracy_references
+from ce_gym.bench.accuracy_curves import Curve, Measured, Point, comparisons, rms_error, time_to
+from ce_gym.bench.accuracy_ours import Ours
+from ce_gym.bench.accuracy_peers import Family, Peer
+from ce_gym.bench.accuracy_scenarios import HOLD, SCENES, Scene
+
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+
+
+def short(name: str, holds: int) -> Scene:
+    scene = SCENES[name]()
+    return replace(scene, drive=scene.drive[:holds], push=None if scene.push is None else scene.push[:holds])
+
+
+@pytest.mark.parametrize(("name", "holds"), [("belt_leg", 5), ("tumble", 10), ("four_bar", 5), ("stiff_1e3", 3)])
+def test_two_codes_agree_on_smooth_scenes(name: str, holds: int):
+    scene = short(name, holds)
+    truth = accuracy_references.ours(scene, 40)
+    assert np.abs(truth[-1] - scene.q).max() > 0.01  # it did move
+    assert rms_error(scene, accuracy_references.theirs(scene, 100), truth) < 1e-8
+
+
+@pytest.mark.parametrize("name", ["breakaway", "reversal"])
+def test_two_codes_agree_on_a_block(name: str):
+    scene = short(name, 5)
+    limit = Ours(scene, "extrapolated", "exact", "tangent", 1).run(2000)
+    assert np.abs(limit[-1] - scene.q).max() > 1e-4
+    assert rms_error(scene, accuracy_contact.block(scene, 600), limit) < 1e-7
+
+
+@pytest.mark.slow
+def test_two_codes_agree_on_a_robot_that_lands():
+    scene = short("drop_3cm", 5)
+    lower = replace(scene, q=scene.q - 0.03 * np.eye(len(scene.q))[2])
+    limit = Ours(lower, "euler", "exact", "secant", 1).run(8000)
+    error = rms_error(lower, accuracy_contact.robot(lower, 20_000), limit)
+    coarse = rms_error(lower, Ours(lower, "euler", "exact", "secant", 1).run(100), limit)
+    assert error < 1e-5 < 10 * error + 1e-5 < coarse
+
+
+def test_a_step_that_is_an_input_is_the_simulators():
+    scene = short("belt_leg", 3)
+    model = Model(scene.robot)
+    simulator = Simulator(model, 1, HOLD / 5, control="torque", outputs=())
+    simulator.set_state(scene.q, scene.v)
+    for torque in scene.drive:
+        simulator.step(torque, 5)
+    path = Ours(scene, "euler", "exact", "tangent", 9).run(5)
+    np.testing.assert_allclose(path[-1], simulator.q[0], rtol=1e-12, atol=1e-13)
+
+
+def test_mujoco_runs_the_same_scene():
+    """Rotors held stiffly: it comes to our solution, at its second order; without them it does not."""
+    scene = short("belt_leg", 5)
+    truth = accuracy_references.ours(scene, 40)
+    stiff, armature = Family(scene, "exact", stiff=True), Family(scene, "armature", stiff=False)
+    errors = [rms_error(scene, Peer(stiff, "RK4", n).run(), truth) for n in (5, 20)]
+    assert errors[1] < errors[0] / 8 < 1e-4
+    assert rms_error(scene, Peer(armature, "RK4", 20).run(), truth) > 100 * errors[0]
+    assert stiff.tied
+    assert not armature.tied
+
+
+def test_a_block_slides_as_far_as_coulomb_says():
+    table = accuracy_coulomb.distance_table()
+    finest = {row[:2]: row[-1] for row in table.rows}
+    for scene in ("breakaway", "slide"):
+        assert finest[scene, "ce_gym extrapolated, tangent friction"] == pytest.approx(1.0, abs=0.01)
+        assert finest[scene, "MuJoCo RK4"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_error_counts_a_turn_once():
+    scene, turn = short("tumble", 1), 0.3
+    a = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+    b = np.array([[0.0, 0.0, 0.4, -np.cos(turn / 2), 0.0, -np.sin(turn / 2), 0.0]])
+    assert rms_error(scene, b, a) == pytest.approx(np.sqrt((0.4**2 + turn**2) / 6))
+    assert rms_error(scene, a, a) == 0.0
+    assert np.isnan(rms_error(scene, np.nan * a, a))
+
+
+def curve(code: str, seconds: list[float], errors: list[float]) -> Curve:
+    return Curve(code, "exact", "m", tuple(Point(0.1 / s, s, e, e) for s, e in zip(seconds, errors, strict=True)))
+
+
+def test_time_to_an_error():
+    c = curve("ce_gym", [1.0, 10.0, 100.0], [1e-1, 1e-3, 1e-5])
+    errors = [p.truth for p in c.points]
+    assert time_to(c, errors, 0.5) == 1.0
+    assert time_to(c, errors, 1e-4) == pytest.approx(10**1.5)
+    assert time_to(c, errors, 1e-6) is None
+    by_chance = [1e-1, 1e-6, 1e-3]
+    assert time_to(c, by_chance, 1e-4) is None
+    assert time_to(c, [np.nan, 1e-3, 1e-5], 1e-2) == 10.0
+
+
+def test_comparison_ends_where_references_do():
+    scene = short("tumble", 1)
+    ours = curve("ce_gym", [1.0, 10.0, 100.0], [1e-1, 1e-3, 1e-5])
+    theirs = curve("MuJoCo", [50.0, 500.0, 5000.0], [1e-1, 1e-3, 2e-3])
+    found = comparisons(Measured(scene, 1e-6, [ours, theirs]))
+    assert [f"{c.error:.0e}" for c in found] == ["1e-01", "1e-02", "1e-03", "1e-04", "1e-05"]
+    assert [c.ratio for c in found[:2]] == pytest.approx([50.0, 50.0])
+    assert [c.theirs for c in found[2:]] == [None, None, None]
+    assert accuracy.requirement(Measured(scene, 1e-6, [ours, theirs])).met
+    slow = curve("ce_gym", [10.0, 100.0, 1000.0], [1e-1, 1e-3, 1e-5])
+    assert not accuracy.requirement(Measured(scene, 1e-6, [slow, theirs])).met
+
+
+@pytest.mark.slow
+def test_writes_picture_and_tables(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(accuracy_curves, "PEER_LIMIT", 100)
+    monkeypatch.setattr(accuracy, "QUICK_STEPS", (1, 5))
+    scene = short("belt_leg", 3)
+    monkeypatch.setitem(SCENES, "belt_leg", lambda: scene)
+    report = accuracy.run(argparse.Namespace(out=tmp_path / "new", scenes=["belt_leg"], rounds=1, quick=True))
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {"accuracy.png", "accuracy.csv", "accuracy.md"}
+    with (tmp_path / "new" / "accuracy.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * (4 + 9)  # ours, and MuJoCo with armature, rotors and rotors held stiffly
+    exact = [float(row["error against the truth"]) for row in rows if row["method"] == "rk4"]
+    assert exact[1] < exact[0] / 100
+    assert all(float(row["time per simulated second [s]"]) > 0 for row in rows)
+    assert [r.met for r in report.requirements] == [True]
