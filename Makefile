@@ -2,7 +2,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := viewer,train,bench,dev
+EXTRAS := viewer,video,train,bench,dev
 
 .PHONY: help venv demo test lint types wheel clean
 

@@ -10,6 +10,7 @@
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.custom import register_robot
 from ce_gym.envs.registration import environment_ids, register_environments
+from ce_gym.envs.rendering import use_renderers
 from ce_gym.envs.scene_text import scene_report
 from ce_gym.envs.terms import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
@@ -38,3 +39,4 @@ __all__ = [
 ]
 
 register_environments()
+use_renderers("ce_gym.viewer.renderers")

@@ -12,6 +12,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from ce_gym.envs.program import OBSERVATION_BOUND, TaskProgram
+from ce_gym.envs.rendering import RENDER_MODES, Screen
 from ce_gym.envs.setup import make_batch
 from ce_gym.envs.shell import BatchShell
 
@@ -31,21 +32,34 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         robot: Name of a robot that ships with the package, or a path to a robot file.
         task: Name of a task.
         obs_mode: "vector", or "dict" for `{"policy": ..., "critic": ...}`, where the critic may see more.
+        render_mode: None; "rgb_array", for pictures as arrays; or "human", for a live page at this machine's loopback.
+        width: Of a picture [pixels].
+        height: Of a picture [pixels].
         **kwargs: See `ce_gym.envs.setup.make_batch`.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own declaration)
+    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES]}  # noqa: RUF012  (Gymnasium's own declaration)
 
     def __init__(
-        self, robot: str = "mini_cheetah", task: str = "velocity", *, obs_mode: str = "vector", **kwargs: Any
+        self,
+        robot: str = "mini_cheetah",
+        task: str = "velocity",
+        *,
+        obs_mode: str = "vector",
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        **kwargs: Any,
     ) -> None:
-        EzPickle.__init__(self, robot, task, obs_mode=obs_mode, **kwargs)
+        shown_as = {"obs_mode": obs_mode, "render_mode": render_mode, "width": width, "height": height}
+        EzPickle.__init__(self, robot, task, **shown_as, **kwargs)
         self.batch = make_batch(robot, task, num_envs=1, **kwargs)
         self.model = self.batch.program.model
         self.observation_space, self.action_space = spaces(self.batch.program, obs_mode)
         self._names = [f"reward_{name}" for name in self.batch.program.reward_terms]
         self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
-        self.render_mode = None
+        self.render_mode = render_mode
+        self._screen = Screen(render_mode, self.batch, width=width, height=height)
         self.n_diverged = 0
         self._seeded = False
 
@@ -58,7 +72,9 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
             key = seed if seed is not None else self.np_random.integers(2**63)
             self.batch.seed(np.array([key], np.uint64))
             self._seeded = True
-        return self._shown(self.batch.reset(np.ones(1, bool)))[0], {"diverged": False, **self._whereabouts()}
+        observation = self._shown(self.batch.reset(np.ones(1, bool)))[0]
+        self._screen.refresh()
+        return observation, {"diverged": False, **self._whereabouts()}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Carry out one control step; see `gymnasium.Env.step`.
@@ -72,7 +88,17 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         info = {"diverged": diverged, **dict(zip(self._names, outcome.terms[0].tolist(), strict=True))}
         info |= self._whereabouts()
         observation = self._shown(outcome.observation[0])
+        self._screen.refresh()
         return observation, float(outcome.reward[0]), bool(outcome.terminated[0]), diverged, info
+
+    def render(self) -> Any:
+        """Return a picture, uint8, shape (height, width, 3), or None if there is none."""
+        frames = self._screen.frames()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Give back whatever rendering holds; harmless if done before."""
+        self._screen.close()
 
     def _shown(self, rows: NDArray[np.float32]) -> Any:
         return shown(rows, self.batch.program, self.observation_space)

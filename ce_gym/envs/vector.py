@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ce_gym.envs.rendering import RENDER_MODES, Screen
 from ce_gym.envs.setup import make_batch
 from ce_gym.envs.shell import BatchShell
 from ce_gym.envs.single import checked_action, recorded_state, shown, spaces
@@ -39,13 +40,16 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         robot: Name of a robot that ships with the package, or a path to a robot file.
         task: Name of a task.
         obs_mode: "vector", or "dict" for `{"policy": ..., "critic": ...}`, where the critic may see more.
+        render_mode: None; "rgb_array", for a picture of every environment; or "human", for a live page of the first.
+        width: Of a picture [pixels].
+        height: Of a picture [pixels].
         **kwargs: See `ce_gym.envs.setup.make_batch`.
 
     Raises:
         ValueError: If an argument is not one of the choices.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -56,6 +60,9 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         robot: str = "mini_cheetah",
         task: str = "velocity",
         obs_mode: str = "vector",
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
         **kwargs: Any,
     ) -> None:
         self.autoreset_mode = as_autoreset_mode(autoreset_mode)
@@ -72,7 +79,8 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         self.single_observation_space, self.single_action_space = spaces(program, obs_mode)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.render_mode = None
+        self.render_mode = render_mode
+        self._screen = Screen(render_mode, self.batch, width=width, height=height)
         self.n_diverged = 0
         self._elapsed = np.zeros(num_envs, np.int64)
         self._finished = np.zeros(num_envs, bool)
@@ -98,6 +106,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         self._observation = np.where(mask[:, None], fresh, self._observation)
         self._elapsed[mask] = 0
         self._finished[mask] = False
+        self._screen.refresh()
         return self._shown(self._observation), {"diverged": np.zeros(self.num_envs, bool)}
 
     def step(
@@ -143,7 +152,16 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
                 done = np.zeros(self.num_envs, bool)
         self._finished = done
         self._observation = observation
+        self._screen.refresh()
         return self._shown(observation), reward, terminated, truncated, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a picture of every environment, each uint8 (height, width, 3), or None if there are none."""
+        return self._screen.frames()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Give back whatever rendering holds; see `gymnasium.vector.VectorEnv.close`."""
+        self._screen.close()
 
     def _shown(self, rows: NDArray[np.float32]) -> Any:
         """Return observations as the space has them, fresh arrays."""

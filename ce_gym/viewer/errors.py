@@ -10,3 +10,8 @@ class ViewerError(RuntimeError):
     def missing_meshcat(cls) -> ViewerError:
         """Return the error for a missing meshcat, with the command that installs it."""
         return cls('the viewer needs meshcat, which is not installed: pip install "ce_gym[viewer]"')
+
+    @classmethod
+    def missing_embreex(cls) -> ViewerError:
+        """Return the error for a missing embreex, with the command that installs it."""
+        return cls('render_mode="rgb_array" needs embreex, which is not installed: pip install "ce_gym[video]"')

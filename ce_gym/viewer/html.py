@@ -46,7 +46,7 @@ def page(
         ViewerError: meshcat is not installed, or a rollout does not fit its robot.
     """
     rollouts = [rollouts] if isinstance(rollouts, Rollout) else list(rollouts)
-    code = _meshcat_code()
+    code = meshcat_code()
     commands = build_scene(rollouts, models, spacing=spacing, max_fps=max_fps)
     packed = [base64.b64encode(three.pack(command)).decode() for command in commands]
     title = title or " / ".join(dict.fromkeys(rollout.robot for rollout in rollouts))
@@ -67,7 +67,12 @@ def write_html(rollouts: Rollout | Sequence[Rollout], path: str | Path, **option
     return path
 
 
-def _meshcat_code() -> str:
+def meshcat_code() -> str:
+    """Return the code of meshcat's page.
+
+    Raises:
+        ViewerError: meshcat is not installed.
+    """
     spec = importlib.util.find_spec("meshcat")
     if spec is None or spec.origin is None:
         raise ViewerError.missing_meshcat()

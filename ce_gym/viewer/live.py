@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -47,9 +47,14 @@ def show(
 
 
 @contextlib.contextmanager
-def serve(text: str) -> Iterator[str]:
-    """Serve one page at a free loopback port inside the context, which gets its address."""
-    server = ThreadingHTTPServer((LOOPBACK, 0), _handler(text.encode("utf-8")))
+def serve(text: str, events: Callable[[], Iterator[bytes]] | None = None) -> Iterator[str]:
+    """Serve one page at a free loopback port inside the context, which gets its address.
+
+    Args:
+        text: The page.
+        events: Gives what the page's browsers get as server-sent events from `/events`; none if not given.
+    """
+    server = ThreadingHTTPServer((LOOPBACK, 0), _handler(text.encode("utf-8"), events))
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
     thread.start()
@@ -61,9 +66,12 @@ def serve(text: str) -> Iterator[str]:
         thread.join()
 
 
-def _handler(body: bytes) -> type[BaseHTTPRequestHandler]:
+def _handler(body: bytes, events: Callable[[], Iterator[bytes]] | None) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
+            if self.path == "/events" and events is not None:
+                self._send_events(events())
+                return
             if self.path != "/":
                 self.send_error(HTTPStatus.NOT_FOUND)
                 return
@@ -72,6 +80,15 @@ def _handler(body: bytes) -> type[BaseHTTPRequestHandler]:
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             self.wfile.write(body)
+
+        def _send_events(self, items: Iterator[bytes]) -> None:
+            self.send_response(HTTPStatus.OK)
+            self.send_header("Content-Type", "text/event-stream")
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            with contextlib.closing(items), contextlib.suppress(ConnectionError):  # type: ignore[type-var]
+                for item in items:
+                    self.wfile.write(item)
 
         def log_message(self, format: str, *args: object) -> None:
             """Say nothing: requests are of no interest to whoever watches."""

@@ -1,0 +1,93 @@
+"""What `render` shows: environments ask for a render mode, the top of the package says where its renderer is.
+
+The rooms that draw lie above this one, so this file does not know them: `use_renderers` is told the name of a module
+that has a function for each render mode, and that module is imported when an environment is made with one. May know
+batches and Gymnasium's logger.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium import logger
+from numpy.typing import NDArray
+
+from ce_gym.envs.batch import Batch
+
+RENDER_MODES = ("human", "rgb_array")
+
+_home: list[str] = []  # the module of the renderers, once it is known
+
+
+class Renderer(Protocol):
+    """Shows one robot."""
+
+    def draw(self, q: NDArray[np.float64]) -> NDArray[np.uint8] | None:
+        """Show the robot at positions `q`, shape (nq,); return a picture, shape (height, width, 3), if it is one."""
+        ...
+
+    def close(self) -> None:
+        """Give back whatever is held; harmless if done before."""
+        ...
+
+
+def use_renderers(module: str) -> None:
+    """Say where renderers are.
+
+    Args:
+        module: Name of a module with a function for each render mode, which takes a model, positions in a typical
+            pose, shape (nq,), and the keywords width [pixels], height [pixels] and fps [1/s], and returns a `Renderer`.
+    """
+    _home[:] = [module]
+
+
+class Screen:
+    """Shows the robots of a batch in one render mode.
+
+    Args:
+        mode: "human", "rgb_array" or None.
+        batch: The environments.
+        width: Of a picture [pixels].
+        height: Of a picture [pixels].
+
+    Raises:
+        ValueError: If there is no such mode, or the size is not positive.
+        ViewerError: If what the mode needs is not installed.
+    """
+
+    def __init__(self, mode: str | None, batch: Batch, *, width: int, height: int) -> None:
+        if mode is not None and mode not in RENDER_MODES:
+            raise ValueError(f"render_mode={mode!r}; expected one of {', '.join(RENDER_MODES)}, or None")
+        for name, value in (("width", width), ("height", height)):
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ValueError(f"{name}={value!r}; expected a whole number of pixels, at least 1")
+        self._mode, self._batch = mode, batch
+        self._renderer: Renderer | None = None
+        if mode is not None:
+            model, fps = batch.program.model, 1 / batch.program.control_dt
+            make: Any = getattr(import_module(_home[0]), mode)
+            self._renderer = make(model, model.standing_q, width=int(width), height=int(height), fps=fps)
+
+    def frames(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a picture of each environment; or show the first one and return None."""
+        if self._renderer is None:
+            logger.warn(f"render() does nothing without a render mode; make the environment with one of {RENDER_MODES}")
+            return None
+        q = self._batch.rows("q").astype(float)
+        if self._mode == "human":
+            self._renderer.draw(q[0])
+            return None
+        pictures = [self._renderer.draw(row) for row in q]
+        return tuple(picture for picture in pictures if picture is not None)
+
+    def refresh(self) -> None:
+        """Show the new state to whoever watches; Gymnasium wants "human" to draw by itself."""
+        if self._mode == "human":
+            self.frames()
+
+    def close(self) -> None:
+        """Give back whatever the renderer holds; harmless if done before."""
+        if self._renderer is not None:
+            self._renderer.close()

@@ -1,0 +1,28 @@
+"""The renderers of environments, a function for each render mode. Knows pictures and windows; imports either lately."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.viewer.actor import PosedModel
+
+if TYPE_CHECKING:
+    from ce_gym.viewer.picture import Picture
+    from ce_gym.viewer.window import Window
+
+
+def rgb_array(model: PosedModel, q: NDArray[np.float64], *, width: int, height: int, fps: float) -> Picture:
+    """Return what draws arrays; see `Picture`."""
+    from ce_gym.viewer.picture import Picture
+
+    return Picture(model, q, width=width, height=height)
+
+
+def human(model: PosedModel, q: NDArray[np.float64], *, width: int, height: int, fps: float) -> Window:
+    """Return what shows a page in browsers on this machine; see `Window`."""
+    from ce_gym.viewer.window import Window
+
+    return Window(model, q, fps=fps)
