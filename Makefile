@@ -2,7 +2,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := viewer,video,train,bench,dev
+EXTRAS := viewer,video,train,export,rsl-rl,bench,dev
 
 .PHONY: help venv demo test lint types wheel clean
 

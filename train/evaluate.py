@@ -4,6 +4,7 @@ Every environment of a batch plays exactly one whole episode, so that short epis
 long ones. Uses public names of ce_gym only, and no name of a robot or task.
 
     python train/evaluate.py runs/mini_cheetah_velocity/policy.zip --transmission armature
+    python train/evaluate.py policy.onnx
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from policy_file import Policy, PolicyError, read_policy
 from stable_baselines3 import PPO
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
@@ -23,12 +25,11 @@ EVALUATION_SEED = 1_000_000
 """Far from training seeds, so that a policy is judged on commands and starts it has not met."""
 
 
-class PolicyError(ValueError):
-    """A policy that cannot be used; the message is one line for the user."""
-
-
 def load_policy(path: str | Path) -> tuple[PPO, dict[str, Any]]:
-    """Read a policy and the record that training wrote beside it.
+    """Read a policy with all that training it on needs, and the record that training wrote beside it.
+
+    Only for files you trust: Stable-Baselines3 unpickles objects, which can run any code. To judge or show a policy,
+    `policy_file.read_policy` reads its weights and nothing else.
 
     Args:
         path: Of the policy, `<name>.zip`; its record is `<name>.json`.
@@ -59,7 +60,7 @@ def env_kwargs(record: dict[str, Any], transmission: str | None = None) -> dict[
 
 
 def evaluate(
-    model: PPO, env_id: str, *, episodes: int = 256, seed: int = EVALUATION_SEED, **kwargs: Any
+    model: PPO | Policy, env_id: str, *, episodes: int = 256, seed: int = EVALUATION_SEED, **kwargs: Any
 ) -> dict[str, float]:
     """Play one episode in each of `episodes` environments with the policy's mean action.
 
@@ -83,7 +84,7 @@ def evaluate(
         envs.close()
 
 
-def _play(model: PPO, envs: SB3VecEnv) -> dict[str, float]:
+def _play(model: PPO | Policy, envs: SB3VecEnv) -> dict[str, float]:
     """Step until every environment has ended its first episode."""
     native: Any = envs.envs.unwrapped
     period = 1.0 / native.metadata["render_fps"]
@@ -143,7 +144,7 @@ def report(result: dict[str, float]) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments shared by the programs that judge a policy."""
-    parser.add_argument("policy", help="policy.zip written by train/ppo.py (its policy.json lies beside it)")
+    parser.add_argument("policy", help="policy.zip of train/ppo.py, its policy.json beside it, or .onnx of export.py")
     parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes, side by side (default 256)")
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")
     parser.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
@@ -158,9 +159,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     args = parser.parse_args(argv)
     try:
-        model, record = load_policy(args.policy)
-        kwargs = env_kwargs(record, args.transmission)
-        result = evaluate(model, record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
+        model = read_policy(args.policy, args.transmission)
+        kwargs = env_kwargs(model.record, args.transmission)
+        result = evaluate(model, model.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
     except ValueError as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2

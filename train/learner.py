@@ -30,7 +30,7 @@ SHARES = 4
 class Samples:
     """Collected steps, all of them or some; every tensor has one row per step."""
 
-    observations: Tensor
+    observations: Tensor | dict[str, Tensor]
     actions: Tensor
     log_probs: Tensor
     advantages: Tensor
@@ -38,7 +38,11 @@ class Samples:
 
     def at(self, rows: Tensor) -> Samples:
         """The steps numbered `rows`."""
-        return Samples(*(tensor[rows] for tensor in vars(self).values()))
+        observations, *others = vars(self).values()
+        chosen = (
+            observations[rows] if isinstance(observations, Tensor) else {k: x[rows] for k, x in observations.items()}
+        )
+        return Samples(chosen, *(tensor[rows] for tensor in others))
 
 
 @dataclass(frozen=True)
@@ -81,9 +85,15 @@ class ThreadedPPO(PPO):
     def _samples(self) -> Samples:
         """The rollout buffer as tensors that share its memory."""
         buffer = self.rollout_buffer
-        arrays = (buffer.observations, buffer.actions, buffer.log_probs, buffer.advantages, buffer.returns)
         steps = buffer.buffer_size * buffer.n_envs
-        return Samples(*(torch.from_numpy(a.reshape(steps, *a.shape[2:])) for a in arrays))
+
+        def flat(a: np.ndarray) -> Tensor:
+            return torch.from_numpy(a.reshape(steps, *a.shape[2:]))
+
+        seen: Any = buffer.observations  # an array, or a dictionary of arrays
+        observations = {key: flat(a) for key, a in seen.items()} if isinstance(seen, dict) else flat(seen)
+        arrays = (buffer.actions, buffer.log_probs, buffer.advantages, buffer.returns)
+        return Samples(observations, *(flat(a) for a in arrays))
 
     def _update(self, samples: Samples, rows: Tensor, workers: list[Any], each: Callable) -> Tensor:
         """One step of the optimiser on the samples numbered `rows`; `each` maps over shares. Returns FIGURES."""
@@ -107,7 +117,7 @@ class ThreadedPPO(PPO):
         """Gradient of the loss on one share, times its weight (Schulman et al. 2017, arXiv:1707.06347, eq. 7 and 9)."""
         clip = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
         advantages = (s.advantages - centre) / scale
-        values, log_probs, entropy = policy.evaluate_actions(s.observations, s.actions)
+        values, log_probs, entropy = policy.evaluate_actions(s.observations, s.actions)  # type: ignore[arg-type]
         log_ratio = log_probs - s.log_probs
         ratio = log_ratio.exp()
         policy_loss = -torch.min(advantages * ratio, advantages * ratio.clamp(1 - clip, 1 + clip)).mean()

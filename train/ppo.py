@@ -5,6 +5,7 @@ TensorBoard logs and `checkpoints/`. Uses public names of ce_gym only, and no na
 
     python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0
     python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0 --transmission armature --seeds 0 1 2
+    python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0 --critic contact_forces feet_in_contact
     python train/ppo.py --resume runs/mini_cheetah_velocity/policy.zip --steps 20e6
 """
 
@@ -32,6 +33,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import FloatSchedule
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
+from ce_gym.adapters.sb3_asymmetric import AsymmetricPolicy
 
 CHECKPOINTS = 10
 """Checkpoints per training run."""
@@ -154,7 +156,8 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
         "device": "cpu",
     }
     if job.resume is None:
-        model = ThreadedPPO("MlpPolicy", envs, policy_kwargs=network, seed=job.seed, **options)
+        policy = AsymmetricPolicy if isinstance(envs.observation_space, gymnasium.spaces.Dict) else "MlpPolicy"
+        model = ThreadedPPO(policy, envs, policy_kwargs=network, seed=job.seed, **options)
         model.threads = job.threads
         return model
     try:
@@ -177,13 +180,17 @@ def _activation(name: str) -> type[torch.nn.Module]:
 
 def _record(model: PPO, envs: SB3VecEnv, job: Job, seconds: float) -> dict[str, Any]:
     """What somebody needs to know to use or repeat this policy."""
-    observation, action = envs.observation_space.shape, envs.action_space.shape
+    seen, action = envs.observation_space, envs.action_space.shape
+    observation = seen["policy"].shape if isinstance(seen, gymnasium.spaces.Dict) else seen.shape
+    native: Any = envs.envs.unwrapped
     return {
         "env": job.env_id,
-        "transmission": envs.envs.unwrapped.model.transmission,  # type: ignore[attr-defined]
+        "transmission": native.model.transmission,
         "env_kwargs": job.env_kwargs,
         "observation_size": observation[0] if observation else 0,
         "action_size": action[0] if action else 0,
+        "activation": model.policy.activation_fn.__name__,  # type: ignore[union-attr]
+        "contract": native.contract(),
         "steps": model.num_timesteps,
         "seed": job.seed,
         "resumed_from": str(job.resume) if job.resume else None,
@@ -236,6 +243,7 @@ def jobs(args: argparse.Namespace) -> list[Job]:
     settings = load_settings(path, overrides)
     kwargs = dict(record.get("env_kwargs", {}))
     kwargs |= {"transmission": args.transmission} if args.transmission else {}
+    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
     out = args.out or Path("runs") / "-".join([path.stem, *([args.transmission] if args.transmission else [])])
     seeds = args.seeds or [args.seed]
     return [
@@ -263,6 +271,9 @@ def parser() -> argparse.ArgumentParser:
     what = result.add_argument_group("what to train")
     what.add_argument("--env", metavar="ID", help="environment id, such as ce_gym/MiniCheetahVelocity-v0")
     what.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
+    what.add_argument(
+        "--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees, such as base_height"
+    )
     what.add_argument(
         "--resume", type=Path, metavar="FILE", help="policy.zip to go on from; --steps counts its steps too"
     )

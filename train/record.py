@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from evaluate import EVALUATION_SEED, env_kwargs, load_policy
+from evaluate import EVALUATION_SEED, env_kwargs
+from policy_file import Policy, read_policy
 from stable_baselines3 import PPO
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
@@ -35,7 +36,13 @@ SHOW: Script = (
 
 
 def record(
-    model: PPO, env_id: str, script: Script = SHOW, *, seed: int = EVALUATION_SEED, label: str = "", **kwargs: Any
+    model: PPO | Policy,
+    env_id: str,
+    script: Script = SHOW,
+    *,
+    seed: int = EVALUATION_SEED,
+    label: str = "",
+    **kwargs: Any,
 ) -> Rollout:
     """Drive one environment with the policy's mean action and record every step.
 
@@ -82,7 +89,7 @@ def _add_frame(recorder: Recorder, time: float, state: dict[str, np.ndarray]) ->
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = argparse.ArgumentParser(description="Record a trained policy for the viewer: an npz and an HTML page.")
-    parser.add_argument("policy", help="policy.zip written by train/ppo.py")
+    parser.add_argument("policy", help="policy.zip of train/ppo.py or .onnx of train/export.py")
     parser.add_argument(
         "--command", nargs=4, type=float, action="append", metavar=("SECONDS", "FORWARD", "LATERAL", "YAW"),
         help="what to command, and for how long; may be given several times (default: a short show)",
@@ -98,8 +105,9 @@ def main(argv: list[str] | None = None) -> int:
     script = [(t, (vx, vy, yaw)) for t, vx, vy, yaw in args.command] if args.command else SHOW
     out = args.out or Path(args.policy).parent / "rollout.npz"
     try:
-        model, about = load_policy(args.policy)
-        rollout = record(model, about["env"], script, seed=args.seed, **env_kwargs(about, args.transmission))
+        model = read_policy(args.policy, args.transmission)
+        kwargs = env_kwargs(model.record, args.transmission)
+        rollout = record(model, model.record["env"], script, seed=args.seed, **kwargs)
         rollout.save(out)
     except ValueError as error:
         print(f"record.py: {error}", file=sys.stderr)

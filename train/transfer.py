@@ -12,7 +12,8 @@ import json
 import sys
 from typing import Any
 
-from evaluate import EVALUATION_SEED, add_arguments, env_kwargs, evaluate, load_policy
+from evaluate import EVALUATION_SEED, add_arguments, env_kwargs, evaluate
+from policy_file import Policy, read_policy
 from stable_baselines3 import PPO
 
 LEVELS = ("exact", "coupled", "armature", "none")
@@ -29,7 +30,7 @@ _COLUMNS = (
 
 
 def transfer(
-    model: PPO, record: dict[str, Any], *, episodes: int = 256, seed: int = EVALUATION_SEED
+    model: PPO | Policy, record: dict[str, Any], *, episodes: int = 256, seed: int = EVALUATION_SEED
 ) -> dict[str, dict[str, float]]:
     """Evaluate a policy on every level, with the same seeds, and return the result by level."""
     return {
@@ -53,12 +54,12 @@ def main(argv: list[str] | None = None) -> int:
     add_arguments(parser)
     args = parser.parse_args(argv)
     try:
-        model, record = load_policy(args.policy)
-        results = transfer(model, record, episodes=args.episodes, seed=args.seed)
+        model = read_policy(args.policy)
+        results = transfer(model, model.record, episodes=args.episodes, seed=args.seed)
     except ValueError as error:
         print(f"transfer.py: {error}", file=sys.stderr)
         return 2
-    print(json.dumps(results, indent=2) if args.json else table(results, record["transmission"]))
+    print(json.dumps(results, indent=2) if args.json else table(results, model.record["transmission"]))
     return 0
 
 

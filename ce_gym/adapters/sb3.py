@@ -8,7 +8,7 @@ ended get one of their own. Knows the two contracts; knows nothing of robots, ta
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -49,11 +49,11 @@ class SB3VecEnv(VecEnv):
         self._start = time.monotonic()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
-    def reset(self) -> np.ndarray:
+    def reset(self) -> Any:
         """Reset all environments with the seed and options given since the last reset.
 
         Returns:
-            Observations, shape (num_envs, n_obs).
+            Observations, shape (num_envs, n_obs), or a dictionary of such arrays.
         """
         obs, _ = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._reset_seeds()
@@ -68,7 +68,7 @@ class SB3VecEnv(VecEnv):
         """Step all environments.
 
         Returns:
-            Observations (num_envs, n_obs), rewards (num_envs,), dones (num_envs,) and one dictionary per environment.
+            Observations as of `reset`, rewards (num_envs,), dones (num_envs,) and one dictionary per environment.
             An environment that is done already shows the first observation of its next episode; its dictionary holds
             the last one of the old episode as `terminal_observation`, `TimeLimit.truncated`, and `episode`.
         """
@@ -88,7 +88,7 @@ class SB3VecEnv(VecEnv):
         episodes = self._episodes(ended, infos)
         for i, episode in zip(ended.tolist(), episodes, strict=True):
             dicts[i] = {
-                "terminal_observation": infos["final_obs"][i],
+                "terminal_observation": _row(infos["final_obs"], i),
                 "TimeLimit.truncated": bool(timed_out[i]),
                 "diverged": bool(diverged[i]),
                 "episode": episode,
@@ -156,6 +156,13 @@ class SB3VecEnv(VecEnv):
             raise ValueError(f"{name}: indices is {indices}, expected None: the batch is one environment object")
 
 
+def _row(observations: Any, i: int) -> Any:
+    """Observation of environment `i` from an array or a dictionary of arrays with one row per environment."""
+    if isinstance(observations, Mapping):
+        return {key: rows[i] for key, rows in observations.items()}
+    return observations[i]
+
+
 def _episode_entries(infos: dict[str, Any]) -> dict[str, np.ndarray]:
     """Entries of ended episodes, each shape (num_envs,), under the names that Stable-Baselines3 uses.
 
@@ -174,7 +181,8 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwa
         env_id: Such as `"ce_gym/MiniCheetahVelocity-v0"`.
         num_envs: Size of the batch.
         seed: Used by the first reset; environment i gets `seed + i`. None seeds from the operating system.
-        **kwargs: Given to the environment, such as `transmission="armature"` or `num_threads=2`.
+        **kwargs: Given to the environment, such as `transmission="armature"`, `num_threads=2` or `obs_mode="dict"`
+            for the learner's "MultiInputPolicy" and our `AsymmetricPolicy`.
 
     Returns:
         The batch, not yet reset.

@@ -227,8 +227,8 @@ class Contact:
         """Return the cone [N], and the slope [N s/m] and force (3,) [N] of a bristle that sticks, with its norm."""
         c, n, velocity = self.compliance, self.touch.normal, self.touch.velocity + gain
         cone = ca.if_else(self.normal_slope > 0, c.friction * self.touch.load, 0)
-        slope = cone / c.slip_speed + self.dt * c.bristle
-        x = c.bristle * self.touch.anchor + slope * (velocity - ca.dot(n, velocity) * n)
+        slope = ca.if_else(cone > 0, cone / c.slip_speed + self.dt * c.bristle, 0)  # nothing sticks to the air
+        x = slope * (velocity - ca.dot(n, velocity) * n) + ca.if_else(cone > 0, c.bristle, 0) * self.touch.anchor
         return cone, slope, x, _length(x)
 
     def _response(self, friction: SX, slope: SX, slip: SX, gain: SX) -> ContactResponse:

@@ -147,6 +147,19 @@ class TaskProgram:
         """Length of the critic's observation; 0 if the task gives it none of its own."""
         return sum(self.critic_sizes.values()) if self.task.critic else 0
 
+    def look(self) -> ca.Function:
+        """Return the state buffers that are looked at -> each block of an observation, `failed`.
+
+        One observation of the policy, neither noisy nor clipped, and whether the episode ends: for robots that
+        something else simulates.
+        """
+        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}
+        s = self._snapshot(self._seen(state | {"previous_action": state["action"]}))
+        seen = {name: SX(term(s)) for name, term in self.observation_terms.items()}
+        seen["failed"] = sum([term(s) for term in self.termination_terms], SX(0)) > 0
+        everything = ca.vertcat(*seen.values())
+        return traced("look", {n: x for n, x in state.items() if ca.depends_on(everything, x)}, seen)
+
     def added_terms(self) -> str:
         """Return a text that changes with the terms that users have added, for cache keys."""
         state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}

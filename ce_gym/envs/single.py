@@ -54,6 +54,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         shown_as = {"obs_mode": obs_mode, "render_mode": render_mode, "width": width, "height": height}
         EzPickle.__init__(self, robot, task, **shown_as, **kwargs)
         self.batch = make_batch(robot, task, num_envs=1, **kwargs)
+        self.task = task
         self.model = self.batch.program.model
         self.observation_space, self.action_space = spaces(self.batch.program, obs_mode)
         self._names = [f"reward_{name}" for name in self.batch.program.reward_terms]

@@ -68,6 +68,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         self.autoreset_mode = as_autoreset_mode(autoreset_mode)
         self.num_envs = num_envs
         self.batch = make_batch(robot, task, num_envs=num_envs, **kwargs)
+        self.task = task
         program = self.batch.program
         self.model = program.model
         self.max_episode_steps = max_episode_steps or program.task.episode_length
@@ -170,6 +171,19 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
     def state(self) -> dict[str, NDArray]:
         """Return what a recorder needs: q, v, command and, if computed, contact_forces (num_envs, n_contacts, 3)."""
         return recorded_state(self.batch)
+
+    @property
+    def elapsed_steps(self) -> NDArray[np.int64]:
+        """Control steps since each episode began, by which time runs out, shape (num_envs,).
+
+        Learners set it at random at first, so that episodes do not all end together; lengths and means that are
+        reported of those first episodes count from there too.
+        """
+        return self._elapsed.copy()
+
+    @elapsed_steps.setter
+    def elapsed_steps(self, steps: NDArray[Any]) -> None:
+        self._elapsed[:] = steps
 
     def set_command(self, command: NDArray[Any]) -> None:
         """Command velocities until the task draws new ones.

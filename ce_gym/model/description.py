@@ -249,7 +249,7 @@ class ContactMaterial:
     stiffness: float = 5e4
     damping: float = 500.0
     friction: float = 0.8
-    slip_speed: float = 0.1
+    slip_speed: float = 1e-3
     bristle: float = 5e4
     dissipation: float | None = None
 

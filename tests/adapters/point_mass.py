@@ -1,7 +1,8 @@
 """A toy vector environment that keeps ce_gym's contract: a point that must move at a commanded speed.
 
 It exists so that the shells for learners and the training scripts are tested without a robot: one action is a force,
-the observation is (speed, command), the reward is one minus the squared error of speed.
+the observation is (speed, command), the reward is one minus the squared error of speed. In a dictionary of
+observations the critic sees the clock as well.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -19,13 +20,22 @@ ID = "test/PointMassVelocity-v0"
 
 class PointMassVectorEnv(VectorEnv):
     def __init__(
-        self, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, transmission="exact", horizon=50, standard=False, **_
+        self,
+        num_envs,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+        transmission="exact",
+        horizon=50,
+        standard=False,
+        obs_mode="vector",
+        **_,
     ):
-        self.num_envs, self.horizon, self.standard = num_envs, horizon, standard
+        self.num_envs, self.horizon, self.standard, self.obs_mode = num_envs, horizon, standard, obs_mode
+        self.max_episode_steps = horizon
         self.model = SimpleNamespace(robot=SimpleNamespace(name="point", source=""), transmission=transmission)
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_fps": 50, "render_modes": []}
         self.render_mode = None
-        self.single_observation_space = Box(-np.inf, np.inf, (2,), np.float32)
+        seen, known = (Box(-np.inf, np.inf, (size,), np.float32) for size in (2, 3))
+        self.single_observation_space = Dict({"policy": seen, "critic": known}) if obs_mode == "dict" else seen
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -48,13 +58,24 @@ class PointMassVectorEnv(VectorEnv):
         self.clock, self.error, self.total = self.clock + 1, self.error + error, self.total + reward
         diverged = np.abs(self.speed) > 8.0
         terminated = np.abs(self.speed) > 3.0
-        truncated = (self.clock >= self.horizon) & ~terminated
+        truncated = self.clock >= self.horizon
         done = terminated | truncated
         infos = {"diverged": diverged}
         if done.any():
             infos |= self._ending(done)
             self._restart(done)
         return self._obs(), reward, terminated, truncated, infos
+
+    @property
+    def elapsed_steps(self):
+        return self.clock.copy()
+
+    @elapsed_steps.setter
+    def elapsed_steps(self, steps):
+        self.clock[:] = steps
+
+    def contract(self):
+        return {"format": "toy", "transmission": self.model.transmission, "joints": ["slider"], "control_dt": 0.02}
 
     def state(self):
         v = np.zeros((self.num_envs, 7))
@@ -85,7 +106,10 @@ class PointMassVectorEnv(VectorEnv):
         self.command[lanes] = drawn[lanes] if self.fixed is None else self.fixed[0]
 
     def _obs(self):
-        return np.stack([self.speed, self.command], axis=1).astype(np.float32)
+        seen = np.stack([self.speed, self.command], axis=1).astype(np.float32)
+        if self.obs_mode == "vector":
+            return seen
+        return {"policy": seen, "critic": np.column_stack([seen, self.clock / self.horizon]).astype(np.float32)}
 
 
 if ID not in gymnasium.registry:

@@ -8,15 +8,16 @@ from point_mass import ID
 from stable_baselines3 import PPO
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
+from ce_gym.adapters.sb3_asymmetric import AsymmetricPolicy
 
 
-def weights(cls, threads=1, minibatches=1):
+def weights(cls, threads=1, minibatches=1, policy="MlpPolicy", **env_kwargs):
     """All parameters after three rollouts and nine updates."""
-    envs = make_sb3_vec_env(ID, 16, seed=2)
+    envs = make_sb3_vec_env(ID, 16, seed=2, **env_kwargs)
     # Plain descent shows the length of a gradient, which Adam would hide; a narrow range, that ratios are clipped.
     descent = {"policy_kwargs": {"optimizer_class": torch.optim.SGD}, "learning_rate": 0.03, "max_grad_norm": 1e9}
     model = cls(
-        "MlpPolicy",
+        policy,
         envs,
         n_steps=20,
         batch_size=320 // minibatches,
@@ -48,3 +49,9 @@ def test_it_is_ppo():
 @pytest.mark.parametrize("threads", [2, 3])
 def test_threads_do_not_change_the_result(threads):
     np.testing.assert_array_equal(weights(ThreadedPPO, minibatches=4)[0], weights(ThreadedPPO, threads, 4)[0])
+
+
+def test_it_is_ppo_on_dictionaries_too():
+    kwargs = {"policy": AsymmetricPolicy, "obs_mode": "dict"}
+    ours, theirs = (weights(cls, **kwargs)[0] for cls in (ThreadedPPO, PPO))
+    np.testing.assert_allclose(ours, theirs, atol=5e-5)

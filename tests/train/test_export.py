@@ -1,0 +1,186 @@
+"""Policies as files: ONNX acts as the learner does, the contract says what a policy sees, and no file runs code."""
+
+import json
+import pickle
+import warnings
+import zipfile
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from evaluate import evaluate, load_policy
+from evaluate import main as evaluate_main
+from point_mass import ID
+from policy_file import LevelWarning, PolicyError, read_actor, read_policy
+from ppo import Job, train
+from settings import config_file, load_settings
+
+import ce_gym
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+from export import main, to_onnx  # noqa: E402
+
+ROBOT_ENV = next(iter(ce_gym.environment_ids()))
+SMALL = ["num_envs=16", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]"]
+
+
+def trained_policy(out: Path, *settings: str, env=ID, **env_kwargs) -> Path:
+    chosen = load_settings(config_file(env), [*SMALL, "steps=300", *settings])
+    return train(Job(env, chosen, out, env_kwargs=env_kwargs, tensorboard=False)).policy
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """A robot's policy, hardly trained, and its ONNX file."""
+    path = trained_policy(tmp_path_factory.mktemp("robot"), "initial_std=2.0", env=ROBOT_ENV)
+    assert main([str(path), str(path.parent / "out.onnx")]) == 0
+    return path
+
+
+@pytest.mark.parametrize("activation", ["Tanh", "ELU", "ReLU", "SELU"])
+def test_onnx_acts_as_the_learner(activation, tmp_path):
+    path = trained_policy(tmp_path, f"activation={activation}", "learning_rate=0.1", "target_kl=0")
+    assert main([str(path), str(tmp_path / "out.onnx")]) == 0
+    obs = 3 * np.random.default_rng(0).standard_normal((500, 2)).astype(np.float32)
+    expected, _ = load_policy(path)[0].predict(obs, deterministic=True)
+    assert np.abs(expected).max() == 1.0  # some are clipped
+    assert np.ptp(expected) > 0.1
+    for file in (path, tmp_path / "out.onnx"):
+        actions, _ = read_policy(file).predict(obs)
+        np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-5)
+
+
+def test_onnx_of_a_robot_acts_as_the_learner(policy):
+    size = read_policy(policy).record["observation_size"]
+    obs = np.random.default_rng(1).standard_normal((64, size)).astype(np.float32)
+    expected, _ = load_policy(policy)[0].predict(obs, deterministic=True)
+    np.testing.assert_allclose(read_policy(policy.parent / "out.onnx").predict(obs)[0], expected, rtol=0, atol=1e-5)
+
+
+def test_an_asymmetric_policy_needs_no_critic_to_act(tmp_path):
+    path = trained_policy(tmp_path, obs_mode="dict")
+    assert main([str(path), str(tmp_path / "out.onnx")]) == 0
+    rng = np.random.default_rng(2)
+    obs = {key: rng.standard_normal((9, size)).astype(np.float32) for key, size in (("policy", 2), ("critic", 3))}
+    expected, _ = load_policy(path)[0].predict(obs, deterministic=True)
+    np.testing.assert_allclose(read_policy(tmp_path / "out.onnx").predict(obs["policy"])[0], expected, atol=1e-5)
+
+
+def test_the_contract_lies_in_the_file_and_beside_it(policy):
+    beside = json.loads((policy.parent / "out.json").read_text())
+    entries = {entry.key: entry.value for entry in onnx.load(policy.parent / "out.onnx").metadata_props}
+    assert beside == gymnasium.make_vec(ROBOT_ENV, 1).unwrapped.contract()
+    assert json.loads(entries["joints"]) == beside["joints"]
+    assert json.loads(entries["observation"]) == beside["observation"]
+    assert entries["transmission"] == beside["transmission"] == "exact"
+    assert json.loads(entries["ce_gym_policy"])["env"] == ROBOT_ENV
+
+
+def test_the_contract_rebuilds_observations():
+    """From the contract alone, and from the environment's own terms, on states the environment has been in."""
+    envs = gymnasium.make_vec(ROBOT_ENV, 5).unwrapped
+    envs.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        action = rng.uniform(-1, 1, envs.action_space.shape).astype(np.float32)
+        obs, *_ = envs.step(action)
+    state = {**envs.state(), "action": action}
+    np.testing.assert_array_equal(envs.look(state)[0], obs)
+    start, found = 0, 0
+    for block in envs.contract()["observation"]["blocks"]:
+        rows = slice(start, start + block["size"])
+        start += block["size"]
+        if "of" in block:
+            rebuilt = np.array(block["offset"]) + np.array(block["scale"]) * state[block["of"]][:, block["rows"]]
+            np.testing.assert_allclose(rebuilt, obs[:, rows], atol=1e-6)
+            found += block["size"]
+    assert start == obs.shape[1]
+    assert found == start - 3  # all but the direction of gravity
+
+
+def test_looking_needs_all_that_is_looked_at():
+    envs = gymnasium.make_vec(ROBOT_ENV, 2).unwrapped
+    with pytest.raises(ValueError, match="looks at command"):
+        envs.look({"q": np.zeros((2, 19)), "v": np.zeros((2, 18)), "action": np.zeros((2, 12))})
+
+
+def test_an_episode_that_ends_is_seen_to_end():
+    envs = gymnasium.make_vec(ROBOT_ENV, 2).unwrapped
+    envs.reset(seed=0)
+    state = {**envs.state(), "action": np.zeros((2, 12))}
+    state["q"][1, 3:7] = (0, 1, 0, 0)  # on its back
+    assert envs.look(state)[1].tolist() == [False, True]
+
+
+def test_another_level_is_told_in_one_line(policy, capsys):
+    with pytest.warns(LevelWarning, match="trained on 'exact', used on 'armature'") as caught:
+        read_policy(policy.parent / "out.onnx", "armature")
+    assert "\n" not in str(caught[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_policy(policy.parent / "out.onnx", "exact")
+
+
+def test_an_onnx_file_is_judged_as_the_policy(tmp_path, capsys):
+    path = trained_policy(tmp_path)
+    assert main([str(path)]) == 0
+    capsys.readouterr()
+    assert evaluate_main([str(tmp_path / "exported.onnx"), "--episodes", "8", "--json"]) == 0
+    judged = json.loads(capsys.readouterr().out)
+    assert judged["reward"] == pytest.approx(evaluate(load_policy(path)[0], ID, episodes=8)["reward"], rel=1e-4)
+
+
+class Bomb:
+    def __reduce__(self):
+        return (Path.touch, (Path("exploded"),))
+
+
+def test_a_policy_file_runs_no_code(tmp_path, monkeypatch):
+    """Pickled code in either part of a policy.zip, where Stable-Baselines3 would run it."""
+    monkeypatch.chdir(tmp_path)
+    path = trained_policy(tmp_path / "run")
+    parts = {name: zipfile.ZipFile(path).read(name) for name in ("data", "policy.pth")}
+    for bad in parts:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in (parts | {bad: pickle.dumps(Bomb(), 2)}).items():
+                archive.writestr(name, content)
+        if bad == "data":
+            read_actor(path)
+        else:
+            with pytest.raises(PolicyError, match=r"policy\.zip"):
+                read_actor(path)
+    assert not Path("exploded").exists()
+    pickle.loads(pickle.dumps(Bomb()))
+    assert Path("exploded").exists()
+
+
+def test_mistakes_are_one_line(tmp_path, capsys):
+    path = trained_policy(tmp_path)
+    (tmp_path / "not.onnx").write_bytes(b"not onnx")
+    record = path.with_suffix(".json")
+    capsys.readouterr()
+    cases = [
+        (main, [str(tmp_path / "missing.zip")], "missing.json"),
+        (main, [str(path), str(path.with_suffix(".onnx"))], "not the policy's own"),
+        (main, [str(path), str(tmp_path / "nowhere" / "out.onnx")], "cannot be written"),
+        (evaluate_main, [str(tmp_path / "not.onnx")], "not.onnx"),
+        (evaluate_main, [str(tmp_path / "no.onnx")], "no such file"),
+    ]
+    for function, arguments, words in cases:
+        assert function(arguments) == 2
+        error = capsys.readouterr().err.strip()
+        assert words in error
+        assert "\n" not in error
+    record.write_text(json.dumps({k: v for k, v in json.loads(record.read_text()).items() if k != "contract"}))
+    assert main([str(path)]) == 2
+    assert "contract: missing" in capsys.readouterr().err
+    actor, record = read_actor(trained_policy(tmp_path / "gelu", "activation=GELU"))
+    with pytest.raises(PolicyError, match="activation 'GELU'"):
+        to_onnx(actor, record)
+
+
+def test_observations_of_another_size_are_refused(policy):
+    with pytest.raises(PolicyError, match="expected the 48"):
+        read_policy(policy).predict(np.zeros((1, 47), np.float32))

@@ -1,0 +1,140 @@
+"""A policy acts in MuJoCo: same start, same observations, same commands, same judgement."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+from policy_file import Policy
+from ppo import Job, train
+from settings import config_file, load_settings
+from sim2sim import MujocoWorld, OurWorld, compare, course, main, play, table
+
+import ce_gym
+from ce_gym.adapters.sb3 import make_sb3_vec_env
+from ce_gym.bench.mujoco_twin import MujocoTwin
+
+ROBOT_ENV = next(iter(ce_gym.environment_ids()))
+NEVER = 10**9
+
+
+def world(level, n=3, seed=0, **kwargs):
+    envs = make_sb3_vec_env(ROBOT_ENV, n, seed, command_period=1e6, max_episode_steps=NEVER, **kwargs)
+    obs = envs.reset()
+    return MujocoWorld(envs.envs.unwrapped, obs, level), envs, obs
+
+
+@pytest.mark.parametrize("level", ["armature", "exact"])
+def test_robots_start_in_the_same_state(level):
+    made, envs, obs = world(level)
+    state = envs.envs.unwrapped.state()
+    q, v = made.twin.state()
+    np.testing.assert_allclose(q, state["q"], atol=1e-12)
+    np.testing.assert_allclose(v, state["v"], atol=1e-12)
+    frame, failed = made.native.look({**state, "action": np.zeros((3, 12))})
+    np.testing.assert_array_equal(frame, obs)
+    assert not failed.any()
+    rotors = [body for body in made.native.model.robot.bodies if body.kind == "rotor"] if level == "exact" else []
+    assert made.twin.model.njnt == 1 + 12 + len(rotors)
+
+
+@pytest.mark.parametrize("level", ["armature", "exact"])
+def test_both_fly_alike(level):
+    """High above the ground, where there are no contacts to differ in, and at small steps."""
+    made, envs, _ = world(level, transmission=level, dt=0.0005, n_substeps=40)
+    made.twin.model.opt.timestep = 0.0005
+    native = envs.envs.unwrapped
+    state = native.state()
+    state["q"][:, 2] += 5.0
+    native.batch.write("q", state["q"])
+    made.twin.start(state["q"], state["v"])
+    rng, ours = np.random.default_rng(0), OurWorld(envs)
+    for _ in range(5):
+        action = rng.uniform(-0.5, 0.5, (3, 12)).astype(np.float32)
+        theirs, v, failed = made.step(action, state["command"])
+        obs, v_ours, fallen = ours.step(action, state["command"])
+    assert not failed.any()
+    assert not fallen.any()
+    assert np.abs(v_ours[:, 6:]).max() > 5.0  # joints have moved fast
+    np.testing.assert_allclose(v[:, :6], v_ours[:, :6], atol=0.05)
+    np.testing.assert_allclose(v[:, 6:], v_ours[:, 6:], atol=0.3)
+    np.testing.assert_allclose(theirs[:, 12:24], obs[:, 12:24], atol=0.01)  # joint positions
+
+
+def test_a_history_is_kept_newest_first():
+    made, _, obs = world("armature", history=3)
+    size = obs.shape[1] // 3
+    first = made.step(np.zeros((3, 12), np.float32), np.zeros((3, 3)))[0]
+    np.testing.assert_array_equal(first[:, size:], obs[:, : 2 * size])
+    second = made.step(np.zeros((3, 12), np.float32), np.zeros((3, 3)))[0]
+    np.testing.assert_array_equal(second[:, size : 2 * size], first[:, :size])
+    np.testing.assert_array_equal(second[:, 2 * size :], obs[:, :size])
+
+
+def test_commands_last_a_period_and_stay_in_range():
+    contract = {"control_dt": 0.02, "command": {"range": [[-1, 1], [0, 0.5], [2, 2]], "period": 0.1}}
+    first = np.full((200, 3), 9.0)
+    drawn = course(contract, first, 0.5, seed=1).commands
+    assert drawn.shape == (26, 200, 3)
+    assert (drawn[:5] == first).all()
+    assert (drawn[5:10] == drawn[5]).all()
+    assert not (drawn[10] == drawn[5]).all()
+    moving = drawn[5][drawn[5].any(axis=1)]
+    assert 0 < 200 - len(moving) < 50
+    assert (moving[:, 2] == 2).all()
+    assert moving[:, 1].min() >= 0
+
+
+def test_judgement_ends_with_a_fall():
+    """Robot 1 falls at the third step; what it does then does not count."""
+    step = iter(range(100))
+
+    def stepped(action, command):
+        k = next(step)
+        v = np.zeros((2, 7))
+        v[0, 3], v[1, 3] = 0.5, 100.0 if k >= 2 else 0.5
+        return np.zeros((2, 1), np.float32), v, np.array([False, k == 2])
+
+    policy = Policy(lambda obs: obs, {"observation_size": 1})
+    given = SimpleNamespace(commands=np.ones((11, 2, 3)), control_dt=0.1)
+    result = play(policy, SimpleNamespace(step=stepped), np.zeros((2, 1), np.float32), given)
+    assert result["falls"] == 0.5
+    assert result["episode_length"] == pytest.approx(0.5 * (1.0 + 0.2))
+    assert result["forward_error"] == pytest.approx(0.5)
+    assert result["yaw_rate_error"] == pytest.approx(1.0)
+
+
+def test_standing_robots_stand_and_tilted_ones_fall():
+    stand = Policy(lambda obs: np.zeros((len(obs), 12), np.float32), {"observation_size": 48})
+    made, envs, obs = world("armature", n=2)
+    state = envs.envs.unwrapped.state()
+    state["q"][1, 3:7] = (np.cos(0.6), np.sin(0.6), 0.0, 0.0)  # rolled by 69 degrees
+    assert not made.native.look({**state, "action": np.zeros((2, 12))})[1].any()
+    made.twin.start(state["q"], state["v"])
+    result = play(stand, made, obs, course(made.contract, np.zeros((2, 3)), 1.0, seed=0))
+    assert result["falls"] == 0.5
+
+
+def test_the_program_compares_four_simulations(tmp_path, capsys):
+    settings = load_settings(config_file(ROBOT_ENV), ["num_envs=16", "rollout=8", "steps=300", "minibatches=2"])
+    policy = train(Job(ROBOT_ENV, settings, tmp_path, env_kwargs={}, tensorboard=False)).policy
+    capsys.readouterr()
+    arguments = [str(policy), "--episodes", "2", "--seconds", "0.2", "--out", str(tmp_path / "result.json"), "--json"]
+    assert main(arguments) == 0
+    results = json.loads(capsys.readouterr().out)
+    assert results == json.loads((tmp_path / "result.json").read_text())
+    assert list(results) == ["ce_gym, exact", "ce_gym, armature", "MuJoCo, armature", "MuJoCo, rotors as bodies"]
+    assert all(result["episode_length"] == pytest.approx(0.2) for result in results.values())
+    assert "rotors as bodies" in table(results)
+    assert callable(compare)
+
+
+def test_mistakes_are_one_line(tmp_path, capsys):
+    assert main([str(tmp_path / "missing.zip")]) == 2
+    assert "\n" not in capsys.readouterr().err.strip()
+    with pytest.raises(ValueError, match="expected one of armature, exact"):
+        MujocoTwin(ce_gym.load_robot("mini_cheetah"), "none", 1)
+    with pytest.raises(ValueError, match="expected 'joint_pd'"):
+        world("armature", actions="joint_torque")

@@ -1,0 +1,100 @@
+"""Write a trained policy as ONNX, with all that somebody must know to run it elsewhere.
+
+The network takes observations `obs` (n, n_obs) and returns clipped mean actions `actions` (n, n_actions). The metadata
+of the file holds the record of the policy, and in it the contract: joint order, default pose, what an action means,
+what an observation is made of, gains, time steps, robot, task and transmission level; the contract also lies beside the
+file as JSON. Only weights are read from the policy, no pickled code is run. No name of a robot or task here.
+
+    python train/export.py runs/mini_cheetah_velocity/policy.zip policy.onnx
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+from policy_file import METADATA, Actor, PolicyError, read_actor
+
+OPERATORS = {"Tanh": "Tanh", "ELU": "Elu", "ReLU": "Relu", "SELU": "Selu", "Sigmoid": "Sigmoid", "Softplus": "Softplus"}
+"""ONNX operator of each activation, by its name in torch.nn, where their defaults agree."""
+
+OPSET, IR_VERSION = 17, 8
+"""Old enough for the runtimes that robots carry."""
+
+
+def to_onnx(actor: Actor, record: dict[str, Any]) -> onnx.ModelProto:
+    """Return an actor as an ONNX model, the record in its metadata.
+
+    Raises:
+        PolicyError: If ONNX has no counterpart of the activation.
+    """
+    if actor.activation not in OPERATORS:
+        raise PolicyError(f"activation {actor.activation!r}; expected one of {', '.join(OPERATORS)}")
+    nodes, constants, value = [], [], "obs"
+    for i, (weight, bias) in enumerate(actor.layers):
+        if i:
+            nodes.append(helper.make_node(OPERATORS[actor.activation], [value], [f"active_{i}"]))
+            value = f"active_{i}"
+        nodes.append(helper.make_node("Gemm", [value, f"weight_{i}", f"bias_{i}"], [f"linear_{i}"], transB=1))
+        constants += [numpy_helper.from_array(x.numpy(), f"{n}_{i}") for n, x in (("weight", weight), ("bias", bias))]
+        value = f"linear_{i}"
+    limits = [helper.make_tensor(name, TensorProto.FLOAT, (), [x]) for name, x in (("low", -1.0), ("high", 1.0))]
+    nodes.append(helper.make_node("Clip", [value, "low", "high"], ["actions"]))
+    ends = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", record[size]])
+        for name, size in (("obs", "observation_size"), ("actions", "action_size"))
+    ]
+    graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], constants + limits)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+    add_record(model, record)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def add_record(model: onnx.ModelProto, record: dict[str, Any]) -> None:
+    """Put the record of a policy into a model's metadata, and its contract once more, entry by entry."""
+    entries = {METADATA: record, **record["contract"]}
+    helper.set_model_props(model, {k: x if isinstance(x, str) else json.dumps(x) for k, x in entries.items()})
+
+
+def write(model: onnx.ModelProto, record: dict[str, Any], out: Path) -> None:
+    """Write `out` and the contract beside it as JSON.
+
+    Raises:
+        PolicyError: If that cannot be done.
+    """
+    try:
+        onnx.save(model, out)
+        out.with_suffix(".json").write_text(json.dumps(record["contract"], indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise PolicyError(f"{out}: cannot be written: {error.strerror}") from None
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line of this file."""
+    parser = argparse.ArgumentParser(description="Write a trained policy as ONNX with its contract.")
+    parser.add_argument("policy", type=Path, help="policy.zip written by train/ppo.py (its policy.json lies beside it)")
+    parser.add_argument(
+        "out", type=Path, nargs="?", help="ONNX file to write (default: exported.onnx beside the policy)"
+    )
+    args = parser.parse_args(argv)
+    out = args.out or args.policy.parent / "exported.onnx"
+    try:
+        if out.suffix != ".onnx" or out.with_suffix(".json") == args.policy.with_suffix(".json"):
+            raise PolicyError(f"{out}: expected a name that ends in .onnx and is not the policy's own")
+        actor, record = read_actor(args.policy)
+        write(to_onnx(actor, record), record, out)
+    except PolicyError as error:
+        print(f"export.py: {error}", file=sys.stderr)
+        return 2
+    print(f"{out}\n{out.with_suffix('.json')}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

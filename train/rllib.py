@@ -1,0 +1,186 @@
+# pyright: reportMissingImports=false
+"""Train a policy with RLlib's PPO: processes that step a native batch each, on one machine or on a cluster.
+
+Needs the extra `ray` in an environment of its own, see docs/rllib.md. Settings come from the same files as those of
+train/ppo.py; `num_envs` counts the environments of all processes together. The policy is written as `policy.onnx` with
+its contract, which evaluate.py, transfer.py, record.py and sim2sim.py read. Uses public names of ce_gym only, and no
+name of a robot or task. (Ray is not installed where types are checked, hence the line above.)
+
+    python train/rllib.py --env ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --minutes 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import ray
+import torch
+from export import to_onnx, write
+from policy_file import Actor, PolicyError
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from settings import Settings, SettingsError, config_file, load_settings
+
+import ce_gym  # noqa: F401  (registers the environments in this process)
+
+
+def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
+    """Return RLlib's PPO with our settings.
+
+    Args:
+        env_id: Registered environment id.
+        s: What shapes learning. The divergence is kept near `target_kl` by a penalty, not by the learning rate.
+        runners: Processes that step environments; 0 steps them here.
+        learners: Processes that learn; 0 learns here.
+        seed: Of everything.
+        **env_kwargs: Given to the environments.
+
+    Raises:
+        SettingsError: If the environments cannot be divided among the processes.
+    """
+    if s.num_envs % max(runners, 1):
+        raise SettingsError(f"num_envs: {s.num_envs}; expected a multiple of the {runners} env runners")
+    samples = s.num_envs * s.rollout
+    config = (
+        PPOConfig()
+        .environment(f"ce_gym:{env_id}", env_config=env_kwargs, disable_env_checking=True)
+        .env_runners(
+            num_env_runners=runners,
+            num_envs_per_env_runner=s.num_envs // max(runners, 1),
+            gym_env_vectorize_mode="vector_entry_point",
+            rollout_fragment_length=s.rollout,
+        )
+        .learners(num_learners=learners)
+        .training(
+            train_batch_size_per_learner=samples // max(learners, 1),
+            minibatch_size=samples // s.minibatches // max(learners, 1),
+            num_epochs=s.epochs,
+            lr=s.learning_rate,
+            gamma=s.gamma,
+            lambda_=s.gae_lambda,
+            clip_param=s.clip,
+            entropy_coeff=s.entropy,
+            vf_loss_coeff=s.value,
+            vf_clip_param=float("inf"),
+            grad_clip=s.max_grad_norm,
+            use_kl_loss=s.target_kl > 0,
+            kl_target=s.target_kl,
+        )
+        .rl_module(
+            model_config=DefaultModelConfig(
+                fcnet_hiddens=list(s.hidden),
+                fcnet_activation=s.activation.lower(),
+                vf_share_layers=False,
+                free_log_std=True,
+                log_std_clip_param=float("inf"),
+            )
+        )
+        .debugging(seed=seed, log_level="ERROR")
+    )
+    return config.build_algo()
+
+
+def set_initial_std(algo: Algorithm, std: float) -> None:
+    """Set the standard deviation of the actions, which RLlib starts at 1, in every process."""
+
+    def set_weights(weights: dict[str, Any]) -> None:
+        for name in weights:
+            if name.endswith("log_std"):
+                weights[name] = np.full_like(weights[name], np.log(std))
+
+    state = algo.learner_group.get_weights()
+    for weights in state.values():
+        set_weights(weights)
+    algo.learner_group.set_weights(state)
+    algo.env_runner_group.sync_weights(from_worker_or_learner_group=algo.learner_group)
+
+
+def actor_of(algo: Algorithm, activation: str) -> Actor:
+    """Return the layers of an algorithm's actor, the mean of its actions; `activation` as in torch.nn."""
+    weights = next(iter(algo.learner_group.get_weights().values()))
+    layers = [
+        (torch.tensor(weights[name]), torch.tensor(weights[name.removesuffix("weight") + "bias"]))
+        for name in weights
+        if name.endswith("weight") and ("actor_encoder" in name or name.startswith("pi."))
+    ]
+    return Actor(tuple(layers), activation)
+
+
+def train(algo: Algorithm, steps: float, seconds: float) -> int:
+    """Train until so many environment steps are done or so much time is over; return the steps done."""
+    start, done = time.monotonic(), 0
+    while done < steps and time.monotonic() - start < seconds:
+        result = algo.train()
+        figures = result["env_runners"]
+        done = int(figures["num_env_steps_sampled_lifetime"])
+        passed = time.monotonic() - start
+        print(
+            f"{passed:6.0f} s  {done / 1e6:6.2f} M steps  {done / passed / 1e3:5.1f} k steps/s  "
+            f"reward {figures.get('episode_return_mean', float('nan')):7.2f}  "
+            f"length {figures.get('episode_len_mean', float('nan')):6.1f}",
+            flush=True,
+        )
+    return done
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line of this file."""
+    parser = argparse.ArgumentParser(description="Train a policy with RLlib's PPO.")
+    parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
+    parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
+    parser.add_argument("--env-runners", type=int, default=2, metavar="N", help="processes that step (default 2)")
+    parser.add_argument("--learners", type=int, default=0, metavar="N", help="processes that learn (default: this one)")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads of each process (default 1)")
+    parser.add_argument("--address", metavar="HOST:PORT", help="cluster to connect to; 'auto' for this node's own")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
+    parser.add_argument("--minutes", type=float, default=float("inf"), metavar="M", help="stop after so long")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
+    args = parser.parse_args(argv)
+    kwargs = {"num_threads": args.threads} | ({"transmission": args.transmission} if args.transmission else {})
+    try:
+        path = config_file(args.env)
+        s = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
+        one = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # says in one line what is wrong, and fills the cache
+        ray.init(address=args.address, log_to_driver=False, include_dashboard=False)
+        algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **kwargs)
+        set_initial_std(algo, s.initial_std)
+        steps = train(algo, s.steps, 60.0 * args.minutes)
+        out = args.out or Path("runs") / f"{path.stem}-rllib"
+        out.mkdir(parents=True, exist_ok=True)
+        algo.save_to_path(str((out / "checkpoint").resolve()))
+        record = _record(one.unwrapped, args.env, kwargs, s, steps)
+        write(to_onnx(actor_of(algo, s.activation), record), record, out / "policy.onnx")
+        algo.stop()
+    except (PolicyError, SettingsError, ValueError, ConnectionError, gymnasium.error.Error) as error:
+        print(f"rllib.py: {error}", file=sys.stderr)
+        return 2
+    print(out / "policy.onnx")
+    return 0
+
+
+def _record(native: Any, env_id: str, kwargs: dict[str, Any], s: Settings, steps: int) -> dict[str, Any]:
+    """What somebody needs to know to use this policy."""
+    return {
+        "env": env_id,
+        "env_kwargs": {key: value for key, value in kwargs.items() if key != "num_threads"},
+        "transmission": native.model.transmission,
+        "observation_size": native.single_observation_space.shape[0],
+        "action_size": native.single_action_space.shape[0],
+        "activation": s.activation,
+        "contract": native.contract(),
+        "settings": s.as_dict(),
+        "steps": steps,
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,125 @@
+"""Train a policy with rsl_rl's PPO: any registered environment, from the same settings files as train/ppo.py.
+
+Writes rsl_rl's own checkpoints and TensorBoard logs into the output folder, and the policy as `policy.onnx` with its
+contract, which evaluate.py, transfer.py, record.py and sim2sim.py read. Needs the extra `rsl-rl`. Uses public names of
+ce_gym only, and no name of a robot or task.
+
+    python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --steps 6e6
+    python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --critic contact_forces base_height
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import torch
+from evaluate import evaluate, report
+from export import to_onnx, write
+from policy_file import Actor, read_policy
+from rsl_rl.runners import OnPolicyRunner
+from settings import Settings, config_file, load_settings
+
+from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
+
+
+def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str, Any]:
+    """Return our settings in the form that rsl_rl's runner takes; `groups` are those of the observations."""
+    network = {"class_name": "MLPModel", "hidden_dims": list(s.hidden), "activation": s.activation.lower()}
+    spread = {"class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log"}
+    iterations = math.ceil(s.steps / (s.num_envs * s.rollout))
+    return {
+        "seed": seed,
+        "num_steps_per_env": s.rollout,
+        "save_interval": max(iterations // 10, 1),
+        "obs_groups": {"actor": ["policy"], "critic": ["critic" if "critic" in groups else "policy"]},
+        "actor": network | {"distribution_cfg": spread},
+        "critic": dict(network),
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": s.epochs,
+            "num_mini_batches": s.minibatches,
+            "clip_param": s.clip,
+            "gamma": s.gamma,
+            "lam": s.gae_lambda,
+            "value_loss_coef": s.value,
+            "entropy_coef": s.entropy,
+            "learning_rate": s.learning_rate,
+            "max_grad_norm": s.max_grad_norm,
+            "schedule": "adaptive" if s.target_kl else "fixed",
+            "desired_kl": s.target_kl or None,
+        },
+    }
+
+
+def train(envs: RslRlVecEnv, settings: Settings, seed: int, out: Path | None = None) -> OnPolicyRunner:
+    """Train until the steps of the settings are done; with a folder, log and save there."""
+    torch.manual_seed(seed)
+    chosen = runner_settings(settings, tuple(map(str, envs.get_observations().keys())), seed)
+    runner = OnPolicyRunner(envs, chosen, str(out) if out else None, device=str(envs.device))
+    iterations = math.ceil(settings.steps / (settings.num_envs * settings.rollout))
+    runner.learn(iterations, init_at_random_ep_len=True)
+    return runner
+
+
+def actor_of(runner: OnPolicyRunner, activation: str) -> Actor:
+    """Return the layers of a runner's actor; `activation` as in torch.nn."""
+    modules = runner.alg.get_policy().mlp.modules()
+    linear = [module for module in modules if isinstance(module, torch.nn.Linear)]
+    return Actor(tuple((x.weight.detach().cpu(), x.bias.detach().cpu()) for x in linear), activation)
+
+
+def record_of(envs: RslRlVecEnv, env_id: str, env_kwargs: dict[str, Any], settings: Settings) -> dict[str, Any]:
+    """What somebody needs to know to use this policy."""
+    native: Any = envs.envs.unwrapped
+    return {
+        "env": env_id,
+        "env_kwargs": env_kwargs,
+        "transmission": native.model.transmission,
+        "observation_size": envs.get_observations()["policy"].shape[-1],
+        "action_size": envs.num_actions,
+        "activation": settings.activation,
+        "contract": native.contract(),
+        "settings": settings.as_dict(),
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line of this file."""
+    parser = argparse.ArgumentParser(description="Train a policy with rsl_rl's PPO.")
+    parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
+    parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
+    parser.add_argument("--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
+    parser.add_argument("--device", default="cpu", help="where the networks are (default cpu)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rsl_rl")
+    parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes of the evaluation at the end")
+    args = parser.parse_args(argv)
+    kwargs: dict[str, Any] = {"transmission": args.transmission} if args.transmission else {}
+    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
+    try:
+        path = config_file(args.env)
+        settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
+        out = args.out or Path("runs") / f"{path.stem}-rsl_rl"
+        out.mkdir(parents=True, exist_ok=True)
+        envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **kwargs)
+        runner = train(envs, settings, args.seed, out)
+        record = record_of(envs, args.env, kwargs, settings)
+        write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
+        policy = read_policy(out / "policy.onnx")
+        print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))
+    except (ValueError, gymnasium.error.Error) as error:
+        print(f"rsl_rl_ppo.py: {error}", file=sys.stderr)
+        return 2
+    print(out / "policy.onnx")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
