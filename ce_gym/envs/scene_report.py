@@ -8,7 +8,6 @@ CasADi function for one robot. May know programs, models and traces; `scene_timi
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -29,16 +28,26 @@ from ce_gym.dynamics.scene import Friction, StepOptions, make_scene, symbolic_st
 from ce_gym.dynamics.spatial import SX
 from ce_gym.dynamics.step import solve
 from ce_gym.dynamics.trace import OUTPUTS
-from ce_gym.envs import metrics, observations, rewards, terminations
 from ce_gym.envs.program import TaskProgram
-from ce_gym.envs.tasks import TASKS, Task
+from ce_gym.envs.setup import make_program
+from ce_gym.envs.tasks import Task
+from ce_gym.envs.terms import OWN
 from ce_gym.model.description import Robot
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim.simulator import select_contacts
 from ce_gym.sim.substeps import substeps
 
-TERMS = {"terminations": terminations, "metrics": metrics, "rewards": rewards, "observations": observations}
-"""Where the terms of each field of a `Task` are."""
+TERMS = {
+    "terminations": "termination",
+    "metrics": "metric",
+    "rewards": "reward",
+    "observations": "observation",
+    "critic": "observation",
+}
+"""Fields of a `Task` that name terms, in the order in which they are added, and the kind of each."""
+
+NO_TERMS: dict[str, Any] = {"rewards": {}, "noise": {}, "history": 1} | {f: () for f in TERMS if f != "rewards"}
+"""What makes a task one without terms."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +84,13 @@ class Item:
         group: What it is part of.
         name: For people.
         instructions: That it adds, for one robot.
-        compiled: The sub-step or function with it, and with all before it in a sequence.
+        compiled: The sub-step or function with it, and with all before it in a sequence; None if it is not timed.
     """
 
     group: str
     name: str
     instructions: int
-    compiled: SubStep | ca.Function
+    compiled: SubStep | ca.Function | None
 
 
 @dataclass(frozen=True)
@@ -127,24 +136,28 @@ class SceneReport:
         return self.program.task.n_substeps * self.sub_step + sum(item.instructions for item in self.once)
 
 
-def report_scene(env_id: str) -> SceneReport:
+def report_scene(env_id: str, **arguments: Any) -> SceneReport:
     """Count what a registered environment costs.
 
+    Args:
+        env_id: Its id.
+        **arguments: What `gymnasium.make` would be given besides, see `ce_gym.envs.setup.make_program`.
+
     Raises:
-        ValueError: If the id is not one of this package's.
+        ValueError: If the id is not one of this package's, or an argument is wrong.
     """
     if env_id not in gymnasium.registry or "transmission" not in gymnasium.spec(env_id).kwargs:
         raise ValueError(f"environment {env_id!r} is not registered; `python -m ce_gym list` shows those that are")
-    chosen = gymnasium.spec(env_id).kwargs
-    program = TaskProgram(Model(chosen["robot"], chosen["transmission"]), TASKS[chosen["task"]])
-    whole = SubStep(program.model, program.options, ("torque",))
+    program = make_program(**{**gymnasium.spec(env_id).kwargs, **arguments})
+    outputs = ("torque", "contact_forces") if program.contact_forces else ("torque",)
+    whole = SubStep(program.model, program.options, outputs)
     again = [c.function for c in whole.calls if c.only_if]
     sometimes = [("second attempt at a sub-step", f) for f in again] + [("reset", program.function("begin"))]
     return SceneReport(
         name=env_id,
         program=program,
         layers=tuple(_differences("sub-step", layers(whole))),
-        once=tuple(_once(program)),
+        once=tuple(_once(program, whole)),
         sometimes=tuple(Item("where needed", name, f.n_instructions(), f) for name, f in sometimes),
         left_out=tuple(
             Item("left out", name, step.instructions - whole.instructions, step) for name, step in left_out(whole)
@@ -168,14 +181,12 @@ def layers(whole: SubStep) -> Iterator[tuple[str, int, SubStep | ca.Function]]:
     yield "kinematics", kinematics.n_instructions() - kinematics.nnz_out(), kinematics
     yield "inertias and accelerations", acceleration.n_instructions(), acceleration
     yield "integration and checks", step.instructions, step
-    step = replace(step, options=replace(step.options, control=options.control))
-    yield f"{options.control} control", step.instructions, step
-    step = replace(step, model=Model(loose, "none"))
-    yield "joint friction and torque limits", step.instructions, step
-    step = replace(step, model=Model(robot, "none"))
-    yield "joint stops", step.instructions, step
-    step = replace(step, model=whole.model)
-    yield "rotors", step.instructions, step
+    present = replace(step, options=replace(step.options, control=options.control))
+    steps = [(f"{options.control} control", present, options.control != "torque")]
+    steps += [("joint friction and torque limits", replace(present, model=Model(loose, "none")), True)]
+    steps += [("joint stops", replace(present, model=Model(robot, "none")), True)]
+    present = replace(present, model=whole.model)
+    steps += [("rotors", present, whole.model.transmission != "none")]
     for name, field in (
         ("contact", "contacts"),
         ("ground field", "ground"),
@@ -183,9 +194,11 @@ def layers(whole: SubStep) -> Iterator[tuple[str, int, SubStep | ca.Function]]:
         ("method", "method"),
         ("parameters", "parameters"),
     ):
-        step = replace(step, options=replace(step.options, **{field: getattr(options, field)}))
-        yield name, step.instructions, step
-    yield "outputs", whole.instructions, whole
+        chosen = getattr(options, field)
+        before, present = present, replace(present, options=replace(present.options, **{field: chosen}))
+        steps += [(name, present, present.options != before.options)]
+    steps += [("outputs", whole, bool(whole.outputs))]
+    yield from ((name, step.instructions, step) for name, step, is_there in steps if is_there)
 
 
 def left_out(whole: SubStep) -> Iterator[tuple[str, SubStep]]:
@@ -223,11 +236,10 @@ def left_out(whole: SubStep) -> Iterator[tuple[str, SubStep]]:
 
 
 def _differences(group: str, cumulative: Iterable[tuple[str, int, SubStep | ca.Function]]) -> Iterator[Item]:
-    """Turn running totals into items; a feature that adds nothing is not there."""
+    """Turn running totals into items."""
     before = 0
     for name, total, compiled in cumulative:
-        if total != before:
-            yield Item(group, name, total - before, compiled)
+        yield Item(group, name, total - before, compiled)
         before = total
 
 
@@ -240,6 +252,7 @@ def _with_joints(robot: Robot, **figures: Any) -> Robot:
 def _parts_of_dynamics(step: SubStep) -> tuple[ca.Function, ca.Function]:
     """Trace what the kinematics leave for the recursions, and the accelerations."""
     mechanism, options = step.model.mechanism, step.options
+    assert options.dt is not None, "an environment's step has a length"
     state, target = symbolic_state(mechanism, options), SX.sym("target", len(mechanism.robot.independent))
     solved = solve(make_scene(mechanism, options, SX(0, 1), SX(3, 0)), state, target, options.dt, SX(6, 0))
     found = [x for body in solved.kinematics.bodies.values() for x in (body.X.E, body.X.p, body.c, body.v[:3])]
@@ -249,18 +262,34 @@ def _parts_of_dynamics(step: SubStep) -> tuple[ca.Function, ca.Function]:
     return traced("kinematics", inputs, results), traced("acceleration", inputs, {"vdot": solved.vdot})
 
 
-def _once(program: TaskProgram) -> Iterator[Item]:
+def _once(program: TaskProgram, whole: SubStep) -> Iterator[Item]:
     """Build up what an environment step does around its sub-steps, one term after the other."""
     act = program.function("act")
     yield Item("action", "action", act.n_instructions(), act)
-    task = replace(program.task, rewards={}, observations=(), terminations=(), metrics=())
+    if late := _late_actions(program, whole):
+        yield Item("late actions", "late actions", late, None)
+    task = replace(program.task, **NO_TERMS)
     assess = replace(program, task=task).function("assess")
     yield Item("commands and clocks", "commands and clocks", assess.n_instructions(), assess)
-    for field in TERMS:
-        for term in getattr(program.task, field):
-            before, task = assess, with_term(task, field, term, program.task.rewards)
-            assess = replace(program, task=task).function("assess")
+    steps = [(field, term) for field in TERMS for term in getattr(program.task, field)]
+    for field, term in (*steps, ("noise and history", "noise and history")):
+        known = field in TERMS
+        before, task = assess, with_term(task, field, term, program.task.rewards) if known else program.task
+        assess = replace(program, task=task).function("assess")
+        if known or assess.n_instructions() != before.n_instructions():
             yield Item(field, term, assess.n_instructions() - before.n_instructions(), assess)
+
+
+def _late_actions(program: TaskProgram, whole: SubStep) -> int:
+    """Instructions that choose, in each sub-step of an environment step, between the last action and the new one."""
+    physics, total = {call.function.name() for call in whole.calls}, 0
+    for step in program.step_program().steps:
+        for call in step.calls if isinstance(step, Repeat) else ():
+            if isinstance(call, Call) and call.function.name() not in physics:
+                total += program.task.n_substeps * call.function.n_instructions()
+        if isinstance(step, Call) and step.function.name() == "arrived":
+            total += step.function.n_instructions()
+    return total
 
 
 def with_term(task: Task, field: str, term: str, weights: Mapping[str, float]) -> Task:
@@ -271,11 +300,22 @@ def with_term(task: Task, field: str, term: str, weights: Mapping[str, float]) -
 
 
 def _terms_left_out(program: TaskProgram) -> Iterator[Item]:
-    """What each term that the task does not have would add to it."""
-    whole = program.function("assess").n_instructions()
-    for field, module in TERMS.items():
-        for term, function in inspect.getmembers(module, inspect.isfunction):
-            if function.__module__ == module.__name__ and term not in getattr(program.task, field):
-                task = with_term(program.task, field, term, {})
-                other = replace(program, task=task).function("assess")
-                yield Item(field, term, other.n_instructions() - whole, other)
+    """What each term and feature that the task does not have would add to what is done once in its step."""
+    task, whole = program.task, program.function("assess").n_instructions()
+    changes = [
+        (field, term, with_term(task, field, term, {}))
+        for field, kind in TERMS.items()
+        for term in OWN[kind]
+        if field != "critic" and term not in getattr(task, field)
+    ]
+    for name, change in {
+        "noise of every observation": {} if task.noise else {"noise": dict.fromkeys(task.observations, 0.1)},
+        "history of 2 observations": {} if task.history > 1 else {"history": 2},
+        "heading commands": {} if task.heading else {"heading": True},
+        "pushes": {} if task.push_period else {"push_period": 1.0},
+    }.items():
+        if change:
+            changes.append(("task", name, replace(task, **change)))
+    for group, name, other in changes:
+        function = replace(program, task=other).function("assess")
+        yield Item(group, name, function.n_instructions() - whole, function)

@@ -20,7 +20,7 @@ from ce_gym.dynamics.parameters import parameter_defaults
 from ce_gym.envs.batch import Batch
 from ce_gym.envs.scene_report import SceneReport, SubStep
 from ce_gym.sim.simulator import load_step_kernel
-from ce_gym.sim.substeps import TIMES
+from ce_gym.sim.substeps import FRAME, HEIGHTS, TIMES
 from ce_gym.sim.tiles import tiles, write_rows
 
 BATCH = 512
@@ -58,7 +58,7 @@ def time_scene(report: SceneReport) -> SceneTimes:
     works[env] = _env_work(report)
     rounds = _in_turn(works)
     added: dict[tuple[str, str], float] = {}
-    for chain in (report.layers, report.groups[1:]):
+    for chain in (report.layers, [item for item in report.groups[1:] if item.compiled]):
         before: NDArray | float = 0.0
         for item in chain:
             now = rounds[item.group, item.name]
@@ -91,6 +91,7 @@ def _work(model: Model, compiled: SubStep | ca.Function) -> Work:
         "v": np.random.default_rng(0).normal(0, 0.1, (BATCH, model.nv)),
         "dependent": model.guess,
         "parameters": np.concatenate([np.zeros(0), *defaults.values()]),
+        FRAME: np.array([-4.0, -4.0, 0.5]),
     }
     start = {name: tiles(BATCH, b.size, DTYPE) for name, b in kernel.buffers.items() if b.kind == "tiles"}
     for name, array in start.items():
@@ -98,6 +99,7 @@ def _work(model: Model, compiled: SubStep | ca.Function) -> Work:
     arrays = {name: tiles(BATCH, array.shape[1], DTYPE) for name, array in start.items()}
     standing = model.standing_q[model.nq - len(model.joint_links) :]
     given = {"target": np.tile(standing, (BATCH, 1))} if "target" not in start else {}
+    given[HEIGHTS] = np.zeros((17, 17), DTYPE)
 
     def work() -> float:
         for name, array in arrays.items():
@@ -111,7 +113,7 @@ def _env_work(report: SceneReport) -> Work:
     batch = Batch(report.program, BATCH, DTYPE, 1)
     batch.seed(np.arange(BATCH).astype(np.uint64))
     batch.reset(np.ones(BATCH, bool))
-    actions = np.random.default_rng(0).uniform(-1, 1, (BATCH, report.program.n_joints)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-1, 1, (BATCH, report.program.n_actions)).astype(np.float32)
     return lambda: _clocked(lambda: batch.step(actions), BATCH)
 
 

@@ -23,12 +23,9 @@ def make_batch(
     task: str,
     *,
     num_envs: int,
-    transmission: str = "exact",
-    contact_forces: bool = False,
     dtype: str = "float64",
     num_threads: int | None = None,
-    reward_weights: Mapping[str, float] | None = None,
-    **changes: Any,
+    **arguments: Any,
 ) -> Batch:
     """Build a batch of environments.
 
@@ -36,10 +33,39 @@ def make_batch(
         robot: Name of a robot that ships with the package, or a path to a robot file.
         task: Name of a task.
         num_envs: Number of environments.
-        transmission: "exact", "coupled", "armature" or "none".
-        contact_forces: Whether contact forces are computed, for recording.
         dtype: "float64" or "float32" for physics.
         num_threads: Threads; the number of usable cores if None.
+        **arguments: What `make_program` takes besides.
+
+    Raises:
+        ValueError: If an argument is not one of the choices.
+        RobotError: If the robot file is not valid.
+    """
+    if dtype not in ("float64", "float32"):
+        raise ValueError(f"dtype={dtype!r}; expected 'float64' or 'float32'")
+    for name, value in (("num_envs", num_envs), ("num_threads", num_threads)):
+        if value is not None and (not isinstance(value, int) or value < 1):
+            raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
+    program = make_program(robot, task, **arguments)
+    return Batch(program, num_envs, dtype, num_threads or len(os.sched_getaffinity(0)))
+
+
+def make_program(
+    robot: str,
+    task: str,
+    *,
+    transmission: str = "exact",
+    contact_forces: bool = False,
+    reward_weights: Mapping[str, float] | None = None,
+    **changes: Any,
+) -> TaskProgram:
+    """Put a task on a robot.
+
+    Args:
+        robot: Name of a robot that ships with the package, or a path to a robot file.
+        task: Name of a task.
+        transmission: "exact", "coupled", "armature" or "none".
+        contact_forces: Whether contact forces are computed, for recording.
         reward_weights: Weights that replace or add to those of the task, by the name of the term; 0 removes a term.
         **changes: Attributes of `Task` that replace those of the task, such as command_range, contacts, actions,
             noise, history, latency, randomise, push_period or episode_length.
@@ -52,17 +78,10 @@ def make_batch(
         raise ValueError(f"task={task!r}; expected one of {', '.join(TASKS)}")
     if transmission not in get_args(Level):
         raise ValueError(f"transmission={transmission!r}; expected one of {', '.join(get_args(Level))}")
-    if dtype not in ("float64", "float32"):
-        raise ValueError(f"dtype={dtype!r}; expected 'float64' or 'float32'")
-    for name, value in (("num_envs", num_envs), ("num_threads", num_threads)):
-        if value is not None and (not isinstance(value, int) or value < 1):
-            raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
     model = Model(robot, transmission)
     own = {key: value for name, group in model.robot.tasks if name == task for key, value in group}
     weights = {**dict(own.pop("reward_weights", ())), **(reward_weights or {})}
-    chosen = changed_task(TASKS[task], weights, {**own, **changes})
-    program = TaskProgram(model, chosen, contact_forces)
-    return Batch(program, num_envs, dtype, num_threads or len(os.sched_getaffinity(0)))
+    return TaskProgram(model, changed_task(TASKS[task], weights, {**own, **changes}), contact_forces)
 
 
 def changed_task(task: Task, reward_weights: Mapping[str, float], changes: Mapping[str, Any]) -> Task:

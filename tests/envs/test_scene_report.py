@@ -29,7 +29,7 @@ def report() -> SceneReport:
 
 
 def always(program: TaskProgram) -> dict[str, int]:
-    """Instructions of every function of the environment's kernel that runs whatever the robots do, by name."""
+    """Instructions of the functions of the environment's kernel, by name."""
     return {call.function.name(): call.function.n_instructions() for call in program.step_program().calls}
 
 
@@ -45,11 +45,33 @@ def test_lines_add_up_to_the_kernel(report: SceneReport):
     }
 
 
+def test_lines_add_up_whatever_a_task_asks_for():
+    """Late actions, randomised figures, noise, history, pushes, a critic, forces for recording, limited motors."""
+    report = report_scene(
+        ENVIRONMENT, latency=(0, 2), randomise={"friction": (0.3, 1.0)}, noise={"joint_positions": 0.1}, history=2,
+        push_period=1.0, heading=True, critic=("feet_in_contact",), contact_forces=True, motors="limited",
+        friction="secant",
+    )  # fmt: skip
+    counts, n = always(report.program), report.program.task.n_substeps
+    assert report.sub_step == counts["step"]
+    once = counts["act"] + counts["assess"] + n * counts["arrive"] + counts["arrived"]
+    assert report.env_step == n * counts["step"] + once
+    layers_there = {item.name: item.instructions for item in report.layers}
+    assert layers_there["limited motors"] > 0
+    assert layers_there["parameters"] == 0, "a constant has become an input, nothing else"
+    assert {"late actions", "critic", "noise and history"} <= {group.name for group in report.groups}
+    missing = {item.name for item in (*report.left_out, *report.terms_left_out)}
+    assert not {"motors='limited'", "parameter 'friction'", "output 'contact_forces'", "pushes"} & missing
+
+
 def test_every_term_of_the_task_has_a_line(report: SceneReport):
     task = report.program.task
     terms = [item.name for item in report.once[2:]]
     assert terms == [*task.terminations, *task.metrics, *task.rewards, *task.observations]
     assert all(item.instructions > 0 for item in report.once)
+    there = {(item.group, item.name) for item in report.terms_left_out}
+    assert {("rewards", "joint_limits"), ("observations", "feet_in_contact"), ("task", "pushes")} <= there
+    assert not there & {(item.group, item.name) for item in report.once}
 
 
 def test_layers_are_what_is_compiled_in(report: SceneReport):
@@ -119,7 +141,7 @@ def test_what_is_enabled_is_a_layer_and_no_longer_left_out(report: SceneReport):
     running = {name: total for name, total, _ in layers(whole)}
     assert running["outputs"] == step_function(whole.model.mechanism, options, ("torque",)).n_instructions()
     assert running["method"] > 3 * running["limited motors"] > 3 * running["joint stops"]
-    assert running["rotors"] == running["joint stops"], "this level has none"
+    assert "rotors" not in running, "this level has none"
     missing = [name for name, _ in left_out(whole)]
     assert not {"motors='limited'", "parameter 'kp'", "method='rk4' instead", "transmission='none' instead"} & set(
         missing
