@@ -28,7 +28,7 @@ demo: .venv/installed
 	@$(BIN)/python train/demo.py
 
 test: .venv/installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: .venv/installed
 	$(BIN)/ruff check .
