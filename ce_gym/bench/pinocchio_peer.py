@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
+import pinocchio as pin  # type: ignore[import-not-found]
 from numpy.typing import NDArray
 
 from ce_gym.bench.timing import Competitor
