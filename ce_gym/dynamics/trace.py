@@ -97,7 +97,8 @@ class _Given:
     def results(self, stepped: Stepped, outputs: tuple[str, ...]) -> dict[str, SX]:
         """State after the step, or as it was if the robot has diverged now or before, and outputs."""
         after = stepped.state
-        sane = ca.logic_and(ca.sumsqr(after.v) + ca.sumsqr(after.anchor) < SANE_SPEED**2, self.diverged < 0.5)  # false if it is not a number:
+        size = ca.sumsqr(after.v) + ca.sumsqr(after.anchor)
+        sane = ca.logic_and(size < SANE_SPEED**2, self.diverged < 0.5)  # false if it is not a number:
         sane = ca.logic_and(sane, ca.sumsqr(after.q) < SANE_DISTANCE**2)  # not all positions act on velocities
         if any(closures(self.mechanism)):
             sane = ca.logic_and(sane, loops_close(self.mechanism, stepped.solved.kinematics, after))
