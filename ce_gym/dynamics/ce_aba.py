@@ -26,6 +26,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.constraints import ClusterCoordinates
+from ce_gym.dynamics.gyroscope import Whirl, solve_turning
 from ce_gym.dynamics.kinematics import Kinematics, constant, is_free
 from ce_gym.dynamics.rotors import lateral_inertia
 from ce_gym.dynamics.spatial import (
@@ -87,7 +88,11 @@ class Articulation:
 
 
 def inward_inertia_pass(
-    mechanism: Mechanism, kinematics: Kinematics, joints: JointTerms, external: dict[str, BodyTerms]
+    mechanism: Mechanism,
+    kinematics: Kinematics,
+    joints: JointTerms,
+    external: dict[str, BodyTerms],
+    whirl: Whirl | None = None,
 ) -> Articulation:
     """Collect articulated inertias and bias forces, tip to base (paper Alg. 1, inward pass).
 
@@ -96,6 +101,7 @@ def inward_inertia_pass(
         kinematics: From the outward velocity pass.
         joints: Forces on the independent coordinates.
         external: Forces on bodies, by name, such as contacts.
+        whirl: The step, if there is one.
     """
     IA: dict[str, SX] = {}
     pA: dict[str, SX] = {}
@@ -117,6 +123,9 @@ def inward_inertia_pass(
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
         D = mirrored(condensed.D + joints.slope[rows, rows])
         U, u = condensed.U, joints.tau[rows] - condensed.bias - lateral_bias
+        if whirl is not None and cluster.output_body is not None:
+            more, drag = whirl.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
+            D, u = mirrored(D + more), u + drag
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
         articulation.handle_body[k] = handle.name if handle else None
         if cluster.output_body is None:
@@ -148,9 +157,15 @@ def _add_lateral_inertias(
 
 
 def outward_acceleration_pass(
-    mechanism: Mechanism, kinematics: Kinematics, articulation: Articulation
+    mechanism: Mechanism, kinematics: Kinematics, articulation: Articulation, turning: SX | None = None
 ) -> tuple[SX, dict[str, SX]]:
     """Compute accelerations, base to tip (paper Alg. 1, outward pass 2, without its misprint).
+
+    Args:
+        mechanism: The mechanism.
+        kinematics: From the outward velocity pass.
+        articulation: From the inward pass.
+        turning: Of a floating base, see `turning_momentum`, if there is a step.
 
     Returns:
         vdot, shape (nv,), in the coordinates of `v`; and the acceleration of every body *minus gravity*, body
@@ -164,7 +179,9 @@ def outward_acceleration_pass(
         if is_free(mechanism, cluster):
             base = cluster.bodies[0]
             inertia, force = articulation.base  # type: ignore[misc]
-            a[base] = solve_positive_definite(inertia, force)
+            a[base] = (
+                solve_positive_definite(inertia, force) if turning is None else solve_turning(inertia, turning, force)
+            )
             state = kinematics.bodies[base]
             vdot[rows] = a[base] + ca.vertcat(SX(3, 1), state.R.T @ gravity - cross(state.v[:3], state.v[3:]))
             continue

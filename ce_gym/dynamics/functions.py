@@ -229,6 +229,12 @@ def _contact_accelerations(mechanism: Mechanism) -> ca.Function:
 
 def _energy(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
+    kinetic, potential = kinetic_and_potential(mechanism, q, v, guess)
+    return _function("energy", guess, {"q": q, "v": v}, {"kinetic": kinetic, "potential": potential})
+
+
+def kinetic_and_potential(mechanism: Mechanism, q: SX, v: SX, guess: SX) -> tuple[SX, SX]:
+    """Return kinetic and potential energy [J] of a mechanism at positions (nq,) and velocities (nv,)."""
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
     at_rest = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
     momentum = inverse_dynamics(mechanism, at_rest, v) - inverse_dynamics(mechanism, at_rest, SX(*v.shape))
@@ -239,7 +245,7 @@ def _energy(mechanism: Mechanism) -> ca.Function:
         moment = constant(np.array([body.inertia[2, 4], body.inertia[0, 5], body.inertia[1, 3]]))  # mass * com
         state = kinematics.bodies[name]
         potential -= ca.dot(gravity, mass * state.p + state.R @ moment)
-    return _function("energy", guess, {"q": q, "v": v}, {"kinetic": ca.dot(v, momentum) / 2, "potential": potential})
+    return ca.dot(v, momentum) / 2, potential
 
 
 def loop_gap(mechanism: Mechanism, kinematics: Kinematics) -> SX:

@@ -39,6 +39,7 @@ class BodyState:
         v: Spatial velocity in body coordinates, shape (6,).
         c: Velocity-product acceleration, centripetal and Coriolis, of the step from its parent, `a = X a_parent + S qdd
             + c`, shape (6,). Constraint terms `S g` not included.
+        drift: Acceleration with all of `vdot` zero, the base's linear velocity kept in the world, shape (6,).
         R: Rotation, body to world, shape (3, 3). Rows nobody asks for cost nothing.
         p: Origin in the world [m], shape (3,).
     """
@@ -47,6 +48,7 @@ class BodyState:
     S: SX
     v: SX
     c: SX
+    drift: SX
     R: SX
     p: SX
 
@@ -120,24 +122,24 @@ def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None =
         for body in mechanism.moving(cluster):
             i = coordinates.index[body.name]
             parent = kinematics.bodies[body.parent] if body.parent is not None else None
-            kinematics.bodies[body.name] = _outward(body, parent, coordinates.q[i], coordinates.qd[i])
+            kinematics.bodies[body.name] = _outward(body, parent, coordinates.q[i], coordinates.qd[i], coordinates.g[i])
     return kinematics
 
 
 def _free_base(q: SX, v: SX) -> BodyState:
     R = quaternion_to_rotation(q[3:7])
-    return BodyState(X=Transform(R.T, q[:3]), S=SX.eye(6), v=v[:6], c=SX(6, 1), R=R, p=q[:3])
+    return BodyState(X=Transform(R.T, q[:3]), S=SX.eye(6), v=v[:6], c=SX(6, 1), drift=SX(6, 1), R=R, p=q[:3])
 
 
-def _outward(body: MovingBody, parent: BodyState | None, q: SX, qd: SX) -> BodyState:
+def _outward(body: MovingBody, parent: BodyState | None, q: SX, qd: SX, g: SX) -> BodyState:
     X, S = joint_transform(body, q)
     still = SX(6, 1)
-    R, p, v = (parent.R, parent.p, parent.v) if parent is not None else (SX.eye(3), SX(3, 1), still)
+    R, p, v, a = (parent.R, parent.p, parent.v, parent.drift) if parent else (SX.eye(3), SX(3, 1), still, still)
     vJ = S * qd
     velocity = X.motion(v) + vJ
     centripetal = X.E @ cross(v[:3], cross(v[:3], X.p))
     c = ca.vertcat(cross(velocity[:3], vJ[:3]), centripetal + 2 * cross(velocity[:3], vJ[3:]))
-    return BodyState(X=X, S=S, v=velocity, c=c, R=R @ X.E.T, p=p + R @ X.p)
+    return BodyState(X=X, S=S, v=velocity, c=c, drift=X.motion(a) + S * g + c, R=R @ X.E.T, p=p + R @ X.p)
 
 
 def joint_transform(body: MovingBody, q: SX) -> tuple[Transform, SX]:

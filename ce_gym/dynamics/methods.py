@@ -18,7 +18,7 @@ from ce_gym.dynamics.functions import guessed_coordinates
 from ce_gym.dynamics.integration import between, turned_by
 from ce_gym.dynamics.scene import Scene, State
 from ce_gym.dynamics.spatial import SX, cross, quaternion_product, quaternion_to_rotation
-from ce_gym.dynamics.step import Solved, Stepped, implicit_step, looked_up_from, solve, stacked
+from ce_gym.dynamics.step import Solved, Stepped, implicit_step, looked_up_from, no_hints, solve, stacked
 
 
 class Method(Protocol):
@@ -109,7 +109,7 @@ class RungeKutta:
             here = _from_flat(stage, state, floating)
             if first is not None:
                 here.dependent = guessed_coordinates(first.kinematics, first.vdot, dt * sum(row))
-            solved = solve(scene, here, target, 0.0, SX(6, len(scene.options.contacts)))
+            solved = solve(scene, here, target, 0.0, no_hints(scene))
             if first is None:
                 first, scene = solved, looked_up_from(scene, solved.kinematics)
             rates.append(_rate(here, solved, floating))

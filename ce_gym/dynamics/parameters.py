@@ -19,6 +19,7 @@ from ce_gym.model.mechanism import Mechanism, MovingBody
 PARAMETERS = {
     "gravity": "acceleration of free fall in the world [m/s^2], 3",
     "friction": "Coulomb coefficient of the contacts [-], 1",
+    "slip_speed": "speed at which the damping of friction alone carries its full force [m/s], 1",
     "stiffness": "normal stiffness of the contacts [N/m], 1",
     "damping": "normal damping of the contacts [N s/m], 1",
     "kp": "position gains of the joints [N m/rad or N/m], n_joints",
@@ -58,6 +59,7 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
     plain = {
         "gravity": np.array(robot.gravity),
         "friction": np.array([material.friction]),
+        "slip_speed": np.array([material.slip_speed]),
         "stiffness": np.array([material.stiffness]),
         "damping": np.array([material.damping]),
         "kp": np.array([gains["kp"].get(name, 0.0) for name in robot.independent]),
@@ -87,7 +89,7 @@ def figures(robot: Robot, material: ContactMaterial, names: tuple[str, ...], val
         damping=chosen("damping", material.damping),
         dissipation=None if material.dissipation is None else SX(material.dissipation),
         friction=chosen("friction", material.friction),
-        slip_speed=SX(material.slip_speed),
+        slip_speed=chosen("slip_speed", material.slip_speed),
         bristle=SX(material.bristle),
     )
     kp, kd = chosen("kp", defaults["kp"]), chosen("kd", defaults["kd"])

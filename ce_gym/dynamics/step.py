@@ -20,8 +20,9 @@ from ce_gym.dynamics.ce_aba import (
     inward_inertia_pass,
     outward_acceleration_pass,
 )
-from ce_gym.dynamics.contact import Contact, ContactResponse, touch_ground
+from ce_gym.dynamics.contact import Contact, ContactResponse, Hint, touch_ground
 from ce_gym.dynamics.functions import guessed_coordinates
+from ce_gym.dynamics.gyroscope import Whirl, turning_momentum
 from ce_gym.dynamics.integration import advance
 from ce_gym.dynamics.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.dynamics.scene import Scene, State, StepOptions
@@ -59,7 +60,7 @@ def solve(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Solve
         state: At the start of the step.
         target: Joint targets or torques, shape (nj,), see `StepOptions.control`.
         dt: Length of the step [s].
-        hints: What a first attempt at this step has found, see `Stepped`, shape (6, n_contacts); zero for the first.
+        hints: What the attempt before has found, shape (Hint.SIZE, n_contacts); zero for the first.
     """
     mechanism, n = scene.mechanism, len(scene.mechanism.robot.independent)
     y, yd = state.q[state.q.shape[0] - n :], state.v[state.v.shape[0] - n :]
@@ -67,15 +68,19 @@ def solve(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Solve
 
     motors = motor_forces(scene, kinematics, controller(scene, y, yd, target, dt), yd, dt)
     joints = on_coordinates(mechanism, motors + passive_forces(mechanism.robot, y, yd, dt))
-    contacts = touching(scene, kinematics, state, dt)
+    contacts = touching(scene, kinematics, state, dt, hints)
     if scene.options.friction == "secant":
         responses = [contact.secant() for contact in contacts]
     else:
-        responses = [contact.tangent(hints[:3, i], hints[3:, i]) for i, contact in enumerate(contacts)]
+        responses = [contact.tangent() for contact in contacts]
 
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    articulation = inward_inertia_pass(mechanism, kinematics, joints, on_bodies(contacts, responses, gravity))
-    vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation)
+    external = on_bodies(contacts, responses, gravity)
+    at_once = isinstance(dt, float) and dt == 0  # the acceleration of the moment
+    whirl = None if at_once else Whirl(state.v, dt)
+    turning = None if at_once else turning_momentum(mechanism, state.v, dt)
+    articulation = inward_inertia_pass(mechanism, kinematics, joints, external, whirl)
+    vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, turning)
     gains = [r.velocity_gain(a[c.body], gravity[c.body]) for c, r in zip(contacts, responses, strict=True)]
     return Solved(kinematics, vdot, motors, contacts, responses, gains)
 
@@ -89,9 +94,8 @@ class Stepped:
         solved: How it came about.
         torque: Motor torque at each joint, mean over the step [N m or N], shape (nj,).
         contact_forces: Mean force on each contact over the step, world axes [N], shape (3, n_contacts).
-        misjudged: 1 if a contact was taken to stick or to slip and did otherwise, else 0.
-        hints: For a second attempt if misjudged, else zero: what the velocity of each contact gained [m/s], and the
-            direction of its slip, shape (6, n_contacts).
+        misjudged: 1 if a contact did not do what it was taken to do, else 0.
+        hints: What to make another attempt with, if misjudged; else what this one was made with.
         error: Estimate of the error of the step in `v` [rad/s or m/s]; 0 for a method that has none.
     """
 
@@ -120,7 +124,7 @@ def attempt(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Ste
     )
     forces = [R @ r.force_after(gain) for R, (_, r, gain) in zip(rotations, triples, strict=True)]
     misjudged = ca.sum1(stacked([c.misjudged(gain, r.slip) for c, r, gain in triples])) > 0
-    found = ca.horzcat(SX(6, 0), *[ca.vertcat(gain, r.slip) for _, r, gain in triples])
+    found = ca.horzcat(SX(Hint.SIZE, 0), *[c.hint_after(gain, r.slip) for c, r, gain in triples])
     ydd = solved.vdot[solved.vdot.shape[0] - solved.motors.tau.shape[0] :]
     return Stepped(
         state=after,
@@ -128,20 +132,32 @@ def attempt(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Ste
         torque=solved.motors.tau - solved.motors.slope @ ydd,
         contact_forces=ca.horzcat(SX(3, 0), *forces),
         misjudged=misjudged,
-        hints=ca.if_else(misjudged, found, 0),
+        hints=ca.if_else(misjudged, found, hints),
         error=SX(0),
     )
 
 
 def implicit_step(scene: Scene, state: State, target: SX, dt: float) -> Stepped:
-    """Advance one robot by one linearly implicit Euler step, with a second attempt where contacts call for it."""
-    stepped = attempt(scene, state, target, dt, SX(6, len(scene.options.contacts)))
-    if scene.options.friction == "secant" or not scene.options.contacts:
-        return stepped
-    return attempt(scene, state, target, dt, stepped.hints)
+    """Advance one robot by one linearly implicit Euler step, with further attempts where contacts call for it."""
+    stepped = attempt(scene, state, target, dt, no_hints(scene))
+    for _ in range(further_attempts(scene.options)):
+        stepped = attempt(scene, state, target, dt, stepped.hints)
+    return stepped
 
 
-def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:
+def further_attempts(options: StepOptions) -> int:
+    """Return how many attempts at a step may follow the first."""
+    if options.friction == "secant" or not options.contacts:
+        return 0
+    return 2 if options.method == "euler" else 1  # unrolled in the other methods, where they would cost every step
+
+
+def no_hints(scene: Scene) -> SX:
+    """Return the hints of a first attempt."""
+    return SX(Hint.SIZE, len(scene.options.contacts))
+
+
+def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float, hints: SX) -> list[Contact]:
     """Place every contact sphere of the scene against the ground."""
     contacts = []
     for i, sphere in enumerate(contact_spheres(scene.mechanism, scene.options)):
@@ -154,7 +170,7 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> l
             normal = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
         touch = touch_ground(body, position, sphere.radius, height, normal, state.load[i], anchor)
-        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, dt))
+        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, dt, Hint.of(hints[:, i])))
     return contacts
 
 

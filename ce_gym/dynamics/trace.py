@@ -9,6 +9,8 @@ import casadi as ca
 
 from ce_gym.dynamics.actuation import actuated_clusters
 from ce_gym.dynamics.closure import closures
+from ce_gym.dynamics.contact import Hint
+from ce_gym.dynamics.energy import mechanical_energy
 from ce_gym.dynamics.functions import loop_gap, loop_state, traced
 from ce_gym.dynamics.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.methods import METHODS
@@ -52,9 +54,9 @@ def attempt_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[
 
     Returns:
         Function (*state, diverged, *given, hints) -> (*state, diverged, hints, misjudged, *outputs), see
-        `step_function`; hints are zero at first, shape (6 n_contacts,).
+        `step_function`; hints are zero at first, shape (Hint.SIZE * n_contacts,).
     """
-    given, hints = _Given(mechanism, options), SX.sym("hints", 6, len(options.contacts))
+    given, hints = _Given(mechanism, options), SX.sym("hints", Hint.SIZE, len(options.contacts))
     stepped = attempt(given.scene, given.state, given.target, given.dt, hints)
     results = given.results(stepped, outputs)
     kept = {name: results.pop(name) for name in list(results) if name.endswith("_next")}
@@ -67,6 +69,7 @@ OUTPUTS = {
     "motor_speed": "speed of each motor's rotor at the end of the step [rad/s]",
     "power": "mechanical power of the motors at each joint, end of the step [W]",
     "contact_forces": "force on each contact, mean over the step, world axes [N]",
+    "energy": "kinetic, potential and elastic energy at the end of the step, see `mechanical_energy` [J]",
     "error": "estimated error of the step in the velocities, of methods that have one [rad/s or m/s]",
     "loop_gap": "norm of the residuals of the closed loops, start of the step [m or -]",
     "nearness": "distance from a singularity, see `Model.nearness`, start of the step",
@@ -114,6 +117,8 @@ class _Given:
             return stacked([W @ yd[rows] for rows, W, _ in actuated_clusters(self.scene, kinematics)])
         if name == "power":
             return stepped.torque * yd
+        if name == "energy":
+            return mechanical_energy(self.scene, stepped.state, self.target)
         if name == "loop_gap":
             return loop_gap(self.mechanism, kinematics)
         return loop_state(kinematics)[1] if name == "nearness" else getattr(stepped, name)

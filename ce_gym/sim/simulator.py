@@ -39,8 +39,8 @@ class Simulator:
             joint torques [N m].
         contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
         material: Compliance and friction of the contacts; the robot's own if None.
-        outputs: Which of "torque", "motor_speed", "power", "contact_forces", "error", "loop_gap" and "nearness" to
-            compute; those left out cost nothing and read as errors.
+        outputs: Which of "torque", "motor_speed", "power", "contact_forces", "energy", "error", "loop_gap" and
+            "nearness" to compute; those left out cost nothing and read as errors.
         method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
             scenes).
         friction: "tangent" solves steps with a change from stick to slip twice; "secant" is faster and slow to break
@@ -193,8 +193,9 @@ class Simulator:
         """Set a figure that was declared in `parameters`.
 
         Args:
-            name: "gravity", "friction", "stiffness", "damping", "kp", "kd", "motor_strength", "rotor_inertia",
-                "added_mass:BODY" or "com_shift:BODY"; sizes and units are in `ce_gym.dynamics.parameters.PARAMETERS`.
+            name: "gravity", "friction", "slip_speed", "stiffness", "damping", "kp", "kd", "motor_strength",
+                "rotor_inertia", "added_mass:BODY" or "com_shift:BODY"; sizes and units are in
+                `ce_gym.dynamics.parameters.PARAMETERS`.
             value: Shape (num_envs, size) or (size,) or ().
             mask: Which robots, bool, shape (num_envs,); all of them if None.
 
@@ -261,6 +262,11 @@ class Simulator:
     def error(self) -> NDArray:
         """Estimated error of the last sub-step in `v`, of methods that have one [rad/s or m/s], shape (num_envs,)."""
         return self._read("error")[:, 0]
+
+    @property
+    def energy(self) -> NDArray:
+        """Kinetic, potential and elastic energy at the end of the last sub-step [J], shape (num_envs,)."""
+        return self._read("energy")[:, 0]
 
     @property
     def loop_gap(self) -> NDArray:

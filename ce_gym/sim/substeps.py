@@ -10,6 +10,7 @@ from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step
 from ce_gym.dynamics.ground import places_function, planes_function, touching_function
 from ce_gym.dynamics.scene import StepOptions
 from ce_gym.dynamics.spatial import SX
+from ce_gym.dynamics.step import further_attempts
 from ce_gym.dynamics.trace import attempt_function, step_function
 from ce_gym.model.mechanism import Mechanism
 
@@ -31,15 +32,15 @@ def substeps(
         field, and outputs; further buffers, for scratch and on a field the table `HEIGHTS`; and the steps. An output
         that is empty for this robot is left out.
     """
-    twice = options.method == "euler" and options.friction == "tangent" and bool(options.contacts)
-    trace = attempt_function if twice else step_function
+    more = further_attempts(options) if options.method == "euler" else 0
+    trace = attempt_function if more else step_function
     function = trace(mechanism, options, outputs)
     if empty := [name for name in outputs if not function.numel_out(name)]:
         return substeps(mechanism, options, tuple(name for name in outputs if name not in empty))
     state = tuple(n.removesuffix("_next") for n in function.name_out() if n.endswith("_next") and n != "hints_next")
     sizes = {name: function.numel_in(name) for name in function.name_in() if name != "hints"}
     sizes |= {name: function.numel_out(name) for name in outputs}
-    buffers, before, each = _attempts(function, state, outputs) if twice else _single(function, state, outputs)
+    buffers, before, each = _attempts(function, state, outputs, more) if more else _single(function, state, outputs)
     if "ground" in sizes:
         further, look = _look_up(mechanism, options)
         buffers, each = [*buffers, *further], (*look, *each)
@@ -73,8 +74,8 @@ def _single(step: ca.Function, state: tuple[str, ...], outputs: tuple[str, ...])
     return [], (), (Call(step, tuple(step.name_in()), (*state, *outputs)),)
 
 
-def _attempts(attempt: ca.Function, state: tuple[str, ...], outputs: tuple[str, ...]) -> Parts:
-    """A tile makes a second attempt only if one of its robots needs it; the others come to the same result twice."""
+def _attempts(attempt: ca.Function, state: tuple[str, ...], outputs: tuple[str, ...], more: int) -> Parts:
+    """A tile makes another attempt only if one of its robots needs it; the others come to the same result again."""
     tried = tuple(f"tried_{name}" for name in state)
     sizes = {f"tried_{name}": attempt.numel_in(name) for name in state}
     values = [SX.sym(name, size) for name, size in sizes.items()]
@@ -84,5 +85,5 @@ def _attempts(attempt: ca.Function, state: tuple[str, ...], outputs: tuple[str, 
     left = (*tried, "hints", "misjudged", *outputs)
     first = Call(attempt, tuple(attempt.name_in()), left)
     again = Call(attempt, tuple(attempt.name_in()), left, only_if="misjudged")
-    each = (first, again, Call(keep, tried, (*state, "hints")))
+    each = (first, *[again] * more, Call(keep, tried, (*state, "hints")))
     return [Buffer(name, size, "scratch") for name, size in sizes.items()], (Call(forget, (), ("hints",)),), each

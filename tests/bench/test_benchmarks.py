@@ -85,17 +85,6 @@ def test_ours_stands_like_mujoco():
     assert ours.height == pytest.approx(reference.height, abs=0.05)
 
 
-def test_drop_settles():
-    from ce_gym.bench import stability
-    from ce_gym.dynamics.model import Model
-    from ce_gym.sim import Simulator
-
-    outcome = stability.drop(Simulator(Model(load_robot("mini_cheetah")), num_envs=4, dt=0.005))
-    assert outcome.finite
-    assert outcome.stable, outcome
-    assert not stability.Outcome(True, 0.9, 1.0, 0.01, 0.5).stable
-
-
 def test_forward_dynamics_kernel_computes_forward_dynamics():
     pytest.importorskip("mujoco")
     from ce_gym.bench import forward

@@ -29,7 +29,7 @@ def whirl(sim: Simulator) -> tuple[np.ndarray, np.ndarray]:
     """Let the joints of one robot turn too fast for a step of 10 ms; return its state, shapes (nq,) and (nv,)."""
     v = sim.v
     v[BAD] = 0.0
-    v[BAD, 6:] = 400.0 * np.resize([1.0, -1.0], 12)
+    v[BAD, 6:] = 3300.0 * np.resize([1.0, -1.0], 12)
     sim.set_state(sim.q, v)
     return sim.q[BAD], v[BAD]
 
@@ -52,8 +52,8 @@ def test_a_bad_number_anywhere_is_flagged_and_stays_in_its_lane(model: Model, na
 def test_a_robot_out_of_bounds_is_frozen_at_its_last_good_state(model: Model):
     sim = in_the_air(model)
     v = sim.v
-    v[BAD, 3] = 9e3  # m/s, and a spin that turns the whole of it into accelerations
-    v[BAD, 0] = 9e3
+    v[BAD, 3] = 9.9e3  # m/s, and a spin that turns the whole of it into accelerations
+    v[BAD, 0] = 9.9e3
     sim.set_state(sim.q, v)
     target = model.standing_q[7:]
     states = []
@@ -91,7 +91,7 @@ def test_a_robot_that_blows_up_is_stepped_again_with_smaller_steps(model: Model)
         fails.append(bool(alone.diverged[0]))
         if not fails[-1]:
             break
-    assert fails == [True, True, False], "halving once is not enough here, so that going on is tested too"
+    assert fails[:2] == [True, True] and not fails[-1], "halving once is not enough here, so that going on is tested too"
     for array in ("q", "v", "torque", "contact_forces"):
         np.testing.assert_array_equal(getattr(saved, array)[BAD], getattr(alone, array)[0])
         np.testing.assert_array_equal(getattr(saved, array)[OTHERS], getattr(unharmed, array)[OTHERS])

@@ -1,0 +1,137 @@
+"""Stability over many steps: nothing gains energy, nothing creeps, nothing rattles, nothing far away is felt."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ce_gym import Model, Simulator
+from ce_gym.bench import stability_cases as cases
+from ce_gym.bench import stability_grid as grid
+from ce_gym.bench import stability_robots as robots
+from ce_gym.bench import stability_scenes as scenes
+from ce_gym.model import ContactMaterial
+
+QUICK = (
+    *(cases.free_tumble, cases.free_conservation, cases.spinning_egg, cases.rest_penetration, cases.rolling),
+    *(cases.free_robot, cases.breakaway, cases.slide, cases.incline, cases.gears, cases.light_foot),
+    *(cases.turning_linkage, cases.thin_linkage),
+)
+
+
+@pytest.fixture(scope="module")
+def cheetah() -> Model:
+    return Model("mini_cheetah")
+
+
+@pytest.mark.parametrize("case", QUICK, ids=lambda case: case.__name__)
+def test_case(case):
+    """The bars are written where the figures are measured."""
+    outcome = case()
+    assert outcome.met, f"{outcome.required}: {outcome.measured}"
+
+
+def test_a_chain_of_a_hundred_rods_swings():
+    """For half a second from horizontal, on undamped joints: Euler's gain of energy stays below a tenth of it."""
+    sim = scenes.simulator(scenes.chain(100), 0.002, outputs=())
+    q = np.zeros(100)
+    q[:2] = np.pi / 2
+    sim.set_state(q, np.zeros(100))
+    start, lowest = (float(np.sum(sim.model.energy(x, np.zeros(100)))) for x in (q, np.zeros(100)))
+    for _ in range(25):
+        sim.step(np.zeros(100), 10)
+        assert np.sum(sim.model.energy(sim.q[0], sim.v[0])) - start < 0.1 * (start - lowest)
+    assert np.abs(sim.v).max() > 1.0
+
+
+def test_standing_for_a_minute(cheetah: Model):
+    stood = robots.stand(cheetah, 60.0)
+    assert stood.drift < 1e-6
+    assert stood.speed < 1e-12
+
+
+def test_a_base_at_fifty_radians_per_second(cheetah: Model):
+    lost, energy = robots.spin(cheetah)
+    assert lost == 0
+    assert energy <= 1.0
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.02])
+def test_a_robot_without_motors_never_gains_energy(cheetah: Model, dt: float):
+    """On ground of any stiffness and slip speed; with the energy of its springs, if the step resolves them."""
+    finite, gain, excess = grid.fall(cheetah, dt, 1.5, "float64")
+    assert finite.all()
+    assert (excess <= 0).all()
+    resolved = np.array(grid.STIFFNESSES) * dt**2 <= 0.5  # stiffer than that, half a kilogram bounces within a step
+    assert (gain[resolved] <= (1e-9 if dt < 0.005 else 0.1)).all()
+
+
+def test_a_robot_that_stands_is_silent(cheetah: Model):
+    """At the coarsest step, on ground of any stiffness and slip speed; on the softest it rocks for a minute."""
+    finite, speed, _ = grid.stand(cheetah, 0.02, 120.0, "float64")
+    assert finite.all()
+    assert (speed <= 1e-6).all()
+
+
+def test_random_torques_lose_no_robot():
+    """Light shanks without rotors turn by more than a radian in a step."""
+    assert robots.fuzz(Model("mini_cheetah", "none"), 100_000) == 0
+
+
+@pytest.mark.parametrize("method", ["euler", "extrapolated"])
+def test_contacts_in_the_air_do_nothing(cheetah: Model, method: str):
+    """Far above the ground a robot moves as one that has no contacts, to the last digits."""
+    rng = np.random.default_rng(0)
+    q, v = np.tile(cheetah.standing_q, (8, 1)), rng.normal(0, 3, (8, cheetah.nv))
+    q[:, 2] += 50.0
+    target = cheetah.standing_q[7:] + rng.normal(0, 0.3, (8, 12))
+    with_contacts, without = (Simulator(cheetah, 8, contacts=c, method=method) for c in ("all", ()))
+    for sim in (with_contacts, without):
+        sim.set_state(q, v)
+    for _ in range(200):
+        with_contacts.step(target)
+        assert not with_contacts.contact_forces.any()
+    without.step(target, 200)
+    np.testing.assert_allclose(with_contacts.v, without.v, rtol=0, atol=1e-9)
+
+
+def test_a_corner_that_is_hit_second_is_seen():
+    """Blocks land on one edge, which throws the other one down within the step; from heights a part of a step apart."""
+    n, half = 16, 0.15
+    sim = scenes.simulator(scenes.block(stiffness=1e6, damping=1e3), 0.01, n)
+    q = np.tile([0.0, 0.0, 0.0, np.cos(half), 0.0, np.sin(half), 0.0], (n, 1))
+    q[:, 2] = np.linspace(0.1, 0.13, n)
+    sim.set_state(q, [0.0, 0.0, 0.0, 0.0, 0.0, -3.0])
+    deepest = 0.0
+    for _ in range(60):
+        sim.step(np.zeros(0))
+        centres, _ = sim.model.contact_points(sim.q, np.zeros((n, 6)))
+        deepest = max(deepest, float((0.01 - centres[..., 2]).max()))
+    assert deepest < 2e-3
+
+
+def test_slip_speed_differs_from_robot_to_robot():
+    robot = scenes.block(pull=1.2 * 0.5 * 9.81)
+    together = Simulator(Model(robot), 2, 0.004, control="torque", parameters=("slip_speed",))
+    together.set_parameter("slip_speed", [[1e-3], [1e-1]])
+    together.step(np.zeros(0), 25)
+    for i, slip_speed in enumerate((1e-3, 1e-1)):
+        material = ContactMaterial(**(vars(robot.material) | {"slip_speed": slip_speed}))
+        alone = Simulator(Model(robot), 1, 0.004, control="torque", material=material)
+        alone.step(np.zeros(0), 25)
+        np.testing.assert_allclose(together.q[i], alone.q[0], rtol=0, atol=1e-12)
+
+
+def test_energy_is_what_moves_falls_and_is_bent(cheetah: Model):
+    """On its springs, which carry its weight: half a square of the weight over the stiffness, and no more."""
+    sim = scenes.simulator(scenes.block(), 0.01)
+    sim.step(np.zeros(0), 2000)
+    weight, k = 10.0 * 9.81, scenes.GROUND.stiffness
+    expected = weight * (0.05 - weight / (4 * k)) + weight**2 / (8 * k)
+    assert sim.energy[0] == pytest.approx(expected, rel=1e-9)
+    held = Simulator(cheetah, 1, contacts=(), outputs=("energy",))
+    held.step(cheetah.standing_q[7:] + 0.1)
+    kinetic, potential = cheetah.energy(held.q[0], held.v[0])
+    gains = np.array([dict(cheetah.robot.gains.kp)[name] for name in cheetah.joint_links])
+    spring = float(gains @ (cheetah.standing_q[7:] + 0.1 - held.q[0, 7:]) ** 2) / 2
+    assert held.energy[0] == pytest.approx(float(kinetic + potential) + spring, rel=1e-9)
