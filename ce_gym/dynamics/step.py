@@ -149,7 +149,7 @@ def further_attempts(options: StepOptions) -> int:
     """Return how many attempts at a step may follow the first."""
     if options.friction == "secant" or not options.contacts:
         return 0
-    return 2 if options.method == "euler" else 1  # unrolled in the other methods, where they would cost every step
+    return 2
 
 
 def no_hints(scene: Scene) -> SX:

@@ -13,7 +13,7 @@ from ce_gym.dynamics.contact import Hint
 from ce_gym.dynamics.energy import mechanical_energy
 from ce_gym.dynamics.functions import loop_gap, loop_state, traced
 from ce_gym.dynamics.kinematics import Kinematics, outward_velocity_pass
-from ce_gym.dynamics.methods import METHODS
+from ce_gym.dynamics.methods import METHODS, beyond
 from ce_gym.dynamics.parameters import parameter_defaults
 from ce_gym.dynamics.scene import State, StepOptions, make_scene, symbolic_state
 from ce_gym.dynamics.spatial import SX
@@ -64,6 +64,40 @@ def attempt_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[
     return traced("attempt", given.inputs() | {"hints": ca.vec(hints)}, kept | results)
 
 
+def extrapolation_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
+    """Trace what follows from a step and two of half the length, as `Extrapolated` has it.
+
+    Returns:
+        Function (*state, diverged, *of the steps) -> (*state, diverged, *outputs). Of the steps it is given those parts
+        it needs, by names such as `coarse_q`, `fine_v` and `half_torque`: the whole step, the second half and the
+        first half. A robot that diverges in one of them stays where it was.
+    """
+    before = symbolic_state(mechanism, options)
+    coarse, fine = (symbolic_state(mechanism, options) for _ in range(2))
+    flags = {name: SX.sym(name) for name in ("diverged", "coarse_diverged", "half_diverged", "fine_diverged")}
+    inputs = dict(before.items()) | flags
+    inputs |= {f"coarse_{name}": getattr(coarse, name) for name in ("q", "v")}
+    inputs |= {f"fine_{name}": value for name, value in fine.items()}
+    v_fine = fine.v
+    fine.q, fine.v = beyond(coarse, fine, mechanism.robot.floating)
+    sane = ca.logic_and(ca.sumsqr(fine.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
+    results = {f"{name}_next": ca.if_else(sane, getattr(fine, name), value) for name, value in before.items()}
+    results["diverged_next"] = ca.if_else(sane, 0, 1)
+    plain = attempt_function(mechanism, options, tuple(name for name in outputs if name != "error"))
+    for name in outputs:
+        if name == "error":
+            results[name] = ca.norm_2(v_fine - coarse.v) / 2
+            continue
+        told = {stage: SX.sym(name, plain.numel_out(name)) for stage in ("coarse", "half", "fine")}
+        if name in AT_START:
+            weights = {"coarse": 1.0}
+        else:
+            weights = {"half": 0.5, "fine": 0.5} if name in MEANS else {"fine": 2.0, "coarse": -1.0}
+        inputs |= {f"{stage}_{name}": told[stage] for stage in weights}
+        results[name] = sum((weight * told[stage] for stage, weight in weights.items()), SX(0))
+    return traced("extrapolation", inputs, results)
+
+
 OUTPUTS = {
     "torque": "motor torque at each joint, mean over the step [N m or N]",
     "motor_speed": "speed of each motor's rotor at the end of the step [rad/s]",
@@ -75,6 +109,8 @@ OUTPUTS = {
     "nearness": "distance from a singularity, see `Model.nearness`, start of the step",
 }
 """What a step can report, if asked."""
+AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "contact_forces")
+"""Outputs that belong to the start of a step, or to the whole of it; the others belong to its end."""
 
 
 class _Given:

@@ -27,18 +27,18 @@ def start(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return q, v, q[:, 7:] + rng.normal(0, 0.2, (40, 12))
 
 
-def run(model: Model, start, rows=slice(None), threads: int = 1, dtype: str = "float64", n_substeps: int = 10):
+def run(model: Model, start, rows=slice(None), threads: int = 1, dtype: str = "float64", n_substeps: int = 10, **more):
     q, v, target = (x[rows] for x in start)
-    sim = Simulator(model, len(q), num_threads=threads, dtype=dtype)
+    sim = Simulator(model, len(q), num_threads=threads, dtype=dtype, **more)
     sim.set_state(q, v)
     sim.step(target, n_substeps)
     return sim
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_kernel_follows_the_traced_step(level: str, start):
+@pytest.mark.parametrize(("level", "method"), [*((level, "euler") for level in LEVELS), ("exact", "extrapolated")])
+def test_kernel_follows_the_traced_step(level: str, method: str, start):
     model = Model("mini_cheetah", level)
-    sim = run(model, start)
+    sim = run(model, start, method=method)
     function = step_function(model.mechanism, sim.options, ("torque", "contact_forces"))
     q, v, target = start
     for i in (0, 7, 39):
