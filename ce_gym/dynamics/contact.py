@@ -42,6 +42,8 @@ from ce_gym.dynamics.spatial import SX, cross, mirrored, skew, symmetric_blocks
 
 CONE_TOLERANCE = 0.02
 """Share by which a sticking contact may leave the cone before its step is solved again."""
+SECOND_TOLERANCE = 1.0
+"""What is added to it for a third attempt: holding on too long costs accuracy, but no energy."""
 CONE_FLOOR = 1e-6
 """The same as a force, for cones near zero [N]."""
 TINY_SPEED = 1e-9
@@ -250,10 +252,19 @@ class Contact:
         share = ca.fmin(1, cone / size)
         return self._response(share * x, share * slope, SX(3, 1), SX(3, 1))
 
+    @property
+    def released(self) -> SX:
+        """1 in a second attempt if the first one, in which it stuck, took it out of the cone."""
+        cone, _, _, size = self._trial(self.hint.gain)
+        stuck = ca.logic_and(self.hint.attempts > 0.5, ca.sumsqr(self.hint.slip) < 0.5)
+        return ca.logic_and(stuck, size > cone)
+
     def tangent(self) -> ContactResponse:
         """Linearise about the velocity of the attempt before, with the true slope, which is none along the slip.
 
-        A contact that turned round in that attempt sticks; the last attempt takes the secant.
+        A contact that turned round in that attempt sticks. One that was held and left the cone is let go by the secant
+        about what it has come to: which way it will slip is not known yet, as several may be let go at once. The last
+        attempt takes the secant about the start.
         """
         safe, slipped = self.hint.last, self.hint.slip
         gain = ca.if_else(safe, 0, self.hint.gain)
@@ -261,18 +272,19 @@ class Contact:
         turned = ca.logic_and(ca.sumsqr(slipped) > 0.5, ca.dot(slipped, x) <= cone)
         slips = ca.logic_and(size > cone, ca.logic_or(safe, ca.logic_not(turned)))
         share = ca.if_else(slips, cone / size, 1)
-        slip = ca.if_else(ca.logic_and(slips, ca.logic_not(safe)), x / size, 0)
+        slip = ca.if_else(ca.logic_and(slips, ca.logic_not(ca.logic_or(safe, self.released))), x / size, 0)
         return self._response(share * x, share * slope, slip, gain)
 
-    def misjudged(self, gain: SX, slip: SX) -> SX:
+    def misjudged(self, response: ContactResponse, gain: SX) -> SX:
         """Return 1 if the contact did not do what it was taken to do, given its gain in velocity; else 0.
 
         One taken to slip has turned round, one taken to stick has left the cone, one taken to stay away is in the
         ground, or one above it was pulled down.
         """
         cone, _, x, size = self._trial(gain)
-        out_of_cone = size > (1 + CONE_TOLERANCE) * cone + CONE_FLOOR
-        slid = ca.if_else(ca.sumsqr(slip) > 0.5, ca.dot(slip, x) < cone, out_of_cone)
+        tolerance = CONE_TOLERANCE + SECOND_TOLERANCE * self.hint.attempts
+        out_of_cone = ca.logic_and(size > (1 + tolerance) * cone + CONE_FLOOR, ca.logic_not(self.released))
+        slid = ca.if_else(ca.sumsqr(response.slip) > 0.5, ca.dot(response.slip, x) < cone, out_of_cone)
         arrived = self.touch.depth - self.dt * self._closing(gain) > 0
         pulled = ca.logic_and(self.above, self.normal_after(gain) < -CONE_FLOOR)
         return ca.logic_or(slid, ca.if_else(self.there, pulled, arrived))

@@ -123,7 +123,7 @@ def attempt(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Ste
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
     )
     forces = [R @ r.force_after(gain) for R, (_, r, gain) in zip(rotations, triples, strict=True)]
-    misjudged = ca.sum1(stacked([c.misjudged(gain, r.slip) for c, r, gain in triples])) > 0
+    misjudged = ca.sum1(stacked([c.misjudged(r, gain) for c, r, gain in triples])) > 0
     found = ca.horzcat(SX(Hint.SIZE, 0), *[c.hint_after(gain, r.slip) for c, r, gain in triples])
     ydd = solved.vdot[solved.vdot.shape[0] - solved.motors.tau.shape[0] :]
     return Stepped(
