@@ -145,9 +145,9 @@ def passive_forces(robot: Robot, y: SX, yd: SX, dt: float) -> JointForce:
 
 
 def limit_stiffness(robot: Robot, name: str) -> tuple[float, float]:
-    """Return stiffness [N m/rad] and damping [N m s/rad] of a joint's stops: full torque at 0.05 rad, well damped."""
+    """Return stiffness [N m/rad] and damping [N m s/rad] of a joint's stops: full torque at 0.02 rad, well damped."""
     torque = robot.body(name).joint.torque
-    stiffness = 20.0 * torque if math.isfinite(torque) else 1e3
+    stiffness = 50.0 * torque if math.isfinite(torque) else 1e3
     return stiffness, stiffness / LIMIT_FREQUENCY
 
 
