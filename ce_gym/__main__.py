@@ -20,7 +20,7 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
   python -m ce_gym list                  robots and environments
   python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
   python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
-  python -m ce_gym view walk.npz         write a recorded rollout as one HTML file (or --live)
+  python -m ce_gym view walk.npz         write a recorded rollout, or a policy's, as one HTML file (or --live)
   python -m ce_gym bench                 benchmarks
 
 Each has --help. In Python: gymnasium.make("ce_gym:ce_gym/MiniCheetahVelocity-v0")."""

@@ -6,10 +6,12 @@ environments report; knows nothing of robots or tasks.
 
 from __future__ import annotations
 
+import csv
 import signal
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -40,6 +42,59 @@ class EpisodeLog(_Quiet):
         for key, value in episode_means(self.model.ep_info_buffer).items():
             if key not in ("r", "l"):  # the learner logs these two itself
                 self.logger.record(key, value)
+
+
+class Curve(_Quiet):
+    """Writes how learning goes into a small CSV file: steps, seconds, mean reward and length of recent episodes.
+
+    The learner's own log begins anew when training goes on from a policy; this one keeps what came before.
+
+    Args:
+        file: To write, a row after every rollout.
+        before: Rows of the training that led to the policy gone on from, see `read_curve`.
+    """
+
+    def __init__(self, file: Path, before: list[dict[str, float]]) -> None:
+        super().__init__()
+        self.file, self.before = file, before
+
+    def _on_training_start(self) -> None:
+        rows = [row for row in self.before if row["steps"] <= self.num_timesteps]
+        self.started = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
+        self._write(rows, "w")
+
+    def _on_rollout_end(self) -> None:
+        means = episode_means(self.model.ep_info_buffer)
+        if means:
+            seconds = round(time.perf_counter() - self.started, 2)
+            values = (self.num_timesteps, seconds, round(means["r"], 4), round(means["l"], 2))
+            self._write([dict(zip(CURVE, values, strict=True))], "a")
+
+    def _write(self, rows: list[dict[str, float]], mode: str) -> None:
+        with self.file.open(mode, newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, CURVE)
+            if mode == "w":
+                writer.writeheader()
+            writer.writerows(rows)
+
+
+CURVE: tuple[str, ...] = ("steps", "seconds", "reward", "length")
+"""Columns of a learning curve."""
+
+
+def read_curve(file: Path) -> list[dict[str, float]]:
+    """Return the rows of a learning curve; none if there is no such file.
+
+    Raises:
+        ValueError: If it is something else.
+    """
+    if not file.exists():
+        return []
+    try:
+        with file.open(newline="", encoding="utf-8") as lines:
+            return [{key: float(row[key]) for key in CURVE} for row in csv.DictReader(lines)]
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise ValueError(f"{file}: expected the columns {', '.join(CURVE)}, numbers in each row") from None
 
 
 class AdaptiveLearningRate(_Quiet):

@@ -16,7 +16,7 @@ from evaluate import load_policy, report
 from ppo import Job, Trained, available_threads, train
 from record import record
 from settings import config_file, load_settings
-from transfer import table, transfer
+from transfer import summary, table, transfer
 
 from ce_gym.viewer import write_html
 
@@ -78,8 +78,9 @@ def show(policy: Path, episodes: int, out: Path) -> None:
     """Print how good a policy is, on every transmission level, and write its rollout; the last line is the page."""
     model, about = load_policy(policy)
     results = transfer(model, about, episodes=episodes)
+    entry = {"transmission": about["transmission"], "results": results}
     print(f"\nJudged on {about['transmission']} transmissions:\n{report(results[about['transmission']])}")
-    print(f"\nThe same policy on every transmission level:\n{table(results, about['transmission'])}")
+    print(f"\nThe same policy on every transmission level:\n{table(summary([entry]))}")
     rollout = record(model, about["env"], label=f"{about['transmission']}, seed {about['seed']}", **about["env_kwargs"])
     page = out / f"{rollout.robot}.html"
     rollout.save(page.with_suffix(".npz"))

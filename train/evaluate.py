@@ -1,22 +1,24 @@
-"""Judge a trained policy: how well it follows its commands, and how often it falls.
+"""Judge a trained policy: how well it follows its commands, how often it falls, what it asks of the motors.
 
 Every environment of a batch plays exactly one whole episode, so that short episodes do not count more often than
 long ones. Uses public names of ce_gym only, and no name of a robot or task.
 
-    python train/evaluate.py runs/mini_cheetah_velocity/policy.zip --transmission armature
-    python train/evaluate.py policy.onnx
+    python train/evaluate.py runs/mini_cheetah_velocity --transmission armature
+    python train/evaluate.py policy.onnx --pushes --json result.json
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from policy_file import Policy, PolicyError, read_policy
+from console import add_json_argument, positive, print_result, run
+from effort import effort
+from policy_file import WHERE, Policy, PolicyError, locate, read_policy
+from pushes import push_envelope, push_table
 from stable_baselines3 import PPO
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
@@ -32,7 +34,7 @@ def load_policy(path: str | Path) -> tuple[PPO, dict[str, Any]]:
     `policy_file.read_policy` reads its weights and nothing else.
 
     Args:
-        path: Of the policy, `<name>.zip`; its record is `<name>.json`.
+        path: Of the policy, `<name>.zip`, or of its folder; its record is `<name>.json`.
 
     Returns:
         The policy and its record: environment, transmission level, steps, seed and so on.
@@ -40,7 +42,7 @@ def load_policy(path: str | Path) -> tuple[PPO, dict[str, Any]]:
     Raises:
         PolicyError: If one of the two files is missing or damaged.
     """
-    policy = Path(path).with_suffix(".zip")
+    policy = locate(path).with_suffix(".zip")
     for file in (policy, policy.with_suffix(".json")):
         if not file.exists():
             raise PolicyError(
@@ -73,8 +75,9 @@ def evaluate(
 
     Returns:
         forward_error, lateral_error [m/s], yaw_rate_error [rad/s]: mean absolute difference between commanded and
-        actual base velocity, in base coordinates, over every step of every episode. falls, diverged: fraction of
-        episodes that ended early, and that were stopped because the state was no longer finite. episode_length [s],
+        actual base velocity, in base coordinates, over every step of every episode; velocity_error [m/s]: the same of
+        the length of the horizontal difference. falls, timed_out, diverged: fraction of episodes that ended early,
+        that lasted to the end, and that were stopped because the state was no longer finite. episode_length [s],
         reward: means over episodes. episodes: their number. Other entries are means of what the task reports itself.
     """
     envs = make_sb3_vec_env(env_id, episodes, seed, **kwargs)
@@ -97,29 +100,36 @@ def _play(model: PPO | Policy, envs: SB3VecEnv) -> dict[str, float]:
         obs, _, dones, infos = envs.step(action)
         state = native.state()
         going = running & ~dones  # an environment that is done shows its next episode already
-        errors.append(np.abs(_planar_velocity(state["v"]) - command)[going])
+        errors.append((planar_velocity(state["v"]) - command)[going])
         ended |= {i: infos[i] for i in np.flatnonzero(running & dones)}
         running &= ~dones
     return _summary(np.concatenate(errors), list(ended.values()), period)
 
 
-def _planar_velocity(v: np.ndarray) -> np.ndarray:
+def planar_velocity(v: np.ndarray) -> np.ndarray:
     """Forward and lateral speed [m/s] and yaw rate [rad/s] of the base, shape (n, 3); `v` has angular part first."""
     return np.stack([v[:, 3], v[:, 4], v[:, 2]], axis=1)
 
 
+def tracking(errors: np.ndarray) -> dict[str, float]:
+    """Means of how far velocities (n, 3) are from those commanded, by name; not a number if there are none."""
+    if not len(errors):
+        errors = np.full((1, 3), np.nan)
+    forward, lateral, yaw = np.abs(errors).mean(axis=0).tolist()
+    velocity = float(np.hypot(errors[:, 0], errors[:, 1]).mean())
+    return {"forward_error": forward, "lateral_error": lateral, "yaw_rate_error": yaw, "velocity_error": velocity}
+
+
 def _summary(errors: np.ndarray, ended: list[dict[str, Any]], period: float) -> dict[str, float]:
     """Means over steps (errors) and over episodes (the rest)."""
-    forward, lateral, yaw = errors.mean(axis=0).tolist()
     episodes = [info["episode"] for info in ended]
     mean = {key: float(np.mean([episode[key] for episode in episodes])) for key in episodes[0] if key != "t"}
     timed_out = np.array([info["TimeLimit.truncated"] for info in ended])
     diverged = np.array([info["diverged"] for info in ended])
     return {
-        "forward_error": forward,
-        "lateral_error": lateral,
-        "yaw_rate_error": yaw,
+        **tracking(errors),
         "falls": float(np.mean(~timed_out & ~diverged)),
+        "timed_out": float(np.mean(timed_out & ~diverged)),
         "diverged": float(np.mean(diverged)),
         "episode_length": mean.pop("l") * period,
         "reward": mean.pop("r"),
@@ -128,44 +138,74 @@ def _summary(errors: np.ndarray, ended: list[dict[str, Any]], period: float) -> 
     }
 
 
-def report(result: dict[str, float]) -> str:
-    """The figures that matter, one per line."""
-    return "\n".join(
-        [
-            f"forward speed error  {result['forward_error']:.3f} m/s    (mean absolute, over every step)",
-            f"lateral speed error  {result['lateral_error']:.3f} m/s",
-            f"yaw rate error       {result['yaw_rate_error']:.3f} rad/s",
-            f"falls                {100 * result['falls']:.1f} % of {result['episodes']} episodes",
-            f"episode length       {result['episode_length']:.1f} s",
-            f"reward per episode   {result['reward']:.2f}",
-        ]
-    )
+def report(result: dict[str, Any]) -> str:
+    """The figures that matter, one per line; those of motors and pushes if they are there."""
+    rows = [
+        ("forward speed error", f"{result['forward_error']:.3f} m/s", "mean absolute, over every step"),
+        ("lateral speed error", f"{result['lateral_error']:.3f} m/s", ""),
+        ("yaw rate error", f"{result['yaw_rate_error']:.3f} rad/s", ""),
+        ("velocity error", f"{result['velocity_error']:.3f} m/s", "horizontal, mean length"),
+        ("falls", f"{result['falls']:.1%}", f"of {result['episodes']} episodes"),
+        ("time-outs", f"{result['timed_out']:.1%}", "on its feet to the end"),
+        ("episode length", f"{result['episode_length']:.1f} s", "mean"),
+        ("reward per episode", f"{result['reward']:.2f}", ""),
+    ]
+    if result["diverged"]:
+        rows.append(("diverged", f"{result['diverged']:.1%}", "stopped because numbers went astray"))
+    lines = [f"{name:<20} {figure:<12} {note}".rstrip() for name, figure, note in rows + _effort_rows(result)]
+    return "\n".join(lines) + (f"\n\n{push_table(result['pushes'])}" if "pushes" in result else "")
+
+
+def _effort_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What the motors do, or nothing if nobody watched them."""
+    found = result.get("effort")
+    if not found:
+        return []
+    rows = [("power", f"{found['power']:.0f} W", f"of driving motors, at {found['speed']:.2f} m/s")]
+    if found["cost_of_transport"] is not None:
+        net = f"braking lost; {found['cost_of_transport_net']:.2f} if it is taken back"
+        rows.append(("cost of transport", f"{found['cost_of_transport']:.2f}", net))
+    for what in ("torque", "power"):
+        if found[f"mean_{what}"] is not None:
+            figures = f"{found[f'mean_{what}']:.0%}, {found[f'peak_{what}']:.0%}"
+            rows.append((f"motor {what}", figures, f"of its limit, mean and peak ({found[f'peak_{what}_at']})"))
+    return rows
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments shared by the programs that judge a policy."""
-    parser.add_argument("policy", help="policy.zip of train/ppo.py, its policy.json beside it, or .onnx of export.py")
+    """Arguments shared by the programs that judge policies, apart from the policies."""
     parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes, side by side (default 256)")
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
+    add_json_argument(parser)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(description="Judge a trained policy: tracking errors, falls, episode length.")
-    add_arguments(parser)
+    parser = argparse.ArgumentParser(
+        description="Judge a trained policy: tracking errors, falls, what it asks of the motors, how hard it can be "
+        "pushed. Torques and powers are those of sub-steps, as shares of what the motors can give."
+    )
+    parser.add_argument("policy", help=WHERE)
     parser.add_argument(
         "--transmission", metavar="LEVEL", help="exact, coupled, armature or none (default: as trained)"
     )
+    parser.add_argument("--pushes", action="store_true", help="also push it, from all sides, harder and harder")
+    add_arguments(parser)
     args = parser.parse_args(argv)
-    try:
-        model = read_policy(args.policy, args.transmission)
-        kwargs = env_kwargs(model.record, args.transmission)
-        result = evaluate(model, model.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
-    except ValueError as error:
-        print(f"evaluate.py: {error}", file=sys.stderr)
-        return 2
-    print(json.dumps(result, indent=2) if args.json else report(result))
+    positive(parser, episodes=args.episodes)
+    return run("evaluate.py", lambda: _judge(args))
+
+
+def _judge(args: argparse.Namespace) -> int:
+    """Do everything that the command line asks for."""
+    model = read_policy(args.policy, args.transmission)
+    kwargs = env_kwargs(model.record, args.transmission)
+    result: dict[str, Any] = evaluate(model, model.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
+    if found := effort(model, episodes=min(args.episodes, 32), seed=args.seed, **kwargs):
+        result["effort"] = found
+    if args.pushes:
+        result["pushes"] = push_envelope(model, seed=args.seed, **kwargs)
+    print_result(result, report(result), args.json)
     return 0
 
 

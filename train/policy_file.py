@@ -1,9 +1,11 @@
-"""Trained policies as files that are safe to open, and acting with one.
+"""Trained policies as files that are safe to open, where they are found, and acting with one.
 
 A `policy.zip` of Stable-Baselines3 holds pickled Python objects next to the weights, and unpickling runs whatever its
 author wanted. Here only the weights are read (`torch.load(weights_only=True)`) and the plain `policy.json` beside
-them; an ONNX file holds no code at all. So a stranger's policy can be judged; to train one on is another matter, see
-`evaluate.load_policy`. Knows the two formats; no environments, robots or tasks.
+them; an ONNX file holds no code at all. A `policy.npz`, in which policies are shipped, has the actor's weights and the
+record and nothing else: a tenth of the zip, readable by numpy alone with pickling forbidden. So a stranger's policy can
+be judged; to train one on is another matter, see `evaluate.load_policy`. Knows the formats and where shipped policies
+lie; no environments, robots or tasks.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import json
 import pickle
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +27,18 @@ from numpy.typing import NDArray
 
 METADATA = "ce_gym_policy"
 """Key under which an ONNX file holds the record of its policy."""
+
+SHIPPED = Path(__file__).resolve().parents[1] / "assets" / "policies"
+"""Policies that come with the repository: a folder each, named `<robot>_<task>_<level>`."""
+
+WHERE = "a file (policy.zip, .npz or .onnx), the folder of a training run, or the name of a shipped policy"
+"""What `locate` takes, for help texts."""
+
+
+FORMATS = (".zip", ".npz", ".onnx")
+"""Kinds of policy files, in the order in which they are looked for."""
+
+LAYER = ("weight", "bias")
 
 
 class PolicyError(ValueError):
@@ -83,17 +98,45 @@ class Policy:
         return self.act(rows), None
 
 
+def locate(path: str | Path) -> Path:
+    """Return the file of a policy.
+
+    Args:
+        path: A file; a folder that has one; or the name of a shipped policy, whose level may be left out if it is
+            exact.
+
+    Raises:
+        PolicyError: If there is none.
+    """
+    path = Path(path)
+    if path.suffix in FORMATS:
+        return path
+    folders = [path, *([SHIPPED / path, SHIPPED / f"{path}_exact"] if len(path.parts) == 1 else [])]
+    files = [folder / f"policy{suffix}" for folder in folders for suffix in FORMATS]
+    for file in (*files, path.with_name(f"{path.name}.zip")):
+        if file.is_file():
+            return file
+    known = ", ".join(shipped()) or "none yet"
+    raise PolicyError(f"{path}: no such policy; expected {WHERE} (there are: {known})")
+
+
+def shipped() -> list[str]:
+    """Return the names of the policies that come with the repository."""
+    return sorted(file.parent.name for file in SHIPPED.glob("*/policy.npz"))
+
+
 def read_policy(path: str | Path, transmission: str | None = None) -> Policy:
     """Read a policy without running code that it may carry.
 
     Args:
-        path: `<name>.zip` with its `<name>.json`, as train/ppo.py writes them, or `<name>.onnx` of train/export.py.
+        path: What `locate` takes: `<name>.zip` with its `<name>.json`, as train/ppo.py writes them, `<name>.npz` of
+            train/card.py or `<name>.onnx` of train/export.py, or where one lies.
         transmission: Level that it will run on; a `LevelWarning` tells if it was trained on another.
 
     Raises:
         PolicyError: If a file is missing, damaged or of another kind.
     """
-    path = Path(path)
+    path = locate(path)
     if path.suffix == ".onnx":
         policy = _read_onnx(path)
     else:
@@ -106,12 +149,15 @@ def read_policy(path: str | Path, transmission: str | None = None) -> Policy:
 
 
 def read_actor(path: str | Path) -> tuple[Actor, dict[str, Any]]:
-    """Read the actor's layers of a `policy.zip`, weights only, and the record beside it.
+    """Read the actor's layers, weights only, and the record: of a `policy.npz`, or a `policy.zip` and its JSON.
 
     Raises:
-        PolicyError: If one of the two files is missing, damaged or no policy of linear layers.
+        PolicyError: If a file is missing, damaged or no policy of linear layers.
     """
-    policy = Path(path).with_suffix(".zip")
+    policy = locate(path)
+    if policy.suffix == ".npz":
+        return _read_npz(policy)
+    policy = policy.with_suffix(".zip")
     record = _read_record(policy.with_suffix(".json"))
     if not policy.exists():
         raise PolicyError(f"{policy}: no such file; expected a policy.zip as train/ppo.py writes it")
@@ -123,11 +169,47 @@ def read_actor(path: str | Path) -> tuple[Actor, dict[str, Any]]:
         layers = tuple((weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names)
     except (OSError, KeyError, RuntimeError, ValueError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
         raise PolicyError(f"{policy}: no weights of an actor can be read from it: {_one_line(error)}") from None
-    if layers[0][0].shape[1] != record["observation_size"]:
-        raise PolicyError(
-            f"{policy}: takes {layers[0][0].shape[1]} numbers; expected the {record['observation_size']} of its record"
-        )
-    return Actor(layers, record["activation"]), record
+    return _fitting(Actor(layers, record["activation"]), record, policy)
+
+
+def write_npz(actor: Actor, record: dict[str, Any], out: Path) -> None:
+    """Write an actor's weights, float32, and its record, as JSON, into one file that numpy reads without unpickling.
+
+    Raises:
+        PolicyError: If that cannot be done.
+    """
+    named = [(i, zip(LAYER, layer, strict=True)) for i, layer in enumerate(actor.layers)]
+    arrays: dict[str, Any] = {f"{name}_{i}": tensor.numpy() for i, layer in named for name, tensor in layer}
+    try:
+        np.savez_compressed(out, record=np.array(json.dumps(record)), **arrays)
+    except OSError as error:
+        raise PolicyError(f"{out}: cannot be written: {error.strerror}") from None
+
+
+def _read_npz(path: Path) -> tuple[Actor, dict[str, Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        record = json.loads(str(arrays.pop("record")))
+        n = len(arrays) // len(LAYER)
+        layers = tuple(tuple(torch.from_numpy(arrays[f"{name}_{i}"]) for name in LAYER) for i in range(n))
+    except FileNotFoundError:
+        raise PolicyError(f"{path}: no such file; expected a policy.npz as train/card.py writes it") from None
+    except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise PolicyError(f"{path}: no weights of an actor can be read from it: {_one_line(error)}") from None
+    record = checked_record(record, path)
+    return _fitting(Actor(layers, record["activation"]), record, path)  # type: ignore[arg-type]  # two of each
+
+
+def _fitting(actor: Actor, record: dict[str, Any], path: Path) -> tuple[Actor, dict[str, Any]]:
+    """Return both if each layer takes what the one before gives, the first what the record says."""
+    sizes = [record["observation_size"], *(len(bias) for _, bias in actor.layers)]
+    for (weight, bias), size in zip(actor.layers, sizes, strict=False):
+        if weight.shape != (len(bias), size):
+            raise PolicyError(f"{path}: a layer takes {weight.shape[-1]} numbers; expected {size}")
+    if sizes[1:] == [] or sizes[-1] != record["action_size"]:
+        raise PolicyError(f"{path}: gives {sizes[-1]} numbers; expected the {record['action_size']} of its record")
+    return actor, record
 
 
 def _read_record(path: Path) -> dict[str, Any]:

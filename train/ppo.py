@@ -1,7 +1,8 @@
 """Train a policy with PPO: any registered environment, any transmission level, from one settings file.
 
 Writes into the output folder: `policy.zip` (Stable-Baselines3), `policy.json` (what it was trained on), `progress.csv`,
-TensorBoard logs and `checkpoints/`. Uses public names of ce_gym only, and no name of a robot or task.
+`curve.csv` (how learning went, from the very beginning), TensorBoard logs and `checkpoints/`. Uses public names of
+ce_gym only, and no name of a robot or task.
 
     python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0
     python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0 --transmission armature --seeds 0 1 2
@@ -24,7 +25,7 @@ from typing import Any
 
 import gymnasium
 import torch
-from callbacks import AdaptiveLearningRate, Checkpoints, EpisodeLog, ProgressBar, StopInOrder
+from callbacks import AdaptiveLearningRate, Checkpoints, Curve, EpisodeLog, ProgressBar, StopInOrder, read_curve
 from evaluate import PolicyError, evaluate, load_policy, report
 from learner import ThreadedPPO
 from settings import Settings, SettingsError, config_file, load_settings
@@ -108,6 +109,7 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
     model.set_logger(configure(str(job.out), ["csv", "tensorboard"] if job.tensorboard else ["csv"]))
     settings, before = job.settings, model.num_timesteps
+    earlier = read_curve(job.resume.parent / "curve.csv") if job.resume else []
     start = time.perf_counter()
 
     def record(finished: bool = False) -> dict[str, Any]:
@@ -118,7 +120,7 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
 
     with StopInOrder(job.seconds) as stop:
         callbacks = [stop, Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog()]
-        callbacks.append(ProgressBar(settings.steps))
+        callbacks += [Curve(job.out / "curve.csv", earlier), ProgressBar(settings.steps)]
         if settings.target_kl:
             callbacks.append(AdaptiveLearningRate(settings.target_kl))
         if before < settings.steps:

@@ -2,28 +2,27 @@
 
 The robot is exported as MJCF at two levels, with armature and with every rotor a body on a stiff equality; it starts
 in the same states, has the same gains and limits, and gets the same random commands as in our own simulation beside it.
-Observations are rebuilt from MuJoCo's state by the task's own terms. Needs MuJoCo (extra `mjcf`). Uses public names of
-ce_gym only, and no name of a robot or task.
+Observations are rebuilt from MuJoCo's state by the task's own terms. The verdict: on each level nearly all keep on
+their feet, and commands are followed hardly worse than on the same level of ours. Needs MuJoCo (extra `mjcf`). Uses
+public names of ce_gym only, and no name of a robot or task.
 
-    python train/sim2sim.py runs/mini_cheetah_velocity/policy.zip
+    python train/sim2sim.py runs/mini_cheetah_velocity
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from evaluate import EVALUATION_SEED, env_kwargs
+from console import add_json_argument, positive, print_result, run
+from evaluate import EVALUATION_SEED, env_kwargs, planar_velocity, tracking
 from numpy.typing import NDArray
-from policy_file import Policy, PolicyError, read_policy
+from policy_file import WHERE, Policy, PolicyError, read_policy
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
-from ce_gym.bench.mujoco_twin import TIMESTEPS, MujocoTwin
+from ce_gym.bench.mujoco_twin import MujocoTwin
 
 STEADY = {"push_period": 0.0, "randomise": {}, "latency": (0, 0), "heading": False, "command_period": 1e6}
 """What is left out of the comparison, as MuJoCo knows nothing of it; commands come from here."""
@@ -31,9 +30,16 @@ STEADY = {"push_period": 0.0, "randomise": {}, "latency": (0, 0), "heading": Fal
 STANDING_FRACTION = 0.1
 """Share of commands that ask the robot to stand."""
 
+ON_FEET, WORSE = 0.95, 1.5
+"""What is asked for in MuJoCo: share without a fall, at least; errors over those of our own simulation, at most."""
+
+TWINS = {"armature": ("MuJoCo, armature", "armature"), "exact": ("MuJoCo, rotors as bodies", "exact")}
+"""Name of each level of `MujocoTwin`, and the level of ours that has the same physics."""
+
 COLUMNS = (
     ("forward [m/s]", "forward_error", ".3f"),
     ("lateral [m/s]", "lateral_error", ".3f"),
+    ("velocity [m/s]", "velocity_error", ".3f"),
     ("yaw [rad/s]", "yaw_rate_error", ".3f"),
     ("falls", "falls", ".1%"),
     ("length [s]", "episode_length", ".1f"),
@@ -123,11 +129,11 @@ class Course:
     control_dt: float
 
 
-def course(contract: dict[str, Any], first: NDArray, seconds: float, seed: int) -> Course:
-    """Draw commands from the task's range, new ones every period; the first are given, shape (n, 3)."""
+def course(contract: dict[str, Any], first: NDArray, seconds: float, every: float, seed: int) -> Course:
+    """Draw commands from the task's range, new ones `every` so many seconds; the first are given, shape (n, 3)."""
     dt, rng = contract["control_dt"], np.random.default_rng(seed)
     steps = round(seconds / dt)
-    period = min(max(round(contract["command"]["period"] / dt), 1), steps + 1)
+    period = min(max(round(min(every, seconds + dt) / dt), 1), steps + 1)
     low, high = np.array(contract["command"]["range"]).T
     drawn = [first]
     for _ in range(steps // period):
@@ -140,51 +146,82 @@ def play(policy: Policy, world: World, obs: Any, given: Course) -> dict[str, flo
     """Act until the course ends, and judge every robot up to its first fall.
 
     Returns:
-        forward_error, lateral_error [m/s], yaw_rate_error [rad/s]: mean absolute difference between commanded and
-        actual base velocity, in base coordinates. falls: fraction of robots. episode_length [s]: mean.
+        Errors as of `evaluate.tracking`. falls: fraction of robots. episode_length [s]: mean.
     """
     running = np.ones(given.commands.shape[1], bool)
-    errors, steps = [], 0
+    errors, steps = [np.zeros((0, 3))], 0
     for command, following in zip(given.commands[:-1], given.commands[1:], strict=True):
         action, _ = policy.predict(obs)
         obs, v, failed = world.step(action, following)
         running &= ~failed
-        errors.append(np.abs(v[:, [3, 4, 2]] - command)[running])
+        errors.append((planar_velocity(v) - command)[running])
         steps += int(running.sum())
         if not running.any():
             break
-    forward, lateral, yaw = np.concatenate(errors).mean(axis=0).tolist() if steps else (float("nan"),) * 3
     return {
-        "forward_error": forward,
-        "lateral_error": lateral,
-        "yaw_rate_error": yaw,
+        **tracking(np.concatenate(errors)),
         "falls": float(np.mean(~running)),
         "episode_length": steps * given.control_dt / len(running),
     }
 
 
-def compare(policy: Policy, *, episodes: int = 64, seconds: float = 20.0, seed: int = EVALUATION_SEED) -> dict:
-    """Play the same course with our dynamics, at the level of training and with armature, and with MuJoCo's.
+def compare(
+    policy: Policy,
+    *,
+    episodes: int = 50,
+    seconds: float = 10.0,
+    every: float = float("inf"),
+    seed: int = EVALUATION_SEED,
+) -> dict[str, Any]:
+    """Play the same course with our dynamics, at the level of training and the two of MuJoCo, and with MuJoCo's.
+
+    Args:
+        policy: With its record.
+        episodes: Robots.
+        seconds: How long they walk.
+        every: Time between new commands [s]; one for the whole time if longer than that.
+        seed: Of starts and commands.
 
     Returns:
-        The result of `play` by the name of the simulation.
+        simulations: the result of `play` by the name of the simulation; verdict: see `verdicts`; passed: whether all
+        of them are.
     """
     record, results = policy.record, {}
-    for level in dict.fromkeys((record["transmission"], "armature")):
-        envs, obs, given = _environment(record, level, episodes, seconds, seed)
-        results[f"ce_gym, {level}"] = play(policy, OurWorld(envs), obs, given)
+    for level in dict.fromkeys((record["transmission"], "exact", "armature")):
+        envs, obs, given = _environment(record, level, episodes, seconds, every, seed)
+        results[_ours(level)] = play(policy, OurWorld(envs), obs, given)
         envs.close()
-    for level in TIMESTEPS:
-        envs, obs, given = _environment(record, record["transmission"], episodes, seconds, seed)
-        world = MujocoWorld(envs.envs.unwrapped, obs, level)
-        name = "armature" if level == "armature" else "rotors as bodies"
-        results[f"MuJoCo, {name}"] = play(policy, world, obs, given)
+    for level, (name, _) in TWINS.items():
+        envs, obs, given = _environment(record, record["transmission"], episodes, seconds, every, seed)
+        results[name] = play(policy, MujocoWorld(envs.envs.unwrapped, obs, level), obs, given)
         envs.close()
-    return results
+    found = verdicts(results)
+    return {"simulations": results, "verdict": found, "passed": all(verdict["passed"] for verdict in found.values())}
+
+
+def _ours(level: str) -> str:
+    return f"ce_gym, {level}"
+
+
+def verdicts(results: dict[str, dict[str, float]]) -> dict[str, dict[str, Any]]:
+    """Judge MuJoCo's levels against the same levels of ours.
+
+    Returns:
+        By the name of the simulation: on_feet, share without a fall; error_ratio and yaw_ratio, velocity and yaw rate
+        error over ours; passed, whether these are within `ON_FEET` and `WORSE`.
+    """
+    found = {}
+    for name, level in TWINS.values():
+        theirs, ours = results[name], results[_ours(level)]
+        on_feet = 1.0 - theirs["falls"]
+        ratios = [theirs[key] / max(ours[key], 1e-9) for key in ("velocity_error", "yaw_rate_error")]
+        passed = on_feet >= ON_FEET and all(ratio <= WORSE for ratio in ratios)  # not if nothing was measured
+        found[name] = {"on_feet": on_feet, "error_ratio": ratios[0], "yaw_ratio": ratios[1], "passed": passed}
+    return found
 
 
 def _environment(
-    record: dict[str, Any], level: str, n: int, seconds: float, seed: int
+    record: dict[str, Any], level: str, n: int, seconds: float, every: float, seed: int
 ) -> tuple[SB3VecEnv, Any, Course]:
     """An environment just reset, its observations, and what is commanded; the same for every level."""
     clear = {block["name"]: 0.0 for block in record["contract"]["observation"]["blocks"]}
@@ -192,38 +229,48 @@ def _environment(
     envs = make_sb3_vec_env(record["env"], n, seed, max_episode_steps=10**9, **kwargs)
     obs = envs.reset()
     native: Any = envs.envs.unwrapped
-    period = {"command": record["contract"]["command"]}  # the environment's own is out of force
-    return envs, obs, course(native.contract() | period, native.state()["command"], seconds, seed)
+    return envs, obs, course(native.contract(), native.state()["command"], seconds, every, seed)
 
 
-def table(results: dict[str, dict[str, float]]) -> str:
-    """One line per simulation."""
+def table(result: dict[str, Any]) -> str:
+    """One line per simulation, then one per verdict."""
     lines = [f"{'simulated by':<26}" + "".join(f"{title:>15}" for title, _, _ in COLUMNS)]
-    for name, result in results.items():
-        lines.append(f"{name:<26}" + "".join(f"{result[key]:>15{form}}" for _, key, form in COLUMNS))
-    return "\n".join([*lines, "errors are mean absolute, over every step until a robot falls"])
+    for name, figures in result["simulations"].items():
+        lines.append(f"{name:<26}" + "".join(f"{figures[key]:>15{form}}" for _, key, form in COLUMNS))
+    lines += ["errors are means over every step until a robot falls", ""]
+    for name, verdict in result["verdict"].items():
+        found = (
+            f"{verdict['on_feet']:.0%} without a fall, velocity error {verdict['error_ratio']:.2f} and yaw rate error"
+        )
+        found += f" {verdict['yaw_ratio']:.2f} times ours: {'passed' if verdict['passed'] else 'FAILED'}"
+        lines.append(f"{name:<26} {found}")
+    return "\n".join([*lines, f"asked for: at least {ON_FEET:.0%} without a fall, errors at most {WORSE:g} times ours"])
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(description="Let a policy act in MuJoCo, beside our own simulation.")
-    parser.add_argument("policy", help="policy.zip of train/ppo.py, its policy.json beside it, or .onnx of export.py")
-    parser.add_argument("--episodes", type=int, default=64, metavar="N", help="robots (default 64)")
-    parser.add_argument("--seconds", type=float, default=20.0, metavar="T", help="how long they walk (default 20)")
+    parser = argparse.ArgumentParser(
+        description="Let a policy act in MuJoCo, beside our own simulation. Exit code 0 if it does well enough in "
+        "both of MuJoCo's, 1 if not, 2 after a mistake.",
+    )
+    parser.add_argument("policy", help=WHERE)
+    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="robots (default 50)")
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="T", help="how long they walk (default 10)")
+    text = "new commands every T seconds (default: one for the whole time)"
+    parser.add_argument("--every", type=float, default=float("inf"), metavar="T", help=text)
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="of starts and commands")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="JSON file to write as well")
+    add_json_argument(parser)
     args = parser.parse_args(argv)
-    try:
-        results = compare(read_policy(args.policy), episodes=args.episodes, seconds=args.seconds, seed=args.seed)
-        text = json.dumps(results, indent=2)
-        if args.out:
-            args.out.write_text(text + "\n", encoding="utf-8")
-    except (ValueError, OSError) as error:
-        print(f"sim2sim.py: {error}", file=sys.stderr)
-        return 2
-    print(text if args.json else table(results))
-    return 0
+    positive(parser, episodes=args.episodes, seconds=args.seconds, every=args.every)
+    return run("sim2sim.py", lambda: _work(args))
+
+
+def _work(args: argparse.Namespace) -> int:
+    """Compare, print, and say whether it passed."""
+    policy = read_policy(args.policy)
+    result = compare(policy, episodes=args.episodes, seconds=args.seconds, every=args.every, seed=args.seed)
+    print_result(result, table(result), args.json)
+    return 0 if result["passed"] else 1
 
 
 if __name__ == "__main__":

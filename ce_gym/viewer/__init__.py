@@ -5,7 +5,7 @@
     recorder.rollout().save("walk.npz")
     write_html(Rollout.load("walk.npz"), "walk.html")
 
-Knows models and rollouts; knows nothing of learning. meshcat is needed only when something is drawn.
+Knows models, environments and rollouts; knows nothing of learning. meshcat is needed only when something is drawn.
 """
 
 from __future__ import annotations
@@ -19,10 +19,14 @@ if TYPE_CHECKING:
     from ce_gym.viewer.live import show
     from ce_gym.viewer.recorder import Recorder
     from ce_gym.viewer.rollout import Rollout, RolloutError
+    from ce_gym.viewer.walk import SHOW, Script, drive
 
-__all__ = ["Recorder", "Rollout", "RolloutError", "ViewerError", "show", "write_html"]
+__all__ = ["SHOW", "Recorder", "Rollout", "RolloutError", "Script", "ViewerError", "drive", "show", "write_html"]
 
 _HOMES = {
+    "SHOW": "walk",
+    "Script": "walk",
+    "drive": "walk",
     "Recorder": "recorder",
     "Rollout": "rollout",
     "RolloutError": "rollout",

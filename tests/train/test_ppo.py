@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from callbacks import AdaptiveLearningRate
+from callbacks import AdaptiveLearningRate, read_curve
 from evaluate import evaluate, load_policy
 from evaluate import main as evaluate_main
 from point_mass import ID
@@ -84,14 +84,33 @@ def test_checkpoints_are_policies(trained):
     assert not list(trained.policy.parent.rglob(".*"))
 
 
+def test_the_curve_ends_where_training_ends(trained):
+    curve = read_curve(trained.policy.parent / "curve.csv")
+    assert curve[-1]["steps"] == trained.record["steps"]
+    assert curve[-1]["length"] == 50
+    assert curve[-1]["reward"] > curve[0]["reward"] + 5
+
+
+def test_a_damaged_curve_is_one_line(tmp_path):
+    (tmp_path / "curve.csv").write_text("steps,seconds\n1,2\n")
+    with pytest.raises(ValueError, match="expected the columns steps, seconds, reward, length"):
+        read_curve(tmp_path / "curve.csv")
+    assert read_curve(tmp_path / "none.csv") == []
+
+
 def test_the_log_has_every_reward_term(trained):
     header = (trained.policy.parent / "progress.csv").read_text().splitlines()[0].split(",")
     assert {"reward/speed", "metrics/velocity_error", "rollout/ep_rew_mean", "train/approx_kl"} <= set(header)
 
 
 def test_resume_goes_on_counting(trained, tmp_path):
-    again = train(job(tmp_path, 32_000, resume=trained.policy))
-    assert 32_000 <= again.model.num_timesteps < 33_000
+    before = read_curve(trained.policy.parent / "curve.csv")
+    again = train(job(tmp_path, 36_000, resume=trained.policy))
+    curve = read_curve(tmp_path / "curve.csv")
+    assert curve[: len(before)] == before
+    assert curve[-1]["steps"] == again.record["steps"]
+    assert np.all(np.diff([row["seconds"] for row in curve]) > 0)
+    assert 36_000 <= again.model.num_timesteps < 37_000
     assert again.record["resumed_from"] == str(trained.policy)
     assert evaluate(again.model, ID, episodes=16)["forward_error"] < 0.2
 
@@ -145,7 +164,7 @@ def test_same_seed_trains_the_same_policy(tmp_path):
 
 def test_levels_reach_the_environment(trained, capsys):
     assert transfer_main([str(trained.policy), "--episodes", "8", "--json"]) == 0
-    results = json.loads(capsys.readouterr().out)
+    results = json.loads(capsys.readouterr().out)["policies"][0]["results"]
     assert tuple(results) == LEVELS
     assert results["exact"] == results["coupled"]  # the toy does not tell these two apart
     assert results["exact"]["reward"] != results["none"]["reward"]
@@ -198,7 +217,7 @@ def test_learning_rate_follows_the_divergence(kl, factor):
     assert callback.model.lr_schedule(1.0) == pytest.approx(1e-3 * factor)
 
 
-@pytest.mark.parametrize("script", ["ppo", "evaluate", "transfer", "record", "demo", "export", "sim2sim"])
+@pytest.mark.parametrize("script", ["ppo", "evaluate", "transfer", "record", "demo", "export", "sim2sim", "card"])
 def test_every_script_explains_itself(script):
     command = [sys.executable, str(ROOT / "train" / f"{script}.py"), "--help"]
     run = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)})

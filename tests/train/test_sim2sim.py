@@ -10,7 +10,7 @@ pytest.importorskip("mujoco")
 from policy_file import Policy
 from ppo import Job, train
 from settings import config_file, load_settings
-from sim2sim import MujocoWorld, OurWorld, compare, course, main, play, table
+from sim2sim import MujocoWorld, OurWorld, course, main, play, table, verdicts
 
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
@@ -74,9 +74,10 @@ def test_a_history_is_kept_newest_first():
 
 
 def test_commands_last_a_period_and_stay_in_range():
-    contract = {"control_dt": 0.02, "command": {"range": [[-1, 1], [0, 0.5], [2, 2]], "period": 0.1}}
+    contract = {"control_dt": 0.02, "command": {"range": [[-1, 1], [0, 0.5], [2, 2]]}}
     first = np.full((200, 3), 9.0)
-    drawn = course(contract, first, 0.5, seed=1).commands
+    assert (course(contract, first, 0.5, every=np.inf, seed=1).commands == first).all()
+    drawn = course(contract, first, 0.5, every=0.1, seed=1).commands
     assert drawn.shape == (26, 200, 3)
     assert (drawn[:5] == first).all()
     assert (drawn[5:10] == drawn[5]).all()
@@ -104,6 +105,7 @@ def test_judgement_ends_with_a_fall():
     assert result["episode_length"] == pytest.approx(0.5 * (1.0 + 0.2))
     assert result["forward_error"] == pytest.approx(0.5)
     assert result["yaw_rate_error"] == pytest.approx(1.0)
+    assert result["velocity_error"] == pytest.approx(np.hypot(0.5, 1.0))
 
 
 def test_standing_robots_stand_and_tilted_ones_fall():
@@ -113,22 +115,60 @@ def test_standing_robots_stand_and_tilted_ones_fall():
     state["q"][1, 3:7] = (np.cos(0.6), np.sin(0.6), 0.0, 0.0)  # rolled by 69 degrees
     assert not made.native.look({**state, "action": np.zeros((2, 12))})[1].any()
     made.twin.start(state["q"], state["v"])
-    result = play(stand, made, obs, course(made.contract, np.zeros((2, 3)), 1.0, seed=0))
+    result = play(stand, made, obs, course(made.contract, np.zeros((2, 3)), 1.0, every=1.0, seed=0))
     assert result["falls"] == 0.5
+
+
+def figures(velocity, yaw, falls):
+    return {"velocity_error": velocity, "yaw_rate_error": yaw, "falls": falls}
+
+
+@pytest.mark.parametrize(
+    ("theirs", "passes"),
+    [
+        (figures(0.149, 0.29, 0.04), True),
+        (figures(0.149, 0.29, 0.06), False),
+        (figures(0.151, 0.29, 0.0), False),
+        (figures(0.149, 0.31, 0.0), False),
+        (figures(float("nan"), float("nan"), 0.0), False),
+    ],
+)
+def test_the_verdict_compares_like_with_like(theirs, passes):
+    """Rotors as bodies with our exact level, armature with our armature, whatever the policy was trained on."""
+    bad, ours = figures(9.0, 9.0, 1.0), figures(0.1, 0.2, 0.0)
+    simulations = {
+        "ce_gym, none": bad,
+        "ce_gym, exact": ours,
+        "ce_gym, armature": bad,
+        "MuJoCo, armature": bad,
+        "MuJoCo, rotors as bodies": theirs,
+    }
+    found = verdicts(simulations)
+    assert found["MuJoCo, rotors as bodies"]["passed"] is passes
+    assert not found["MuJoCo, armature"]["passed"]  # nobody is on its feet
+    assert found["MuJoCo, armature"]["error_ratio"] == 1.0
+    text = table({"simulations": simulations | {n: x | BLANK for n, x in simulations.items()}, "verdict": found})
+    assert ("passed" in text) is passes
+    assert "FAILED" in text
+
+
+BLANK = {"forward_error": 0.0, "lateral_error": 0.0, "episode_length": 1.0}
 
 
 def test_the_program_compares_four_simulations(tmp_path, capsys):
     settings = load_settings(config_file(ROBOT_ENV), ["num_envs=16", "rollout=8", "steps=300", "minibatches=2"])
     policy = train(Job(ROBOT_ENV, settings, tmp_path, env_kwargs={}, tensorboard=False)).policy
     capsys.readouterr()
-    arguments = [str(policy), "--episodes", "2", "--seconds", "0.2", "--out", str(tmp_path / "result.json"), "--json"]
-    assert main(arguments) == 0
-    results = json.loads(capsys.readouterr().out)
-    assert results == json.loads((tmp_path / "result.json").read_text())
-    assert list(results) == ["ce_gym, exact", "ce_gym, armature", "MuJoCo, armature", "MuJoCo, rotors as bodies"]
-    assert all(result["episode_length"] == pytest.approx(0.2) for result in results.values())
-    assert "rotors as bodies" in table(results)
-    assert callable(compare)
+    arguments = [str(policy), "--episodes", "2", "--seconds", "0.2", "--json"]
+    code = main(arguments)
+    result = json.loads(capsys.readouterr().out)
+    assert main([*arguments, str(tmp_path / "result.json")]) == code
+    assert "asked for" in capsys.readouterr().out
+    assert result == json.loads((tmp_path / "result.json").read_text())
+    simulations = result["simulations"]
+    assert list(simulations) == ["ce_gym, exact", "ce_gym, armature", "MuJoCo, armature", "MuJoCo, rotors as bodies"]
+    assert all(figures["episode_length"] == pytest.approx(0.2) for figures in simulations.values())
+    assert result["passed"] is (code == 0)
 
 
 def test_mistakes_are_one_line(tmp_path, capsys):

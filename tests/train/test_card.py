@@ -1,0 +1,172 @@
+"""Cards of policies, policies as small safe files, and where they are found."""
+
+import json
+import pickle
+import shlex
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import policy_file
+import pytest
+from card import card, command, main, portable, short_name
+from evaluate import main as evaluate_main
+from policy_file import PolicyError, locate, read_actor, read_policy, write_npz
+from ppo import Job, jobs, parser, train
+from record import main as record_main
+from settings import config_file, load_settings
+
+import ce_gym
+
+ROBOT_ENV = next(iter(ce_gym.environment_ids()))
+SMALL = ["num_envs=32", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]", "steps=1000"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Folder of a training run, hardly begun."""
+    out = tmp_path_factory.mktemp("run")
+    train(Job(ROBOT_ENV, load_settings(config_file(ROBOT_ENV), SMALL), out, env_kwargs={}, tensorboard=False))
+    return out
+
+
+@pytest.fixture
+def shelf(tmp_path, monkeypatch):
+    """Where shipped policies lie, for one test."""
+    for module in ("policy_file", "card", "record"):
+        monkeypatch.setattr(f"{module}.SHIPPED", tmp_path / "policies")
+    return tmp_path / "policies"
+
+
+def test_a_shipped_policy_is_found_by_name(run, shelf, monkeypatch, capsys):
+    assert main([str(run), "--ship", "--episodes", "2", "--robots", "0"]) == 0
+    folder = shelf / "mini_cheetah_velocity_exact"
+    assert {file.name for file in folder.iterdir()} == {"policy.npz", "card.md", "curve.png"}
+    assert policy_file.shipped() == ["mini_cheetah_velocity_exact"]
+    obs = np.random.default_rng(0).standard_normal((64, 48)).astype(np.float32)
+    expected = read_policy(run / "policy.zip").predict(obs)[0]
+    for name in ("mini_cheetah_velocity_exact", "mini_cheetah_velocity", folder, folder / "policy.npz"):
+        np.testing.assert_array_equal(read_policy(name).predict(obs)[0], expected)
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 200_000
+    assert folder.joinpath("policy.npz").stat().st_size < 0.5 * (run / "policy.zip").stat().st_size
+    text = (folder / "card.md").read_text()
+    assert str(run) not in text
+    assert "Not judged: not asked for" in text
+    capsys.readouterr()
+    assert evaluate_main(["mini_cheetah_velocity", "--episodes", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["effort"]["motors"]
+    monkeypatch.chdir(shelf.parent)
+    assert record_main(["mini_cheetah_velocity", "--command", "0.2", "0", "0", "0"]) == 0
+    assert Path("mini_cheetah_velocity_exact.html").exists()  # not in the assets
+
+
+def test_the_command_on_the_card_makes_the_same_job(run):
+    record = read_policy(run).record
+    words = shlex.split(command(record))
+    assert words[:2] == ["python", "train/ppo.py"]
+    (job,) = jobs(parser().parse_args(words[2:]))
+    assert (job.env_id, job.seed, job.resume) == (record["env"], record["seed"], None)
+    assert json.loads(json.dumps(job.settings.as_dict())) == record["settings"]
+    kwargs = {"transmission": "none", "obs_mode": "dict", "critic": ["contact_forces", "rotor_speeds"]}
+    (job,) = jobs(parser().parse_args(shlex.split(command(record | {"env_kwargs": kwargs}))[2:]))
+    assert job.env_kwargs == kwargs
+
+
+def test_a_run_that_a_deadline_ended_is_repeated_that_long(run):
+    record = read_policy(run).record
+    (job,) = jobs(parser().parse_args(shlex.split(command(record | {"steps": 512}))[2:]))
+    assert job.settings.steps == 512
+
+
+@pytest.mark.parametrize(
+    ("change", "words"), [({"resumed_from": "x.zip"}, "resumed from x.zip"), ({"env_kwargs": {"dt": 0.002}}, "dt")]
+)
+def test_what_no_command_repeats_is_said(run, change, words):
+    record = read_policy(run).record | change
+    with pytest.raises(PolicyError, match=words):
+        command(record)
+
+
+def test_a_card_says_what_was_measured(run):
+    record = read_policy(run).record
+    figures = {"forward_error": 0.123, "lateral_error": 0.2, "yaw_rate_error": 0.3, "falls": 0.456, "reward": 7.0}
+    figures |= {"episodes": 12, "velocity_error": 0.321}
+    pushes = {"command": [0.5, 0, 0], "speeds": [1.0], "directions": [0.0], "survived": [[0.25]]}
+    simulations = {"ce_gym, exact": figures, "MuJoCo, rotors as bodies": figures | {"falls": 0.02}}
+    verdict = {"MuJoCo, rotors as bodies": {"passed": True}}
+    sim2sim = {"simulations": simulations, "verdict": verdict}
+    result = {"levels": {"exact": figures}, "effort": {}, "pushes": pushes, "sim2sim": sim2sim}
+    curve = [{"steps": 1, "seconds": 98.7, "reward": 1.0, "length": 1.0}]
+    text = card(record, result, curve, short_name(record))
+    for words in ("0.123", "45.6%", "25%", "2.0%", "passed", "99 s", ROBOT_ENV, "[32, 16]", "curve.png"):
+        assert words in text, words
+    assert "## Motors" not in text
+
+
+def test_no_path_of_this_machine_is_shipped(run):
+    record = portable(read_policy(run).record | {"resumed_from": "/home/somebody/runs/policy.zip"})
+    assert record["resumed_from"] == "policy.zip"
+
+
+class Bomb:
+    def __reduce__(self):
+        return (Path.touch, (Path("exploded"),))
+
+
+def test_a_small_policy_file_runs_no_code(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_npz(*read_actor(run), tmp_path / "policy.npz")
+    with np.load("policy.npz") as file:
+        arrays = dict(file)
+    for name in ("record", "weight_0"):
+        np.savez("bad.npz", **arrays | {name: np.array([Bomb()], dtype=object)})
+        with pytest.raises(PolicyError, match=r"bad\.npz"):
+            read_policy("bad.npz")
+    (tmp_path / "bad.npz").write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(PolicyError, match=r"bad\.npz"):
+        read_policy("bad.npz")
+    assert not Path("exploded").exists()
+
+
+def test_damage_is_told_in_one_line(run, tmp_path):
+    file = tmp_path / "policy.npz"
+    write_npz(*read_actor(run), file)
+    whole = file.read_bytes()
+    with np.load(file) as opened:
+        arrays = dict(opened)
+    for content in (b"", b"nothing", whole[: len(whole) // 2]):
+        file.write_bytes(content)
+        with pytest.raises(PolicyError, match=r"policy\.npz: no weights"):
+            read_policy(file)
+    for name, bad in (("weight_1", arrays["weight_1"][:, 1:]), ("weight_2", arrays["weight_2"][:-1])):
+        np.savez(file, **arrays | {name: bad})
+        with pytest.raises(PolicyError, match="a layer takes"):
+            read_policy(file)
+    np.savez(file, **{name: arrays[name] for name in ("record", "weight_0", "bias_0")})
+    with pytest.raises(PolicyError, match="gives 32 numbers; expected the 12"):
+        read_policy(file)
+
+
+def test_what_is_not_there_is_told_with_what_is(shelf, run, tmp_path):
+    shutil.copytree(run, tmp_path / "copy")
+    assert locate(tmp_path / "copy") == tmp_path / "copy" / "policy.zip"
+    assert locate(tmp_path / "copy" / "policy") == tmp_path / "copy" / "policy.zip"
+    (shelf / "dog_walk_none").mkdir(parents=True)
+    (shelf / "dog_walk_none" / "policy.npz").touch()
+    for name in ("cat_walk", str(tmp_path)):
+        with pytest.raises(PolicyError, match=r"no such policy; expected .* \(there are: dog_walk_none\)") as caught:
+            locate(name)
+        assert "\n" not in str(caught.value)
+
+
+def test_everything_that_is_installed_stays_small(tmp_path):
+    """What goes into the wheel, packed as a wheel is: code and assets, shipped policies among them."""
+    package = Path(ce_gym.__file__).parent
+    assets = ce_gym.model.assets_folder()
+    with zipfile.ZipFile(tmp_path / "wheel.zip", "w", zipfile.ZIP_DEFLATED) as wheel:
+        for folder in {package, assets}:
+            for file in folder.rglob("*"):
+                if file.is_file() and "__pycache__" not in file.parts:
+                    wheel.write(file, file.relative_to(folder.parent))
+    assert (tmp_path / "wheel.zip").stat().st_size < 5e6

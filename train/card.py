@@ -1,0 +1,219 @@
+"""Write the card of a trained policy: what it is, how it was trained, how good it is, how to repeat it.
+
+From the folder of a training run: `card.md`, `curve.png` and `policy.npz`, the actor's weights and the record, small
+and safe to open. With `--ship` they go where shipped policies lie, under `<robot>_<task>_<level>`, the short name by
+which the other programs find it. Uses public names of ce_gym only, and no name of a robot or task.
+
+    python train/card.py runs/mini_cheetah_velocity
+    python train/card.py runs/mini_cheetah_velocity --ship
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+from callbacks import read_curve
+from console import Table, add_json_argument, markdown, positive, print_result, run
+from effort import effort
+from evaluate import EVALUATION_SEED, evaluate
+from pictures import draw_curve
+from policy_file import SHIPPED, Policy, PolicyError, locate, read_actor, write_npz
+from pushes import direction_name, push_envelope
+from settings import config_file, load_settings
+from transfer import LEVELS
+
+
+def judged(policy: Policy, episodes: int, sim2sim_robots: int, seed: int = EVALUATION_SEED) -> dict[str, Any]:
+    """Judge a policy for its card.
+
+    Args:
+        policy: With its record.
+        episodes: Episodes on each level.
+        sim2sim_robots: Robots in MuJoCo; 0 leaves that out.
+        seed: Of the first episode.
+
+    Returns:
+        levels: result of `evaluate` by level; effort and pushes, on the level of training; sim2sim, or sim2sim_missing,
+        one line that says why there is none.
+    """
+    record, kwargs = policy.record, policy.record["env_kwargs"]
+    levels = {
+        level: evaluate(policy, record["env"], episodes=episodes, seed=seed, **{**kwargs, "transmission": level})
+        for level in LEVELS
+    }
+    result: dict[str, Any] = {"levels": levels, "effort": effort(policy, seed=seed, **kwargs)}
+    result["pushes"] = push_envelope(policy, seed=seed, **kwargs)
+    if not sim2sim_robots:
+        return result | {"sim2sim_missing": "not asked for"}
+    try:
+        from sim2sim import compare
+
+        return result | {"sim2sim": compare(policy, episodes=sim2sim_robots, seed=seed)}
+    except ImportError:
+        return result | {"sim2sim_missing": "MuJoCo is not installed: pip install ce_gym[mjcf]"}
+    except ValueError as error:  # MuJoCo cannot express every robot
+        return result | {"sim2sim_missing": " ".join(str(error).split())}
+
+
+def command(record: dict[str, Any]) -> str:
+    """Return the command line that repeats a training run.
+
+    Raises:
+        PolicyError: If none can: the policy goes on from another one, or its environment has arguments that
+            `train/ppo.py` does not take.
+    """
+    if record["resumed_from"]:
+        raise PolicyError(f"resumed from {record['resumed_from']}; expected a run from the beginning")
+    words = ["python", "train/ppo.py", "--env", record["env"], "--seed", str(record["seed"])]
+    kwargs = dict(record["env_kwargs"])
+    if level := kwargs.pop("transmission", None):
+        words += ["--transmission", level]
+    if "critic" in kwargs and kwargs.pop("obs_mode", None) == "dict":
+        words += ["--critic", *kwargs.pop("critic")]
+    if kwargs:
+        raise PolicyError(f"env_kwargs: {', '.join(kwargs)}; expected none that train/ppo.py does not take")
+    usual = json.loads(json.dumps(load_settings(config_file(record["env"])).as_dict()))
+    chosen = record["settings"] | {"steps": min(record["settings"]["steps"], record["steps"])}  # a deadline may end it
+    changed = {key: value for key, value in chosen.items() if value != usual[key]}
+    words += ["--set", *(f"{key}={value}" for key, value in changed.items())] if changed else []
+    return shlex.join(words)
+
+
+def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, float]], name: str) -> str:
+    """Return the card as Markdown.
+
+    Args:
+        record: Of the policy.
+        result: As `judged` returns it.
+        curve: Rows of the learning curve.
+        name: Of the policy.
+    """
+    versions = ", ".join(f"{package} {number}" for package, number in record["versions"].items())
+    seconds = max([record["training_seconds"], *(row["seconds"] for row in curve)])
+    facts: Table = [
+        ["what", ""],
+        ["environment", f"`{record['env']}`"],
+        ["trained on", f"`{record['transmission']}` transmissions"],
+        ["seed", str(record["seed"])],
+        ["steps", f"{record['steps']:,}"],
+        ["wall-clock time", f"{seconds:.0f} s"],
+        ["observation, action", f"{record['observation_size']} numbers, {record['action_size']} numbers"],
+        ["date", record["date"]],
+        ["versions", versions],
+    ]
+    settings: Table = [["setting", "value"], *([key, str(value)] for key, value in record["settings"].items())]
+    parts = [
+        f"# {name}",
+        f"{markdown(facts)}\n\n{_how_to_repeat(record)}",
+        *(["![Learning curve](curve.png)"] if curve else []),
+        f"## On every transmission level\n\n{_levels(record, result['levels'])}",
+        *([f"## Motors\n\n{_motors(result['effort'])}"] if result["effort"] else []),
+        f"## Pushes\n\n{_pushes(result['pushes'])}",
+        f"## In MuJoCo\n\n{_sim2sim(result)}",
+        f"## Settings\n\n{markdown(settings)}",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _how_to_repeat(record: dict[str, Any]) -> str:
+    try:
+        return f"Trained by\n\n```sh\n{command(record)}\n```"
+    except PolicyError as error:
+        return f"No single command repeats it: {error}"
+
+
+def _levels(record: dict[str, Any], levels: dict[str, dict[str, float]]) -> str:
+    titles = ["judged on", "forward [m/s]", "sideways [m/s]", "yaw rate [rad/s]", "falls", "reward"]
+    keys = (("forward_error", ".3f"), ("lateral_error", ".3f"), ("yaw_rate_error", ".3f"), ("falls", ".1%"))
+    rows = [titles]
+    for level, figures in levels.items():
+        own = " (trained)" if level == record["transmission"] else ""
+        rows.append([f"`{level}`{own}", *(f"{figures[key]:{form}}" for key, form in (*keys, ("reward", ".2f")))])
+    count, length = figures["episodes"], record["contract"]["control_dt"]
+    return f"{markdown(rows)}\n\nMean absolute errors over every step of {count} episodes; a step is {length:g} s."
+
+
+def _motors(found: dict[str, Any]) -> str:
+    rows: Table = [["", ""], ["mean speed", f"{found['speed']:.2f} m/s"], ["power", f"{found['power']:.0f} W"]]
+    if found["cost_of_transport"] is not None:
+        rows.append(["cost of transport", f"{found['cost_of_transport']:.2f}"])
+        rows.append(["the same, braking recovered", f"{found['cost_of_transport_net']:.2f}"])
+    for what in ("torque", "power"):
+        if found[f"mean_{what}"] is not None:
+            peak = f"{found[f'peak_{what}']:.0%} of its limit (`{found[f'peak_{what}_at']}`)"
+            rows += [[f"mean {what} of a motor", f"{found[f'mean_{what}']:.0%} of its limit"], [f"peak {what}", peak]]
+    return f"{markdown(rows)}\n\nMechanical, at the rotors, every sub-step counted, on random commands."
+
+
+def _pushes(found: dict[str, Any]) -> str:
+    rows: Table = [["pushed towards", *(f"{speed:g} m/s" for speed in found["speeds"])]]
+    for angle, row in zip(found["directions"], found["survived"], strict=True):
+        rows.append([direction_name(angle), *(f"{share:.0%}" for share in row)])
+    walking = f"{found['command'][0]:g} m/s forward"
+    return f"{markdown(rows)}\n\nShare on its feet after a sudden change of velocity, at {walking}."
+
+
+def _sim2sim(result: dict[str, Any]) -> str:
+    if "sim2sim" not in result:
+        return f"Not judged: {result['sim2sim_missing']}"
+    rows: Table = [["simulated by", "velocity error [m/s]", "yaw rate error [rad/s]", "falls", "verdict"]]
+    for name, figures in result["sim2sim"]["simulations"].items():
+        verdict = result["sim2sim"]["verdict"].get(name)
+        said = "" if verdict is None else "passed" if verdict["passed"] else "failed"
+        errors = [f"{figures[key]:.3f}" for key in ("velocity_error", "yaw_rate_error")]
+        rows.append([name, *errors, f"{figures['falls']:.1%}", said])
+    return f"{markdown(rows)}\n\nRandom commands, one for each robot; `python train/sim2sim.py` says what is asked for."
+
+
+def short_name(record: dict[str, Any]) -> str:
+    """The name under which a policy is shipped."""
+    contract = record["contract"]
+    return f"{contract['robot']}_{contract['task']}_{record['transmission']}"
+
+
+def portable(record: dict[str, Any]) -> dict[str, Any]:
+    """A record without paths of the machine it was written on."""
+    resumed = record.get("resumed_from")
+    return record | {"resumed_from": Path(resumed).name if resumed else None}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line of this file."""
+    parser = argparse.ArgumentParser(
+        description="Judge the policy of a training run and write its card, its learning curve and policy.npz."
+    )
+    parser.add_argument("run", help="folder of train/ppo.py, or the policy.zip in it")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--out", type=Path, metavar="FOLDER", help="where to write (default: the run's folder)")
+    where.add_argument("--ship", action="store_true", help="write to assets/policies/<robot>_<task>_<level>")
+    parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes on each level (default 256)")
+    parser.add_argument("--robots", type=int, default=50, metavar="N", help="robots in MuJoCo; 0: none (default 50)")
+    add_json_argument(parser)
+    args = parser.parse_args(argv)
+    positive(parser, episodes=args.episodes)
+    return run("card.py", lambda: _work(args))
+
+
+def _work(args: argparse.Namespace) -> int:
+    """Judge, and write the three files."""
+    source = locate(args.run)
+    actor, record = read_actor(source)
+    record, curve = portable(record), read_curve(source.parent / "curve.csv")
+    name = short_name(record)
+    out = SHIPPED / name if args.ship else args.out or source.parent
+    result = judged(Policy(actor, record), args.episodes, args.robots)
+    out.mkdir(parents=True, exist_ok=True)
+    write_npz(actor, record, out / "policy.npz")
+    if curve:
+        draw_curve(curve, name, out / "curve.png")
+    (out / "card.md").write_text(card(record, result, curve, name), encoding="utf-8")
+    print_result(result, str(out / "card.md"), args.json)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,67 @@
+"""What the judging programs have in common on the command line: results as text and JSON, errors in one line.
+
+Knows nothing of policies, environments or robots.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+Table = list[list[str]]
+"""Rows of cells, the heading first."""
+
+
+def run(program: str, work: Callable[[], int]) -> int:
+    """Do the work of a program and return its exit code: 2 after a mistake that a user can mend, told in one line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: print(f"{program}: warning: {message}", file=sys.stderr)
+            return work()
+    except OSError as error:
+        print(f"{program}: {error.filename}: {error.strerror or error}", file=sys.stderr)
+        return 2
+    except (ValueError, gymnasium.error.Error) as error:
+        print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+
+
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`, which `print_result` understands."""
+    text = "write the result to FILE as JSON as well; without FILE, print JSON and nothing else"
+    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help=text)
+
+
+def print_result(result: Any, text: str, json_file: str | None) -> None:
+    """Print a result as `text`, and write it as JSON where `--json` says.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    data = json.dumps(result, indent=2)
+    print(data if json_file == "-" else text)
+    if json_file not in (None, "-"):
+        Path(str(json_file)).write_text(data + "\n", encoding="utf-8")
+
+
+def positive(parser: argparse.ArgumentParser, **arguments: float) -> None:
+    """End the program with one line if an argument that must be above 0 is not."""
+    for name, value in arguments.items():
+        if not value > 0:
+            parser.error(f"--{name}: {value:g}; expected more than 0")
+
+
+def markdown(table: Table) -> str:
+    """Return a table as Markdown whose columns are aligned, so that it reads well as it is."""
+    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
+    heading, *rows = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in table
+    ]
+    return "\n".join([heading, "|" + "|".join("-" * (width + 2) for width in widths) + "|", *rows])
