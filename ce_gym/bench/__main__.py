@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-BENCHMARKS = ("speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy")
+BENCHMARKS = ("speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak")
 
 
 def summary(name: str) -> str:

@@ -6,7 +6,7 @@ cluster. A saturated motor gives a constant torque and has no slope.
 Controllers ask for torques at the joints. "Ideal" motors deliver them up to the joints' limits. "Limited" motors are
 the ones the robot has: their torques `tau_m` and speeds `W yd` belong to rotors, with `W` the rows of the constraint
 Jacobian, and what they do to the joints is `W^T tau_m`. Limits and friction there do not depend on the transmission
-level. May know CasADi, descriptions and kinematics.
+level. May know CasADi, descriptions, mechanisms and kinematics.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ce_gym.dynamics.kinematics import Kinematics
 from ce_gym.dynamics.scene import Scene
 from ce_gym.dynamics.spatial import SX
 from ce_gym.model.description import Motor, Robot
+from ce_gym.model.mechanism import Mechanism
 
 LIMIT_FREQUENCY = 2 * math.pi * 20.0
 """Stiffness over damping of a soft joint limit [1/s]; the stop relaxes in the inverse of it, 8 ms."""
@@ -54,45 +55,74 @@ def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce
 
 def motor_forces(scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float) -> JointForce:
     """Return what the motors deliver of the torques they are asked for."""
-    robot, strength = scene.mechanism.robot, scene.figures.strength
+    strength = scene.figures.strength
     force = JointForce(strength * asked.tau, strength * asked.slope)
-    actuated = actuated_clusters(scene, kinematics) if scene.options.motors == "limited" else []
-    for rows, W, motors in actuated:
+    actuated = actuated_clusters(scene.mechanism, kinematics) if scene.options.motors == "limited" else []
+    for cluster in actuated:
+        rows = cluster.rows
         local = JointForce(force.tau[rows], force.slope[rows, rows])
-        local = _through_motors(local, W, W @ yd[rows], motors, strength, dt)
+        local = _through_motors(local, cluster, yd, strength, dt)
         force.tau[rows], force.slope[rows, rows] = local.tau, local.slope
-    driven = {row for rows, _, _ in actuated for row in rows}
-    for row, name in enumerate(robot.independent):
-        limit = robot.body(name).joint.torque
-        if row not in driven and not math.isinf(limit):
+    driven = {row for cluster in actuated for row in cluster.rows}
+    return within_joint_limits(scene, force, [row for row in range(yd.numel()) if row not in driven])
+
+
+def within_joint_limits(scene: Scene, force: JointForce, rows: list[int]) -> JointForce:
+    """Return a force of the motors that the joints `rows` limit; it is changed in place."""
+    robot, strength = scene.mechanism.robot, scene.figures.strength
+    for row in rows:
+        limit = robot.body(robot.independent[row]).joint.torque
+        if not math.isinf(limit):
             tau, limit = force.tau[row], strength * limit
             force.slope[row, row] = ca.if_else(ca.fabs(tau) > limit, 0, force.slope[row, row])
             force.tau[row] = ca.fmax(-limit, ca.fmin(limit, tau))
     return JointForce(force.tau, ca.sparsify(force.slope))
 
 
-def actuated_clusters(scene: Scene, kinematics: Kinematics) -> list[tuple[list[int], SX, list[Motor]]]:
-    """Return, for each cluster with motors, its rows of `y`, the matrix `W` (n_motors, d), and its motors.
+@dataclass
+class Actuated:
+    """A cluster with motors at one state.
 
-    Row i of `W` is the speed of motor i for unit velocities of the independent joints (footnote on general actuation
-    of arXiv:2311.13732); torques of motors go the other way, `tau = W^T tau_m`.
+    Attributes:
+        rows: Its rows of `y`, d of them.
+        motors: Its motors.
+        angles: Of the motors' rotors [rad], shape (n_motors,).
+        W: Speeds of the motors for unit velocities of the independent joints, shape (n_motors, d) (footnote on general
+            actuation of arXiv:2311.13732); torques of motors go the other way, `tau = W^T tau_m`.
     """
-    mechanism, first = scene.mechanism, 6 if scene.mechanism.robot.floating else 0
+
+    rows: list[int]
+    motors: list[Motor]
+    angles: SX
+    W: SX
+
+
+def actuated_clusters(mechanism: Mechanism, kinematics: Kinematics) -> list[Actuated]:
+    """Return the clusters with motors."""
+    first = 6 if mechanism.robot.floating else 0
     found = []
     for cluster, rows, coordinates in zip(
         mechanism.tree.clusters, kinematics.rows, kinematics.coordinates, strict=True
     ):
         motors = [motor for motor in mechanism.robot.motors if motor.rotor in cluster.bodies]
         if motors and coordinates is not None:
-            W = coordinates.G[[coordinates.index[motor.rotor] for motor in motors], :]
-            found.append(([row - first for row in rows], ca.sparsify(W), motors))
+            turning = [coordinates.index[motor.rotor] for motor in motors]
+            W = ca.sparsify(coordinates.G[turning, :])
+            found.append(Actuated([row - first for row in rows], motors, coordinates.q[turning], W))
     return found
 
 
-def _through_motors(asked: JointForce, W: SX, speed: SX, motors: list[Motor], strength: SX, dt: float) -> JointForce:
-    """Share joint torques out to motors, limit each, take its friction off, and carry the sum back to the joints."""
-    to_motors = _effort_matrix(W)
-    tau, slope = to_motors @ asked.tau, to_motors @ asked.slope @ to_motors.T
+def _through_motors(asked: JointForce, cluster: Actuated, yd: SX, strength: SX, dt: float) -> JointForce:
+    """Share joint torques out to motors and carry back to the joints what those deliver."""
+    to_motors = _effort_matrix(cluster.W)
+    shares = JointForce(to_motors @ asked.tau, to_motors @ asked.slope @ to_motors.T)
+    return delivered(shares, cluster, yd, strength, dt)
+
+
+def delivered(asked: JointForce, cluster: Actuated, yd: SX, strength: SX, dt: float) -> JointForce:
+    """Limit the torques that motors are asked for, take friction off each, and carry the sum to the joints."""
+    W, motors, speed = cluster.W, cluster.motors, cluster.W @ yd[cluster.rows]
+    tau, slope = SX(asked.tau), asked.slope
     free, own = SX.eye(len(motors)), SX(len(motors), len(motors))
     for i, motor in enumerate(motors):
         if math.isfinite(motor.torque) or math.isfinite(motor.velocity):

@@ -11,7 +11,7 @@ linear; closure.py does the others. May know descriptions and CasADi.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -82,6 +82,14 @@ def loop_coordinates(cluster: Cluster, closure: Closure, y: SX, yd: SX, guess: S
     guessed = tuple(closure.assembly.unknown[j] for j in closure.guessed)
     loop = LoopState(guessed, gap, nearness)
     return ClusterCoordinates({name: i for i, name in enumerate(cluster.bodies)}, q, qd, G, g, loop)
+
+
+def geared(coordinates: ClusterCoordinates, rotors: list[str], ratio: SX | float) -> ClusterCoordinates:
+    """Return coordinates whose rotors turn `ratio` times as far; nothing else follows from them."""
+    scale = SX.ones(coordinates.q.numel())
+    scale[[coordinates.index[name] for name in rotors]] = ratio
+    q, qd, g = scale * coordinates.q, scale * coordinates.qd, scale * coordinates.g
+    return replace(coordinates, q=q, qd=qd, G=ca.sparsify(ca.diag(scale) @ coordinates.G), g=g)
 
 
 def explicit_constraint(cluster: Cluster, y: SX) -> SX:

@@ -13,6 +13,7 @@ import casadi as ca
 from ce_gym.dynamics.actuation import limit_stiffness
 from ce_gym.dynamics.functions import kinetic_and_potential
 from ce_gym.dynamics.kinematics import outward_velocity_pass
+from ce_gym.dynamics.motor_control import motor_springs
 from ce_gym.dynamics.scene import Scene, State
 from ce_gym.dynamics.spatial import SX
 from ce_gym.dynamics.step import no_hints, touching
@@ -27,7 +28,7 @@ def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
     Args:
         scene: The robot and what surrounds it.
         state: Of the robot.
-        target: Joint targets, or torques, which have no energy, shape (nj,).
+        target: Targets, or torques, which have no energy, shape (n_targets,), see `target_names`.
     """
     kinetic, potential = kinetic_and_potential(scene.mechanism, state.q, state.v, state.dependent)
     return kinetic + potential + contact_energy(scene, state) + joint_energy(scene, state, target)
@@ -53,4 +54,8 @@ def joint_energy(scene: Scene, state: State, target: SX) -> SX:
         total += limit_stiffness(robot, name)[0] * beyond**2 / 2
     if scene.options.control == "position":
         total += ca.sum1(scene.figures.strength * scene.figures.kp * (target - y) ** 2) / 2
+    if scene.options.control == "motor_position":
+        kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
+        stiffness, stretch = motor_springs(scene, kinematics, y, target)
+        total += ca.sum1(scene.figures.strength * stiffness * stretch**2) / 2
     return total

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.closure import closures, reference_guess
-from ce_gym.dynamics.constraints import ClusterCoordinates, cluster_coordinates, loop_coordinates
+from ce_gym.dynamics.constraints import ClusterCoordinates, cluster_coordinates, geared, loop_coordinates
 from ce_gym.dynamics.spatial import (
     SX,
     Transform,
@@ -118,6 +118,9 @@ def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None =
         else:
             first, used = used, used + len(closure.guessed)
             coordinates = loop_coordinates(cluster, closure, y, yd, guess[first:used])
+        if mechanism.ratio is not None:
+            rotors = [name for name in cluster.bodies if mechanism.robot.body(name).kind == "rotor"]
+            coordinates = geared(coordinates, rotors, mechanism.ratio)
         kinematics.coordinates.append(coordinates)
         for body in mechanism.moving(cluster):
             i = coordinates.index[body.name]

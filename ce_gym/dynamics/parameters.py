@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ce_gym.dynamics.contact import Compliance
 from ce_gym.dynamics.spatial import SX, skew
-from ce_gym.model.description import ContactMaterial, Robot
+from ce_gym.model.description import ContactMaterial, LinearConstraint, Robot
 from ce_gym.model.mechanism import Mechanism, MovingBody
 
 PARAMETERS = {
@@ -26,6 +26,7 @@ PARAMETERS = {
     "kd": "velocity gains of the joints [N m s/rad or N s/m], n_joints",
     "motor_strength": "factor on motor torques and their limits [-], 1",
     "rotor_inertia": "factor on the spin inertia of symmetric rotors [-], 1",
+    "ratio": "factor on the gear ratios: how far rotors turn for a motion of the joints [-], 1",
     "added_mass:BODY": "mass added at the centre of mass of a body [kg], 1",
     "com_shift:BODY": "shift of the centre of mass of a body, in its frame [m], 3",
 }
@@ -66,6 +67,7 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
         "kd": np.array([gains["kd"].get(name, 0.0) for name in robot.independent]),
         "motor_strength": np.ones(1),
         "rotor_inertia": np.ones(1),
+        "ratio": np.ones(1),
     }
     links = [body.name for body in robot.bodies if body.kind == "link"]
     plain |= {f"added_mass:{link}": np.zeros(1) for link in links}
@@ -73,6 +75,8 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
     for name in names:
         if name not in plain:
             raise ValueError(f"parameters={name!r}; expected one of {', '.join(PARAMETERS)}, BODY being a link")
+    if "ratio" in names:
+        check_ratios(robot)
     return {name: plain[name] for name in names}
 
 
@@ -104,7 +108,21 @@ def with_parameters(mechanism: Mechanism, names: tuple[str, ...], values: SX) ->
     spins = mechanism.spins
     if factor is not None:
         spins = tuple(tuple(replace(spin, inertia=spin.inertia * factor) for spin in group) for group in spins)
-    return replace(mechanism, bodies=bodies, spins=spins, gravity=given.get("gravity", mechanism.gravity))
+    ratio, gravity = given.get("ratio", mechanism.ratio), given.get("gravity", mechanism.gravity)
+    return replace(mechanism, bodies=bodies, spins=spins, gravity=gravity, ratio=ratio)
+
+
+def check_ratios(robot: Robot) -> None:
+    """Check that the angles of all rotors follow from those of links by linear ties, so that a factor scales them.
+
+    Raises:
+        ValueError: A rotor is an independent joint, or is tied by something else than gears and belts.
+    """
+    rotors = {rotor.name for rotor in robot.rotors()}
+    other = {name for tie in robot.constraints if not isinstance(tie, LinearConstraint) for name in tie.bodies}
+    if bad := sorted(rotors & (other | set(robot.independent))):
+        expected = "expected rotors that follow from links by gears and belts alone"
+        raise ValueError(f"parameters='ratio': {bad[0]} of {robot.name}; {expected}")
 
 
 def _split(robot: Robot, material: ContactMaterial, names: tuple[str, ...], values: SX) -> dict[str, SX]:

@@ -11,7 +11,7 @@ from ce_gym.dynamics.spatial import SX
 from ce_gym.model.description import ContactMaterial
 from ce_gym.model.mechanism import Mechanism
 
-Control = Literal["position", "torque"]
+Control = Literal["position", "torque", "motor_position", "motor_torque"]
 Friction = Literal["tangent", "secant"]
 Motors = Literal["ideal", "limited"]
 Ground = Literal["flat", "field"]
@@ -23,7 +23,8 @@ class StepOptions:
 
     Attributes:
         dt: Length of the step [s]; None makes it an input of the traced step.
-        control: "position" for joint targets [rad or m] through the robot's gains, "torque" for joint torques.
+        control: "position" for joint targets [rad or m] through the robot's gains, "torque" for joint torques;
+            "motor_position" and "motor_torque" for angles and torques of the motors' rotors instead.
         contacts: Names of the contact spheres that can touch the ground.
         material: Compliance and friction of the contacts.
         friction: "tangent" solves a step in which a contact sticks or slips against expectation a second time; "secant"
@@ -93,6 +94,22 @@ class State:
     def items(self) -> list[tuple[str, SX]]:
         """Return the parts that are there, by name."""
         return [(f.name, getattr(self, f.name)) for f in fields(self) if getattr(self, f.name).numel()]
+
+
+def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:
+    """Return what each entry of a step's target is for, by the name of the body that it moves.
+
+    The independent joints; or, for control at the motors, the motors' rotors and then the joints that no motor drives,
+    which are controlled as joints.
+    """
+    robot = mechanism.robot
+    if control in ("position", "torque"):
+        return robot.independent
+    rotors = tuple(motor.rotor for motor in robot.motors)
+    driven = {
+        name for cluster in mechanism.tree.clusters if set(rotors) & set(cluster.bodies) for name in cluster.bodies
+    }
+    return rotors + tuple(name for name in robot.independent if name not in driven)
 
 
 def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from ce_gym.dynamics.actuation import JointForce, controller, motor_forces, passive_forces
+from ce_gym.dynamics.actuation import JointForce, passive_forces
 from ce_gym.dynamics.ce_aba import (
     BodyTerms,
     JointTerms,
@@ -25,6 +25,7 @@ from ce_gym.dynamics.functions import guessed_coordinates
 from ce_gym.dynamics.gyroscope import Whirl, turning_momentum
 from ce_gym.dynamics.integration import advance
 from ce_gym.dynamics.kinematics import Kinematics, constant, outward_velocity_pass
+from ce_gym.dynamics.motor_control import commanded_forces
 from ce_gym.dynamics.scene import Scene, State, StepOptions
 from ce_gym.dynamics.spatial import SX
 from ce_gym.model.description import ContactSphere
@@ -58,7 +59,7 @@ def solve(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Solve
     Args:
         scene: The robot and what surrounds it.
         state: At the start of the step.
-        target: Joint targets or torques, shape (nj,), see `StepOptions.control`.
+        target: Targets or torques of what `target_names` says, shape (n_targets,).
         dt: Length of the step [s].
         hints: What the attempt before has found, shape (Hint.SIZE, n_contacts); zero for the first.
     """
@@ -66,7 +67,7 @@ def solve(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Solve
     y, yd = state.q[state.q.shape[0] - n :], state.v[state.v.shape[0] - n :]
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
 
-    motors = motor_forces(scene, kinematics, controller(scene, y, yd, target, dt), yd, dt)
+    motors = commanded_forces(scene, kinematics, y, yd, target, dt)
     joints = on_coordinates(mechanism, motors + passive_forces(mechanism.robot, y, yd, dt))
     contacts = touching(scene, kinematics, state, dt, hints)
     if scene.options.friction == "secant":

@@ -15,7 +15,7 @@ from ce_gym.dynamics.functions import loop_gap, loop_state, traced
 from ce_gym.dynamics.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.methods import METHODS, beyond
 from ce_gym.dynamics.parameters import parameter_defaults
-from ce_gym.dynamics.scene import State, StepOptions, make_scene, symbolic_state
+from ce_gym.dynamics.scene import State, StepOptions, make_scene, symbolic_state, target_names
 from ce_gym.dynamics.spatial import SX
 from ce_gym.dynamics.step import Stepped, attempt, stacked
 from ce_gym.model.mechanism import Mechanism
@@ -120,7 +120,7 @@ class _Given:
         robot, n = mechanism.robot, len(options.contacts)
         self.mechanism = mechanism
         self.state, self.diverged = symbolic_state(mechanism, options), SX.sym("diverged")
-        self.target = SX.sym("target", len(robot.independent))
+        self.target = SX.sym("target", len(target_names(mechanism, options.control)))
         defaults = parameter_defaults(robot, options.material, options.parameters)
         self.parameters = SX.sym("parameters", sum(len(default) for default in defaults.values()))
         self.ground = SX.sym("ground", 3, n if options.ground == "field" else 0)
@@ -146,11 +146,11 @@ class _Given:
         return results | {name: ca.vec(self._output(name, stepped)) for name in outputs}
 
     def _output(self, name: str, stepped: Stepped) -> SX:
-        n = self.target.numel()
+        n = len(self.mechanism.robot.independent)
         yd = stepped.state.v[stepped.state.v.numel() - n :]
         kinematics = stepped.solved.kinematics
         if name == "motor_speed":
-            return stacked([W @ yd[rows] for rows, W, _ in actuated_clusters(self.scene, kinematics)])
+            return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
         if name == "power":
             return stepped.torque * yd
         if name == "energy":

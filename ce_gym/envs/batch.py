@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.compile import Kernel, load_kernel
+from ce_gym.envs.fields import make_field
 from ce_gym.envs.program import TaskProgram
 from ce_gym.sim.simulator import model_key
+from ce_gym.sim.substeps import FRAME, HEIGHTS
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
 
@@ -52,13 +54,26 @@ class Batch:
         self.observation_size = self._step.buffers["observation"].size
         self._arrays = {name: tiles(num_envs, size, dtype) for name, size in program.state_sizes.items()}
         self._arrays["chosen"] = tiles(num_envs, 1, dtype)
+        if program.ground:
+            field = make_field(program.task.terrain)
+            self._arrays[FRAME] = tiles(num_envs, 3, dtype)
+            self._arrays[HEIGHTS] = field.heights.astype(dtype)
+            write_rows(self._arrays[FRAME], [*field.origin, field.cell])
+        self._judged = (*program.progress.sizes, "command", "clock") if program.progress.sizes else ()
         self.keys = np.zeros(num_envs, np.uint64)
         self._counters = np.zeros(num_envs, np.int64)
 
     def seed(self, keys: NDArray[np.uint64]) -> None:
-        """Start the random streams of all copies anew, one key for each, shape (num_envs,)."""
+        """Start the random streams and curricula of all copies anew, one key for each, shape (num_envs,)."""
         self.keys[:] = keys
         self._counters[:] = 0
+        for name, size in self.program.progress.sizes.items():
+            self.write(name, np.zeros((self.num_envs, size)))
+
+    def progress(self) -> dict[str, NDArray]:
+        """Return where the copies are in the curricula of the task, each shape (num_envs,)."""
+        names = {"level": "terrain_level", "grown": "times_grown"}
+        return {shown: self.rows(name)[:, 0] for name, shown in names.items() if name in self._arrays}
 
     def reset(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start new episodes where `mask` is true.
@@ -78,8 +93,10 @@ class Batch:
 
         Args:
             action: Shape (num_envs, n_actions), finite; clipped to [-1, 1].
-            ignored: Copies about to be reset, whose step must not use up random numbers, shape (num_envs,).
+            ignored: Copies about to be reset, whose step must not use up random numbers nor count in a curriculum,
+                shape (num_envs,).
         """
+        judged = {name: self.rows(name) for name in self._judged} if ignored is not None else {}
         observation = np.empty((self.num_envs, self.observation_size), np.float32)
         outcome = np.empty((self.num_envs, 3 + len(self.program.reward_terms)))
         self._step(
@@ -91,7 +108,11 @@ class Batch:
             num_threads=self.num_threads,
         )
         self._counters += 1 if ignored is None else ~ignored
+        for name, rows in judged.items():
+            self.write(name, rows, ignored)
         flags = outcome[:, 1:3] > 0.5
+        if flags[:, 1].any():  # whose state may have held anything when it was written, numbers that are none included
+            outcome[flags[:, 1]] = _finite(outcome[flags[:, 1]])
         return Outcome(observation, outcome[:, 0].copy(), flags[:, 0].copy(), flags[:, 1].copy(), outcome[:, 3:])
 
     def rows(self, name: str) -> NDArray:
@@ -112,7 +133,12 @@ class Batch:
         index = np.flatnonzero(mask)
         sums = np.zeros((self.num_envs, len(self.program.sum_names)))
         sums[index] = self._arrays["sums"][index // lanes, :, index % lanes]
-        return dict(zip(self.program.sum_names, sums.T, strict=True))
+        return dict(zip(self.program.sum_names, _finite(sums).T, strict=True))
+
+
+def _finite(values: NDArray) -> NDArray:
+    """Return values with 0 in place of what is not finite."""
+    return np.where(np.isfinite(values), values, 0.0)
 
 
 def _kernels(program: TaskProgram, dtype: str) -> tuple[Kernel, Kernel]:

@@ -18,6 +18,16 @@ from ce_gym.envs.program import OBSERVATION_BOUND, TaskProgram
 
 FORMAT = "ce_gym policy contract, version 1"
 
+MEANINGS = {
+    "joint_pd": "joint target [rad] = default_pose + scale * clip(action, -1, 1); torque = kp * (target - position) "
+    "- kd * velocity, within torque_limits; joints without an action hold the default pose",
+    "joint_torque": "joint torque [N m] = scale * clip(action, -1, 1); joints without an action have none",
+    "motor_pd": "rotor target [rad] = rest + scale * clip(action, -1, 1); the gains of a motor are those of its "
+    "joints as it feels them in the default pose while the other motors of its cluster are at rest",
+    "motor_torque": "rotor torque [N m] = scale * clip(action, -1, 1); motors without an action have none",
+}
+"""What an action means, by its kind."""
+
 COORDINATES = {
     "q": "base position in the world (3) [m], base quaternion w x y z, body to world (4), joints in the order of "
     "`joints` [rad]",
@@ -72,20 +82,13 @@ def contract(program: TaskProgram, task: str) -> dict[str, Any]:
 
 
 def _action(program: TaskProgram) -> dict[str, Any]:
-    names, chosen = program.model.robot.independent, program.task
-    limits = [program.model.robot.body(names[i]).joint.torque for i in program.moved]
-    position = chosen.actions == "joint_pd"
-    meaning = (
-        "joint target [rad] = default_pose + scale * clip(action, -1, 1); torque = kp * (target - position) "
-        "- kd * velocity, within torque_limits; joints without an action hold the default pose"
-        if position
-        else "joint torque [N m] = scale * clip(action, -1, 1); joints without an action have none"
-    )
+    actions, kind = program.actions, program.task.actions
     return {
-        "kind": chosen.actions,
-        "meaning": meaning,
-        "joints": [names[i] for i in program.moved],
-        "scale": [chosen.action_scale] * len(program.moved) if position else [float(limit) for limit in limits],
+        "kind": kind,
+        "meaning": MEANINGS[kind],
+        "motors" if kind.startswith("motor") else "joints": [actions.targets[i] for i in actions.moved],
+        "scale": [float(scale) for scale in actions.scale],
+        **({"rest": [float(actions.rest[i]) for i in actions.moved]} if kind == "motor_pd" else {}),
         "low": -1.0,
         "high": 1.0,
     }

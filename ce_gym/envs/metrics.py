@@ -41,3 +41,13 @@ def tilt_angle(s: Snapshot) -> SX:
 def highest_base(s: Snapshot) -> SX:
     """Height of the base above its standing height, where positive [m]."""
     return ca.fmax(0, s.base_height - s.mechanism.robot.pose.height)
+
+
+def terrain_level(s: Snapshot) -> SX:
+    """Level of the terrain on which the episode began, 0 the easiest."""
+    return s.terrain_level
+
+
+def times_grown(s: Snapshot) -> SX:
+    """How often the range of commands had grown when the episode began."""
+    return s.times_grown

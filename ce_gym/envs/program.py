@@ -10,30 +10,31 @@ May know dynamics, sim, compile and the term files; no Gymnasium.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from functools import cached_property
 from typing import Literal
 
 import casadi as ca
 import numpy as np
 
-from ce_gym.compile import Buffer, Call, Program, Repeat, Step
+from ce_gym.compile import Buffer, Call, Program, Step
 from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.scene import StepOptions, state_sizes
 from ce_gym.dynamics.spatial import SX
+from ce_gym.envs.actions import ActionMap
+from ce_gym.envs.commands import Commands
 from ce_gym.envs.draws import Draws
+from ce_gym.envs.ground import SEEN, Ground, starting_place
+from ce_gym.envs.progress import Progress
 from ce_gym.envs.randomisation import Randomised
 from ce_gym.envs.snapshot import Snapshot
 from ce_gym.envs.tasks import Task
 from ce_gym.envs.terms import find_term, is_added
 from ce_gym.sim.simulator import select_contacts
-from ce_gym.sim.substeps import substeps
+from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
 OBSERVATION_BOUND = 100.0
 """Observations are clipped here; blocks are of order one, so only a robot about to fail comes near it."""
-HEADING_GAIN = 0.5
-"""Commanded yaw rate for each radian between a robot and the heading it shall have [1/s]."""
 
 
 @dataclass
@@ -57,9 +58,11 @@ class TaskProgram:
         robot, task = self.model.robot, self.task
         if not robot.floating:
             raise ValueError(f"{robot.name} has a fixed base; a task needs a robot with a floating base")
+        self.progress = Progress(task)
+        self.commands = Commands(task, self.progress)
         self.reward_terms = {name: find_term("reward", name) for name in task.rewards}
         self.termination_terms = [find_term("termination", name) for name in task.terminations]
-        self.metric_terms = {name: find_term("metric", name) for name in task.metrics}
+        self.metric_terms = {name: find_term("metric", name) for name in (*task.metrics, *self.progress.metrics)}
         self.observation_terms = {name: find_term("observation", name) for name in task.observations}
         self.critic_terms = {name: find_term("observation", name) for name in task.critic}
         for name in task.noise:
@@ -70,21 +73,20 @@ class TaskProgram:
             raise ValueError(
                 f"latency={task.latency}; expected at most the {task.n_substeps} sub-steps of a control step"
             )
+        self.ground = Ground(self.model.mechanism, self.contacts) if self.progress.on_field else None
         self.randomised = Randomised(robot, task.randomise)
+        self.actions = ActionMap(self.model.mechanism, task)
         self.options = StepOptions(
             dt=task.dt,
-            control="position" if task.actions == "joint_pd" else "torque",
+            control=self.actions.control,
             contacts=self.contacts,
             material=robot.material,
             friction=task.friction,
             motors=task.motors,
+            ground="field" if self.ground and self.contacts else "flat",
             parameters=self.randomised.parameters,
         )
-        joints = robot.independent
-        self.moved = [i for i, n in enumerate(joints) if any(fnmatch(n, p) for p in task.action_joints)]
-        if not self.moved:
-            raise ValueError(f"action_joints={task.action_joints!r}; expected patterns of joints among {joints}")
-        self.n_joints, self.n_actions = len(joints), len(self.moved)
+        self.n_joints, self.n_actions = len(robot.independent), len(self.actions.moved)
         feet = {contact.body for contact in robot.contacts if contact.group == "foot"}
         self.n_feet = len(feet)
 
@@ -110,8 +112,9 @@ class TaskProgram:
             "parameters": self.randomised.size,
             "draw": self.randomised.n_draws,
             "delay": 1 if late else 0,
-            "target": self.n_joints if late else 0,
+            "target": len(self.actions.targets) if late else 0,
             "contact_forces": 3 * len(self.contacts) if self.contact_forces else 0,
+            **self.progress.sizes,
         }
         sizes = {name: size for name, size in sizes.items() if size}
         if self.task.history > 1:
@@ -171,7 +174,8 @@ class TaskProgram:
 
     def step_program(self) -> Program:
         """Return act, physics and assess as one program."""
-        act, (assess, n_draws) = self._act(), self._assess()
+        act, (assess, n_draws) = self.actions.act("delay" in self.state_sizes), self._assess()
+        look, seeing = self._look_at_ground()
         _, scratch, physics = substeps(self.model.mechanism, self.options, self._physics_outputs)
         buffers = [Buffer(name, size, "tiles") for name, size in self.state_sizes.items()]
         buffers += [
@@ -180,15 +184,16 @@ class TaskProgram:
             *([Buffer("draws", n_draws, "random")] if n_draws else []),
             Buffer("observation", self.observation_size + self.critic_size, "rows_out", "float32"),
             Buffer("outcome", 3 + len(self.reward_terms), "rows_out", "float64"),
-            *scratch,
+            *[buffer for buffer in scratch if buffer.kind != "table"],
+            *seeing,
         ]
         if "delay" in self.state_sizes:
-            buffers += [Buffer("new_target", self.n_joints, "scratch"), Buffer("waited", 1, "scratch")]
-            calls = (Call(act, ("action_in",), ("clipped", "new_target", "waited")), *self._delayed(physics))
+            buffers += [Buffer("new_target", len(self.actions.targets), "scratch"), Buffer("waited", 1, "scratch")]
+            calls = (Call(act, ("action_in",), ("clipped", "new_target", "waited")), *self.actions.delayed(physics))
         else:
-            buffers += [Buffer("target", self.n_joints, "scratch")]
+            buffers += [Buffer("target", len(self.actions.targets), "scratch")]
             calls = (Call(act, ("action_in",), ("clipped", "target")), *physics)
-        steps = (*calls, Call(assess, tuple(assess.name_in()), self._assess_outputs))
+        steps = (*calls, *look, Call(assess, tuple(assess.name_in()), self._assess_outputs))
         return Program(f"{self.model.robot.name} {self.model.transmission} environment", tuple(buffers), steps)
 
     def reset_program(self) -> Program:
@@ -200,13 +205,31 @@ class TaskProgram:
             Buffer("draws", n_draws, "random"),
             Buffer("observation", self.observation_size + self.critic_size, "rows_out", "float32"),
         ]
-        call = Call(begin, tuple(begin.name_in()), (*self.state_sizes, "observation"))
+        calls: tuple[Step, ...] = (Call(begin, tuple(begin.name_in()), (*self.state_sizes, "observation")),)
+        if self.ground:
+            place, n_draws = self._place()
+            look, seeing = self._look_at_ground()
+            buffers += [Buffer("place_draws", n_draws, "random"), *seeing]
+            placed = tuple(name.removesuffix("_next") for name in place.name_out())
+            calls = (Call(place, tuple(place.name_in()), placed), *look, *calls)
         name = f"{self.model.robot.name} {self.model.transmission} reset"
-        return Program(name, tuple(buffers), (call,), skip_unless="chosen")
+        return Program(name, tuple(buffers), calls, skip_unless="chosen")
+
+    def _look_at_ground(self) -> tuple[tuple[Step, ...], list[Buffer]]:
+        """What a program has to do, and the buffers that takes, for the task to see the ground; nothing if flat."""
+        if not self.ground:
+            return (), []
+        buffers, look = self.ground.look(self.state_sizes.get("dependent", 0))
+        return look, [Buffer(FRAME, 3, "tiles"), Buffer(HEIGHTS, 0, "table"), *buffers]
 
     def function(self, name: Literal["act", "assess", "begin"]) -> ca.Function:
         """Trace what is done once in an environment step, before and after its sub-steps, or in a reset."""
-        return {"act": self._act, "assess": lambda: self._assess()[0], "begin": lambda: self._begin()[0]}[name]()
+        late = "delay" in self.state_sizes
+        return {
+            "act": lambda: self.actions.act(late),
+            "assess": lambda: self._assess()[0],
+            "begin": lambda: self._begin()[0],
+        }[name]()
 
     @property
     def _physics_outputs(self) -> tuple[str, ...]:
@@ -214,7 +237,7 @@ class TaskProgram:
 
     @property
     def _assess_outputs(self) -> tuple[str, ...]:
-        optional = [name for name in ("heading", "history") if name in self.state_sizes]
+        optional = [name for name in ("heading", "history", "walked", "tracked") if name in self.state_sizes]
         pushed = ["v"] if self.task.push_period else []
         return ("action", "command", "clock", "air_time", "sums", *optional, *pushed, "observation", "outcome")
 
@@ -228,39 +251,13 @@ class TaskProgram:
     def _seen(self, state: dict[str, SX]) -> dict[str, SX]:
         return state | ({"scaled_parameters": 2 * state["draw"] - 1} if "draw" in state else {})
 
-    def _act(self) -> ca.Function:
-        """(action_in) -> clipped action, joint targets or torques, and 0 sub-steps waited if actions come late."""
-        action, robot = SX.sym("action_in", self.n_actions), self.model.robot
-        clipped = ca.fmax(-1, ca.fmin(1, action))
-        if self.task.actions == "joint_pd":
-            target = SX(self._snapshot({}).standing_joints)
-            target[self.moved] += self.task.action_scale * clipped
-        else:
-            target = SX.zeros(self.n_joints)
-            limits = np.array([robot.body(robot.independent[i]).joint.torque for i in self.moved])
-            if not np.isfinite(limits).all():
-                raise ValueError(f"{robot.name}: actions='joint_torque' needs a torque limit (effort) of every joint")
-            target[self.moved] = limits * clipped
-        late = {"waited": SX(0)} if "delay" in self.state_sizes else {}
-        return traced("act", {"action_in": action}, {"clipped": clipped, "target": target} | late)
-
-    def _delayed(self, physics: tuple[Step | Repeat, ...]) -> tuple[Step | Repeat, ...]:
-        """Put before each sub-step the choice between the target of the last action and that of the new one."""
-        waited, delay = SX.sym("waited"), SX.sym("delay")
-        old, new = SX.sym("target", self.n_joints), SX.sym("new_target", self.n_joints)
-        outputs = {"target_next": ca.if_else(waited < delay, old, new), "waited_next": waited + 1}
-        arrive = traced("arrive", {"waited": waited, "delay": delay, "target": old, "new_target": new}, outputs)
-        call = Call(arrive, tuple(arrive.name_in()), ("target", "waited"))
-        arrived = Call(ca.Function("arrived", [new], [new]), ("new_target",), ("target",))
-        steps = [Repeat(step.times, (call, *step.calls)) if isinstance(step, Repeat) else step for step in physics]
-        return (*steps, arrived)
-
     def _assess(self) -> tuple[ca.Function, int]:
         """State after the sub-steps -> bookkeeping, observation, outcome [reward, terminated, diverged, terms]."""
         unused = ("anchor", "parameters", "delay", "target", "contact_forces")
         state = {name: SX.sym(name, size) for name, size in self.state_sizes.items() if name not in unused}
+        seen_ground = {SEEN: SX.sym(SEEN, self.ground.size)} if self.ground else {}
         clipped, draws = SX.sym("clipped", self.n_actions), Draws()
-        values = self._seen(state | {"action": clipped, "previous_action": state["action"]})
+        values = self._seen(state | seen_ground | {"action": clipped, "previous_action": state["action"]})
         s = self._snapshot(values)
 
         terms = [self.task.rewards[name] * term(s) * self.control_dt for name, term in self.reward_terms.items()]
@@ -274,79 +271,92 @@ class TaskProgram:
             ca.if_else(s.foot_contact, 0, state["air_time"] + self.control_dt) if self.n_feet else state["air_time"]
         )
         clock = state["clock"] + 1
-        fresh = self._new_command(draws)
+        fresh = self.commands.new(draws, state.get("grown"))
         due = self._every(self.task.command_period, clock)
         after = {name: ca.if_else(due, fresh[name], state[name]) for name in fresh}
         v = self._pushed(state["v"], clock, draws) if self.task.push_period else state["v"]
-        after = self._steered(values | {"v": v}, after)
+        after = self.commands.steered(values | {"v": v}, after)
         seen = values | after | {"air_time": air_time, "clock": clock, "v": v}
         observation, history = self._observation(seen, state.get("history"), draws)
         outputs = {"action_next": clipped, "command_next": after["command"], "clock_next": clock}
         outputs |= {"air_time_next": air_time, "sums_next": sums}
         outputs |= {"heading_next": after["heading"]} if "heading" in after else {}
         outputs |= {"history_next": history} if "history" in state else {}
+        outputs |= {f"{name}_next": value for name, value in self.progress.followed(s, state).items()}
         outputs |= {"v_next": v} if self.task.push_period else {}
         outputs |= {"observation": observation, "outcome": ca.vertcat(reward, terminated, state["diverged"], *terms)}
-        inputs = {**state, "clipped": clipped}
+        inputs = {**state, **seen_ground, "clipped": clipped}
         count = draws.symbols.numel()
         return traced("assess", inputs | ({"draws": draws.symbols} if count else {}), outputs), count
 
     def _begin(self) -> tuple[ca.Function, int]:
-        """State, chosen, draws -> state of a new episode where chosen, observation."""
+        """State, chosen, draws -> state of a new episode where chosen, observation.
+
+        On a field the robots have been placed: their state has where they stand, all but the height of the ground.
+        """
         state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}
         chosen, draws = SX.sym("chosen"), Draws()
         fresh = {name: SX(size, 1) for name, size in self.state_sizes.items()}
-        fresh["q"], fresh["v"] = self._start(draws)
+        seen_ground = {SEEN: SX.sym(SEEN, self.ground.size)} if self.ground else {}
+        if self.ground:
+            lift = self.ground.lift(state["q"], state.get("dependent"), seen_ground[SEEN])
+            fresh["q"], fresh["level"] = SX(state["q"]), state["level"]
+            fresh["q"][2] += lift
+        else:
+            fresh["q"] = self._starting_pose(draws)
+        fresh["v"] = self._starting_velocity(draws)
         if "dependent" in fresh:
             fresh["dependent"] = SX(self.model.guess)
+        if "grown" in fresh:
+            fresh["grown"] = self.progress.grown(state)
         if "draw" in fresh:
             fresh["draw"] = ca.vertcat(*[draws.unit() for _ in range(self.randomised.n_draws)])
             fresh["parameters"] = self.randomised.values(fresh["draw"])
         if "delay" in fresh:
             low, high = self.task.latency
             fresh["delay"] = ca.floor(draws.uniform(low, high + 1))
-            fresh["target"] = SX(self._snapshot({}).standing_joints) * (self.task.actions == "joint_pd")
-        fresh |= self._new_command(draws)
-        fresh |= self._steered(fresh, {name: fresh[name] for name in ("command", "heading") if name in fresh})
+            fresh["target"] = SX(self.actions.rest)
+        fresh |= self.commands.new(draws, fresh.get("grown"))
+        fresh |= self.commands.steered(fresh, {name: fresh[name] for name in ("command", "heading") if name in fresh})
         after = {name: ca.if_else(chosen > 0.5, ca.densify(fresh[name]), state[name]) for name in state}
-        seen = self._seen(after | {"previous_action": after["action"]})
+        seen = self._seen(after | seen_ground | {"previous_action": after["action"]})
         observation, history = self._observation(seen, None, draws)
         if "history" in state:
             after["history"] = ca.if_else(chosen > 0.5, history, state["history"])
         outputs = {f"{name}_next": value for name, value in after.items()} | {"observation": observation}
-        inputs = {**state, "chosen": chosen, "draws": draws.symbols}
+        inputs = {**state, **seen_ground, "chosen": chosen, "draws": draws.symbols}
         return traced("begin", inputs, outputs), draws.symbols.numel()
 
-    def _start(self, draws: Draws) -> tuple[SX, SX]:
-        """Positions and velocities near the standing pose, heading anywhere."""
-        noise, standing = self.task.reset_noise, self.model.standing_q
+    def _place(self) -> tuple[ca.Function, int]:
+        """State, chosen, place_draws -> where chosen, a pose on a tile of the field as if the ground were at 0."""
+        names = [n for n in ("q", "dependent", "level", "walked", "command", "clock") if n in self.state_sizes]
+        state = {name: SX.sym(name, self.state_sizes[name]) for name in names}
+        chosen, draws = SX.sym("chosen"), Draws()
+        level = self.progress.level(state, draws, self.control_dt)
+        place = starting_place(self.progress, level, draws)
+        fresh = {"q": self._starting_pose(draws), "level": level}
+        fresh["q"][:2] = place
+        fresh |= {"dependent": SX(self.model.guess)} if "dependent" in state else {}
+        outputs = {f"{name}_next": ca.if_else(chosen > 0.5, value, state[name]) for name, value in fresh.items()}
+        inputs = {**state, "chosen": chosen, "place_draws": draws.symbols}
+        return traced("place", inputs, outputs), draws.symbols.numel()
+
+    def _starting_pose(self, draws: Draws) -> SX:
+        """Positions near the standing pose, heading anywhere."""
+        standing = self.model.standing_q
         half_yaw = draws.uniform(-np.pi / 2, np.pi / 2)
-        joints = standing[7:] + draws.symmetric(self.n_joints, noise["joint_position"])
-        q = ca.vertcat(standing[:3], ca.cos(half_yaw), 0, 0, ca.sin(half_yaw), joints)
+        joints = standing[7:] + draws.symmetric(self.n_joints, self.task.reset_noise["joint_position"])
+        return ca.densify(ca.vertcat(standing[:3], ca.cos(half_yaw), 0, 0, ca.sin(half_yaw), joints))
+
+    def _starting_velocity(self, draws: Draws) -> SX:
+        """Velocities near rest."""
+        noise = self.task.reset_noise
         base = draws.symmetric(6, noise["base_velocity"])
-        return q, ca.vertcat(base, draws.symmetric(self.n_joints, noise["joint_velocity"]))
+        return ca.vertcat(base, draws.symmetric(self.n_joints, noise["joint_velocity"]))
 
     def _every(self, period: float, clock: SX) -> SX:
         """1 once in a period [s], else 0."""
         return ca.fmod(clock, max(round(period / self.control_dt), 1)) < 0.5
-
-    def _new_command(self, draws: Draws) -> dict[str, SX]:
-        """A command within the task's range, or standing still; and a heading."""
-        standing = draws.unit() < self.task.standing_fraction
-        command = {"command": ca.if_else(standing, 0, draws.within(self.task.command_range))}
-        return command | ({"heading": draws.uniform(-np.pi, np.pi)} if self.task.heading else {})
-
-    def _steered(self, values: dict[str, SX], command: dict[str, SX]) -> dict[str, SX]:
-        """Replace the commanded yaw rate by one that turns the robot to its heading."""
-        if "heading" not in command:
-            return command
-        w, x, y, z = (values["q"][3 + i] for i in range(4))
-        behind = command["heading"] - ca.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        error = ca.atan2(ca.sin(behind), ca.cos(behind))
-        low, high = self.task.command_range[2]
-        rate = ca.fmax(low, ca.fmin(high, HEADING_GAIN * error))
-        moving = ca.sumsqr(command["command"]) > 0
-        return command | {"command": ca.vertcat(command["command"][:2], ca.if_else(moving, rate, 0))}
 
     def _pushed(self, v: SX, clock: SX, draws: Draws) -> SX:
         """Now and then change the horizontal velocity of the base, as seen from it, at a stroke."""

@@ -11,7 +11,7 @@ from ce_gym.dynamics.spatial import SX
 from ce_gym.envs.tasks import RANDOMISED, Range
 from ce_gym.model.description import Robot
 
-FACTORS = ("stiffness", "kp", "kd", "motor_strength", "rotor_inertia")
+FACTORS = ("stiffness", "kp", "kd", "motor_strength", "rotor_inertia", "ratio")
 """Figures whose ranges are factors on what the robot has."""
 
 
@@ -39,6 +39,8 @@ class Randomised:
                 raise ValueError(f"randomise={name!r}; expected one of {', '.join(RANDOMISED)}")
             if not low <= high:
                 raise ValueError(f"randomise[{name!r}]=({low}, {high}); expected low <= high")
+            if low < 0 and name.split(":")[0] not in ("added_mass", "com_shift"):
+                raise ValueError(f"randomise[{name!r}]=({low}, {high}); expected 0 or more")
             names.append(f"{name}:{base}" if name in ("added_mass", "com_shift") else name)
         self.parameters = tuple(names)
         self._ranges = tuple(ranges.values())

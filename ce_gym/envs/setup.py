@@ -44,7 +44,7 @@ def make_batch(
     if dtype not in ("float64", "float32"):
         raise ValueError(f"dtype={dtype!r}; expected 'float64' or 'float32'")
     for name, value in (("num_envs", num_envs), ("num_threads", num_threads)):
-        if value is not None and (not isinstance(value, int) or value < 1):
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
             raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
     program = make_program(robot, task, **arguments)
     return Batch(program, num_envs, dtype, num_threads or len(os.sched_getaffinity(0)))
@@ -74,7 +74,13 @@ def make_program(
         ValueError: If an argument is not one of the choices.
         RobotError: If the robot file is not valid.
     """
-    if task not in TASKS:
+    if not isinstance(robot, str | os.PathLike):
+        raise ValueError(f"robot={robot!r}; expected the name of a robot or a path to a file")
+    if not isinstance(contact_forces, bool):
+        raise ValueError(f"contact_forces={contact_forces!r}; expected true or false")
+    if reward_weights is not None and not isinstance(reward_weights, Mapping):
+        raise ValueError(f"reward_weights={reward_weights!r}; expected numbers by the name of a reward term")
+    if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"task={task!r}; expected one of {', '.join(TASKS)}")
     if transmission not in get_args(Level):
         raise ValueError(f"transmission={transmission!r}; expected one of {', '.join(get_args(Level))}")

@@ -70,7 +70,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         """Start a new episode; see `gymnasium.Env.reset`. The same seed gives the same episodes, step by step."""
         super().reset(seed=seed)
         if seed is not None or not self._seeded:
-            key = seed if seed is not None else self.np_random.integers(2**63)
+            key = checked_seed(seed) if seed is not None else self.np_random.integers(2**63)
             self.batch.seed(np.array([key], np.uint64))
             self._seeded = True
         observation = self._shown(self.batch.reset(np.ones(1, bool)))[0]
@@ -112,6 +112,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
             "y_position": y,
             "distance_from_origin": math.hypot(x, y),
             "x_velocity": a * (1 - 2 * (j * j + k * k)) + 2 * b * (i * j - w * k) + 2 * c * (i * k + w * j),
+            **{name: float(values[0]) for name, values in self.batch.progress().items()},
             "y_velocity": 2 * a * (i * j + w * k) + b * (1 - 2 * (i * i + k * k)) + 2 * c * (j * k - w * i),
         }
 
@@ -150,14 +151,37 @@ def checked_action(action: Any, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return an action as contiguous float32 rows.
 
     Raises:
-        ValueError: If its shape is wrong or it is not finite.
+        ValueError: If it is not an array of numbers, its shape is wrong or it is not finite.
     """
-    rows = np.ascontiguousarray(action, dtype=np.float32)
-    if rows.shape != shape and rows.shape != (shape[1],) * (shape[0] == 1):
+    try:
+        rows = np.asarray(action)
+    except ValueError:  # lists of unequal lengths
+        rows = np.empty(0, object)
+    if rows.dtype.kind not in "fiu":
+        raise ValueError(f"action is {_brief(action)}; expected an array of real numbers, such as float32")
+    if rows.shape not in ((shape, shape[1:]) if shape[0] == 1 else (shape,)):
         raise ValueError(f"action has shape {np.shape(action)}; expected {shape if shape[0] > 1 else shape[1:]}")
     if not np.isfinite(rows).all():
         raise ValueError("action holds a number that is not finite")
-    return rows.reshape(shape)
+    if rows.dtype != np.float32:
+        rows = np.clip(rows, -1.0, 1.0)  # as the kernel does; a large number could not be converted
+    return np.ascontiguousarray(rows, dtype=np.float32).reshape(shape)
+
+
+def checked_seed(seed: Any) -> int:
+    """Return a seed of one environment.
+
+    Raises:
+        ValueError: If it is not a whole number from 0 to 2**62.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed <= 2**62:
+        raise ValueError(f"seed={seed!r}; expected a whole number from 0 to 2**62")
+    return int(seed)
+
+
+def _brief(value: Any) -> str:
+    kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
+    return kind if value is not None else "None"
 
 
 def recorded_state(batch: Any) -> dict[str, NDArray]:

@@ -24,7 +24,8 @@ class Snapshot:
     Args:
         mechanism: The robot at a transmission level.
         values: Expressions of the state buffers, by name: q, v, command, action, previous_action, torque,
-            air_time, clock, load, scaled_parameters.
+            air_time, clock, load, scaled_parameters; and seen_ground, height and slopes of the ground under the base
+            and each contact sphere, shape (3 (1 + n_spheres),), if it is not flat.
         control_dt: Length of a control step [s].
         gait_period: Time of one cycle of the gait's clock [s].
     """
@@ -112,7 +113,21 @@ class Snapshot:
     @property
     def base_height(self) -> SX:
         """Height of the base origin above the ground [m]."""
-        return self.q[2]
+        return self.q[2] - self._ground[0] if self._ground.numel() else self.q[2]
+
+    @property
+    def terrain_level(self) -> SX:
+        """Level of the terrain on which the episode began; 0 on flat ground."""
+        return self._values.get("level", SX(0))
+
+    @property
+    def times_grown(self) -> SX:
+        """How often the range of commands has grown, see `ce_gym.envs.progress`."""
+        return self._values.get("grown", SX(0))
+
+    @property
+    def _ground(self) -> SX:
+        return self._values.get("seen_ground", SX(0, 1))
 
     @cached_property
     def up(self) -> SX:
@@ -133,12 +148,15 @@ class Snapshot:
     def lowest_points(self, group: str) -> list[tuple[str, SX, SX]]:
         """Return body, height above the ground [m] and velocity (3,) [m/s] of each contact sphere of a group."""
         points = []
-        for sphere in self.mechanism.robot.contacts:
+        for i, sphere in enumerate(self.mechanism.robot.contacts):
             if sphere.group == group:
                 body = self.kinematics.bodies[sphere.body]
                 centre = constant(np.array(sphere.position))
-                velocity = body.R @ body.point_velocity(centre)
-                points.append((sphere.body, body.point_position(centre)[2] - sphere.radius, velocity))
+                velocity, above = body.R @ body.point_velocity(centre), body.point_position(centre)[2]
+                if self._ground.numel():
+                    height, slope = self._ground[3 * i + 3], self._ground[3 * i + 4 : 3 * i + 6]
+                    above = (above - height) / ca.sqrt(1 + ca.sumsqr(slope))
+                points.append((sphere.body, above - sphere.radius, velocity))
         return points
 
     def touching(self, group: str) -> SX:

@@ -1,4 +1,4 @@
-"""Checks of the figures of a task that users give as arguments. May know tasks."""
+"""Checks of the figures of a task that users give as arguments. May know tasks and fields."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
+from ce_gym.envs.fields import checked_terrain
 from ce_gym.envs.tasks import Actions
 
 CHOICES = {"actions": get_args(Actions), "friction": ("tangent", "secant"), "motors": ("ideal", "limited")}
 POSITIVE = ("action_scale", "command_period", "gait_period", "dt")
-COUNTS = ("history", "n_substeps", "episode_length")
+COUNTS = ("history", "n_substeps", "episode_length", "max_episode_steps")
+LARGEST = {"dt": 0.1, "standing_fraction": 1.0}
 
 
 def checked_value(name: str, value: Any, old: Any) -> Any:
@@ -27,6 +29,8 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
     if name in CHOICES:
         _check(name, value, value in CHOICES[name], " or ".join(repr(choice) for choice in CHOICES[name]))
         return value
+    if name == "terrain":
+        return checked_terrain(value)
     if name == "contacts":
         return value if isinstance(value, str) else _names(name, value)
     if name == "command_range":
@@ -41,18 +45,28 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
         _check(name, value, isinstance(value, Mapping), "pairs (low, high) by the name of a figure")
         return {str(key): _pair(f"randomise[{key!r}]", pair) for key, pair in value.items()}
     if name in COUNTS:
-        _check(name, value, isinstance(value, int) and value >= 1, "a whole number, at least 1")
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        _check(name, value, whole and value >= 1, "a whole number, at least 1")
         return value
     if isinstance(old, bool):
         _check(name, value, isinstance(value, bool), "true or false")
         return value
     if isinstance(old, Mapping):
         _check(name, value, isinstance(value, Mapping), "numbers by name")
-        return {**old, **{str(key): number(f"{name}[{key!r}]", x) for key, x in value.items()}}
+        for key, figure in value.items():
+            _check(f"{name}[{key!r}]", figure, number(f"{name}[{key!r}]", figure) >= 0, "0 or more")
+            _check(name, key, name != "reset_noise" or key in old, f"one of {', '.join(old)}")
+        return {**old, **{str(key): float(figure) for key, figure in value.items()}}
     if isinstance(old, tuple):
-        return _names(name, value)
+        names = _names(name, value)
+        _check(name, value, len(names) > 0 or name != "observations", "at least one name")
+        return names
+    if name == "command_curriculum":
+        _check(name, value, 0 < number(name, value) <= 1, "a share above 0 and up to 1")
     figure, expected = number(name, value), "a positive number" if name in POSITIVE else "0 or more"
     _check(name, value, figure > 0 or (figure == 0 and name not in POSITIVE), expected)
+    most = LARGEST.get(name, math.inf)
+    _check(name, value, figure <= most, f"at most {most:g}")
     return figure
 
 

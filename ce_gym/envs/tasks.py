@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 Range = tuple[float, float]
-Actions = Literal["joint_pd", "joint_torque"]
+Actions = Literal["joint_pd", "joint_torque", "motor_pd", "motor_torque"]
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,16 @@ class Task:
         noise: Largest error of observation blocks, uniform, by name, in their own units.
         history: How many observations the policy sees, the newest first.
         actions: What an action means: "joint_pd", joint targets `standing pose + action_scale * action` [rad];
-            "joint_torque", shares of the joints' largest torques.
+            "motor_pd", targets of the motors' rotors, `angle in the standing pose + action_scale * N * action`, with N
+            how far a motor turns for each radian of the joint that it drives most; "joint_torque" and "motor_torque",
+            shares of the joints' and the motors' largest torques.
         action_scale: See `actions`.
-        action_joints: Patterns of the joints that actions move, such as "*hip*"; the others hold the standing pose.
+        action_joints: Patterns of the joints that actions move, such as "*hip*"; the others hold the standing pose, or
+            have no torque. Actions on motors move those in the clusters of these joints.
         latency: Range of the time an action takes to arrive, in sub-steps, drawn for each episode.
         command_range: Lower and upper bound of forward [m/s], sideways [m/s] and yaw rate [rad/s] commands.
+        command_curriculum: Share of `command_range` with which every robot begins; it grows with tracking, see
+            `ce_gym.envs.progress`. 1 for all of the range from the start.
         command_period: Time between new commands [s].
         standing_fraction: Share of commands that ask the robot to stand.
         heading: Whether the yaw rate is commanded so that the robot turns to a heading drawn with the command.
@@ -45,6 +50,7 @@ class Task:
         dt: Length of a physics sub-step [s].
         n_substeps: Sub-steps in a control step.
         episode_length: Control steps until time is up.
+        terrain: The ground, by its `kind` and the arguments of that, see `ce_gym.envs.fields`.
         contacts: Which contact spheres take part: "all", or names of groups or spheres. Spheres that end the episode
             when they touch the ground need not.
         friction: "tangent" or "secant", see `ce_gym.Simulator`.
@@ -66,6 +72,7 @@ class Task:
     action_joints: tuple[str, ...] = ("*",)
     latency: tuple[int, int] = (0, 0)
     command_range: tuple[Range, ...] = ((-1.0, 1.0), (-0.5, 0.5), (-1.0, 1.0))
+    command_curriculum: float = 1.0
     command_period: float = 5.0
     standing_fraction: float = 0.1
     heading: bool = False
@@ -76,6 +83,7 @@ class Task:
     dt: float = 0.005
     n_substeps: int = 4
     episode_length: int = 1000
+    terrain: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({"kind": "flat"}))
     contacts: str | tuple[str, ...] = ("foot", "knee")
     friction: Literal["tangent", "secant"] = "tangent"
     motors: Literal["ideal", "limited"] = "ideal"
@@ -92,6 +100,7 @@ RANDOMISED = {
     "kd": "factor on each joint's velocity gain [-]",
     "motor_strength": "factor on motor torques and limits [-]",
     "rotor_inertia": "factor on the spin inertia of rotors [-]",
+    "ratio": "factor on the gear ratios [-]",
     "added_mass": "mass added to the base [kg]; added_mass:BODY for another body",
     "com_shift": "shift of the base's centre of mass, each axis [m]; com_shift:BODY for another body",
 }

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ce_gym.envs.rendering import RENDER_MODES, Screen
 from ce_gym.envs.setup import make_batch
 from ce_gym.envs.shell import BatchShell
-from ce_gym.envs.single import checked_action, recorded_state, shown, spaces
+from ce_gym.envs.single import checked_action, checked_seed, recorded_state, shown, spaces
+from ce_gym.envs.task_values import checked_value
 
 Observations = NDArray[np.float32]
 
@@ -25,7 +26,8 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
     Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit,
     whatever the size of the batch and the number of threads. `infos` holds `diverged`, bool (num_envs,): environments
     whose simulation failed numerically; they are truncated at their last good state and reset alone; and
-    `reward_terms`, the weighted terms of the rewards by name, each (num_envs,). Where an episode has ended,
+    `reward_terms`, the weighted terms of the rewards by name, each (num_envs,); with curricula `terrain_level` and
+    `times_grown`, where each robot stands in them. Where an episode has ended,
     `infos["episode_terms"]` has its length, its return, the sum of every reward term and the mean of every metric (see
     `Task`).
 
@@ -66,6 +68,8 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         **kwargs: Any,
     ) -> None:
         self.autoreset_mode = as_autoreset_mode(autoreset_mode)
+        if max_episode_steps is not None:
+            checked_value("max_episode_steps", max_episode_steps, 1)
         self.num_envs = num_envs
         self.batch = make_batch(robot, task, num_envs=num_envs, **kwargs)
         self.task = task
@@ -100,15 +104,17 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         Raises:
             ValueError: If the mask or the list of seeds has the wrong shape.
         """
-        super().reset(seed=seed if isinstance(seed, int) else None)
         mask = self._reset_mask(options)
+        if seed is not None and (isinstance(seed, str) or not hasattr(seed, "__len__")):
+            seed = checked_seed(seed)
+        super().reset(seed=seed if isinstance(seed, int) else None)
         self._seed(seed)
         fresh = self.batch.reset(mask)
         self._observation = np.where(mask[:, None], fresh, self._observation)
         self._elapsed[mask] = 0
         self._finished[mask] = False
         self._screen.refresh()
-        return self._shown(self._observation), {"diverged": np.zeros(self.num_envs, bool)}
+        return self._shown(self._observation), {"diverged": np.zeros(self.num_envs, bool), **self.batch.progress()}
 
     def step(
         self, actions: NDArray[np.float32]
@@ -153,6 +159,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
                 done = np.zeros(self.num_envs, bool)
         self._finished = done
         self._observation = observation
+        infos |= self.batch.progress()
         self._screen.refresh()
         return self._shown(observation), reward, terminated, truncated, infos
 
@@ -190,8 +197,15 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
 
         Args:
             command: Forward [m/s], sideways [m/s], yaw rate [rad/s], shape (3,) or (num_envs, 3).
+
+        Raises:
+            ValueError: If the shape is wrong or a number is not finite.
         """
-        self.batch.write("command", np.broadcast_to(command, (self.num_envs, 3)))
+        given = np.asarray(command, float)
+        if given.shape not in ((3,), (self.num_envs, 3)) or not np.isfinite(given).all():
+            expected = f"(3,) or ({self.num_envs}, 3), finite"
+            raise ValueError(f"command has shape {given.shape}; expected {expected}")
+        self.batch.write("command", np.broadcast_to(given, (self.num_envs, 3)))
 
     def _episode_terms(self, done: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
         """Length, sums of reward terms and means of metrics of the episodes that have just ended, zero elsewhere."""
@@ -225,7 +239,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         else:
             if len(seed) != self.num_envs or any(s is None for s in seed):
                 raise ValueError(f"seed has {len(seed)} entries; expected {self.num_envs} whole numbers")
-            self.batch.seed(np.array(seed, np.uint64))
+            self.batch.seed(np.array([checked_seed(s) for s in seed], np.uint64))
         self._seeded = True
 
 

@@ -94,6 +94,7 @@ class Mechanism:
         bodies: The bodies that take part in the recursion, by name, parents first.
         spins: Spins of eliminated or approximated rotors, in each cluster.
         gravity: Acceleration of free fall in the world [m/s^2], shape (3,).
+        ratio: Factor on the angles of all rotors, if their gears are not what the robot says.
     """
 
     robot: Robot
@@ -102,6 +103,7 @@ class Mechanism:
     bodies: dict[str, MovingBody]
     spins: tuple[tuple[Spin, ...], ...]
     gravity: Array
+    ratio: float | None = None
 
     def moving(self, cluster: Cluster) -> list[MovingBody]:
         """Return the bodies of a cluster that take part in the recursion, parents first."""

@@ -17,7 +17,7 @@ from ce_gym.compile import Buffer, Kernel, Program, load_kernel
 from ce_gym.dynamics.methods import METHODS
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.parameters import parameter_defaults
-from ce_gym.dynamics.scene import Control, Friction, Motors, StepOptions
+from ce_gym.dynamics.scene import Control, Friction, Motors, StepOptions, target_names
 from ce_gym.dynamics.trace import OUTPUTS
 from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
 from ce_gym.sim.retry import Retry
@@ -36,7 +36,7 @@ class Simulator:
         dtype: "float64" or "float32" for state and arithmetic.
         num_threads: Threads the robots are split over; results do not depend on it.
         control: What `target` means: "position" for joint positions [rad] through the robot's PD gains, "torque" for
-            joint torques [N m].
+            joint torques [N m]; "motor_position" and "motor_torque" for the same of the motors' rotors.
         contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
         material: Compliance and friction of the contacts; the robot's own if None.
         outputs: Which of "torque", "motor_speed", "power", "contact_forces", "energy", "error", "loop_gap" and
@@ -54,6 +54,7 @@ class Simulator:
 
     Attributes:
         n_retried: How many times a robot has been stepped again.
+        target_names: What each entry of a target is for: joints, or the motors' rotors and then joints without one.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -105,6 +106,7 @@ class Simulator:
             ground="field" if terrain is not None and self.contact_names else "flat",
             parameters=tuple(parameters),
         )
+        self.target_names = target_names(model.mechanism, self.options.control)
         defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._kernel = load_step_kernel(model, self.options, asked, dtype)
@@ -171,14 +173,14 @@ class Simulator:
         """Advance all robots by `n_substeps` sub-steps.
 
         Args:
-            target: Joint positions [rad] or torques [N m], shape (num_envs, nj) or (nj,), in the order of
-                `model.joint_links`.
+            target: Positions [rad] or torques [N m], shape (num_envs, n) or (n,), in the order of `target_names`:
+                that of `model.joint_links` unless the motors are controlled.
             n_substeps: Number of sub-steps of length `dt`.
 
         Raises:
             ValueError: If the shape is wrong.
         """
-        n = len(self.model.joint_links)
+        n = len(self.target_names)
         rows = np.asarray(target, dtype=self.dtype)
         if rows.shape not in ((n,), (self.num_envs, n)):
             raise ValueError(f"target has shape {rows.shape}; expected ({n},) or ({self.num_envs}, {n})")
@@ -194,7 +196,7 @@ class Simulator:
 
         Args:
             name: "gravity", "friction", "slip_speed", "stiffness", "damping", "kp", "kd", "motor_strength",
-                "rotor_inertia", "added_mass:BODY" or "com_shift:BODY"; sizes and units are in
+                "rotor_inertia", "ratio", "added_mass:BODY" or "com_shift:BODY"; sizes and units are in
                 `ce_gym.dynamics.parameters.PARAMETERS`.
             value: Shape (num_envs, size) or (size,) or ().
             mask: Which robots, bool, shape (num_envs,); all of them if None.

@@ -14,7 +14,7 @@ from ce_gym.dynamics import Model
 from ce_gym.dynamics.parameters import PARAMETERS, parameter_defaults
 from ce_gym.dynamics.scene import StepOptions
 from ce_gym.dynamics.trace import attempt_function, step_function
-from ce_gym.model import Robot, load_robot
+from ce_gym.model import LinearConstraint, Robot, load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -148,6 +148,59 @@ def test_rotor_inertia_is_that_of_the_spin(cheetah: Robot, states, level: str):
     ours = results(cheetah, states, level, {"rotor_inertia": factor})
     assert_same(ours, results(other, states, level))
     assert_different(ours, results(cheetah, states, level))
+
+
+def with_ratios(robot: Robot, factor: float) -> Robot:
+    """Every rotor turns so much further for a motion of the links."""
+    rotors = {rotor.name for rotor in robot.rotors()}
+
+    def regeared(tie):
+        if not rotors & set(tie.bodies):
+            return tie
+        assert isinstance(tie, LinearConstraint)
+        return replace(tie, coefficients=tuple((b, x if b in rotors else factor * x) for b, x in tie.coefficients))
+
+    return replace(robot, constraints=tuple(regeared(tie) for tie in robot.constraints))
+
+
+@pytest.mark.parametrize("motors", ["ideal", "limited"])
+@pytest.mark.parametrize("level", ["exact", "coupled", "armature", "none"])
+def test_ratio_is_that_of_every_gear(cheetah: Robot, states, level: str, motors: str):
+    other = with_ratios(cheetah, 1.2)
+    ours = results(cheetah, states, level, {"ratio": 1.2}, motors=motors)
+    assert_same(ours, results(other, states, level, motors=motors))
+    if (level, motors) != ("none", "ideal"):  # there a ratio means nothing
+        assert_different(ours, results(cheetah, states, level, motors=motors))
+
+
+@pytest.mark.parametrize("name", ["tello", "mit_humanoid", "jvrc1"])
+def test_ratio_where_belts_and_rods_are_between(name: str):
+    """Rotors without a body of their own, those with one, lopsided ones, and those behind loops."""
+    factor, rng = 0.85, np.random.default_rng(0)
+    for eliminate in (True, False):
+        model = Model(name, eliminate_rotors=eliminate)
+        geared = Model(with_ratios(model.robot, factor), eliminate_rotors=eliminate)
+        q, v = model.standing_q.copy(), rng.normal(0, 1.0, model.nv)
+        q[7:] += rng.uniform(-0.1, 0.1, len(q) - 7)
+        given = {"q": q, "v": v, "diverged": 0.0, "target": rng.normal(0, 30.0, len(q) - 7)}
+        given |= {"dependent": model.dependent_guess(q)} if model.guess.size else {}
+        plain = StepOptions(0.002, control="torque", motors="limited")
+        declared = step_function(model.mechanism, replace(plain, parameters=("ratio",)), ("torque", "motor_speed"))
+        ours = declared(**given, parameters=factor)
+        theirs = step_function(geared.mechanism, plain, ("torque", "motor_speed"))(**given)
+        nominal = step_function(model.mechanism, plain)(**given)
+        for key, value in theirs.items():
+            np.testing.assert_allclose(ours[key].full(), value.full(), rtol=1e-8, atol=1e-8, err_msg=key)
+        assert np.abs((ours["v_next"] - nominal["v_next"]).full()).max() > 1e-3
+
+
+def test_ratio_needs_rotors_that_follow(cheetah: Robot):
+    rotor = next(cheetah.rotors()).name
+    link = next(dict(tie.coefficients) for tie in cheetah.constraints if rotor in tie.bodies)
+    joint = next(name for name in link if name != rotor)
+    turned = replace(cheetah, independent=tuple(rotor if name == joint else name for name in cheetah.independent))
+    with pytest.raises(ValueError, match=f"parameters='ratio': {rotor} of mini_cheetah; expected rotors that follow"):
+        parameter_defaults(turned, turned.material, ("ratio",))
 
 
 def test_rotor_inertia_means_nothing_where_rotors_do_not_spin(cheetah: Robot, states):

@@ -110,10 +110,11 @@ def test_noise_is_for_the_policy_only():
 
 def test_randomised_figures_change_the_motion_and_are_seen_by_the_critic():
     ranges = {"friction": (0.3, 1.2), "added_mass": (-1.0, 3.0), "com_shift": (-0.03, 0.03), "kp": (0.8, 1.2)}
-    ranges |= {"motor_strength": (0.9, 1.1), "rotor_inertia": (0.5, 2.0)}
+    ranges |= {"motor_strength": (0.9, 1.1), "rotor_inertia": (0.5, 2.0), "ratio": (0.95, 1.05)}
     envs = make(1024, randomise=ranges, critic=["parameters"], obs_mode="dict")
     values = envs.batch.rows("parameters")
-    assert values.shape == (1024, 1 + 1 + 3 + 12 + 1 + 1)
+    assert values.shape == (1024, 1 + 1 + 3 + 12 + 1 + 1 + 1)
+    assert 0.95 <= values[:, -1].min() < values[:, -1].max() <= 1.05
     assert 0.3 <= values[:, 0].min() < 0.35
     assert 1.15 < values[:, 0].max() <= 1.2
     np.testing.assert_allclose(values.mean(0)[:5], [0.75, 1.0, 0, 0, 0], atol=0.1)
@@ -164,9 +165,31 @@ def test_headings_are_turned_to():
         ({"push_period": -1}, "push_period=-1; expected 0 or more"),
         ({"heading": 1}, "heading=1; expected true or false"),
         ({"reward_weights": {"torques": "much"}}, "reward_weights='much'; expected a finite number"),
+        ({"reward_weights": ["torques"]}, r"reward_weights=\['torques'\]; expected numbers by the name"),
+        ({"reward_weights": {"torques": float("nan")}}, "reward_weights=nan; expected a finite number"),
+        ({"observations": ["smell"]}, "no observation term 'smell'; expected one of"),
+        ({"observations": []}, r"observations=\[\]; expected at least one name"),
+        ({"terminations": ["boredom"]}, "no termination term 'boredom'"),
+        ({"metrics": ["luck"]}, "no metric term 'luck'"),
+        ({"critic": ["luck"]}, "no observation term 'luck'"),
+        ({"contacts": ["wing"]}, "contacts='wing'; expected 'all', groups or names"),
+        ({"dt": 0.5}, "dt=0.5; expected at most 0.1"),
+        ({"standing_fraction": 2.0}, "standing_fraction=2.0; expected at most 1"),
+        ({"noise": {"joint_positions": -1.0}}, r"noise\['joint_positions'\]=-1.0; expected 0 or more"),
+        ({"reset_noise": {"joint": 1.0}}, "reset_noise='joint'; expected one of joint_position"),
+        ({"randomise": {"kp": (-2, 1)}}, r"randomise\['kp'\]=\(-2.0, 1.0\); expected 0 or more"),
+        ({"latency": (0, 9)}, "latency=.*; expected at most the 4 sub-steps"),
+        ({"history": True}, "history=True; expected a whole number"),
+        ({"num_threads": True}, "num_threads=True; expected a whole number"),
+        ({"max_episode_steps": 0}, "max_episode_steps=0; expected a whole number"),
+        ({"contact_forces": "yes"}, "contact_forces='yes'; expected true or false"),
+        ({"task": ["velocity"]}, r"task=\['velocity'\]; expected one of"),
+        ({"robot": 3}, "robot=3; expected the name of a robot"),
         ({"obs_mode": "image"}, "obs_mode='image'"),
     ],
 )
 def test_bad_arguments(arguments: dict, message: str):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as caught:
         make(**arguments)
+    assert "\n" not in str(caught.value)
+    assert caught.value.__cause__ is None

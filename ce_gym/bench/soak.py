@@ -1,0 +1,164 @@
+"""Random actions on every environment in turn, for minutes, with failures put in; memory and counts must stay right.
+
+Every environment gets a batch with episodes short enough to end by every cause: time, falls, and divergence, which is
+put in by writing a number that is not one into the velocity of a robot now and then. Checked are, beside that nothing
+raises: all that comes out is finite; exactly the robots that were spoilt are flagged, and the counts agree; sums and
+lengths belong to the episodes; and after three rounds through all environments the process does not grow any more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.bench.report import Report, Requirement, Table
+
+NUM_ENVS = 64
+"""Robots in a batch."""
+EPISODE = 60
+"""Control steps until time is up."""
+SPOIL_EVERY = 25
+"""Control steps from one spoilt robot to the next."""
+WARM_UP = 2
+"""Rounds through all environments before memory is first looked at."""
+GROWTH = 24.0
+"""How much the process may grow after that, allocators being what they are [MiB]."""
+
+
+@dataclass
+class Account:
+    """What happened in one environment.
+
+    Attributes:
+        steps: Control steps of robots.
+        episodes: Episodes that have ended.
+        spoilt: Robots that were made to diverge.
+        diverged: Robots that were flagged.
+        complaints: What was not as it should be, one line each.
+    """
+
+    steps: int = 0
+    episodes: int = 0
+    spoilt: int = 0
+    diverged: int = 0
+    complaints: list[str] = field(default_factory=list)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--minutes", type=float, default=30.0, help="how long to go on")
+    parser.add_argument("--env", action="append", help="environment id, may be repeated; all by default")
+    parser.add_argument("--steps", type=int, default=150, help="control steps in one environment before the next")
+    parser.add_argument("--seed", type=int, default=0, help="of actions and failures")
+
+
+def run(arguments: argparse.Namespace) -> Report:
+    """Run the soak; at least one round through the environments, and `WARM_UP` more to judge memory by."""
+    import ce_gym
+
+    ids = arguments.env or sorted(ce_gym.environment_ids())
+    rng, accounts, memory = np.random.default_rng(arguments.seed), {name: Account() for name in ids}, []
+    end = time.monotonic() + 60 * arguments.minutes
+    while len(memory) <= WARM_UP or time.monotonic() < end:
+        for name in ids:
+            soak(name, arguments.steps, rng, accounts[name])
+            if time.monotonic() > end and len(memory) > WARM_UP:
+                break
+        gc.collect()
+        memory.append(resident())
+    return reported(accounts, memory, arguments.minutes)
+
+
+def soak(env_id: str, steps: int, rng: np.random.Generator, account: Account) -> None:
+    """Take `steps` control steps in a fresh batch of one environment, and keep account of them."""
+    import gymnasium
+
+    mode = str(rng.choice(["SameStep", "NextStep"]))
+    envs: Any = gymnasium.make_vec(env_id, num_envs=NUM_ENVS, max_episode_steps=EPISODE, autoreset_mode=mode).unwrapped
+    envs.reset(seed=int(rng.integers(2**31)))
+    length, over, diverged = np.zeros(NUM_ENVS, int), np.zeros(NUM_ENVS, bool), 0
+    for step in range(steps):
+        ignored = over if mode == "NextStep" else np.zeros(NUM_ENVS, bool)
+        victims = spoil(envs, rng, ignored) if step % SPOIL_EVERY == SPOIL_EVERY - 1 else np.zeros(NUM_ENVS, bool)
+        actions = rng.uniform(-1, 1, envs.action_space.shape).astype(np.float32)
+        observation, reward, terminated, truncated, infos = envs.step(actions)
+        length = np.where(ignored, 0, length + 1)
+        over = terminated | truncated
+        if not (np.isfinite(observation).all() and np.isfinite(reward).all()):
+            account.complaints.append(f"{env_id}: step {step} shows a number that is not finite")
+        if not np.array_equal(infos["diverged"], victims):
+            account.complaints.append(f"{env_id}: step {step} flags robots {np.flatnonzero(infos['diverged'])}")
+        if over.any():
+            wrong = inconsistent(infos["episode_terms"], over, length, victims)
+            account.complaints += [f"{env_id}: {text}" for text in wrong]
+        account.steps += NUM_ENVS
+        account.episodes += int(over.sum())
+        account.spoilt += int(victims.sum())
+        diverged += int(infos["diverged"].sum())
+        length[over] = 0
+    account.diverged += envs.n_diverged
+    if envs.n_diverged != diverged:
+        account.complaints.append(f"{env_id}: n_diverged is {envs.n_diverged} after {diverged} flags")
+    envs.close()
+
+
+def spoil(envs: Any, rng: np.random.Generator, spared: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Make some robots of a batch diverge in their next step; returns which, shape (num_envs,)."""
+    victims = (rng.random(NUM_ENVS) < 0.05) & ~spared
+    velocity = envs.batch.rows("v")
+    velocity[victims, rng.integers(velocity.shape[1])] = rng.choice([np.nan, np.inf, 1e9])
+    envs.batch.write("v", velocity, victims)
+    return victims
+
+
+def inconsistent(
+    terms: dict[str, NDArray], over: NDArray[np.bool_], length: NDArray, spoilt: NDArray[np.bool_]
+) -> list[str]:
+    """Return what is wrong with the statistics of the episodes that have just ended."""
+    wrong = []
+    if not np.array_equal(terms["length"], length * over):
+        wrong.append(f"lengths {terms['length'][over]} of episodes of {length[over]}")
+    if not all(np.isfinite(values).all() for values in terms.values()):
+        wrong.append("sums of an episode that are not finite")
+    parts = sum(values for name, values in terms.items() if name.startswith("reward/"))
+    below = terms["return"] < np.asarray(parts) - 1e-6 * (1 + np.abs(parts))  # above only where negative sums count 0
+    if (below & ~spoilt).any():
+        wrong.append("a return below the sum of its terms")
+    if any((values[~over] != 0).any() for values in terms.values()):
+        wrong.append("sums of an episode that has not ended")
+    return wrong
+
+
+def resident() -> float:
+    """Return the resident memory of this process [MiB]; not a number where the system does not tell."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return float("nan")
+    line = next(line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmRSS"))
+    return int(line.split()[1]) / 1024
+
+
+def reported(accounts: dict[str, Account], memory: list[float], minutes: float) -> Report:
+    """Return the report of a soak."""
+    report = Report("soak")
+    rows = tuple((n, a.steps, a.episodes, a.spoilt, a.diverged, len(a.complaints)) for n, a in accounts.items())
+    columns = ("environment", "robot steps", "episodes", "spoilt", "flagged", "complaints")
+    report.tables.append(Table(f"Random actions for {minutes:g} minutes", columns, rows))
+    spoilt, flagged = (sum(getattr(a, name) for a in accounts.values()) for name in ("spoilt", "diverged"))
+    claim = "robots flagged as diverged are those that were spoilt"
+    report.requirements.append(Requirement(claim, f"{flagged} of {spoilt}", flagged == spoilt > 0))
+    complaints = [text for account in accounts.values() for text in account.complaints]
+    report.requirements.append(Requirement("nothing inconsistent", f"{len(complaints)}", not complaints))
+    grown = max(memory[WARM_UP:]) - memory[WARM_UP]
+    claim = f"after {WARM_UP + 1} rounds the process grows by no more than {GROWTH:g} MiB"
+    measured = f"{grown:.1f} MiB in {len(memory) - WARM_UP - 1} more rounds ({memory[WARM_UP]:.0f} MiB)"
+    report.requirements.append(Requirement(claim, measured, not grown > GROWTH))
+    report.remarks += complaints[:20]
+    return report

@@ -1,0 +1,43 @@
+"""The soak finds what it looks for, and nothing where nothing is wrong."""
+
+import argparse
+
+import pytest
+
+from ce_gym.bench import soak
+from ce_gym.envs.batch import Batch
+
+IDS = ["ce_gym/MiniCheetahVelocity-v0", "ce_gym/MiniCheetahRun-v0"]
+
+
+def arguments(**changes) -> argparse.Namespace:
+    return argparse.Namespace(**{"minutes": 0.05, "env": IDS, "steps": 80, "seed": 0, **changes})
+
+
+def test_a_few_seconds_of_it():
+    report = soak.run(arguments())
+    assert [r.met for r in report.requirements] == [True, True, True], report.as_text()
+    rows = report.tables[0].rows
+    assert [row[0] for row in rows] == IDS
+    assert all(row[1] >= 3 * 80 * 64 and row[2] > 64 and row[3] == row[4] > 0 for row in rows)
+
+
+def test_it_notices_failures_that_are_not_flagged(monkeypatch: pytest.MonkeyPatch):
+    step = Batch.step
+
+    def silent(self, *given):
+        outcome = step(self, *given)
+        outcome.diverged[:] = False
+        return outcome
+
+    monkeypatch.setattr(Batch, "step", silent)
+    report = soak.run(arguments(minutes=0.0, env=IDS[:1]))
+    assert [r.met for r in report.requirements][:2] == [False, False]
+
+
+def test_it_notices_a_process_that_grows(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(soak, "WARM_UP", 0)
+    memory = iter([100.0, 100.0 + soak.GROWTH + 1])
+    monkeypatch.setattr(soak, "resident", lambda: next(memory, 200.0))
+    report = soak.run(arguments(minutes=0.02, env=IDS[:1], steps=20))
+    assert not report.requirements[2].met
