@@ -118,7 +118,8 @@ def read_policy(file: Path) -> tuple[Act, dict[str, Any]]:
             n = sum(name.startswith("weight_") for name in arrays.files)
             layers = [(arrays[f"weight_{i}"], arrays[f"bias_{i}"]) for i in range(n)]
         activate = ACTIVATIONS[record["activation"]]
-        record["env"], record["env_kwargs"]
+        if missing := {"env", "env_kwargs"} - record.keys():
+            raise KeyError(*sorted(missing))
         sizes = [int(record["observation_size"]), *(len(bias) for _, bias in layers)]
     except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ViewerError(f"{file}: not a policy that can be run: {' '.join(str(error).split())}") from None
