@@ -2,15 +2,16 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := viewer,video,train,export,rsl-rl,bench,dev
+EXTRAS := viewer,video,train,export,rsl-rl,bench,docs,dev
 
-.PHONY: help venv demo test lint types wheel clean
+.PHONY: help venv demo test lint types docs wheel clean
 
 help:
 	@echo "make demo    train Mini Cheetah to walk, then write a rollout to look at in a browser (a few minutes)"
 	@echo "make test    run the tests"
 	@echo "make lint    ruff: style and format"
 	@echo "make types   pyright: types"
+	@echo "make docs    this documentation as HTML in docs/_build/html; a warning is an error"
 	@echo "make wheel   build sdist and wheel into dist/"
 	@echo "make venv    create .venv with everything the others need"
 	@echo "make clean   remove .venv and build output"
@@ -37,8 +38,12 @@ lint: .venv/installed
 types: .venv/installed
 	$(BIN)/pyright
 
+docs: .venv/installed
+	$(BIN)/python -m sphinx -W --keep-going --nitpicky -q -b html docs docs/_build/html
+	@echo docs/_build/html/index.html
+
 wheel: .venv/installed
 	$(BIN)/python -m build --outdir dist
 
 clean:
-	rm -rf .venv build dist
+	rm -rf .venv build dist docs/_build docs/generated

@@ -87,6 +87,9 @@ def make_program(
     model = Model(robot, transmission)
     own = {key: value for name, group in model.robot.tasks if name == task for key, value in group}
     weights = {**dict(own.pop("reward_weights", ())), **(reward_weights or {})}
+    wanted, groups = TASKS[task].contacts, {contact.group for contact in model.robot.contacts}
+    if not isinstance(wanted, str):  # tasks ask for knees, too, but not every robot has some
+        own.setdefault("contacts", tuple(group for group in wanted if group in groups))
     return TaskProgram(model, changed_task(TASKS[task], weights, {**own, **changes}), contact_forces)
 
 

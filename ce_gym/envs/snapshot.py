@@ -52,7 +52,7 @@ class Snapshot:
 
     @property
     def command(self) -> SX:
-        """Commanded velocity: forward [m/s], sideways [m/s], yaw rate [rad/s], shape (3,)."""
+        """The command, forward and sideways velocity [m/s] and yaw rate [rad/s], shape (3,)."""
         return self._values["command"]
 
     @property

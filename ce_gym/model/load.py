@@ -21,12 +21,10 @@ from ce_gym.model.yaml_file import robot_from_yaml
 def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = None) -> Robot:
     """Load a robot.
 
-    | file    | what it is                                                                                       |
-    |---------|--------------------------------------------------------------------------------------------------|
-    | `.yaml` | the project's own format: names a plain URDF, adds rotors, transmissions, motors, contacts, pose |
-    | `.urdf` | URDF+ if it has `<loop>`, `<coupling>` or `independent`; a plain URDF otherwise. A YAML file     |
-    |         | of the same name beside a plain URDF is read with it if its key `urdf` names the URDF            |
-    | `.xml`  | MJCF, read through the package `mujoco`                                                          |
+    - `.yaml`: the project's own format. It names a plain URDF and adds rotors, transmissions, motors, contacts, a pose.
+    - `.urdf`: URDF+ if it has `<loop>`, `<coupling>` or `independent`; a plain URDF otherwise. A YAML file of the same
+      name beside a plain URDF is read with it if its key `urdf` names the URDF.
+    - `.xml`: MJCF, read through the package `mujoco`.
 
     Args:
         name_or_path: A name such as "mini_cheetah" (`robots()` lists them), or the path of a file.

@@ -47,14 +47,12 @@ def to_mjcf(
 ) -> str:
     """Write a robot as MJCF.
 
-    | level      | in MJCF                                                                                     |
-    |------------|---------------------------------------------------------------------------------------------|
-    | `exact`    | every rotor is a body with a hinge; gears are joint equalities, belts and differentials are |
-    |            | fixed tendons with a tendon equality (soft constraints: MuJoCo has no exact ones)           |
-    | `coupled`  | no rotors; joint armature for gears, tendon armature for what spans several joints of a     |
-    |            | chain; for other chains a massless body with armature, tied by a tendon                     |
-    | `armature` | no rotor bodies; the diagonal of the reflected inertia as joint armature                    |
-    | `none`     | no rotor bodies, no armature                                                                |
+    - `exact`: every rotor is a body with a hinge; gears are joint equalities, belts and differentials are fixed tendons
+      with a tendon equality (soft constraints: MuJoCo has no exact ones).
+    - `coupled`: no rotors; joint armature for gears, tendon armature for what spans several joints of a chain; for
+      other chains a massless body with armature, tied by a tendon.
+    - `armature`: no rotor bodies; the diagonal of the reflected inertia as joint armature.
+    - `none`: no rotor bodies, no armature.
 
     Loops are closed by connects and rods by spatial tendons at every level, see mjcf_export_ties.py. So armature of
     a joint inside a loop is reflected to the independent ones as the pose demands, velocity terms included: `coupled`

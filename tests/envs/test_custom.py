@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ce_gym.envs.custom import register_robot
+from ce_gym.envs.setup import make_program
 from ce_gym.envs.tasks import TASKS
 from ce_gym.model import RobotError, assets_folder
 from ce_gym.model.mechanism import LEVELS
@@ -101,3 +102,15 @@ def test_a_fixed_robot_cannot_walk():
 def test_a_name_needs_letters(dog):
     with pytest.raises(RobotError, match="expected a name with letters"):
         register_robot(dog(), name="--")
+
+
+def test_a_robot_without_knee_spheres_has_every_task(dog):
+    path = dog()
+    path.write_text("\n".join(line for line in path.read_text().splitlines() if "group: knee" not in line))
+    ids = register_robot(path)
+    for task in TASKS:
+        program = make_program(str(path), task)
+        assert {c.group for c in program.model.robot.contacts if c.name in program.contacts} == {"foot"}
+        assert f"ce_gym/MyDog{task.capitalize()}-v0" in ids
+    with pytest.raises(ValueError, match="contacts='knee'; expected"):
+        make_program(str(path), "stand", contacts=["foot", "knee"])

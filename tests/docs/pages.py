@@ -1,0 +1,78 @@
+"""What the pages say, cut into pieces: code blocks by language, commands, links. Knows the Markdown that we use."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "api").glob("*.md")])
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NAMED = re.compile(r"(?:# |<!-- )([\w-]+\.(?:yaml|urdf|xml|py))(?: -->)?\n")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A code block.
+
+    Attributes:
+        language: What stands behind the backticks.
+        text: The code.
+        line: Where it begins in its page, from 0.
+    """
+
+    language: str
+    text: str
+    line: int
+
+    @property
+    def file(self) -> str | None:
+        """Name of the file that it is, if its first line is a comment that says so."""
+        found = NAMED.match(self.text)
+        return found[1] if found else None
+
+
+def name_of(page: Path) -> str:
+    """Return a page's path in the repository."""
+    return str(page.relative_to(ROOT))
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    """Iterate over the code blocks of a page."""
+    text = page.read_text(encoding="utf-8")
+    for found in BLOCK.finditer(text):
+        yield Block(found[1], found[2], text[: found.start(2)].count("\n"))
+
+
+def script(page: Path) -> str:
+    """Return a page as one script: its Python, each line where it is in the page, so that errors name that line.
+
+    A block that is a file is written when its turn has come.
+    """
+    lines = [""] * page.read_text(encoding="utf-8").count("\n")
+    for block in blocks(page):
+        if block.file:
+            lines[block.line] = f"__import__('pathlib').Path({block.file!r}).write_text({block.text!r})"
+        elif block.language == "python":
+            code = block.text.splitlines()
+            lines[block.line : block.line + len(code)] = code
+    return "\n".join(lines) + "\n"
+
+
+def commands(page: Path) -> Iterator[str]:
+    """Iterate over the commands of a page: lines of its shell blocks, and what is set as code and begins like one."""
+    text = page.read_text(encoding="utf-8")
+    for block in blocks(page):
+        if block.language == "sh":
+            yield from (line for line in block.text.splitlines() if line.strip())
+    prose = BLOCK.sub("", text)
+    yield from (" ".join(code.split()) for code in re.findall(r"`((?:python|make|pip|cp) [^`]+)`", prose))
+
+
+def links(page: Path) -> Iterator[str]:
+    """Iterate over the targets of links and pictures that stay in the repository, without their anchors."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", BLOCK.sub("", page.read_text(encoding="utf-8"))):
+        if not re.match(r"[a-z]+:", target) and not target.startswith("#"):
+            yield target.split("#")[0]

@@ -1,0 +1,107 @@
+"""Every Python block of README and docs runs; every command in them exists.
+
+The Python blocks of a page are one script, run from top to bottom in an empty folder. A block of another language whose
+first line is a comment with a file name is that file, and `cp` copies from the repository, so a page can be followed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from pages import PAGES, ROOT, blocks, commands, name_of, script
+
+import ce_gym
+from ce_gym import __main__ as command_line
+from ce_gym.bench.__main__ import BENCHMARKS
+
+WITH_CODE = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
+COMMANDS = sorted({(name_of(page), command) for page in PAGES for command in commands(page)})
+ELSEWHERE = ("ray start", "python3 -m venv", "pip install torch onnx", "python -c")
+"""Beginnings of commands that are not ours to check."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
+def test_python_blocks_run(page: Path, tmp_path: Path):
+    for command in commands(page):
+        if command.startswith("cp "):
+            _, source, target = command.split()
+            shutil.copy(ROOT / source, tmp_path / target)
+    (tmp_path / "page.py").write_text(script(page), encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    result = subprocess.run(
+        [sys.executable, "page.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, f"{name_of(page)}\n{result.stdout[-2000:]}\n{result.stderr[-3000:]}"
+
+
+def test_pages_have_code():
+    assert {"README.md", "docs/start.md", "docs/own_robot.md", "docs/extending.md"} <= {name_of(p) for p in WITH_CODE}
+
+
+@pytest.mark.parametrize(("page", "command"), COMMANDS, ids=[f"{page}: {command}" for page, command in COMMANDS])
+def test_commands_exist(page: str, command: str):
+    words = [word for word in shlex.split(command, comments=True) if word not in ("...",)]
+    while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
+        words.pop(0)
+    words[0] = Path(words[0]).name  # of an environment that the page has made
+    text = " ".join(words)
+    if text.startswith(ELSEWHERE):
+        return
+    if words[0] == "make":
+        targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert set(words[1:]) <= set(targets)
+    elif words[0] == "pip":
+        check_extras(words)
+    elif words[0] == "cp":
+        assert (ROOT / words[1]).is_file()
+    elif words[:2] == ["python", "-m"]:
+        check_module(words[2], words[3:])
+    else:
+        assert words[0] == "python", f"what kind of command is {command!r}?"
+        check_script(ROOT / words[1], words[2:])
+
+
+def check_extras(words: list[str]) -> None:
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    (asked,) = re.findall(r"\[([\w,-]+)\]", words[-1])
+    assert set(asked.split(",")) <= set(known)
+
+
+def check_module(module: str, words: list[str]) -> None:
+    if module == "ce_gym" and words[:1] != ["bench"]:
+        if len(words) == 1:  # a subcommand by its name only
+            with pytest.raises(SystemExit, match=r"^0$"):
+                command_line._parser().parse_args([*words, "--help"])
+        elif words:
+            command_line._parser().parse_args(words)
+        return
+    assert module in ("ce_gym", "ce_gym.bench")
+    named = words if module == "ce_gym.bench" else words[1:]
+    if named:
+        assert named[0] in BENCHMARKS
+        parser = argparse.ArgumentParser()
+        parser.add_argument("--json", metavar="FILE")
+        importlib.import_module(f"ce_gym.bench.{named[0]}").add_arguments(parser)
+        parser.parse_args(named[1:])
+
+
+def check_script(path: Path, words: list[str]) -> None:
+    """The script exists, and so do its options and environments; it is read, not imported, because torch is slow."""
+    calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    adding = [c for c in calls if isinstance(c.func, ast.Attribute) and c.func.attr == "add_argument"]
+    options = {a.value for call in adding for a in call.args if isinstance(a, ast.Constant)}
+    assert {word for word in words if word.startswith("--")} <= options | {"--help"}
+    shipped = [word for word in words if word.startswith("ce_gym/")]
+    assert set(shipped) <= set(ce_gym.environment_ids())

@@ -1,0 +1,86 @@
+"""The pages are built without a warning, lead nowhere that does not exist, and have a place for every public name."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from pages import PAGES, ROOT, links, name_of
+
+import ce_gym
+import ce_gym.model
+import ce_gym.viewer
+
+HAND_WRITTEN = [page for page in PAGES if page.parent == ROOT]
+PUBLIC = (ce_gym, ce_gym.model, ce_gym.viewer)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    if find_spec("sphinx") is None or find_spec("myst_parser") is None or find_spec("furo") is None:
+        pytest.skip("Sphinx is not installed: pip install -e '.[docs]'")
+    out = tmp_path_factory.mktemp("html")
+    options = ["-W", "--keep-going", "--nitpicky", "-q", "-b", "html", "-d", str(out / "doctrees")]
+    command = [sys.executable, "-m", "sphinx", *options, str(ROOT / "docs"), str(out / "html")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert result.returncode == 0, result.stderr[-4000:]
+    return out / "html"
+
+
+@pytest.mark.slow
+def test_every_robot_and_environment_has_a_page(built: Path):
+    generated = built / "generated"
+    assert {path.stem for path in (generated / "robots").glob("*.html")} == set(ce_gym.robots())
+    pages = {(a["robot"], a["task"]) for a in ce_gym.environment_ids().values()}
+    assert {path.stem for path in (generated / "environments").glob("*.html")} == {f"{r}_{t}" for r, t in pages}
+    for path in (generated / "robots").glob("*.html"):
+        assert '<div class="ce-tree"><svg' in path.read_text()
+
+
+@pytest.mark.slow
+def test_every_id_is_on_a_page(built: Path):
+    text = "".join(path.read_text() for path in (built / "generated" / "environments").glob("*.html"))
+    assert not [name for name in ce_gym.environment_ids() if name not in text]
+
+
+@pytest.mark.slow
+def test_every_public_name_is_in_the_reference(built: Path):
+    from sphinx.util.inventory import InventoryFile
+
+    with (built / "objects.inv").open("rb") as file:
+        inventory = InventoryFile.load(file, "", lambda base, path: path)
+    known = {name for kind, entries in inventory.items() if kind.startswith("py:") for name in entries}
+    names = [f"{module.__name__}.{name}" for module in PUBLIC for name in module.__all__]
+    homes = {f"ce_gym.{name}" for name in ce_gym.__all__}
+    missing = [n for n in names if n not in known and f"ce_gym.{n.rsplit('.', 1)[1]}" not in homes & known]
+    assert not missing
+
+
+def test_what_returns_arrays_says_their_shape():
+    silent = []
+    for owner in (ce_gym.Model, ce_gym.Simulator, ce_gym.Terrain):
+        for name, thing in inspect.getmembers(owner):
+            function = thing.fget if isinstance(thing, property) else thing
+            hint = str(getattr(function, "__annotations__", {}).get("return", ""))
+            document = inspect.getdoc(thing) or ""
+            if not name.startswith("_") and "Array" in hint and "shape" not in document:
+                silent.append(f"{owner.__name__}.{name}")
+    assert not silent
+
+
+@pytest.mark.parametrize("page", HAND_WRITTEN, ids=name_of)
+def test_links_lead_somewhere(page: Path):
+    """Those of the other pages are checked by Sphinx."""
+    broken = [target for target in links(page) if not (page.parent / target).exists()]
+    assert not broken
+
+
+def test_the_reference_imports_what_it_names():
+    for module in PUBLIC:
+        for name in module.__all__:
+            assert getattr(importlib.import_module(module.__name__), name) is not None
