@@ -13,14 +13,16 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from ce_gym.viewer.cli import add_view_command
+from ce_gym.viewer.cli import add_play_command, add_view_command
+from ce_gym.viewer.console import Parser, examples
 
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
 
   python -m ce_gym list                  robots and environments
   python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
   python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
-  python -m ce_gym view walk.npz         write a recorded rollout, or a policy's, as one HTML file (or --live)
+  python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
+  python -m ce_gym view walk.npz         show recorded rollouts, several side by side or as ghosts
   python -m ce_gym bench                 benchmarks
 
 Each has --help. In Python: gymnasium.make("ce_gym:ce_gym/MiniCheetahVelocity-v0")."""
@@ -60,18 +62,29 @@ def _show_warning(message: Warning | str, *_: object) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="ce_gym", description=WELCOME.splitlines()[0])
+    parser = Parser(prog="python -m ce_gym", description=WELCOME)
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    list_ = commands.add_parser("list", help="robots and environments")
+    list_ = commands.add_parser("list", help="robots and environments", description="List robots and environments.")
     list_.set_defaults(run=_list)
-    inspect = commands.add_parser("inspect", help="what a robot is made of, or what an environment costs")
+    inspect = commands.add_parser(
+        "inspect",
+        help="what a robot is made of, or what an environment costs",
+        description="Say what a robot is made of and what each transmission level drops, or what a step of an "
+        "environment\ncosts, feature by feature.",
+        epilog=examples(
+            "inspect mini_cheetah", "inspect my_robot.yaml --no-errors", "inspect ce_gym/TelloVelocity-v0 --no-timing"
+        ),
+    )
     inspect.add_argument("name", metavar="NAME", help="name of a robot, path of its file, or id of an environment")
-    inspect.add_argument("--transmission", default="exact", help="exact (default), coupled, armature or none")
+    inspect.add_argument(
+        "--transmission", default="exact", metavar="LEVEL", help="exact (default), coupled, armature or none"
+    )
     inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")
     inspect.add_argument("--no-timing", action="store_true", help="environment: count instructions, compile nothing")
     inspect.set_defaults(run=_inspect)
+    add_play_command(commands)
     add_view_command(commands)
-    commands.add_parser("bench", help="benchmarks")
+    commands.add_parser("bench", help="benchmarks; without a name, the list of them")
     return parser
 
 

@@ -6,12 +6,13 @@ its docstring is its entry in the list. Knows nothing of what they measure, and 
 
 from __future__ import annotations
 
-import argparse
 import ast
 import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+from ce_gym.viewer.console import Parser
 
 BENCHMARKS = ("speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak")
 
@@ -39,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in BENCHMARKS:
         print(f"ce_gym.bench: no benchmark {name!r}; expected one of {', '.join(BENCHMARKS)}", file=sys.stderr)
         return 2
-    parser = argparse.ArgumentParser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
+    parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the report to a JSON file")
     benchmark = importlib.import_module(f"ce_gym.bench.{name}")
     benchmark.add_arguments(parser)

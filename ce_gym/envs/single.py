@@ -117,7 +117,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         }
 
     def state(self) -> dict[str, NDArray]:
-        """Return what a recorder needs: q, v, command and, if computed, contact_forces (n_contacts, 3)."""
+        """Return what a recorder needs: q, v, command, torque and, if computed, contact_forces (n_contacts, 3)."""
         return {name: rows[0] for name, rows in recorded_state(self.batch).items()}
 
 
@@ -185,8 +185,12 @@ def _brief(value: Any) -> str:
 
 
 def recorded_state(batch: Any) -> dict[str, NDArray]:
-    """Return copies of q (n, nq), v (n, nv), command (n, 3) and, if computed, contact_forces (n, n_contacts, 3)."""
-    state = {name: batch.rows(name) for name in ("q", "v", "command")}
+    """Return copies of a batch's state by name, one robot per row.
+
+    q (n, nq); v (n, nv); command (n, 3); torque of the motors at the joints (n, n_joints) [N m]; and, if computed,
+    contact_forces (n, n_contacts, 3) [N].
+    """
+    state = {name: batch.rows(name) for name in ("q", "v", "command", "torque")}
     if batch.program.contact_forces:
         state["contact_forces"] = batch.rows("contact_forces").reshape(batch.num_envs, -1, 3)
     return state

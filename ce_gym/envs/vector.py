@@ -176,7 +176,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         return shown(rows.copy(), self.batch.program, self.single_observation_space)
 
     def state(self) -> dict[str, NDArray]:
-        """Return what a recorder needs: q, v, command and, if computed, contact_forces (num_envs, n_contacts, 3)."""
+        """Return what a recorder needs, one robot per row; see `recorded_state`."""
         return recorded_state(self.batch)
 
     @property

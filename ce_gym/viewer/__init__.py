@@ -1,8 +1,8 @@
 """Recorded rollouts and what shows them: one HTML file, or a page on this machine's loopback.
 
-    recorder = Recorder("mini_cheetah", "exact", dt=0.02)
-    recorder.add(time, q, v, contact_forces, command)
-    recorder.rollout().save("walk.npz")
+    env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0", contact_forces=True)
+    rollout = record(env, lambda observation: env.action_space.sample(), seconds=5.0)
+    rollout.save("walk.npz")
     write_html(Rollout.load("walk.npz"), "walk.html")
 
 Knows models, environments and rollouts; knows nothing of learning. meshcat is needed only when something is drawn.
@@ -18,15 +18,32 @@ if TYPE_CHECKING:
     from ce_gym.viewer.html import write_html
     from ce_gym.viewer.live import show
     from ce_gym.viewer.recorder import Recorder
+    from ce_gym.viewer.recording import record, record_lanes
     from ce_gym.viewer.rollout import Rollout, RolloutError
-    from ce_gym.viewer.walk import SHOW, Script, drive
+    from ce_gym.viewer.walk import SHOW, Script, drive, drive_many
 
-__all__ = ["SHOW", "Recorder", "Rollout", "RolloutError", "Script", "ViewerError", "drive", "show", "write_html"]
+__all__ = [
+    "SHOW",
+    "Recorder",
+    "Rollout",
+    "RolloutError",
+    "Script",
+    "ViewerError",
+    "drive",
+    "drive_many",
+    "record",
+    "record_lanes",
+    "show",
+    "write_html",
+]
 
 _HOMES = {
     "SHOW": "walk",
     "Script": "walk",
     "drive": "walk",
+    "drive_many": "walk",
+    "record": "recording",
+    "record_lanes": "recording",
     "Recorder": "recorder",
     "Rollout": "rollout",
     "RolloutError": "rollout",

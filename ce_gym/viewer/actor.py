@@ -16,7 +16,7 @@ from ce_gym.viewer import tracks
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.robot import body_paths, extent
 from ce_gym.viewer.rollout import Rollout
-from ce_gym.viewer.three import Command
+from ce_gym.viewer.three import Command, transform
 
 Array = NDArray[np.float64]
 
@@ -87,6 +87,16 @@ class Actor:
         if self.robot.floating:
             return self.positions[:, 0, :2]
         return np.tile((self.low + self.high)[:2] / 2, (len(self.times), 1))
+
+    @property
+    def start(self) -> Array:
+        """Where on the ground the base is in the first frame and which way it heads, shape (4, 4)."""
+        if not self.robot.floating:
+            return np.eye(4)
+        (x, y, _), (forward, left, _) = self.positions[0, 0], self.rotations[0, 0, :, 0]
+        length = float(np.hypot(forward, left)) or 1.0
+        c, s = (forward / length, left / length) if forward or left else (1.0, 0.0)
+        return transform([x, y, 0.0], [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def clips(self, end: float) -> Iterator[Command]:
         """Animate every body against its parent until `end` [s]."""

@@ -1,4 +1,4 @@
-"""`python -m ce_gym view`: its arguments, and what it does with them. Knows the viewer's public functions."""
+"""`python -m ce_gym view` and `play`: their arguments, and what they do with them. Knows the viewer's functions."""
 
 from __future__ import annotations
 
@@ -6,52 +6,150 @@ import argparse
 import os
 import sys
 import webbrowser
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from ce_gym.viewer.console import examples
+
+if TYPE_CHECKING:
+    from ce_gym.viewer.rollout import Rollout
+
+LEVELS = ("exact", "coupled", "armature", "none")
+WHERE = "a policy's file (policy.zip, .npz, .onnx), the folder that has it, or the name of a shipped policy"
 
 
 def add_view_command(subparsers: Any) -> None:
     """Add `view` to the subcommands of an argument parser."""
     parser = subparsers.add_parser(
         "view",
-        help="show recorded rollouts and policies, as one HTML file or live",
+        help="show recorded rollouts and policies in a browser",
         description="Show recorded rollouts, or what policies do: write one self-contained HTML file (default), or "
-        "serve a page live.",
+        "serve\nthe page on this machine until Ctrl-C.",
+        epilog=examples(
+            "view walk.npz", "view exact.npz armature.npz --overlay", "view walk.npz --plot 'torque of FL_knee' reward"
+        ),
     )
     parser.add_argument(
-        "rollouts", nargs="+", type=Path, metavar="ROLLOUT",
-        help="rollout file (.npz); a policy.npz or its folder; the name of a shipped policy; several side by side",
-    )  # fmt: skip
-    target = parser.add_mutually_exclusive_group()
-    target.add_argument(
-        "--html",
-        type=Path,
-        metavar="FILE",
-        help="HTML file to write (default: beside the first rollout, here for policies)",
+        "rollouts", nargs="+", type=Path, metavar="ROLLOUT", help=f"a recorded rollout (.npz); or {WHERE}"
     )
-    target.add_argument("--live", action="store_true", help="serve the page on this machine's loopback until Ctrl-C")
     parser.add_argument("--overlay", action="store_true", help="draw all in one place, all but the first as ghosts")
+    _add_page_arguments(parser, "beside the first rollout, here for policies")
+    parser.set_defaults(run=view)
+
+
+def add_play_command(subparsers: Any) -> None:
+    """Add `play` to the subcommands of an argument parser."""
+    parser = subparsers.add_parser(
+        "play",
+        help="let a trained policy act, record it and show it in a browser",
+        description="Let a trained policy drive robots through a list of commands, and show them: several transmission "
+        "levels\nas ghosts of the first, from the same seed, or many robots in a square.",
+        epilog=examples(
+            "play demo",
+            "play demo --transmission exact armature",
+            "play demo --robots 16 --command 5 0.8 0 0 --command 5 0.5 0 1",
+        ),
+    )
+    parser.add_argument("policy", type=Path, metavar="POLICY", help=WHERE)
+    parser.add_argument(
+        "--transmission",
+        nargs="+",
+        choices=LEVELS,
+        metavar="LEVEL",
+        default=[],
+        help=f"{', '.join(LEVELS[:-1])} or {LEVELS[-1]} (default: as trained); all but the first become ghosts",
+    )
+    parser.add_argument(
+        "--robots", type=_at_least_one, default=1, metavar="N", help="robots, each with a seed of its own"
+    )
+    parser.add_argument(
+        "--command",
+        nargs=4,
+        type=float,
+        action="append",
+        metavar=("SECONDS", "FORWARD", "LEFT", "TURN"),
+        help="what to command [m/s, m/s, rad/s], and for how long; may be repeated (default: a short show)",
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first robot (default 0)")
+    parser.add_argument("--save", type=Path, metavar="FOLDER", help="also keep the rollouts as .npz files there")
+    _add_page_arguments(parser, "here, named after the policy's folder")
+    parser.set_defaults(run=play)
+
+
+def _at_least_one(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number, at least 1")
+    return int(text)
+
+
+def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
+    """Add what says where a page goes and how it looks."""
+    target = parser.add_mutually_exclusive_group()
+    target.add_argument("--html", type=Path, metavar="FILE", help=f"HTML file to write (default: {default})")
+    target.add_argument("--live", action="store_true", help="serve the page on this machine's loopback until Ctrl-C")
+    parser.add_argument(
+        "--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot beside the robot at first"
+    )
     parser.add_argument("--title", help="heading of the page (default: the robot's name)")
     parser.add_argument(
         "--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser, if there is a display"
     )
-    parser.set_defaults(run=view)
 
 
 def view(args: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
-    from ce_gym.viewer import Rollout, show, write_html
-    from ce_gym.viewer.walk import policy_file, walk
+    """Run `view`; return its exit code."""
+    from ce_gym.viewer.policies import policy_file
+    from ce_gym.viewer.rollout import Rollout
+    from ce_gym.viewer.walk import walk
 
     policies = [policy_file(path) for path in args.rollouts]
-    rollouts = [walk(p) if p else Rollout.load(path) for p, path in zip(policies, args.rollouts, strict=True)]
-    first = Path(f"{policies[0].parent.resolve().name}.npz") if policies[0] else args.rollouts[0]
-    options = {"title": args.title, "spacing": 0.0 if args.overlay else None}
+    rollouts = [walk(p)[0] if p else Rollout.load(path) for p, path in zip(policies, args.rollouts, strict=True)]
+    beside = args.rollouts[0].with_suffix(".html")
+    return _present(rollouts, args, _page_of(policies[0]) if policies[0] else beside, overlay=args.overlay)
+
+
+def play(args: argparse.Namespace) -> int:
+    """Run `play`; return its exit code."""
+    from ce_gym.viewer.errors import ViewerError
+    from ce_gym.viewer.policies import policy_file
+    from ce_gym.viewer.walk import SHOW, walk
+
+    file = policy_file(args.policy)
+    if file is None:
+        raise ViewerError(f"{args.policy}: no such policy; expected {WHERE}")
+    if args.robots > 1 and len(args.transmission) > 1:
+        raise ViewerError(f"--robots {args.robots}: expected 1, or one level of --transmission")
+    script = [(time, (x, y, turn)) for time, x, y, turn in args.command] if args.command else SHOW
+    options = {"robots": args.robots, "seed": args.seed}
+    levels = [{"transmission": level, "label": level} for level in args.transmission] or [{}]
+    rollouts = [rollout for level in levels for rollout in walk(file, script, **options, **level)]
+    if args.robots > 1:
+        rollouts = [replace(rollout, label=f"seed {args.seed + index}") for index, rollout in enumerate(rollouts)]
+    page = _page_of(file)
+    if args.save:
+        args.save.mkdir(parents=True, exist_ok=True)
+        for index, rollout in enumerate(rollouts):
+            number = f"_{args.seed + index}" if args.robots > 1 else ""
+            print(rollout.save(args.save / f"{page.stem}_{rollout.transmission}{number}.npz"))
+    return _present(rollouts, args, page, overlay=len(levels) > 1)
+
+
+def _page_of(policy: Path) -> Path:
+    return Path(f"{policy.resolve().parent.name}.html")
+
+
+def _present(rollouts: Sequence[Rollout], args: argparse.Namespace, default: Path, *, overlay: bool) -> int:
+    """Write or serve the page of rollouts as asked for; return the exit code."""
+    from ce_gym.viewer import show, write_html
+
+    options: dict[str, Any] = {"title": args.title, "spacing": 0.0 if overlay else None, "plot": args.plot}
     may_open = args.open and has_display()
     if args.live:
         show(rollouts, open_browser=may_open, **options)
         return 0
-    path = write_html(rollouts, args.html or first.with_suffix(".html"), **options)
+    path = write_html(rollouts, args.html or default, **options)
     print(path)
     if may_open:
         webbrowser.open(path.resolve().as_uri(), new=2)

@@ -23,6 +23,7 @@ class Recorder:
         label: A few words for the legend.
         info: Anything else worth keeping, as text.
         contact_names: Which contacts the forces belong to; empty means all of the robot's.
+        signal_names: Of what else is recorded for plots.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class Recorder:
         label: str = "",
         info: Mapping[str, str] | None = None,
         contact_names: Sequence[str] = (),
+        signal_names: Sequence[str] = (),
     ) -> None:
         self._fixed: dict[str, Any] = {
             "robot": robot,
@@ -42,14 +44,22 @@ class Recorder:
             "label": label,
             "info": dict(info or {}),
             "contact_names": tuple(contact_names),
+            "signal_names": tuple(signal_names),
         }
-        self._frames: list[tuple[float, Array, Array, Array, Array]] = []
+        self._frames: list[dict[str, Any]] = []
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def add(
-        self, time: float, q: ArrayLike, v: ArrayLike, contact_forces: ArrayLike = (), command: ArrayLike = ()
+        self,
+        time: float,
+        q: ArrayLike,
+        v: ArrayLike,
+        contact_forces: ArrayLike = (),
+        command: ArrayLike = (),
+        torque: ArrayLike = (),
+        signals: ArrayLike = (),
     ) -> None:
         """Append one frame; the arrays are copied.
 
@@ -59,9 +69,12 @@ class Recorder:
             v: Velocities, shape (nv,).
             contact_forces: Force on each contact, world axes [N], shape (n_contacts, 3).
             command: Shape (n,); see `Rollout.commands`.
+            torque: Of the motors at the independent joints [N m], shape (n_joints,).
+            signals: One number for each of `signal_names`.
         """
-        forces = np.array(contact_forces, float).reshape(-1, 3)
-        self._frames.append((float(time), np.array(q, float), np.array(v, float), forces, np.array(command, float)))
+        frame = {"times": time, "q": q, "v": v, "commands": command, "torques": torque, "signals": signals}
+        frame["contact_forces"] = np.reshape(contact_forces, (-1, 3))
+        self._frames.append({name: np.array(value, float) for name, value in frame.items()})
 
     def rollout(self) -> Rollout:
         """Return everything added so far.
@@ -71,14 +84,13 @@ class Recorder:
         """
         if not self._frames:
             raise RolloutError("nothing was recorded: expected at least one frame")
-        names = ("times", "q", "v", "contact_forces", "commands")
-        columns = zip(names, zip(*self._frames, strict=True), strict=True)
-        arrays: dict[str, Any] = {name: _stack(name, column) for name, column in columns}
+        arrays: dict[str, Any] = {name: _stack(name, self._frames) for name in self._frames[0]}
         return Rollout(**self._fixed, **arrays)
 
 
-def _stack(name: str, column: tuple[Any, ...]) -> Array:
-    shapes = sorted({np.shape(value) for value in column})
+def _stack(name: str, frames: list[dict[str, Any]]) -> Array:
+    column = [frame[name] for frame in frames]
+    shapes = sorted({value.shape for value in column})
     if len(shapes) > 1:
         raise RolloutError(f"{name} changes shape from frame to frame: {shapes[0]} and {shapes[1]}")
     return np.array(column, float)

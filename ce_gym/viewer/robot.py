@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ce_gym.model.description import Placement, Robot, Shape
 from ce_gym.viewer import three
+from ce_gym.viewer.belts import belt_shapes
 from ce_gym.viewer.stand_ins import DARK, LIGHT, rotor_discs, shapes_of
 from ce_gym.viewer.three import Color, Command
 
@@ -37,7 +38,9 @@ def robot_commands(robot: Robot, root: str, *, tint: Color | None = None, opacit
         tint: One colour for everything, in place of the shapes' own.
         opacity: Factor on the opacity of everything, 0..1.
     """
-    paths, shapes, discs = body_paths(robot, root), shapes_of(robot), rotor_discs(robot)
+    paths, shapes, inside = body_paths(robot, root), shapes_of(robot), belt_shapes(robot)
+    for name, disc in rotor_discs(robot).items():
+        inside.setdefault(name, []).append(disc)
     for body in robot.bodies:
         for index, shape in enumerate(shapes[body.name]):
             color = tint or shape.color
@@ -45,15 +48,17 @@ def robot_commands(robot: Robot, root: str, *, tint: Color | None = None, opacit
             yield _shape_command(path, shape, color, opacity * shape.color[3])
             if body.kind == "rotor" and shape.type == "cylinder":
                 yield _spoke_command(f"{path}_spoke", shape, color, opacity)
-        if body.name in discs:
-            yield from _hidden_disc(f"{paths[body.name]}/inside", discs[body.name], tint, opacity)
+        if body.name in inside:
+            yield from _hidden(f"{paths[body.name]}/inside", inside[body.name], tint, opacity)
 
 
-def _hidden_disc(path: str, disc: Shape, tint: Color | None, opacity: float) -> Iterator[Command]:
-    """Draw a rotor that has no shapes, for whoever looks through the links."""
-    color = tint or disc.color
-    yield _shape_command(f"{path}/disc", disc, color, opacity)
-    yield _spoke_command(f"{path}/spoke", disc, color, opacity)
+def _hidden(path: str, shapes: list[Shape], tint: Color | None, opacity: float) -> Iterator[Command]:
+    """Draw rotors, pulleys and belts for whoever looks through the links."""
+    for index, shape in enumerate(shapes):
+        color = tint or shape.color
+        yield _shape_command(f"{path}/part_{index}", shape, color, opacity)
+        if shape.type == "cylinder":
+            yield _spoke_command(f"{path}/spoke_{index}", shape, color, opacity)
     yield three.set_property(path, "visible", False)
 
 

@@ -18,7 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 FORMAT = "ce_gym rollout"
-VERSION = 1
+VERSION = 2
+
+ARRAYS = {"times": 1, "q": 2, "v": 2, "contact_forces": 3, "commands": 2, "torques": 2, "signals": 2}
+"""What a rollout consists of: the number of axes of each array, the first of which is time."""
 
 Array = NDArray[np.float64]
 
@@ -42,6 +45,10 @@ class Rollout:
             be zero. None means zero contacts.
         commands: What the robot was told to do, shape (T, n); n may be zero. The first two columns are drawn as
             speed forward and to the left in the frame of the base's heading [m/s]. None means n = 0.
+        torques: Torque of the motors at each independent joint over the control step that led here [N m], shape
+            (T, n_joints); n_joints may be zero. None means none.
+        signals: Anything else to plot, such as reward terms, shape (T, n). None means n = 0.
+        signal_names: Of the columns of `signals`.
         label: A few words for the legend.
         info: Anything else worth keeping, as text.
         contact_names: Which contacts the forces belong to, for simulations of some contacts only; empty means all of
@@ -56,14 +63,18 @@ class Rollout:
     v: Array
     contact_forces: Array = None  # type: ignore[assignment]  # __post_init__ turns None into an empty array
     commands: Array = None  # type: ignore[assignment]
+    torques: Array = None  # type: ignore[assignment]
+    signals: Array = None  # type: ignore[assignment]
+    signal_names: Sequence[str] = ()
     label: str = ""
     info: Mapping[str, str] = field(default_factory=dict)
     contact_names: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         frames = np.size(self.times)
-        empty = {"contact_forces": np.empty((frames, 0, 3)), "commands": np.empty((frames, 0))}
-        for name, ndim in {"times": 1, "q": 2, "v": 2, "contact_forces": 3, "commands": 2}.items():
+        empty = {name: np.empty((frames, 0)) for name in ("commands", "torques", "signals")}
+        empty["contact_forces"] = np.empty((frames, 0, 3))
+        for name, ndim in ARRAYS.items():
             value = getattr(self, name)
             value = _numbers(name, empty[name] if value is None and name in empty else value)
             object.__setattr__(self, name, value)
@@ -75,6 +86,11 @@ class Rollout:
         named, found = len(self.contact_names), self.contact_forces.shape[1]
         if named and found and named != found:
             raise RolloutError(f"contact_names has {named} names; contact_forces has {found} contacts")
+        object.__setattr__(self, "signal_names", tuple(self.signal_names))
+        if len(self.signal_names) != self.signals.shape[1]:
+            raise RolloutError(
+                f"signal_names has {len(self.signal_names)} names; signals has {self.signals.shape[1]} columns"
+            )
 
     def __len__(self) -> int:
         return len(self.times)
@@ -95,6 +111,7 @@ class Rollout:
             "label": self.label,
             "info": {str(key): str(value) for key, value in self.info.items()},
             "contact_names": list(self.contact_names),
+            "signal_names": list(self.signal_names),
         }
         path = Path(path)
         # An open file, since numpy would append .npz to a name that lacks it.
@@ -103,7 +120,7 @@ class Rollout:
                 file,
                 header=np.array(json.dumps(header)),
                 times=self.times,
-                **{name: getattr(self, name).astype(np.float32) for name in ("q", "v", "contact_forces", "commands")},
+                **{name: getattr(self, name).astype(np.float32) for name in ARRAYS if name != "times"},
             )
         return path
 
@@ -117,7 +134,9 @@ class Rollout:
         entries = _read_entries(Path(path))
         try:
             header = _read_header(entries.pop("header"))
-            return cls(**header, **entries)
+            if missing := [name for name in ARRAYS if name not in entries]:
+                raise RolloutError(f"has no {', '.join(missing)}; expected {', '.join(ARRAYS)}")
+            return cls(**header, **{name: entries[name] for name in ARRAYS})
         except RolloutError as error:
             raise RolloutError(f"{path}: {error}") from None
 
@@ -148,15 +167,14 @@ def _check_clock(dt: float, times: Array) -> None:
 
 
 def _read_entries(path: Path) -> dict[str, Any]:
-    names = {"header", "times", "q", "v", "contact_forces", "commands"}
     try:
         archive = np.load(path, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
             raise RolloutError(f"{path}: not a ce_gym rollout; expected an npz, not a single array")
         with archive:
-            if not names <= set(archive.files):
-                raise RolloutError(f"{path}: not a ce_gym rollout; expected an npz with {', '.join(sorted(names))}")
-            return {name: archive[name] for name in names}
+            if "header" not in archive.files:
+                raise RolloutError(f"{path}: not a ce_gym rollout; expected an npz with an entry 'header'")
+            return {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         raise RolloutError(f"{path}: no such file; expected a rollout (.npz)") from None
     except RolloutError:
@@ -183,6 +201,7 @@ def _read_header(entry: NDArray[Any]) -> dict[str, Any]:
         "label": str,
         "info": dict,
         "contact_names": list,
+        "signal_names": list,
     }
     for key, kind in expected.items():
         if not isinstance(header.get(key), kind):

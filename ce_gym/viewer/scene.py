@@ -1,7 +1,8 @@
 """Rollouts -> the commands of one meshcat scene: robots, arrows, stage and the animation that moves them.
 
-Robots stand side by side, or on top of each other as ghosts, and the world moves under the camera so that the first
-thing to leave the picture is the ground, not the robot. Knows rollouts and posed models; knows no files, no servers.
+Robots stand side by side, many of them in a square, or on top of each other as ghosts. The world moves under the camera
+so that the first thing to leave the picture is the ground, not the robot. Knows rollouts and posed models; knows no
+files, no servers.
 """
 
 from __future__ import annotations
@@ -24,23 +25,18 @@ Array = NDArray[np.float64]
 ROOT = "/world"
 GHOST_TINTS: tuple[Color, ...] = ((0.90, 0.45, 0.25), (0.25, 0.55, 0.85), (0.35, 0.65, 0.35))
 GHOST_OPACITY = 0.4
+ROW = 4  # so many stand in one row; more stand in a square
 FOLLOW_SECONDS = 0.8  # the camera averages the robots' path over this time [s]
 
 
-def build_scene(
-    rollouts: Sequence[Rollout],
-    models: Sequence[PosedModel] | None = None,
-    *,
-    spacing: float | None = None,
-    max_fps: float = 50.0,
-) -> list[Command]:
-    """Return the commands that show rollouts, the animation last.
+def make_actors(
+    rollouts: Sequence[Rollout], models: Sequence[PosedModel] | None = None, max_fps: float = 50.0
+) -> list[Actor]:
+    """Pose the robots of rollouts.
 
     Args:
         rollouts: At least one.
         models: A posed model for each; built from the rollouts' robots if not given.
-        spacing: Distance between neighbours [m]; zero draws all but the first as ghosts in the same place. By default
-            neighbours keep clear of each other.
         max_fps: Frames beyond this rate are left out [1/s].
 
     Raises:
@@ -48,16 +44,31 @@ def build_scene(
     """
     if not rollouts:
         raise ViewerError("nothing to show: expected at least one rollout")
-    models = [load_model(rollout) for rollout in rollouts] if models is None else models
+    if models is None:
+        known = {(rollout.robot, rollout.transmission): rollout for rollout in rollouts}
+        built = {key: load_model(rollout) for key, rollout in known.items()}
+        models = [built[rollout.robot, rollout.transmission] for rollout in rollouts]
     pairs = zip(rollouts, models, strict=True)
-    actors = [Actor(rollout, model, f"{ROOT}/{index}", max_fps) for index, (rollout, model) in enumerate(pairs)]
-    spacing = 1.6 * max(actor.radius for actor in actors) if spacing is None else spacing
+    return [Actor(rollout, model, f"{ROOT}/{index}", max_fps) for index, (rollout, model) in enumerate(pairs)]
+
+
+def build_scene(actors: Sequence[Actor], *, spacing: float | None = None) -> list[Command]:
+    """Return the commands that show actors, the animation last.
+
+    Args:
+        actors: At least one.
+        spacing: Distance between neighbours [m]; zero draws all but the first as ghosts in the same place. By default
+            neighbours keep clear of each other. Robots that stand apart all start towards the same side, x.
+    """
+    poses = places(actors, 1.6 * max(actor.radius for actor in actors) if spacing is None else spacing)
     end = max(max(actor.times[-1], actor.rollout.dt) for actor in actors)
-    commands = [*_stage(actors, spacing)]
-    clips = [_follow(actors, end)]
+    commands = [*_stage(actors, poses)]
+    clips = [_follow(actors, poses, end)]
     for index, actor in enumerate(actors):
         ghost = index > 0 and spacing == 0
-        commands += _actor(actor, index, ghost=ghost, lateral=_lateral(index, actors, spacing))
+        tint = GHOST_TINTS[(index - 1) % len(GHOST_TINTS)] if ghost else None
+        commands += robot_commands(actor.robot, actor.path, tint=tint, opacity=GHOST_OPACITY if ghost else 1.0)
+        commands.append(three.set_transform(actor.path, poses[index]))
         clips += actor.clips(end)
         for arrow in () if ghost else arrows.all_arrows(actor):
             commands += arrow.commands()
@@ -72,29 +83,41 @@ def load_model(rollout: Rollout) -> PosedModel:
     return Model(rollout.robot, transmission=rollout.transmission)
 
 
-def _lateral(index: int, actors: list[Actor], spacing: float) -> float:
-    return spacing * ((len(actors) - 1) / 2 - index)
+def places(actors: Sequence[Actor], spacing: float) -> list[Array]:
+    """Return where the world of each actor is put, shape (4, 4); ghosts share that of the first."""
+    count = len(actors)
+    if spacing == 0:
+        return [np.linalg.inv(actors[0].start)] * count
+    columns = count if count <= ROW else int(np.ceil(np.sqrt(count)))
+    rows = -(-count // columns)
+    result = []
+    for index, actor in enumerate(actors):
+        row, column = divmod(index, columns)
+        place = [spacing * ((rows - 1) / 2 - row), spacing * ((columns - 1) / 2 - column), 0.0]
+        result.append(three.transform(place) @ np.linalg.inv(actor.start))
+    return result
 
 
-def _actor(actor: Actor, index: int, *, ghost: bool, lateral: float) -> Iterator[Command]:
-    tint = GHOST_TINTS[(index - 1) % len(GHOST_TINTS)] if ghost else None
-    yield from robot_commands(actor.robot, actor.path, tint=tint, opacity=GHOST_OPACITY if ghost else 1.0)
-    yield three.set_transform(actor.path, three.transform([0.0, lateral, 0.0]))
-
-
-def _stage(actors: list[Actor], spacing: float) -> Iterator[Command]:
-    width = spacing * (len(actors) - 1)
-    radius = max(actor.radius for actor in actors) + width / 2
-    corners = np.concatenate([actor.positions[..., :2].reshape(-1, 2) for actor in actors])
-    margin = np.array([0.0, width / 2])
-    yield from stage_commands(corners.min(0) - margin, corners.max(0) + margin, root=ROOT, radius=radius)
+def _stage(actors: Sequence[Actor], poses: Sequence[Array]) -> Iterator[Command]:
+    paths = [_moved(actor.positions[..., :2].reshape(-1, 2), pose) for actor, pose in zip(actors, poses, strict=True)]
+    starts = np.array([_moved(actor.middle[:1], pose)[0] for actor, pose in zip(actors, poses, strict=True)])
+    radius = max(actor.radius for actor in actors) + float(np.linalg.norm(np.ptp(starts, 0))) / 2
+    corners = np.concatenate(paths)
+    yield from stage_commands(corners.min(0), corners.max(0), root=ROOT, radius=radius)
     middle = (min(actor.low[2] for actor in actors) + max(actor.high[2] for actor in actors)) / 2
     yield from camera_commands(np.array([0.0, 0.0, middle]), radius)
 
 
-def _follow(actors: list[Actor], end: float) -> Command:
+def _moved(points: Array, pose: Array) -> Array:
+    """Return points of the ground, shape (n, 2), moved by a pose, shape (4, 4)."""
+    return points @ pose[:2, :2].T + pose[:2, 3]
+
+
+def _follow(actors: Sequence[Actor], poses: Sequence[Array], end: float) -> Command:
     """Move the world against the mean path of the robots' middles, so that they stay before the camera."""
     times = max((actor.times for actor in actors), key=len)
-    paths = [[np.interp(times, actor.times, actor.middle[:, axis]) for axis in (0, 1)] for actor in actors]
+    middles = [_moved(actor.middle, pose) for actor, pose in zip(actors, poses, strict=True)]
+    pairs = zip(actors, middles, strict=True)
+    paths = [[np.interp(times, actor.times, middle[:, axis]) for axis in (0, 1)] for actor, middle in pairs]
     centre = smooth(np.mean(paths, 0).T, times, FOLLOW_SECONDS)
     return tracks.moving(ROOT, times, end, {"position": np.column_stack([-centre, np.zeros(len(times))])})

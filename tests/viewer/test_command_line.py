@@ -51,6 +51,7 @@ def test_view_writes_where_it_is_told(standing: Path, tmp_path: Path) -> None:
     target = tmp_path / "two.html"
     assert main(["view", str(standing), str(standing), "--overlay", "--title", "Twins", "--html", str(target)]) == 0
     assert "<title>Twins</title>" in target.read_text(encoding="utf-8")
+    assert target.stat().st_size < 6e6
 
 
 @pytest.mark.parametrize(("display", "asked", "opened"), [("", True, 0), (":0", True, 1), (":0", False, 0)])
@@ -72,6 +73,8 @@ def test_browser_opens_only_if_asked_and_possible(
         (["view", "nowhere.npz"], "nowhere.npz: no such file"),
         (["view", __file__], "test_command_line.py: cannot be read as a rollout"),
         (["inspect", "nobody"], "nobody"),
+        (["play", "nowhere"], "nowhere: no such policy; expected a policy's file"),
+        (["play", __file__], "no such policy"),
         (["inspect", ROBOT, "--transmission", "sloppy"], "sloppy"),
     ],
 )
@@ -82,6 +85,43 @@ def test_mistakes_are_one_line(arguments: list[str], message: str, capsys: pytes
     assert len(errors) == 1
     assert errors[0].startswith("ce_gym: ")
     assert message in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["vieuw"], "'vieuw'"),
+        (["view"], "ROLLOUT"),
+        (["list", "--all"], "--all"),
+        (["play", "x", "--transmission", "sloppy"], "'sloppy'"),
+        (["play", "x", "--robots", "0"], "'0'; expected a whole number, at least 1"),
+        (["play", "x", "--html", "a", "--live"], "not allowed with"),
+    ],
+)
+def test_wrong_arguments_are_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.startswith("ce_gym: ")
+    assert message in error
+    assert "--help" in error
+
+
+@pytest.mark.parametrize("command", ["list", "inspect", "view", "play"])
+def test_help_says_what_it_does(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--help"])
+    assert caught.value.code == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"usage: python -m ce_gym {command}")
+    assert max(len(line) for line in out.splitlines()) <= 120
+
+
+def test_unknown_signal(standing: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", str(standing), "--plot", "torq", "temperature"]) == 2
+    assert "no signal 'temperature' to plot; expected one of forward speed [m/s], " in capsys.readouterr().err
 
 
 def test_unknown_robot_in_a_rollout(standing: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -104,7 +144,7 @@ def test_unwritable_target(standing: Path, tmp_path: Path, capsys: pytest.Captur
 def test_no_arguments_say_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     out = capsys.readouterr().out
-    assert all(word in out for word in ("list", "inspect", "view", "bench"))
+    assert all(word in out for word in ("list", "inspect", "view", "play", "bench"))
 
 
 def test_list_and_inspect_name_the_robot(capsys: pytest.CaptureFixture[str]) -> None:

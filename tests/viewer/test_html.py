@@ -41,7 +41,10 @@ def model() -> StandIn:
 def test_page_needs_nothing_from_outside(tmp_path: Path, model: StandIn) -> None:
     path = write_html(make_rollout(), tmp_path / "walk.html", models=[model])
     text = path.read_text(encoding="utf-8")
-    assert set(re.findall(r"https?://[^\s\"'\\)]+", text)) <= {"http://www.w3.org/1999/xhtml"}  # an XML name
+    assert set(re.findall(r"https?://[^\s\"'\\)]+", text)) <= {
+        "http://www.w3.org/1999/xhtml",  # names in XML
+        "http://www.w3.org/2000/svg",
+    }
     assert not re.search(r"<(script|img|iframe)[^>]*\ssrc=|<link\b|@import", text)
     assert list(tmp_path.iterdir()) == [path]
 
@@ -60,8 +63,9 @@ def test_page_is_the_same_every_time(model: StandIn) -> None:
 
 
 def test_text_is_escaped(model: StandIn) -> None:
-    text = page(make_rollout(label="<b>$x"), models=[model], title="</title><script>")
+    text = page(make_rollout(label="<b>$x</script>"), models=[model], title="</title><script>")
     assert "<b>$x" not in text
+    assert text.count("</script>") == page(make_rollout(), models=[model]).count("</script>")
     assert "&lt;b&gt;$x" in text
     assert "<title>&lt;/title&gt;" in text
 

@@ -11,15 +11,17 @@ from hopper import make_rollout
 
 from ce_gym.viewer import Recorder, Rollout, RolloutError
 
-ARRAYS = ("times", "q", "v", "contact_forces", "commands")
+ARRAYS = ("times", "q", "v", "contact_forces", "commands", "torques", "signals")
 
 
 def test_round_trip(tmp_path: Path) -> None:
-    rollout = make_rollout(contact_names=["foot"])
+    signals = np.arange(100.0).reshape(50, 2)
+    more = {"signals": signals, "signal_names": ["a", "b"], "torques": signals[:, :1]}
+    rollout = make_rollout(contact_names=["foot"], **more)
     loaded = Rollout.load(rollout.save(tmp_path / "walk.npz"))
     for name in ARRAYS:
         np.testing.assert_allclose(getattr(loaded, name), getattr(rollout, name), rtol=1e-6, err_msg=name)
-    for name in ("robot", "transmission", "dt", "label", "info", "contact_names"):
+    for name in ("robot", "transmission", "dt", "label", "info", "contact_names", "signal_names"):
         assert getattr(loaded, name) == getattr(rollout, name)
 
 
@@ -72,6 +74,8 @@ def test_recorder_refuses_nothing_and_changing_shapes() -> None:
         ({"v": np.full((50, 6), np.nan)}, "v has a number that is not finite in frame 0"),
         ({"contact_forces": np.zeros((50, 1, 2))}, "contact_forces has shape"),
         ({"contact_names": ["a", "b"]}, "contact_names has 2 names; contact_forces has 1 contacts"),
+        ({"signals": np.zeros((50, 2)), "signal_names": ["a"]}, "signal_names has 1 names; signals has 2 columns"),
+        ({"torques": np.zeros((49, 2))}, "torques has shape"),
         ({"times": np.zeros(50)}, "times does not increase"),
         ({"dt": 0.0}, "dt is 0.0"),
         ({"dt": float("nan")}, "dt is nan"),
@@ -133,9 +137,13 @@ def single_array(path: Path) -> Path:
         (truncated, "cannot be read"),
         (flipped, "cannot be read"),
         (single_array, "not a ce_gym rollout"),
-        (lambda path: rewritten(path, drop=("q",)), "not a ce_gym rollout; expected an npz with .*q"),
+        (lambda path: rewritten(path, drop=("q",)), "has no q; expected times, q, v"),
         (lambda path: rewritten(path, q=np.array([{}], object)), "cannot be read"),
-        (lambda path: rewritten(path, header={"version": 2}), "version is 2; this ce_gym reads version 1"),
+        (
+            lambda path: rewritten(path, drop=("header",)),
+            "not a ce_gym rollout; expected an npz with an entry 'header'",
+        ),
+        (lambda path: rewritten(path, header={"version": 1}), "version is 1; this ce_gym reads version 2"),
         (lambda path: rewritten(path, header={"format": "other"}), "expected a header"),
         (lambda path: rewritten(path, header={"robot": 3}), "header key 'robot' is 3; expected str"),
         (lambda path: rewritten(path, header={"dt": "x"}), "header key 'dt' is 'x'; expected a number"),

@@ -13,8 +13,13 @@ from hypothesis import strategies as st
 from ce_gym.model.description import ContactSphere
 from ce_gym.viewer import Rollout, ViewerError, three, tracks
 from ce_gym.viewer.arrows import HIDDEN
-from ce_gym.viewer.scene import ROOT, build_scene
+from ce_gym.viewer.scene import ROOT, make_actors, places
+from ce_gym.viewer.scene import build_scene as build_scene_of_actors
 from ce_gym.viewer.stand_ins import frame_along, rotor_discs
+
+
+def build_scene(rollouts: list, models: list, max_fps: float = 50.0, **options: float | None) -> list[dict]:
+    return build_scene_of_actors(make_actors(rollouts, models, max_fps), **options)
 
 
 def clips_of(commands: list[dict]) -> dict[str, dict[str, np.ndarray]]:
@@ -138,6 +143,18 @@ def test_neighbours_keep_apart_and_ghosts_do_not() -> None:
     assert lateral(0.0) == [0.0, 0.0]
     ghosts = [c for c in build_scene(rollouts, models, spacing=0.0) if c["path"].startswith(f"{ROOT}/1/base/link")]
     assert ghosts[0]["object"]["materials"][0]["transparent"]
+
+
+def test_many_stand_in_a_square_and_start_towards_the_same_side() -> None:
+    turned = make_rollout()
+    turned.q[:, 3] += 1.0
+    turned.q[:, :2] += [3.0, 4.0]
+    rollouts = [make_rollout(), turned] * 4 + [make_rollout()]
+    actors = make_actors(rollouts, [StandIn(make_robot())] * 9)
+    poses = [pose @ actor.start for pose, actor in zip(places(actors, 2.0), actors, strict=True)]
+    expected = [[x, y, 0.0] for x in (2.0, 0.0, -2.0) for y in (2.0, 0.0, -2.0)]
+    np.testing.assert_allclose([pose[:3, 3] for pose in poses], expected, atol=1e-12)
+    np.testing.assert_allclose([pose[:3, :3] for pose in poses], [np.eye(3)] * 9, atol=1e-12)
 
 
 def test_high_rates_are_thinned() -> None:

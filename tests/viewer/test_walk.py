@@ -12,7 +12,8 @@ import pytest
 import ce_gym
 from ce_gym.__main__ import main
 from ce_gym.viewer import Rollout, ViewerError, drive
-from ce_gym.viewer.walk import policy_file, read_policy, walk
+from ce_gym.viewer.policies import policy_file, read_policy
+from ce_gym.viewer.walk import walk
 
 ENV = "ce_gym/MiniCheetahVelocity-v0"
 SIZES = (48, 8, 12)
@@ -50,7 +51,7 @@ def test_numpy_acts_as_torch(tmp_path: Path, activation: str) -> None:
 
 
 def test_a_policy_is_run_where_it_was_trained(tmp_path: Path) -> None:
-    rollout = walk(write(tmp_path / "stander" / "policy.npz"))
+    (rollout,) = walk(write(tmp_path / "stander" / "policy.npz"))
     assert (rollout.robot, rollout.transmission, rollout.label) == ("mini_cheetah", "none", "stander")
     np.testing.assert_allclose(np.unique(rollout.commands[:, 0]), [0.0, 0.5, 0.8, 1.0], rtol=1e-6)
     assert len(rollout) == 850
@@ -64,7 +65,7 @@ def test_recording_ends_with_a_fall() -> None:
 
 
 def test_names_folders_and_files_are_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ce_gym.viewer.walk.assets_folder", lambda: tmp_path)
+    monkeypatch.setattr("ce_gym.viewer.policies.assets_folder", lambda: tmp_path)
     shipped = write(tmp_path / "policies" / "dog_walk_exact" / "policy.npz")
     for name in ("dog_walk_exact", "dog_walk", str(shipped), str(shipped.parent)):
         assert policy_file(Path(name)) == shipped

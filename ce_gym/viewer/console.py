@@ -1,0 +1,24 @@
+"""How the commands of the package speak: help that reads well, mistakes in one line. Knows no command."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any, NoReturn
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that keeps line breaks of its texts and tells mistakes in one line."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **options)
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and leave with exit code 2."""
+        print(f"ce_gym: {message}; {self.prog} --help shows what can be given", file=sys.stderr)
+        sys.exit(2)
+
+
+def examples(*lines: str) -> str:
+    """Return an epilog with commands to try."""
+    return "\n".join(["examples:", *(f"  python -m ce_gym {line}" for line in lines)])

@@ -1,0 +1,116 @@
+// The controls of the page. Expects commands, data, FRAME and HORIZON, meshcat's viewer and plots.js.
+
+const find = id => document.getElementById(id);
+const robots = unpackRobots(data.robots);
+
+let viewer;
+try {
+  viewer = new MeshCat.Viewer(find("pane"));
+} catch (error) {
+  find("error").style.display = "block";
+  throw error;
+}
+for (const command of commands) {
+  viewer.handle_command_bytearray(Uint8Array.from(atob(command), c => c.charCodeAt(0)));
+}
+viewer.scene.fog = new MeshCat.THREE.Fog(HORIZON, 8, 40);
+const node = path => viewer.scene_tree.find(path.split("/").filter(Boolean));
+
+// Time.
+const animator = viewer.animator;
+find("time").max = animator.duration;
+
+function seek(time) {
+  animator.pause();
+  animator.seek(time);
+  animator.display_progress(Math.max(0, Math.min(animator.duration, time)));
+}
+function toggle() { animator.playing ? animator.pause() : animator.play(); }
+function step(frames) { seek(animator.time + frames * FRAME); }
+
+find("play").onclick = toggle;
+find("time").oninput = event => seek(Number(event.target.value));
+find("speed").onchange = event => { animator.mixer.timeScale = Number(event.target.value); };
+document.addEventListener("keydown", event => {
+  if (event.target.tagName === "SELECT") return;
+  const keys = { " ": toggle, ArrowLeft: () => step(-1), ArrowRight: () => step(1), Home: () => seek(0) };
+  if (event.key in keys) { event.preventDefault(); keys[event.key](); }
+});
+
+// What is seen. The first action moves the world under the camera; without weight it leaves the world at rest.
+function follow(on) {
+  animator.actions[0].setEffectiveWeight(on ? 1 : 0);
+  animator.mixer.update(0);
+}
+function xray(on) {
+  viewer.scene.traverse(object => {
+    if (object.name === "inside") object.visible = on;
+    if (!object.isMesh || !/^link_\d+$/.test(object.parent.name)) return;
+    const material = object.material;
+    material.userData.opacity ??= material.opacity;
+    material.opacity = material.userData.opacity * (on ? 0.3 : 1);
+    material.transparent = material.opacity < 1;
+    material.depthWrite = !on;
+    material.needsUpdate = true;
+  });
+}
+
+// Links of solid robots, each with the number of the joint that moves it; other links have none and stay grey.
+const REST = new MeshCat.THREE.Color(0xcfd8e1), HALF = new MeshCat.THREE.Color(0xf2b134), FULL = new MeshCat.THREE.Color(0xd7263d);
+const painted = [];
+robots.forEach(robot => {
+  if (robot.ghost || !robot.paths.length) return;
+  const joints = new Map(robot.paths.map((path, joint) => [node(path).object, joint]));
+  node(robot.paths[0].split("/").slice(0, 3).join("/")).object.traverse(object => {
+    if (!object.isMesh || !/^link_\d+$/.test(object.parent.name)) return;
+    const color = object.material.color;
+    painted.push({ robot, color, own: color.clone(), joint: joints.get(object.parent.parent) });
+  });
+});
+function paint(time) {
+  for (const { robot, color, joint } of painted) {
+    const frame = frameAt(robot.times, time);
+    const share = joint === undefined ? 0 : robot.effort[frame * robot.paths.length + joint] / 255;
+    if (share < 0.5) color.copy(REST).lerp(HALF, 2 * share); else color.copy(HALF).lerp(FULL, 2 * share - 1);
+  }
+}
+function torque(on) {
+  find("scale").style.display = on ? "block" : "none";
+  if (!on) for (const { color, own } of painted) color.copy(own);
+}
+if (!painted.length) find("torque").parentElement.style.display = "none";
+
+const switches = { follow, xray, torque, charts: on => { find("plots").style.visibility = on ? "visible" : "hidden"; } };
+for (const [id, change] of Object.entries(switches)) {
+  find(id).onchange = event => { change(event.target.checked); viewer.set_dirty(); };
+}
+for (const box of document.querySelectorAll("#about input")) {
+  box.onchange = () => {
+    for (const path of JSON.parse(box.dataset.paths)) node(path).object.visible = box.checked;
+    viewer.set_dirty();
+  };
+}
+let drawn = null;  // the time that the plots show
+const redraw = () => { drawn = null; };
+const plots = data.chosen.map(name => makePlot(find("plots"), robots, name, animator.duration, seek, redraw));
+if (!plots.length) for (const hidden of [find("plots"), find("charts").parentElement]) hidden.style.display = "none";
+
+// The address may say what to show: #t=4.2&xray&torque&charts=0 opens the page paused there.
+for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
+  if (key === "t") seek(Number(value));
+  if (key in switches) {
+    find(key).checked = value !== "0";
+    find(key).onchange({ target: find(key) });
+  }
+}
+
+function refresh() {
+  find("play").innerHTML = animator.playing ? "&#10074;&#10074;" : "&#9654;";
+  if (document.activeElement !== find("time") || animator.playing) find("time").value = animator.time;
+  find("clock").value = animator.time.toFixed(2) + " / " + animator.duration.toFixed(2) + " s";
+  if (find("torque").checked) { paint(animator.time); viewer.set_dirty(); }
+  if (drawn !== animator.time) for (const move of plots) move(animator.time);
+  drawn = animator.time;
+  requestAnimationFrame(refresh);
+}
+refresh();

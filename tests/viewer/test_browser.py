@@ -1,0 +1,219 @@
+"""The page in a real browser: it loads from the file system, moves, can be steered, and shows what it should."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import PROGRAM, Chromium
+
+from ce_gym.dynamics import Model
+from ce_gym.viewer import Rollout, write_html
+from ce_gym.viewer.html import page
+from ce_gym.viewer.live import serve
+
+pytest.importorskip("meshcat")
+Image = pytest.importorskip("PIL.Image")
+pytestmark = [
+    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: install chromium (Debian's package) to run this"),
+    pytest.mark.slow,
+]
+
+ROBOT = "mini_cheetah"
+SECONDS, STEP = 4.0, 0.02
+
+
+def rollout(label: str, lead: float = 0.0) -> Rollout:
+    """Trots on the spot it moves along; the torque of the first joint is at its limit, all others are zero."""
+    model = Model(ROBOT)
+    times = STEP * np.arange(round(SECONDS / STEP) + 1)
+    q = np.tile(model.standing_q, (len(times), 1))
+    q[:, 7:] += 0.3 * np.sin(6 * times + lead)[:, None]
+    q[:, 0] = 0.3 * times + lead
+    torques = np.zeros((len(times), 12))
+    torques[:, 0] = model.robot.body(model.robot.independent[0]).joint.torque
+    forces = np.zeros((len(times), len(model.contact_names), 3))
+    forces[:, :, 2] = 10.0
+    commands = np.tile([0.3, 0.0, 0.0], (len(times), 1))
+    return Rollout(
+        ROBOT, "exact", STEP, times, q, np.gradient(np.zeros((len(times), model.nv)), axis=0), forces, commands,
+        torques, np.sin(times)[:, None], ["reward"], label,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def twins() -> list[Rollout]:
+    return [rollout("exact"), rollout("armature", lead=0.25)]
+
+
+@pytest.fixture(scope="module")
+def file(twins: list[Rollout], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_html(twins, tmp_path_factory.mktemp("page") / "twins.html", spacing=0.0)
+
+
+@pytest.fixture(scope="module")
+def browser(file: Path):
+    with Chromium(file.as_uri(), size=(900, 700)) as browser:
+        yield browser
+
+
+@pytest.fixture
+def at_rest(browser: Chromium) -> Chromium:
+    browser.run("seek(1.0)")
+    browser.settle()
+    return browser
+
+
+def pixels(browser: Chromium, path: Path) -> np.ndarray:
+    browser.settle()
+    return np.asarray(Image.open(browser.picture(path)).convert("RGB"), int)
+
+
+def click(browser: Chromium, selector: str) -> None:
+    browser.run(f"document.querySelector('{selector}').click()")
+
+
+def test_it_needs_nothing_but_its_file(browser: Chromium, file: Path) -> None:
+    assert browser.errors == []
+    outside = [url for url in browser.requests if not url.startswith(("data:", "blob:", file.as_uri()))]
+    assert outside == []
+
+
+def test_it_plays_pauses_and_changes_speed(browser: Chromium) -> None:
+    browser.run("seek(0); toggle()")
+    browser.until("animator.time > 0.1")
+    click(browser, "#play")
+    browser.settle()
+    time = browser.run("animator.time")
+    browser.settle()
+    assert browser.run("animator.time") == time
+    browser.run("find('speed').value = '0.25'; find('speed').onchange({target: find('speed')})")
+    assert browser.run("animator.mixer.timeScale") == 0.25
+    assert browser.run("find('clock').value").endswith("/ 4.00 s")
+
+
+def test_bodies_are_where_the_model_says(browser: Chromium, twins: list[Rollout]) -> None:
+    """Every body of both robots, the pose as three.js has it, after moving the slider."""
+    frame = 37
+    browser.run(f"find('time').value = {frame * STEP}; find('time').oninput({{target: find('time')}})")
+    model = Model(ROBOT)
+    for index, twin in enumerate(twins):
+        positions, _ = model.body_poses(twin.q[frame : frame + 1])
+        found = browser.run(
+            f"""(() => {{
+              const root = node("/world/{index}").object, places = {{}};
+              root.updateWorldMatrix(true, true);
+              root.traverse(object => {{
+                const place = object.getWorldPosition(new MeshCat.THREE.Vector3());
+                places[object.name] = root.worldToLocal(place).toArray();
+              }});
+              return places;
+            }})()"""
+        )
+        for name, position in zip(model.body_names, positions[0], strict=True):
+            np.testing.assert_allclose(found[name.replace("/", "_")], position, atol=2e-4, err_msg=name)
+
+
+def test_rotors_turn_and_x_ray_shows_them(at_rest: Chromium, tmp_path: Path) -> None:
+    rotor = next(Model(ROBOT).robot.rotors()).name
+    turned = f"node('/world/0').object.getObjectByName('{rotor}').quaternion.toArray()"
+    before = np.array(at_rest.run(turned))
+    at_rest.run("seek(1.3)")
+    assert abs(before @ at_rest.run(turned)) < 0.99  # turned by more than 16 degrees
+    plain = pixels(at_rest, tmp_path / "plain.png")
+    click(at_rest, "#xray")
+    seen = pixels(at_rest, tmp_path / "xray.png")
+    click(at_rest, "#xray")
+    assert (np.abs(seen - plain).max(-1) > 40).sum() > 1000
+
+
+def test_a_picture_shows_the_robot_and_its_ghost(at_rest: Chromium, tmp_path: Path) -> None:
+    both = pixels(at_rest, tmp_path / "both.png")
+    click(at_rest, "#about li:nth-child(2) input")
+    one = pixels(at_rest, tmp_path / "one.png")
+    click(at_rest, "#about li:nth-child(1) input")
+    none = pixels(at_rest, tmp_path / "none.png")
+    click(at_rest, "#about li:nth-child(1) input")
+    click(at_rest, "#about li:nth-child(2) input")
+    again = pixels(at_rest, tmp_path / "again.png")
+    robot = np.abs(one - none).max(-1) > 30
+    assert robot.sum() > 5000
+    rows, columns = np.nonzero(robot)
+    assert abs(np.median(columns) - 450) < 150
+    assert abs(np.median(rows) - robot.shape[0] / 2) < 150
+    ghost = np.abs(both - one).max(-1) > 15
+    assert ghost.sum() > 2000
+    reddish = (both - one)[ghost]
+    assert reddish[:, 0].mean() > reddish[:, 2].mean() + 5  # the first tint is orange
+    assert (np.abs(again - both).max(-1) > 30).sum() < 50
+
+
+def test_arrows_can_be_hidden(at_rest: Chromium, tmp_path: Path) -> None:
+    names = at_rest.run("[...document.querySelectorAll('#about li')].map(item => item.textContent)")
+    assert names == ["exact", "armature", "contact forces", "commanded speed", "actual speed"]
+    for number in (3, 4, 5):
+        shown = pixels(at_rest, tmp_path / "shown.png")
+        click(at_rest, f"#about li:nth-child({number}) input")
+        hidden = pixels(at_rest, tmp_path / "hidden.png")
+        assert (np.abs(shown - hidden).max(-1) > 40).sum() > 100, names[number - 1]
+        click(at_rest, f"#about li:nth-child({number}) input")
+
+
+def test_torque_at_its_limit_is_red(at_rest: Chromium) -> None:
+    def colors() -> dict[str, str]:
+        return at_rest.run(
+            "Object.fromEntries(painted.map(({ color, joint }) => [joint === undefined ? 'none' : joint, "
+            "color.getHexString()]))"
+        )
+
+    plain = colors()
+    click(at_rest, "#torque")
+    at_rest.settle()
+    shown = colors()
+    assert shown.pop("0") == "d7263d"
+    assert set(shown.values()) == {"cfd8e1"}
+    assert len(shown) == 12  # eleven joints, and the links that none of them moves
+    assert at_rest.run("getComputedStyle(find('scale')).display") == "block"
+    click(at_rest, "#torque")
+    assert colors() == plain
+
+
+def test_without_following_the_robot_walks_away(at_rest: Chromium) -> None:
+    place = "node('/world').object.position.x"
+    assert at_rest.run(place) < -0.2
+    click(at_rest, "#follow")
+    assert at_rest.run(place) == 0
+    click(at_rest, "#follow")
+    assert at_rest.run(place) < -0.2
+
+
+def test_plots_show_both_and_move_time(at_rest: Chromium) -> None:
+    at_rest.run("redraw()")
+    at_rest.settle()
+    chosen = at_rest.run("[...document.querySelectorAll('.plot select')].map(select => select.value)")
+    assert chosen[0] == "forward speed [m/s]"
+    assert chosen[1].startswith("torque of ")
+    assert chosen[2] == "reward"
+    values = at_rest.run("[...document.querySelectorAll('.plot:nth-child(3) .values span')].map(s => s.textContent)")
+    np.testing.assert_allclose([float(value) for value in values], np.sin(1.0), atol=1e-3)
+    box = at_rest.run("document.querySelector('.plot svg').getBoundingClientRect().toJSON()")
+    middle = box["y"] + box["height"] / 2
+    at_rest.drag((box["x"] + 5, middle), (box["x"] + 0.75 * box["width"], middle))
+    assert at_rest.run("animator.time") == pytest.approx(0.75 * SECONDS, abs=0.05)
+
+
+def test_the_address_says_what_to_show(file: Path) -> None:
+    with Chromium(file.as_uri() + "#t=2.5&torque&charts=0", size=(900, 700)) as browser:
+        browser.until("animator.time === 2.5")
+        assert not browser.run("animator.playing")
+        assert browser.run("find('torque').checked && !find('charts').checked")
+        assert browser.run("find('plots').style.visibility") == "hidden"
+        assert browser.errors == []
+
+
+def test_the_live_page_is_the_same(twins: list[Rollout]) -> None:
+    with serve(page(twins[:1])) as url, Chromium(url, size=(600, 500)) as browser:
+        browser.until("animator.time > 0.1")
+        assert browser.errors == []
+        assert all(asked.startswith((url, "data:")) for asked in browser.requests)
