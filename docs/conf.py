@@ -67,8 +67,7 @@ _ELSEWHERE = (
 _BARE = (
     r"(NDArray|ArrayLike|Array|Path|PathLike|Mapping|Sequence|Callable|Iterable|Iterator|SX|ca|np|Any|dtype|_F|VecEnv"
 )
-_BARE += (
-    r"|Observations|VecEnvIndices|VecEnvStepReturn|EzPickle|Generic|Env|VectorEnv|Literal.*|optional|float64|bool_)"
-)
-_INNER = r"ce_gym\.(envs\.(shell|program|batch|terms)|model\.mechanism|dynamics\.kinematics)\..*"
+_BARE += r"|Observations|VecEnvIndices|VecEnvStepReturn|EzPickle|Generic|Env|VectorEnv|Literal.*|optional|float64|bool_"
+_BARE += r"|Device)"
+_INNER = r"ce_gym\.(sim\.devices|envs\.(shell|program|batch|terms)|model\.mechanism|dynamics\.kinematics)\..*"
 nitpick_ignore_regex = [(r"py:.*", pattern) for pattern in (_ELSEWHERE, _BARE, _INNER)]

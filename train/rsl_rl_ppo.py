@@ -6,6 +6,7 @@ ce_gym only, and no name of a robot or task.
 
     python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --steps 6e6
     python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --critic contact_forces base_height
+    python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --device cuda --set num_envs=4096
 """
 
 from __future__ import annotations
@@ -97,11 +98,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
-    parser.add_argument("--device", default="cpu", help="where the networks are (default cpu)")
+    parser.add_argument("--device", default="cpu", help="cpu, or cuda for networks and physics on a GPU (default cpu)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rsl_rl")
     parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes of the evaluation at the end")
     args = parser.parse_args(argv)
     kwargs: dict[str, Any] = {"transmission": args.transmission} if args.transmission else {}
+    kwargs |= {"dtype": "float32"} if args.device.startswith("cuda") else {}
     kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
     try:
         path = config_file(args.env)

@@ -1,4 +1,4 @@
-"""rsl_rl's `VecEnv` over a native Gymnasium `VectorEnv`: numpy arrays shown as tensors, without copies.
+"""rsl_rl's `VecEnv` over a native Gymnasium `VectorEnv`: arrays shown as tensors, without copies; a GPU's stay there.
 
 rsl_rl (5.x, https://github.com/leggedrobotics/rsl_rl) never resets environments; it wants observations as groups in a
 `TensorDict`, time-outs apart from failures, and the end of an episode to be followed at once by the next. Knows the two
@@ -30,7 +30,7 @@ class RslRlVecEnv(VecEnv):
     Args:
         envs: A vector environment in SAME_STEP autoreset mode that returns fresh arrays from every call.
         seed: Of the first reset, see `gymnasium.vector.VectorEnv.reset`.
-        device: Where tensors go; physics stays on the processor.
+        device: Where tensors go; physics is where `envs` has it.
 
     Attributes:
         envs: The wrapped environment.
@@ -50,6 +50,7 @@ class RslRlVecEnv(VecEnv):
             raise ValueError(f"RslRlVecEnv: autoreset_mode is {mode}, expected {AutoresetMode.SAME_STEP}")
         native: Any = envs.unwrapped
         self.envs, self._native = envs, native
+        self._on_gpu = isinstance(getattr(native, "device", None), torch.device)
         self.num_envs, self.device = envs.num_envs, device
         self.num_actions = int(np.prod(envs.single_action_space.shape or (0,)))
         self.max_episode_length = int(native.max_episode_steps)
@@ -64,7 +65,7 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: torch.Tensor) -> None:
-        self._native.elapsed_steps = steps.cpu().numpy()
+        self._native.elapsed_steps = steps if self._on_gpu else steps.cpu().numpy()
 
     def get_observations(self) -> TensorDict:
         """Return the current observations, each group of shape (num_envs, n)."""
@@ -80,14 +81,15 @@ class RslRlVecEnv(VecEnv):
             Observations, rewards (num_envs,), dones (num_envs,), and extras: `time_outs` (num_envs,), episodes that
             ended without a failure; `log`, means over the episodes that have just ended.
         """
-        obs, rewards, terminated, truncated, infos = self.envs.step(actions.detach().cpu().numpy())
+        given: Any = actions.detach() if self._on_gpu else actions.detach().cpu().numpy()
+        obs, rewards, terminated, truncated, infos = self.envs.step(given)
         self._observations = self._groups(obs)
         dones = terminated | truncated
         extras: dict[str, Any] = {"time_outs": self._tensor(truncated & ~terminated), "log": {}}
         if dones.any():
             terms = infos.get("episode_terms", {})
-            extras["log"] = {f"/episode/{key}": float(np.mean(rows[dones])) for key, rows in terms.items()}
-        return self._observations, self._tensor(rewards.astype(np.float32)), self._tensor(dones), extras
+            extras["log"] = {f"/episode/{key}": float(rows[dones].mean()) for key, rows in terms.items()}
+        return self._observations, self._tensor(rewards).float(), self._tensor(dones), extras
 
     def close(self) -> None:
         """Close the wrapped environment."""
@@ -98,8 +100,8 @@ class RslRlVecEnv(VecEnv):
         tensors = {key: self._tensor(rows) for key, rows in groups.items()}
         return TensorDict(tensors, batch_size=[self.num_envs], device=self.device)  # type: ignore[arg-type]
 
-    def _tensor(self, rows: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(rows).to(self.device)
+    def _tensor(self, rows: np.ndarray | torch.Tensor) -> torch.Tensor:
+        return torch.as_tensor(rows).to(self.device)
 
 
 def make_rsl_rl_vec_env(
@@ -111,12 +113,13 @@ def make_rsl_rl_vec_env(
         env_id: Such as `"ce_gym/MiniCheetahVelocity-v0"`.
         num_envs: Size of the batch.
         seed: Environment i gets `seed + i`. None seeds from the operating system.
-        device: Where tensors go.
+        device: Where tensors go; with "cuda" or "cuda:N", physics is there too.
         **kwargs: Given to the environment, such as `transmission="armature"` or `obs_mode="dict"`.
 
     Raises:
         gymnasium.error.Error: If the id is unknown or has no native vector environment.
     """
     mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
-    options = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
+    place = {"device": str(device)} if torch.device(device).type == "cuda" else {}
+    options = {"autoreset_mode": AutoresetMode.SAME_STEP, **place, **kwargs}
     return RslRlVecEnv(gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode=mode, **options), seed, device)

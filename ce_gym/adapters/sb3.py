@@ -25,7 +25,8 @@ _RUNNING: dict[str, Any] = {}
 class SB3VecEnv(VecEnv):
     """A batch of environments as Stable-Baselines3 expects it.
 
-    Arrays are handed on as they come. Stable-Baselines3 keeps observations past the next step and adds to rewards in
+    Arrays are handed on as they come; tensors of environments on a GPU are copied to the host, for Stable-Baselines3
+    knows nothing else. Stable-Baselines3 keeps observations past the next step and adds to rewards in
     place, so the wrapped environment must return fresh arrays from every call, as ce_gym's do.
 
     Args:
@@ -55,7 +56,7 @@ class SB3VecEnv(VecEnv):
         Returns:
             Observations, shape (num_envs, n_obs), or a dictionary of such arrays.
         """
-        obs, _ = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
+        obs = _on_host(self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)[0])
         self._reset_seeds()
         self._reset_options()
         return obs
@@ -73,7 +74,7 @@ class SB3VecEnv(VecEnv):
             the last one of the old episode as `terminal_observation`, `TimeLimit.truncated`, and `episode`.
         """
         start = time.perf_counter()
-        obs, rewards, terminated, truncated, infos = self.envs.step(self._actions)
+        obs, rewards, terminated, truncated, infos = map(_on_host, self.envs.step(self._actions))
         self.step_seconds += time.perf_counter() - start
         dones = terminated | truncated
         return obs, rewards.astype(np.float32, copy=False), dones, self._dicts(dones, truncated & ~terminated, infos)
@@ -154,6 +155,13 @@ class SB3VecEnv(VecEnv):
         named: Iterable[int] = self._get_indices(indices)
         if set(named) != set(range(self.num_envs)):
             raise ValueError(f"{name}: indices is {indices}, expected None: the batch is one environment object")
+
+
+def _on_host(value: Any) -> Any:
+    """Return arrays as they are, tensors as copies on the host, and dictionaries of either likewise."""
+    if isinstance(value, Mapping):
+        return {key: _on_host(part) for key, part in value.items()}
+    return value.cpu().numpy() if hasattr(value, "cpu") else value
 
 
 def _row(observations: Any, i: int) -> Any:

@@ -14,7 +14,9 @@ from pathlib import Path
 
 from ce_gym.viewer.console import Parser
 
-BENCHMARKS = ("speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak")
+BENCHMARKS = (
+    "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak", "gpu"
+)  # fmt: skip
 
 
 def summary(name: str) -> str:

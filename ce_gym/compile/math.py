@@ -12,7 +12,6 @@ from fractions import Fraction
 from math import inf, nan
 
 import numpy as np
-from llvmlite import ir
 
 from ce_gym.compile.vector import Value, VectorBuilder
 
@@ -86,7 +85,7 @@ def sin_cos(v: VectorBuilder, x: Value) -> tuple[Value, Value]:
     z = v.builder.fmul(r, r)
     sine = v.fma(v.builder.fmul(r, z), v.polynomial(z, SINE[v.dtype]), r)
     cosine = v.fma(z, v.fma(z, v.polynomial(z, COSINE[v.dtype]), v.const(-0.5)), v.const(1.0))
-    odd = v.builder.trunc(bits, ir.VectorType(ir.IntType(1), v.lanes))
+    odd = v.is_odd(bits)
     next_bits = v.builder.add(bits, v.int_const(1))
     return (
         _flip_sign(v, v.select(odd, cosine, sine), bits),
@@ -113,8 +112,7 @@ def exp(v: VectorBuilder, x: Value) -> Value:
         r = v.fma(exponent, v.const(-part), r)
     mantissa_value = v.fma(v.builder.fmul(r, r), v.polynomial(r, EXPONENTIAL[v.dtype]), r)
     result = v.builder.fadd(mantissa_value, v.const(1.0))
-    shift = ir.Constant(v.int_type, [_bits_of(1.5 * 2.0**mantissa, v.dtype)] * v.lanes)
-    whole = v.builder.sub(bits, shift)
+    whole = v.builder.sub(bits, v.int_const(_bits_of(1.5 * 2.0**mantissa, v.dtype)))
     half = v.builder.ashr(whole, v.int_const(1))  # in two factors: 2^1024 and 2^-1074 have no normal float
     for part in (half, v.builder.sub(whole, half)):
         biased = v.builder.add(part, v.int_const(bias))

@@ -122,6 +122,10 @@ class VectorBuilder:
         """The integer's bits as a float."""
         return self.builder.bitcast(a, self.float_type)
 
+    def is_odd(self, bits: Value) -> Value:
+        """A mask: whether the lowest bit of an integer is set."""
+        return self.builder.trunc(bits, ir.VectorType(ir.IntType(1), self.lanes))
+
     def load(self, base: Value, index: int) -> Value:
         """Vector `index` of an aligned buffer that starts at `base`."""
         return self.builder.load(self.element(base, index), align=ALIGNMENT)

@@ -18,6 +18,9 @@ from ce_gym.sim.simulator import model_key
 from ce_gym.sim.substeps import FRAME, HEIGHTS
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
+PROGRESS = {"level": "terrain_level", "grown": "times_grown"}
+"""State of the curricula, and its names for those who watch."""
+
 
 @dataclass
 class Outcome:
@@ -72,8 +75,7 @@ class Batch:
 
     def progress(self) -> dict[str, NDArray]:
         """Return where the copies are in the curricula of the task, each shape (num_envs,)."""
-        names = {"level": "terrain_level", "grown": "times_grown"}
-        return {shown: self.rows(name)[:, 0] for name, shown in names.items() if name in self._arrays}
+        return {shown: self.rows(name)[:, 0] for name, shown in PROGRESS.items() if name in self._arrays}
 
     def reset(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start new episodes where `mask` is true.
@@ -141,7 +143,12 @@ def _finite(values: NDArray) -> NDArray:
     return np.where(np.isfinite(values), values, 0.0)
 
 
+def kernel_key(program: TaskProgram) -> str:
+    """Return a text that names everything that the kernels of a task on a robot depend on."""
+    return f"{model_key(program.model)} {program.task!r} {program.contact_forces} {program.added_terms()}"
+
+
 def _kernels(program: TaskProgram, dtype: str) -> tuple[Kernel, Kernel]:
-    key = f"{model_key(program.model)} {program.task!r} {program.contact_forces} {program.added_terms()}"
+    key = kernel_key(program)
     step = load_kernel(f"environment {key}", program.step_program, dtype)
     return step, load_kernel(f"reset {key}", program.reset_program, dtype)

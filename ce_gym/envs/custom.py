@@ -80,7 +80,7 @@ def _register(env_id: str, arguments: dict[str, str]) -> None:
     gymnasium.register(
         env_id,
         entry_point="ce_gym.envs.single:LeggedEnv",
-        vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
+        vector_entry_point="ce_gym.envs.vector:make_vector_env",
         max_episode_steps=TASKS[arguments["task"]].episode_length,
         kwargs=arguments,
     )

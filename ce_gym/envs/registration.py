@@ -36,7 +36,7 @@ def register_environments() -> None:
             gymnasium.register(
                 name,
                 entry_point="ce_gym.envs.single:LeggedEnv",
-                vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
+                vector_entry_point="ce_gym.envs.vector:make_vector_env",
                 max_episode_steps=TASKS[arguments["task"]].episode_length,
                 kwargs=arguments,
             )

@@ -41,13 +41,23 @@ def make_batch(
         ValueError: If an argument is not one of the choices.
         RobotError: If the robot file is not valid.
     """
-    if dtype not in ("float64", "float32"):
-        raise ValueError(f"dtype={dtype!r}; expected 'float64' or 'float32'")
+    checked_dtype(dtype)
     for name, value in (("num_envs", num_envs), ("num_threads", num_threads)):
         if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
             raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
     program = make_program(robot, task, **arguments)
     return Batch(program, num_envs, dtype, num_threads or len(os.sched_getaffinity(0)))
+
+
+def checked_dtype(dtype: str) -> str:
+    """Return the argument `dtype`.
+
+    Raises:
+        ValueError: If it is not one of the choices.
+    """
+    if dtype not in ("float64", "float32"):
+        raise ValueError(f"dtype={dtype!r}; expected 'float64' or 'float32'")
+    return dtype
 
 
 def make_program(

@@ -16,6 +16,7 @@ from ce_gym.envs.setup import make_batch
 from ce_gym.envs.shell import BatchShell
 from ce_gym.envs.single import checked_action, checked_seed, recorded_state, shown, spaces
 from ce_gym.envs.task_values import checked_value
+from ce_gym.sim.devices import Device, device_named
 
 Observations = NDArray[np.float32]
 
@@ -241,6 +242,24 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
                 raise ValueError(f"seed has {len(seed)} entries; expected {self.num_envs} whole numbers")
             self.batch.seed(np.array([checked_seed(s) for s in seed], np.uint64))
         self._seeded = True
+
+
+def make_vector_env(num_envs: int = 1, device: str | Device = "cpu", **kwargs: Any) -> VectorEnv:
+    """Make the vector environment of a device; entry point of every registered id.
+
+    Args:
+        num_envs: Number of environments.
+        device: "cpu" for `LeggedVectorEnv`, "cuda" or "cuda:N" for `ce_gym.envs.gpu_vector.GpuVectorEnv`.
+        **kwargs: What that takes.
+
+    Raises:
+        ValueError: If there is no such device, or an argument is not one of the choices.
+    """
+    if device_named(device).name == "cpu":
+        return LeggedVectorEnv(num_envs, **kwargs)
+    from ce_gym.envs.gpu_vector import GpuVectorEnv
+
+    return GpuVectorEnv(num_envs, device, **kwargs)
 
 
 def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:

@@ -8,22 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.compile import Buffer, Kernel, Program, load_kernel
+from ce_gym.compile import Buffer, Program
 from ce_gym.dynamics.methods import METHODS
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.parameters import parameter_defaults
 from ce_gym.dynamics.scene import Control, Friction, Motors, StepOptions, target_names
 from ce_gym.dynamics.trace import OUTPUTS
 from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
+from ce_gym.sim.devices import Array, Device, Processor, device_named, to_numpy
 from ce_gym.sim.retry import Retry
 from ce_gym.sim.substeps import FRAME, HEIGHTS, TIMES, substeps
 from ce_gym.sim.terrain import Terrain
-from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
 
 class Simulator:
@@ -51,8 +51,10 @@ class Simulator:
         terrain: The ground; the plane z = 0 if None, which is faster.
         retry: How often the step is halved for a robot that diverges: it alone is taken back to where it was when
             `step` was called and stepped again. 0, the default, costs nothing; otherwise each call copies the state.
+        device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
 
     Attributes:
+        device: Name of the device.
         n_retried: How many times a robot has been stepped again.
         target_names: What each entry of a target is for: joints, or the motors' rotors and then joints without one.
 
@@ -78,6 +80,7 @@ class Simulator:
         parameters: Sequence[str] = (),
         terrain: Terrain | None = None,
         retry: int = 0,
+        device: str | Device = "cpu",
     ) -> None:
         _check("num_envs", num_envs, num_envs >= 1, "at least 1")
         _check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
@@ -92,6 +95,10 @@ class Simulator:
             _choice("outputs", name, tuple(OUTPUTS))
         if terrain is not None and not isinstance(terrain, Terrain):
             _check("terrain", terrain, False, "a Terrain or None")
+        self._device = device_named(device)
+        if self._device.name != "cpu":
+            _check("retry", retry, retry == 0, f"0 on device {self._device.name!r}")
+        self.device = self._device.name
         self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
         self.dtype, self.num_threads = dtype, num_threads
         self.contact_names = select_contacts(model.robot, contacts)
@@ -109,24 +116,24 @@ class Simulator:
         self.target_names = target_names(model.mechanism, self.options.control)
         defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
         asked = tuple(name for name in OUTPUTS if name in outputs)
-        self._kernel = load_step_kernel(model, self.options, asked, dtype)
+        self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
         self._retry = Retry(
             retry, lambda parts: load_step_kernel(model, replace(self.options, dt=dt / parts), asked, dtype)
         )
         self.n_retried = self._n_cleared = 0
         self._arrays = {
-            name: tiles(num_envs, buffer.size, dtype)
+            name: self._device.tiles(num_envs, buffer.size, dtype)
             for name, buffer in self._kernel.buffers.items()
             if buffer.kind == "tiles"
         }
         ends = np.cumsum([0, *(len(default) for default in defaults.values())])
         self._columns = {name: slice(*ends[i : i + 2]) for i, name in enumerate(defaults)}
         if defaults:
-            write_rows(self._arrays["parameters"], np.concatenate(list(defaults.values())))
-        self._tables: dict[str, NDArray] = {}
+            self._device.write(self._arrays["parameters"], np.concatenate(list(defaults.values())))
+        self._tables: dict[str, Array] = {}
         if terrain is not None and FRAME in self._arrays:
-            self._tables[HEIGHTS] = terrain.heights.astype(dtype)
-            write_rows(self._arrays[FRAME], [*terrain.origin, terrain.cell])
+            self._tables[HEIGHTS] = self._device.rows(terrain.heights.astype(dtype), dtype)
+            self._device.write(self._arrays[FRAME], [*terrain.origin, terrain.cell])
         self.reset()
 
     def reset(self, mask: ArrayLike | None = None) -> None:
@@ -151,23 +158,24 @@ class Simulator:
         Raises:
             ValueError: If a shape is wrong, a number is not finite, or a loop does not close.
         """
-        chosen = self._chosen(mask)
+        chosen, q, v = self._chosen(mask), to_numpy(q), to_numpy(v)
         for name, value, size in (("q", q, self.model.nq), ("v", v, self.model.nv)):
-            value = np.asarray(value, dtype=float)
             if value.shape not in ((size,), (self.num_envs, size)):
                 raise ValueError(f"{name} has shape {value.shape}; expected ({size},) or ({self.num_envs}, {size})")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} holds a number that is not finite")
-            write_rows(self._arrays[name], np.broadcast_to(value, (self.num_envs, size)), chosen)
+            self._device.write(self._arrays[name], np.broadcast_to(value, (self.num_envs, size)), chosen)
         self._n_cleared += int(self.diverged[slice(None) if chosen is None else chosen].sum())
         zeros = {name: np.zeros(self._arrays[name].shape[1]) for name in ("anchor", "diverged") if name in self._arrays}
         if self.contact_names:
             zeros["load"] = self._resting_load(q)
         for name, rows in zeros.items():
-            write_rows(self._arrays[name], np.broadcast_to(rows, (self.num_envs, rows.shape[-1])), chosen)
+            self._device.write(self._arrays[name], np.broadcast_to(rows, (self.num_envs, rows.shape[-1])), chosen)
         if "dependent" in self._arrays:
             guess = self.model.dependent_guess(q)
-            write_rows(self._arrays["dependent"], np.broadcast_to(guess, (self.num_envs, guess.shape[-1])), chosen)
+            self._device.write(
+                self._arrays["dependent"], np.broadcast_to(guess, (self.num_envs, guess.shape[-1])), chosen
+            )
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
         """Advance all robots by `n_substeps` sub-steps.
@@ -181,10 +189,10 @@ class Simulator:
             ValueError: If the shape is wrong.
         """
         n = len(self.target_names)
-        rows = np.asarray(target, dtype=self.dtype)
-        if rows.shape not in ((n,), (self.num_envs, n)):
-            raise ValueError(f"target has shape {rows.shape}; expected ({n},) or ({self.num_envs}, {n})")
-        rows = np.ascontiguousarray(np.broadcast_to(rows, (self.num_envs, n)))
+        rows = self._device.rows(target, self.dtype)
+        if tuple(rows.shape) not in ((n,), (self.num_envs, n)):
+            raise ValueError(f"target has shape {tuple(rows.shape)}; expected ({n},) or ({self.num_envs}, {n})")
+        rows = self._device.rows(rows, self.dtype, (self.num_envs, n))
         given, repeats = {"target": rows}, {TIMES: n_substeps}
         before = {name: array.copy() for name, array in self._arrays.items()} if self._retry.halvings else {}
         self._kernel(self._arrays | self._tables | given, self.num_envs, repeats=repeats, num_threads=self.num_threads)
@@ -209,27 +217,27 @@ class Simulator:
             raise ValueError(
                 f"parameter {name!r}; expected one of those declared with Simulator(..., parameters=): {declared}"
             )
-        rows = read_rows(self._arrays["parameters"], self.num_envs)
+        rows = to_numpy(self._device.read(self._arrays["parameters"], self.num_envs))
         columns = self._columns[name]
         size = columns.stop - columns.start
-        new = np.asarray(value, dtype=float)
+        new = to_numpy(value)
         if new.shape not in ((), (size,), (self.num_envs, size)) or not np.isfinite(new).all():
             raise ValueError(f"{name} has shape {new.shape}; expected ({size},) or ({self.num_envs}, {size}), finite")
         rows[:, columns] = new
-        write_rows(self._arrays["parameters"], rows, self._chosen(mask))
+        self._device.write(self._arrays["parameters"], rows, self._chosen(mask))
 
     @property
-    def q(self) -> NDArray:
+    def q(self) -> Array:
         """Positions, a copy, shape (num_envs, nq)."""
         return self._read("q")
 
     @property
-    def v(self) -> NDArray:
+    def v(self) -> Array:
         """Velocities, a copy, shape (num_envs, nv)."""
         return self._read("v")
 
     @property
-    def diverged(self) -> NDArray[np.bool_]:
+    def diverged(self) -> Array:
         """Robots whose state went out of bounds; they stay frozen at their last good state, shape (num_envs,)."""
         return self._read("diverged")[:, 0] > 0.5
 
@@ -239,49 +247,49 @@ class Simulator:
         return self._n_cleared + int(self.diverged.sum())
 
     @property
-    def torque(self) -> NDArray:
+    def torque(self) -> Array:
         """Motor torques at the joints, mean of the last sub-step [N m], shape (num_envs, nj)."""
         return self._read("torque")
 
     @property
-    def contact_forces(self) -> NDArray:
+    def contact_forces(self) -> Array:
         """Forces on the contact spheres, mean of the last sub-step, world axes [N], shape (num_envs, n_contacts, 3)."""
         if not self.contact_names:
-            return np.zeros((self.num_envs, 0, 3), self.dtype)
+            return self._device.rows(np.zeros((self.num_envs, 0, 3)), self.dtype)
         return self._read("contact_forces").reshape(self.num_envs, -1, 3)
 
     @property
-    def motor_speed(self) -> NDArray:
+    def motor_speed(self) -> Array:
         """Speeds of the motors' rotors at the end of the last sub-step [rad/s], shape (num_envs, n_motors)."""
         return self._read("motor_speed")
 
     @property
-    def power(self) -> NDArray:
+    def power(self) -> Array:
         """Mechanical power of the motors at the joints, end of the last sub-step [W], shape (num_envs, nj)."""
         return self._read("power")
 
     @property
-    def error(self) -> NDArray:
+    def error(self) -> Array:
         """Estimated error of the last sub-step in `v`, of methods that have one [rad/s or m/s], shape (num_envs,)."""
         return self._read("error")[:, 0]
 
     @property
-    def energy(self) -> NDArray:
+    def energy(self) -> Array:
         """Kinetic, potential and elastic energy at the end of the last sub-step [J], shape (num_envs,)."""
         return self._read("energy")[:, 0]
 
     @property
-    def loop_gap(self) -> NDArray:
+    def loop_gap(self) -> Array:
         """Norm of the residuals of the closed loops, start of the last sub-step [m or -], shape (num_envs,)."""
         return self._read("loop_gap")[:, 0]
 
     @property
-    def nearness(self) -> NDArray:
+    def nearness(self) -> Array:
         """Distance from a singularity, see `Model.nearness`, start of the last sub-step, shape (num_envs,)."""
         return self._read("nearness")[:, 0]
 
     def _chosen(self, mask: ArrayLike | None) -> NDArray[np.bool_] | None:
-        chosen = None if mask is None else np.asarray(mask, dtype=bool)
+        chosen = None if mask is None else to_numpy(mask).astype(bool)
         if chosen is not None and chosen.shape != (self.num_envs,):
             raise ValueError(f"mask has shape {chosen.shape}; expected ({self.num_envs},)")
         return chosen
@@ -291,7 +299,8 @@ class Simulator:
         radius, _, above, cosine = self._above_ground(q)
         stiffness: float | NDArray = self.options.material.stiffness
         if "stiffness" in self._columns:
-            stiffness = read_rows(self._arrays["parameters"], self.num_envs)[:, self._columns["stiffness"]]
+            rows = to_numpy(self._device.read(self._arrays["parameters"], self.num_envs))
+            stiffness = rows[:, self._columns["stiffness"]]
         return stiffness * np.maximum(radius - cosine * above, 0)
 
     def _lift(self, q: ArrayLike) -> float:
@@ -313,10 +322,10 @@ class Simulator:
         ground = self.terrain.at(x, y) if self.terrain is not None else np.zeros((*x.shape, 3))
         return radius, z, z - ground[..., 0], 1 / np.sqrt(1 + np.square(ground[..., 1:]).sum(-1))
 
-    def _read(self, name: str) -> NDArray:
+    def _read(self, name: str) -> Array:
         if name not in self._arrays:
             raise ValueError(f"{name} is not computed; ask for it with Simulator(..., outputs=({name!r},))")
-        return read_rows(self._arrays[name], self.num_envs)
+        return self._device.read(self._arrays[name], self.num_envs)
 
 
 def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, ...]:
@@ -346,7 +355,9 @@ def model_key(model: Model) -> str:
     return f"{figures!r} {model.transmission} {model.locked_rotors} {model.eliminated} {traced}"
 
 
-def load_step_kernel(model: Model, options: StepOptions, outputs: tuple[str, ...], dtype: str) -> Kernel:
+def load_step_kernel(
+    model: Model, options: StepOptions, outputs: tuple[str, ...], dtype: str, device: Device | None = None
+) -> Any:
     """Compile, or load from the cache, the kernel that repeats a sub-step.
 
     Args:
@@ -354,16 +365,17 @@ def load_step_kernel(model: Model, options: StepOptions, outputs: tuple[str, ...
         options: The scene.
         outputs: What to compute besides the state.
         dtype: "float64" or "float32".
+        device: Whose kernel; the processor's if None.
     """
 
-    def build() -> Program:
+    def build() -> tuple[Program]:
         sizes, further, steps = substeps(model.mechanism, options, outputs)
         joints = sizes.pop("target", 0)
         buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()]
         buffers += [Buffer("target", joints, "rows_in")] if joints else []
-        return Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps)
+        return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
 
-    return load_kernel(f"step {model_key(model)} {options!r} {outputs!r}", build, dtype)
+    return (device or Processor()).kernel(f"step {model_key(model)} {options!r} {outputs!r}", build, dtype)
 
 
 def _choice(argument: str, value: object, choices: tuple[str, ...]) -> None:

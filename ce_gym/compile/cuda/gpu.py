@@ -1,0 +1,74 @@
+# pyright: reportAttributeAccessIssue=false
+"""The GPU itself: whether there is one, what it is, and launching machine code on it.
+
+Memory and streams are torch's, so that what torch does before and after a launch stays in order; launching is
+`cuda.core`'s. Knows addresses and machine code only. (Compiled modules carry no types, hence the line above.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+
+from ce_gym.compile.cuda.nvrtc import CudaUnavailable, compiler_version
+from ce_gym.compile.cuda.source import BLOCK, ENTRY
+
+
+@cache
+def architecture(gpu: int = 0) -> str:
+    """Return what to compile for on a GPU, such as `sm_90`.
+
+    Raises:
+        CudaUnavailable: If there is no such GPU, or a package is missing; one line.
+    """
+    try:
+        import torch
+    except ImportError:
+        raise CudaUnavailable(
+            "device='cuda': torch was not found; expected the extra gpu: pip install 'ce_gym[gpu]'"
+        ) from None
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if gpu >= count:
+        seen = f"{count} NVIDIA GPUs" if count else "no NVIDIA GPU"
+        raise CudaUnavailable(f"device='cuda:{gpu}': torch {torch.__version__} sees {seen}; expected device='cpu'")
+    compiler_version()
+    major, minor = torch.cuda.get_device_capability(gpu)
+    return f"sm_{major}{minor}"
+
+
+class _Stream:
+    """torch's present stream, as `cuda.core` wants to be told of it."""
+
+    def __init__(self, handle: int):
+        self._handle = handle
+
+    def __cuda_stream__(self) -> tuple[int, int]:
+        return 0, self._handle
+
+
+class GpuLauncher:
+    """One kernel on one GPU.
+
+    Args:
+        code: machine code for its architecture.
+        gpu: number of the GPU.
+    """
+
+    def __init__(self, code: bytes, gpu: int = 0):
+        import torch
+        from cuda.core import Device, LaunchConfig, ObjectCode, launch
+
+        torch.cuda.init()
+        self._device, self._launch, self._config, self._torch = Device(gpu), launch, LaunchConfig, torch
+        self._device.set_current()
+        self._kernel = ObjectCode.from_cubin(code).get_kernel(ENTRY)
+        self._gpu = gpu
+
+    def __call__(self, addresses: Sequence[int], numbers: Sequence[int], count: int) -> None:
+        """Launch on torch's present stream, a thread for each robot."""
+        stream = _Stream(self._torch.cuda.current_stream(self._gpu).cuda_stream)
+        self._device.set_current()
+        config = self._config(grid=-(-count // BLOCK), block=BLOCK)
+        self._launch(stream, config, self._kernel, *addresses, *map(np.int32, (*numbers, count)))

@@ -1,0 +1,119 @@
+"""Emitted CUDA C run by the processor: the same text, through a C++ compiler and a few lines that stand in for CUDA's.
+
+For tests and for comparisons where there is no GPU; a user never needs it. It shows that the arithmetic, the copying
+and the order of stages are right, not how a GPU rounds (its compiler fuses products and sums) nor how fast it is.
+Knows the text of sources and how to call a shared library.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ce_gym.compile.cache import cache_folder, write_atomically
+from ce_gym.compile.cuda.source import BLOCK, ENTRY, Source
+
+SHIM = """#include <cmath>
+#include <cstring>
+using namespace std;
+#define __device__
+#define __global__
+#define __forceinline__ inline
+#define __noinline__
+#define __launch_bounds__(...)
+struct Place { unsigned x; };
+static thread_local Place blockIdx, threadIdx;
+static double __longlong_as_double(long long a) { double b; memcpy(&b, &a, 8); return b; }
+static long long __double_as_longlong(double a) { long long b; memcpy(&b, &a, 8); return b; }
+static float __int_as_float(int a) { float b; memcpy(&b, &a, 4); return b; }
+static int __float_as_int(float a) { int b; memcpy(&b, &a, 4); return b; }
+static double __dadd_rn(double a, double b) { return a + b; }
+static double __dsub_rn(double a, double b) { return a - b; }
+static double __dmul_rn(double a, double b) { return a * b; }
+static double __ddiv_rn(double a, double b) { return a / b; }
+static double __fma_rn(double a, double b, double c) { return fma(a, b, c); }
+static float __fadd_rn(float a, float b) { return a + b; }
+static float __fsub_rn(float a, float b) { return a - b; }
+static float __fmul_rn(float a, float b) { return a * b; }
+static float __fdiv_rn(float a, float b) { return a / b; }
+static float __fmaf_rn(float a, float b, float c) { return fmaf(a, b, c); }
+"""
+
+OPTIONS = ("-std=c++17", "-O0", "-w", "-ffp-contract=off", "-shared", "-fPIC")
+"""Not optimised: seconds instead of minutes, and nothing is fused or reordered."""
+
+
+def host_compiler() -> list[str] | None:
+    """Return the command of a C++ compiler, the one of the package `ziglang` if the machine has none, or None."""
+    for name in ("c++", "g++", "clang++"):
+        if found := shutil.which(name):
+            return [found]
+    if importlib.util.find_spec("ziglang"):
+        return [sys.executable, "-m", "ziglang", "c++"]
+    return None
+
+
+class HostLauncher:
+    """Runs an emitted kernel robot by robot on arrays in the processor's memory.
+
+    Args:
+        source: The kernel.
+        folder: Where the shared library is kept, compiled only if it is not there yet; that of the kernels if None.
+
+    Raises:
+        RuntimeError: One line, if there is no C++ compiler or it refuses the source.
+    """
+
+    def __init__(self, source: Source, folder: Path | None = None) -> None:
+        compiler = host_compiler()
+        if compiler is None:
+            raise RuntimeError("no C++ compiler (c++, g++, clang++ or the package ziglang) to run CUDA C on the host")
+        text = SHIM + source.text + _loop(source.text)
+        folder = folder or cache_folder()
+        name = hashlib.sha256(" ".join((*compiler, *OPTIONS, text)).encode()).hexdigest()[:24]
+        library = folder / f"host_{name}.so"
+        if not library.exists():
+            file, new = folder / f"host_{name}.cpp", folder / f"host_{name}.{os.getpid()}"
+            write_atomically(file, text)
+            result = subprocess.run([*compiler, *OPTIONS, str(file), "-o", str(new)], capture_output=True, text=True)
+            if result.returncode:
+                errors = [line for line in result.stderr.splitlines() if "error" in line]
+                raise RuntimeError(f"{source.layout.name}: {(errors or [result.stderr])[0]}")
+            os.replace(new, library)
+        self._run = ctypes.CDLL(str(library)).run_all
+
+    def __call__(self, addresses: Sequence[int], numbers: Sequence[int], count: int) -> None:
+        """Run the kernel on all robots.
+
+        Args:
+            addresses: Of the arrays, in the layout's order.
+            numbers: Rows and columns of tables, repeat counts.
+            count: Number of robots.
+        """
+        self._run(*map(ctypes.c_void_p, addresses), *map(ctypes.c_int, numbers), ctypes.c_int(count))
+
+
+def _loop(text: str) -> str:
+    """The kernel's threads one after the other, as a function with its arguments."""
+    found = re.search(rf'extern "C" __global__ void [^;{{]*? {ENTRY}\((?P<arguments>[^)]*)\)', text)
+    assert found, "no kernel in the source"
+    arguments = " ".join(found["arguments"].split())
+    names = ", ".join(part.split()[-1] for part in arguments.split(","))
+    return f"""
+extern "C" void run_all({arguments})
+{{
+    for (unsigned thread = 0; thread < unsigned(count); ++thread) {{
+        blockIdx.x = thread / {BLOCK};
+        threadIdx.x = thread % {BLOCK};
+        {ENTRY}({names});
+    }}
+}}
+"""

@@ -1,0 +1,141 @@
+"""What every emitted source begins with: types, the copying of a robot's values, random numbers, the look-up.
+
+C text only. `random` and `lookup` hold the same two formulas for the processor; tests hold them equal.
+"""
+
+from ce_gym.compile.random import FIRST_FACTOR, GOLDEN, RANDOM_BITS, SECOND_FACTOR
+
+TYPES = {
+    "float64": """typedef double real;
+typedef unsigned long long bits;
+#define INFINITE __longlong_as_double(0x7ff0000000000000ll)
+#define NOT_A_NUMBER __longlong_as_double(0x7ff8000000000000ll)
+""",
+    "float32": """typedef float real;
+typedef unsigned int bits;
+#define INFINITE __int_as_float(0x7f800000)
+#define NOT_A_NUMBER __int_as_float(0x7fc00000)
+""",
+}
+
+HELPERS = """typedef unsigned long long word;
+
+// Arrays that stay on the GPU are (size, robots), so that neighbouring threads read neighbouring numbers.
+template <int SIZE> __device__ __forceinline__ void read_lane(real* to, const real* from, word lane, word robots)
+{
+#pragma unroll
+    for (int i = 0; i < SIZE; ++i) to[i] = from[i * robots + lane];
+}
+
+template <int SIZE> __device__ __forceinline__ void write_lane(real* to, const real* from, word lane, word robots)
+{
+#pragma unroll
+    for (int i = 0; i < SIZE; ++i) to[i * robots + lane] = from[i];
+}
+
+// Arrays that come and go are (robots, size), as everywhere else.
+template <int SIZE, class T> __device__ __forceinline__ void read_row(real* to, const T* from, word lane)
+{
+#pragma unroll
+    for (int i = 0; i < SIZE; ++i) to[i] = real(from[lane * SIZE + i]);
+}
+
+template <int SIZE, class T> __device__ __forceinline__ void write_row(T* to, const real* from, word lane)
+{
+#pragma unroll
+    for (int i = 0; i < SIZE; ++i) to[lane * SIZE + i] = T(from[i]);
+}
+"""
+
+RANDOM = """
+// splitmix64, see ce_gym/compile/random.py.
+__device__ __forceinline__ word mix(word x)
+{{
+    x = (x ^ (x >> 30)) * {first:#x}ull;
+    x = (x ^ (x >> 27)) * {second:#x}ull;
+    return x ^ (x >> 31);
+}}
+
+__device__ __forceinline__ word start_of(word key, word counter)
+{{
+    return mix(mix(key + {golden:#x}ull) ^ (counter * {golden:#x}ull));
+}}
+
+template <int SIZE> __device__ __forceinline__ word draw(real* to, word state)
+{{
+    for (int i = 0; i < SIZE; ++i) {{
+        state += {golden:#x}ull;
+        to[i] = real((long long)(mix(state) >> {shift})) * real({scale});
+    }}
+    return state;
+}}
+"""
+
+LOOKUP = """
+// One axis of the surface of ce_gym/compile/lookup.py: the first of three entries, their weights and slopes.
+struct Along {
+    int first;
+    real weight[3], slope[3];
+};
+
+__device__ __forceinline__ Along along(real u, int count)
+{
+    const real number = real(count), half = real(0.5);
+    // Both comparisons are false for a NaN, which so becomes a number before it becomes an index.
+    real inside = u > half ? u : half;
+    const real upper = number - real(1.5), last = number - real(2.0);
+    inside = inside < upper ? inside : upper;
+    real nearest = floor(inside + half);
+    nearest = nearest < last ? nearest : last;
+    const real t = inside - nearest, beyond = u - inside;
+    Along a;
+    a.first = int(nearest) - 1;
+    a.slope[0] = t - half;
+    a.slope[1] = real(-2.0) * t;
+    a.slope[2] = t + half;
+    a.weight[0] = half * (a.slope[0] * a.slope[0]) + a.slope[0] * beyond;
+    a.weight[1] = real(0.75) - t * t + a.slope[1] * beyond;
+    a.weight[2] = half * (a.slope[2] * a.slope[2]) + a.slope[2] * beyond;
+    return a;
+}
+
+__device__ __forceinline__ real weighed(const real* w, const real* x)
+{
+    return w[0] * x[0] + w[1] * x[1] + w[2] * x[2];
+}
+
+template <int POINTS> __device__ void look_up(
+    const real* table, int rows, int columns, const real* frame, const real* points, real* found)
+{
+    const real per_cell = real(1.0) / frame[2];
+#pragma unroll 1
+    for (int p = 0; p < POINTS; ++p) {
+        const Along r = along((points[2 * p] - frame[0]) * per_cell, rows);
+        const Along c = along((points[2 * p + 1] - frame[1]) * per_cell, columns);
+        real value[3], slope[3];
+        for (int i = 0; i < 3; ++i) {
+            const real* line = table + (long long)(r.first + i) * columns + c.first;
+            const real entries[3] = {line[0], line[1], line[2]};
+            value[i] = weighed(c.weight, entries);
+            slope[i] = weighed(c.slope, entries);
+        }
+        found[3 * p] = weighed(r.weight, value);
+        found[3 * p + 1] = weighed(r.slope, value) * per_cell;
+        found[3 * p + 2] = weighed(r.weight, slope) * per_cell;
+    }
+}
+"""
+
+
+def prelude(dtype: str, *, random: bool, lookup: bool) -> str:
+    """Return the text.
+
+    Args:
+        dtype: `float64` or `float32`.
+        random: whether random numbers are drawn.
+        lookup: whether tables are looked up.
+    """
+    shift = 64 - RANDOM_BITS[dtype]
+    scale = (2.0 ** -RANDOM_BITS[dtype]).hex()
+    figures = {"first": FIRST_FACTOR, "second": SECOND_FACTOR, "golden": GOLDEN, "shift": shift, "scale": scale}
+    return TYPES[dtype] + HELPERS + (RANDOM.format(**figures) if random else "") + (LOOKUP if lookup else "")

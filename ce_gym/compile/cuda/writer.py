@@ -1,0 +1,188 @@
+"""The builder that writes CUDA C: the methods of `ce_gym.compile.vector.VectorBuilder`, one robot to a thread.
+
+`lowering` and `math` emit through either builder, so the order of operations, the polynomials and their coefficients
+stand once. What LLVM may contract, the text leaves to the compiler; quotients, which LLVM may turn into products, are
+written as products with a reciprocal. What must be rounded operation by operation is written with the intrinsics that
+no compiler fuses (`__dadd_rn`).
+
+Knows CUDA C's names; nothing of CasADi, kernels or GPUs.
+"""
+
+from __future__ import annotations
+
+from math import inf, isnan
+
+import numpy as np
+
+WIDTH = {"float64": 64, "float32": 32}
+SIGNED = {64: "long long", 32: "int"}
+ROUNDED = {"fadd": "add", "fsub": "sub", "fmul": "mul", "fdiv": "div"}
+"""Operations that are rounded by themselves, and their part of an intrinsic's name."""
+INTEGER = {"add": "+", "sub": "-", "and_": "&", "or_": "|", "xor": "^", "shl": "<<"}
+"""Operations on bits, some of them on masks too."""
+NAMES = {"minnum": "fmin", "maxnum": "fmax"}
+"""LLVM's name of a function -> C's, where they differ."""
+
+
+class Term(str):
+    """A C expression without side effects: a literal or the name of a constant. Equal texts are equal values.
+
+    Attributes:
+        kind: its type: `real`, `bits` (unsigned, as wide as a number) or `bool`.
+    """
+
+    kind: str
+
+    def __new__(cls, text: str, kind: str = "real") -> Term:
+        """A text with a type."""
+        term = super().__new__(cls, text)
+        term.kind = kind
+        return term
+
+
+class Writer:
+    """Writes the statements of one function.
+
+    Attributes:
+        dtype: `float64` or `float32`.
+        bits: width of a number, 64 or 32.
+        float_type: the type of numbers.
+        builder: what stands in for LLVM's builder.
+        lines: the statements so far.
+    """
+
+    float_type = "real"
+
+    def __init__(self, dtype: str):
+        self.dtype, self.bits = dtype, WIDTH[dtype]
+        self.builder = _Instructions(self)
+        self.lines: list[str] = []
+        self._reciprocals: dict[str, Term] = {}
+
+    def let(self, kind: str, expression: str) -> Term:
+        """Name the value of an expression."""
+        name = Term(f"x{len(self.lines)}", kind)
+        self.lines.append(f"const {kind} {name} = {expression};")
+        return name
+
+    def const(self, number: float) -> Term:
+        """A number, rounded to the dtype and written without loss."""
+        rounded = float(np.dtype(self.dtype).type(number))
+        if isnan(rounded):
+            return Term("NOT_A_NUMBER")
+        if abs(rounded) == inf:
+            return Term("INFINITE" if rounded > 0 else "(-INFINITE)")
+        text = rounded.hex() + ("f" if self.bits == 32 else "")
+        return Term(f"({text})" if text.startswith("-") else text)
+
+    def int_const(self, number: int) -> Term:
+        """An integer as wide as a number."""
+        return Term(f"bits({number % 2**self.bits:#x}ull)", "bits")
+
+    def add(self, a: Term, b: Term) -> Term:
+        """Sum."""
+        return self.let("real", f"{a} + {b}")
+
+    def sub(self, a: Term, b: Term) -> Term:
+        """Difference."""
+        return self.let("real", f"{a} - {b}")
+
+    def mul(self, a: Term, b: Term) -> Term:
+        """Product; the compiler may contract it with a following sum."""
+        return self.let("real", f"{a} * {b}")
+
+    def div(self, a: Term, b: Term) -> Term:
+        """Quotient: a product with the reciprocal, which is taken once of each divisor."""
+        one = self.const(1.0)
+        if b not in self._reciprocals:
+            self._reciprocals[b] = self.let("real", f"{one} / {b}")
+        return self._reciprocals[b] if a == one else self.mul(a, self._reciprocals[b])
+
+    def neg(self, a: Term) -> Term:
+        """Sign changed."""
+        return self.let("real", f"-{a}")
+
+    def fma(self, a: Term, b: Term, c: Term) -> Term:
+        """`a * b + c`, rounded once."""
+        return self.let("real", f"{self.rounded('fma')}({a}, {b}, {c})")
+
+    def rounded(self, name: str) -> str:
+        """Name of the intrinsic that rounds once, to nearest."""
+        prefix = "__d" if self.bits == 64 else "__f"
+        return f"__{name}{'' if self.bits == 64 else 'f'}_rn" if name == "fma" else f"{prefix}{name}_rn"
+
+    def intrinsic(self, name: str, *operands: Term) -> Term:
+        """One of C's functions, such as sqrt, fabs, floor, minnum, copysign."""
+        suffix = "" if self.bits == 64 else "f"
+        return self.let("real", f"{NAMES.get(name, name)}{suffix}({', '.join(operands)})")
+
+    def polynomial(self, x: Term, coefficients: tuple[float, ...]) -> Term:
+        """Horner's scheme; coefficients in ascending order."""
+        result = self.const(coefficients[-1])
+        for coefficient in reversed(coefficients[:-1]):
+            result = self.fma(result, x, self.const(coefficient))
+        return result
+
+    def compare(self, sign: str, a: Term, b: Term) -> Term:
+        """A mask; every comparison with a NaN is false except `!=`."""
+        return self.let("bool", f"{a} {sign} {b}")
+
+    def select(self, mask: Term, a: Term, b: Term) -> Term:
+        """`a` where the mask is true, else `b`."""
+        return self.let(a.kind, f"{mask} ? {a} : {b}")
+
+    def to_bits(self, a: Term) -> Term:
+        """The number's bits as an integer."""
+        return self.let("bits", f"bits({'__double_as_longlong' if self.bits == 64 else '__float_as_int'}({a}))")
+
+    def from_bits(self, a: Term) -> Term:
+        """The integer's bits as a number."""
+        name = "__longlong_as_double" if self.bits == 64 else "__int_as_float"
+        return self.let("real", f"{name}({self.signed(a)})")
+
+    def signed(self, a: Term) -> str:
+        """An integer read as one with a sign."""
+        return f"({SIGNED[self.bits]}){a}"
+
+    def is_odd(self, bits: Term) -> Term:
+        """A mask: whether the lowest bit of an integer is set."""
+        return self.let("bool", f"({bits} & 1) != 0")
+
+    def load(self, base: str, index: int) -> Term:
+        """Value `index` of a buffer, as it is now."""
+        return self.let("real", f"{base}[{index}]")
+
+    def store(self, value: Term, base: str, index: int) -> None:
+        """Write value `index` of a buffer."""
+        self.lines.append(f"{base}[{index}] = {value};")
+
+
+class _Instructions:
+    """Stands in for LLVM's builder where `math` and `lowering` ask for one instruction by name."""
+
+    def __init__(self, writer: Writer):
+        self._writer = writer
+
+    def __getattr__(self, name: str):
+        w = self._writer
+        if name in ROUNDED:
+            return lambda a, b: w.let("real", f"{w.rounded(ROUNDED[name])}({a}, {b})")
+        if name in INTEGER:
+            return lambda a, b: w.let(a.kind, f"{a} {INTEGER[name]} {b}")
+        raise AttributeError(f"{name!r} has no CUDA form")
+
+    def not_(self, a: Term) -> Term:
+        """A mask's opposite."""
+        return self._writer.let("bool", f"!{a}")
+
+    def ashr(self, a: Term, b: Term) -> Term:
+        """Bits shifted right, the sign's copies from the left."""
+        return self._writer.let("bits", f"bits(({self._writer.signed(a)}) >> {b})")
+
+    def sitofp(self, a: Term, _type: str) -> Term:
+        """An integer with a sign as a number."""
+        return self._writer.let("real", f"real({self._writer.signed(a)})")
+
+    def icmp_signed(self, sign: str, a: Term, b: Term) -> Term:
+        """A mask from two integers with signs."""
+        return self._writer.let("bool", f"({self._writer.signed(a)}) {sign} ({self._writer.signed(b)})")

@@ -1,0 +1,141 @@
+"""`Simulator(device=...)`: what a GPU would compute, computed by the processor from the emitted source."""
+
+import numpy as np
+import pytest
+import torch
+
+import ce_gym
+from ce_gym.compile.cuda.host import host_compiler
+from ce_gym.sim.devices import Emulated, device_named, to_numpy
+
+N = 20
+BOUND = {"float64": 1e-11, "float32": 1e-5}
+"""Of the difference between emitted source and kernel after a step, relative to the largest number of a robot."""
+
+needs_host_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler to run emitted CUDA C with")
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
+
+
+def stepped(model, dtype, device, **options):
+    """State after a sub-step from random states about the standing pose, by name, rows of robots."""
+    rng = np.random.default_rng(3)
+    sim = ce_gym.Simulator(model, N, dtype=dtype, device=device, **options)
+    q = np.tile(model.standing_q, (N, 1))
+    if model.robot.floating:
+        q[:, 2] += rng.uniform(-0.005, 0.02, N)
+    sim.set_state(q, 0.5 * rng.normal(size=(N, model.nv)))
+    joints = len(model.joint_links)
+    sim.step(model.standing_q[-joints:] + 0.2 * rng.normal(size=(N, joints)))
+    return {name: to_numpy(rows).reshape(N, -1) for name, rows in (("q", sim.q), ("v", sim.v))}
+
+
+def difference(one, other):
+    """Largest difference of each robot, relative to its largest number or 1."""
+    each = [np.abs(one[k] - other[k]).max(1) / np.maximum(1, np.abs(one[k]).max(1)) for k in one]
+    return np.max(each, axis=0)
+
+
+@needs_host_compiler
+@pytest.mark.parametrize("robot", ["mini_cheetah", "planar_leg_linkage", "six_bar", "mit_humanoid_leg"])
+def test_double_precision_agrees(robot):
+    model = ce_gym.Model(robot)
+    cpu, gpu = (stepped(model, "float64", device) for device in ("cpu", Emulated()))
+    assert difference(cpu, gpu).max() <= BOUND["float64"]
+    assert np.abs(cpu["v"]).max() > 0.1
+
+
+@needs_host_compiler
+@pytest.mark.parametrize("robot", ["mini_cheetah", "six_bar"])
+def test_single_precision_agrees(robot):
+    """A step whose contacts amplify every rounding may differ more, but not more than from double precision."""
+    model = ce_gym.Model(robot)
+    cpu, gpu = (stepped(model, "float32", device) for device in ("cpu", Emulated()))
+    own = difference(stepped(model, "float64", "cpu"), cpu)
+    apart = difference(cpu, gpu)
+    assert np.median(apart) <= BOUND["float32"]
+    assert apart.max() <= max(BOUND["float32"], 2 * own.max())
+
+
+@needs_host_compiler
+def test_everything_of_a_simulator():
+    """Terrain, parameters, masks, readings: the same through tensors as through arrays, step after step."""
+    model = ce_gym.Model("mini_cheetah")
+    heights = np.random.default_rng(0).uniform(0, 0.03, (40, 50))
+    options = {
+        "terrain": ce_gym.Terrain(heights, 0.1, (-2.0, -2.5)),
+        "parameters": ("friction", "stiffness", "kp"),
+        "outputs": ("torque", "contact_forces", "energy", "power"),
+        "contacts": "foot",
+    }
+    rng = np.random.default_rng(1)
+    sims = [ce_gym.Simulator(model, N, device=device, **options) for device in ("cpu", Emulated())]
+    mask, friction = rng.random(N) > 0.5, rng.uniform(0.2, 1.0, (N, 1))
+    targets = model.standing_q[7:] + rng.uniform(-0.3, 0.3, (6, N, 12))
+    for sim, kind in zip(sims, (np.asarray, torch.from_numpy), strict=True):
+        sim.set_parameter("friction", kind(friction), kind(mask))
+        for target in targets[:3]:
+            sim.step(kind(target), n_substeps=2)
+        sim.reset(kind(mask))
+        for target in targets[3:]:
+            sim.step(kind(target), n_substeps=2)
+    cpu, gpu = sims
+    assert isinstance(gpu.q, torch.Tensor)
+    for name in ("q", "v", "torque", "contact_forces", "energy", "power"):
+        one, other = getattr(cpu, name), getattr(gpu, name)
+        assert other.shape == one.shape
+        np.testing.assert_allclose(other.numpy(), one, rtol=1e-7, atol=1e-7 * np.abs(one).max(), err_msg=name)
+    assert gpu.n_diverged == cpu.n_diverged == 0
+    before = gpu.q
+    gpu.step(targets[0])
+    assert not torch.equal(before, gpu.q), "what was read must be a copy"
+
+
+@needs_host_compiler
+def test_a_method_of_several_steps_agrees():
+    model = ce_gym.Model("mini_cheetah")
+    options = {"method": "extrapolated", "contacts": "foot", "outputs": ("error",)}
+    cpu, gpu = (stepped(model, "float64", device, **options) for device in ("cpu", Emulated()))
+    assert difference(cpu, gpu).max() <= BOUND["float64"]
+
+
+@needs_host_compiler
+def test_a_diverged_robot_is_frozen_and_flagged():
+    model = ce_gym.Model("mini_cheetah")
+    for device in ("cpu", Emulated()):
+        sim = ce_gym.Simulator(model, 4, device=device)
+        v = np.zeros((4, model.nv))
+        v[2, 0] = 1e6
+        sim.set_state(sim.q, v)
+        sim.step(model.standing_q[7:])
+        assert list(map(bool, sim.diverged)) == [False, False, True, False]
+        assert sim.n_diverged == 1
+        sim.reset(np.array([False, False, True, False]))
+        assert (sim.n_diverged, bool(sim.diverged.any())) == (1, False)
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "CPU"])
+def test_unknown_devices_are_refused(name):
+    with pytest.raises(ValueError, match=r"device='.*'; expected 'cpu', 'cuda' or 'cuda:N'"):
+        device_named(name)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_one_line_says_so():
+    with pytest.raises(ValueError, match=r"^device='cuda:0': torch .* sees no NVIDIA GPU; expected device='cpu'$"):
+        ce_gym.Simulator(ce_gym.Model("six_bar"), device="cuda")
+
+
+def test_retries_are_for_the_processor():
+    with pytest.raises(ValueError, match="retry=1; expected 0 on device 'emulated cuda'"):
+        ce_gym.Simulator(ce_gym.Model("six_bar"), device=Emulated(), retry=1)
+
+
+@needs_gpu
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_gpu_agrees(dtype):
+    model = ce_gym.Model("mini_cheetah")
+    cpu, gpu = (stepped(model, dtype, device) for device in ("cpu", "cuda"))
+    own = difference(stepped(model, "float64", "cpu"), cpu) if dtype == "float32" else np.zeros(1)
+    apart = difference(cpu, gpu)
+    assert np.median(apart) <= BOUND[dtype]
+    assert apart.max() <= max(BOUND[dtype], 2 * own.max())
