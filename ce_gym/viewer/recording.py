@@ -96,7 +96,7 @@ def record_lanes(
             q, v, command, torque = (state[name][lane] for name in ("q", "v", "command", "torque"))
             recorders[lane].add(step * native.dt, q, v, forces, command, torque, rewards[lane])
         observation, reward, terminated, truncated, more = env.step(act(observation))
-        rewards = np.column_stack([np.atleast_1d(reward), *_terms(more, batch.program.reward_terms)])
+        rewards = np.column_stack([np.atleast_1d(reward), *_terms(more, tuple(batch.program.reward_terms))])
         ended = np.atleast_1d(np.logical_or(terminated, truncated))
         running -= set(np.flatnonzero(ended).tolist())
         if not running:

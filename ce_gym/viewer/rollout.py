@@ -72,7 +72,7 @@ class Rollout:
 
     def __post_init__(self) -> None:
         frames = np.size(self.times)
-        empty = {name: np.empty((frames, 0)) for name in ("commands", "torques", "signals")}
+        empty: dict[str, Array] = {name: np.empty((frames, 0)) for name in ("commands", "torques", "signals")}
         empty["contact_forces"] = np.empty((frames, 0, 3))
         for name, ndim in ARRAYS.items():
             value = getattr(self, name)

@@ -87,7 +87,7 @@ def places(actors: Sequence[Actor], spacing: float) -> list[Array]:
     """Return where the world of each actor is put, shape (4, 4); ghosts share that of the first."""
     count = len(actors)
     if spacing == 0:
-        return [np.linalg.inv(actors[0].start)] * count
+        return [np.linalg.inv(actors[0].start).astype(np.float64)] * count
     columns = count if count <= ROW else int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     result = []
