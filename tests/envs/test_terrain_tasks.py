@@ -133,7 +133,7 @@ def test_feet_on_slopes_know_that_they_touch():
     q[:, 0] += 2.0 * np.sign(np.arange(64) % 2 - 0.5)
     q[:, 2] = envs.model.standing_q[2] + field.at(q[:, 0], q[:, 1])[:, 0] + 0.1
     envs.batch.write("q", q)
-    for _ in range(25):
+    for _ in range(75):
         seen, _, terminated, _, _ = envs.step(zeros(envs))
     loaded = envs.batch.rows("load")[:, [n in FEET for n in envs.contact_names]] > 0
     assert loaded.mean() > 0.2

@@ -29,7 +29,7 @@ def whirl(sim: Simulator) -> tuple[np.ndarray, np.ndarray]:
     """Let the joints of one robot turn too fast for a step of 10 ms; return its state, shapes (nq,) and (nv,)."""
     v = sim.v
     v[BAD] = 0.0
-    v[BAD, 6:] = 3300.0 * np.resize([1.0, -1.0], 12)
+    v[BAD, 6:] = 4500.0 * np.resize([1.0, -1.0], 12)
     sim.set_state(sim.q, v)
     return sim.q[BAD], v[BAD]
 

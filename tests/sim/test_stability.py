@@ -63,7 +63,7 @@ def test_a_robot_without_motors_never_gains_energy(cheetah: Model, dt: float):
     assert finite.all()
     assert (excess <= 0).all()
     resolved = np.array(grid.STIFFNESSES) * dt**2 <= 0.5  # stiffer than that, half a kilogram bounces within a step
-    assert (gain[resolved] <= (1e-9 if dt < 0.005 else 0.1)).all()
+    assert (gain[resolved] <= (1e-9 if dt < 0.005 else 0.2)).all()
 
 
 def test_a_robot_that_stands_is_silent(cheetah: Model):

@@ -36,7 +36,8 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     q[:, 7:] += 0.1 * np.sin(times)[:, None]
     q[:, 0] = 0.3 * times
     forces = np.random.default_rng(0).normal(0, 20, (1000, len(model.contact_names), 3))
-    rollout = Rollout(ROBOT, "exact", 0.02, times, q, np.zeros((1000, model.nv)), forces, np.ones((1000, 3)))
+    torques = np.sin(times)[:, None] * np.ones(len(model.joint_links))
+    rollout = Rollout(ROBOT, "exact", 0.02, times, q, np.zeros((1000, model.nv)), forces, np.ones((1000, 3)), torques)
     return rollout.save(tmp_path_factory.mktemp("rollout") / "stand.npz")
 
 
