@@ -104,8 +104,13 @@ def _stage(actors: Sequence[Actor], poses: Sequence[Array]) -> Iterator[Command]
     radius = max(actor.radius for actor in actors) + float(np.linalg.norm(np.ptp(starts, 0))) / 2
     corners = np.concatenate(paths)
     yield from stage_commands(corners.min(0), corners.max(0), root=ROOT, radius=radius)
-    middle = (min(actor.low[2] for actor in actors) + max(actor.high[2] for actor in actors)) / 2
-    yield from camera_commands(np.array([0.0, 0.0, middle]), radius)
+    yield three.set_transform(ROOT, three.transform([0.0, 0.0, -_height(actors)]))
+    yield from camera_commands(radius)
+
+
+def _height(actors: Sequence[Actor]) -> float:
+    """Return the height of the middle of the robots [m], which the camera looks at."""
+    return float(min(actor.low[2] for actor in actors) + max(actor.high[2] for actor in actors)) / 2
 
 
 def _moved(points: Array, pose: Array) -> Array:
@@ -120,4 +125,6 @@ def _follow(actors: Sequence[Actor], poses: Sequence[Array], end: float) -> Comm
     pairs = zip(actors, middles, strict=True)
     paths = [[np.interp(times, actor.times, middle[:, axis]) for axis in (0, 1)] for actor, middle in pairs]
     centre = smooth(np.mean(paths, 0).T, times, FOLLOW_SECONDS)
-    return tracks.moving(ROOT, times, end, {"position": np.column_stack([-centre, np.zeros(len(times))])})
+    return tracks.moving(
+        ROOT, times, end, {"position": np.column_stack([-centre, np.full(len(times), -_height(actors))])}
+    )

@@ -46,12 +46,14 @@ def stage_commands(
     yield from _lights(radius)
 
 
-def camera_commands(target: NDArray[np.float64], radius: float, aspect: float = 1.6) -> Iterator[Command]:
-    """Look at a ball of `radius` [m] around `target` [m] from the front right, a little from above."""
+def camera_commands(radius: float, aspect: float = 1.6) -> Iterator[Command]:
+    """Look at a ball of `radius` [m] around the origin from the front right, a little from above.
+
+    meshcat's camera turns about the origin whatever is done to it, so what is looked at is brought there.
+    """
     distance = 1.3 * radius / np.sin(np.radians(FIELD_OF_VIEW / 2)) * max(1.0, 1.0 / aspect)
     x, y, z = (distance * _unit([0.62, -0.80, 0.30])).tolist()
     lens = "/Cameras/default/rotated/<object>"
-    yield three.set_transform("/Cameras/default", three.transform(target))
     yield three.set_property(lens, "fov", FIELD_OF_VIEW)
     yield three.set_property(lens, "position", [x, z, -y])  # this node of meshcat's has y up
 

@@ -27,7 +27,7 @@ SHOW: Script = (
     (4.0, (1.0, 0.0, 0.0)),
     (1.0, (0.0, 0.0, 0.0)),
 )
-"""Stand, walk, turn, step sideways, walk faster, stand."""
+"""Stand, walk, turn, step sideways, walk faster, stand; each within what the task commands."""
 
 
 def drive(act: Act, env_id: str, script: Script = SHOW, *, seed: int = 0, label: str = "", **kwargs: Any) -> Rollout:
@@ -62,6 +62,9 @@ def drive_many(
     try:
         period = envs.unwrapped.dt  # type: ignore[attr-defined]
         commands = np.repeat([c for _, c in script], [round(t / period) for t, _ in script], axis=0)
+        if script is SHOW:
+            low, high = np.transpose(envs.unwrapped.batch.program.task.command_range)  # type: ignore[attr-defined]
+            commands = np.clip(commands, low, high)
         more: dict[str, Any] = {"seed": seed, "commands": commands, "label": label, "info": {"env": env_id}}
         return record_lanes(envs, act, seconds, lanes=range(robots), **more)
     finally:

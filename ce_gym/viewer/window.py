@@ -53,7 +53,7 @@ class Window:
         positions, rotations = (np.asarray(rows[0]) for rows in model.body_poses(np.asarray(q, float)[None]))
         order = list(self._index.values())
         low, high = extent(self._robot, positions[order], rotations[order])
-        self._middle = (low + high)[:2] / 2
+        self._middle, self._height = (low + high)[:2] / 2, float(low[2] + high[2]) / 2
         self._text = self._page(low, high)
         self._news = threading.Condition()
         self._event, self._count, self._watchers, self._closed = b"", 0, 0, False
@@ -90,7 +90,7 @@ class Window:
         radius = max(float(np.linalg.norm(high - low)) / 2, 0.05)
         here = np.zeros(2)
         commands = [*robot_commands(self._robot, _ROBOT), *stage_commands(here, here, root=_STAGE, radius=radius)]
-        commands += camera_commands(np.array([0.0, 0.0, (low + high)[2] / 2]), radius)
+        commands += camera_commands(radius)
         packed = [base64.b64encode(three.pack(command)).decode() for command in commands]
         return string.Template(_PAGE.read_text(encoding="utf-8")).substitute(
             title=html.escape(self._robot.name),
@@ -104,8 +104,8 @@ class Window:
         poses = {name: three.transform(positions[i], rotations[i]) for name, i in self._index.items()}
         x, y = positions[self._index[self._robot.bodies[0].name], :2] if self._robot.floating else self._middle
         matrices = {
-            _ROBOT: three.transform([-x, -y, 0.0]),
-            _STAGE: three.transform([-(x % TILE), -(y % TILE), 0.0]),  # the same everywhere, so it never ends
+            _ROBOT: three.transform([-x, -y, -self._height]),
+            _STAGE: three.transform([-(x % TILE), -(y % TILE), -self._height]),  # the same everywhere, so it never ends
         }
         for body in self._robot.bodies:
             pose = poses[body.name]
