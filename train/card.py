@@ -56,7 +56,8 @@ def judged(policy: Policy, episodes: int, sim2sim_robots: int, seed: int = EVALU
     except ImportError:
         return result | {"sim2sim_missing": "MuJoCo is not installed: pip install ce_gym[mjcf]"}
     except ValueError as error:  # MuJoCo cannot express every robot
-        return result | {"sim2sim_missing": " ".join(str(error).split())}
+        why = " ".join(str(error).split()).replace(f"{SHIPPED.parent}/", "")  # cards travel, folders do not
+        return result | {"sim2sim_missing": why}
 
 
 def command(record: dict[str, Any]) -> str:
