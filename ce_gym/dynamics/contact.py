@@ -18,8 +18,9 @@ Normal force, with depth `d`, and friction, with cone `mu lam` and the trial for
 
 Friction in one attempt, with w = v: a slipping contact keeps the slope of a sticking one, scaled by mu lam / |x| (the
 secant). That never reverses a velocity, and is slow to break away. In two: the first with the true slope (the tangent,
-none along the slip), the second about its result, in which a contact whose slip would have turned round sticks. If that
-was misjudged too, a third falls back on the secant, which cannot gain energy.
+none along the slip), the second about its result, in which a contact whose slip would have turned round sticks, and one
+that was held and left the cone is let go by the secant. If that was misjudged too, by twice the cone where one was
+held, a third falls back on the secant about the start, which cannot gain energy.
 
 A contact begins if it *will* be in the ground by the end of the step, `d - dt v_n > 0`, and pushes. A corner that its
 velocity does not take there, but the velocity it has after another one was hit, is seen in the second attempt. A point

@@ -5,6 +5,8 @@ May know everything in this room.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import casadi as ca
 
 from ce_gym.dynamics.actuation import actuated_clusters
@@ -64,8 +66,13 @@ def attempt_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[
     return traced("attempt", given.inputs() | {"hints": ca.vec(hints)}, kept | results)
 
 
-def extrapolation_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
+def extrapolation_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
     """Trace what follows from a step and two of half the length, as `Extrapolated` has it.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+        outputs: Sizes of those among `OUTPUTS` that are asked for.
 
     Returns:
         Function (*state, diverged, *of the steps) -> (*state, diverged, *outputs). Of the steps it is given those parts
@@ -83,12 +90,11 @@ def extrapolation_function(mechanism: Mechanism, options: StepOptions, outputs: 
     sane = ca.logic_and(ca.sumsqr(fine.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
     results = {f"{name}_next": ca.if_else(sane, getattr(fine, name), value) for name, value in before.items()}
     results["diverged_next"] = ca.if_else(sane, 0, 1)
-    plain = attempt_function(mechanism, options, tuple(name for name in outputs if name != "error"))
-    for name in outputs:
+    for name, size in outputs.items():
         if name == "error":
             results[name] = ca.norm_2(v_fine - coarse.v) / 2
             continue
-        told = {stage: SX.sym(name, plain.numel_out(name)) for stage in ("coarse", "half", "fine")}
+        told = {stage: SX.sym(name, size) for stage in ("coarse", "half", "fine")}
         if name in AT_START:
             weights = {"coarse": 1.0}
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -50,7 +51,8 @@ def substeps(
         buffers, before, each = _attempts(function, state, outputs, more)
     else:
         again = _look_up(mechanism, options, "half_")[1] if on_field else ()
-        buffers, before, each = _extrapolated(mechanism, options, state, outputs, more, again)
+        asked = {name: sizes[name] for name in outputs}
+        buffers, before, each = _extrapolated(mechanism, options, state, asked, more, again)
     buffers, each = [*buffers, *further], (*look, *each)
     if on_field:
         sizes = {name: size for name, size in sizes.items() if name != "ground"} | {FRAME: 3}
@@ -104,7 +106,7 @@ STAGES = (("coarse", "", "whole"), ("half", "", "part"), ("fine", "half_", "part
 
 
 def _extrapolated(
-    mechanism: Mechanism, options: StepOptions, state: tuple[str, ...], outputs: tuple[str, ...], more: int,
+    mechanism: Mechanism, options: StepOptions, state: tuple[str, ...], outputs: Mapping[str, int], more: int,
     look_again: tuple[Step, ...],
 ) -> Parts:  # fmt: skip
     """A whole Euler step and two halves, each with as many attempts as it needs, and what follows from them."""
