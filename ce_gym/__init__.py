@@ -14,6 +14,7 @@ from ce_gym.envs.rendering import use_renderers
 from ce_gym.envs.scene_text import scene_report
 from ce_gym.envs.terms import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
+from ce_gym.policies import LevelWarning, Policy, PolicyError, load_policy, shipped_policies
 from ce_gym.sim.simulator import Simulator
 from ce_gym.sim.terrain import Terrain
 
@@ -21,13 +22,17 @@ __version__ = "0.1.0"
 
 __all__ = [
     "InertiaWarning",
+    "LevelWarning",
     "LossyImportWarning",
     "Model",
+    "Policy",
+    "PolicyError",
     "Robot",
     "RobotError",
     "Simulator",
     "Terrain",
     "environment_ids",
+    "load_policy",
     "load_robot",
     "metric",
     "observation",
@@ -35,6 +40,7 @@ __all__ = [
     "reward",
     "robots",
     "scene_report",
+    "shipped_policies",
     "termination",
 ]
 

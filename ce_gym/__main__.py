@@ -18,7 +18,7 @@ from ce_gym.viewer.console import Parser, examples
 
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
 
-  python -m ce_gym list                  robots and environments
+  python -m ce_gym list                  robots, environments and trained policies
   python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
   python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
   python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
@@ -64,7 +64,9 @@ def _show_warning(message: Warning | str, *_: object) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="python -m ce_gym", description=WELCOME)
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    list_ = commands.add_parser("list", help="robots and environments", description="List robots and environments.")
+    list_ = commands.add_parser(
+        "list", help="robots, environments and policies", description="List robots, environments and trained policies."
+    )
     list_.set_defaults(run=_list)
     inspect = commands.add_parser(
         "inspect",
@@ -89,11 +91,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from ce_gym import environment_ids
+    from ce_gym import environment_ids, shipped_policies
     from ce_gym.model.listing import robot_table
 
     print(f"Robots:\n{robot_table()}\n\nEnvironments:")
     print("\n".join(f"  {name}" for name in environment_ids()))
+    print("\nPolicies, for `play`:")
+    print("\n".join(f"  {name}" for name in shipped_policies()))
     return 0
 
 
@@ -128,9 +132,10 @@ def _bench(argv: list[str]) -> int:
 
 def _can_be_mended(error: Exception) -> bool:
     from ce_gym.model import RobotError
+    from ce_gym.policies import PolicyError
     from ce_gym.viewer import RolloutError, ViewerError
 
-    return isinstance(error, (RobotError, RolloutError, ViewerError, OSError))
+    return isinstance(error, (RobotError, PolicyError, RolloutError, ViewerError, OSError))
 
 
 if __name__ == "__main__":

@@ -21,10 +21,11 @@ from console import Table, add_json_argument, markdown, positive, print_result, 
 from effort import effort
 from evaluate import EVALUATION_SEED, evaluate
 from pictures import draw_curve
-from policy_file import SHIPPED, Policy, PolicyError, locate, read_actor, write_npz
 from pushes import direction_name, push_envelope
 from settings import config_file, load_settings
 from transfer import LEVELS
+
+from ce_gym.policies import Policy, PolicyError, locate_policy, read_actor, shelf, write_npz
 
 
 def judged(policy: Policy, episodes: int, sim2sim_robots: int, seed: int = EVALUATION_SEED) -> dict[str, Any]:
@@ -56,7 +57,7 @@ def judged(policy: Policy, episodes: int, sim2sim_robots: int, seed: int = EVALU
     except ImportError:
         return result | {"sim2sim_missing": "MuJoCo is not installed: pip install ce_gym[mjcf]"}
     except ValueError as error:  # MuJoCo cannot express every robot
-        why = " ".join(str(error).split()).replace(f"{SHIPPED.parent}/", "")  # cards travel, folders do not
+        why = " ".join(str(error).split()).replace(f"{shelf().parent}/", "")  # cards travel, folders do not
         return result | {"sim2sim_missing": why}
 
 
@@ -201,11 +202,11 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Judge, and write the three files."""
-    source = locate(args.run)
+    source = locate_policy(args.run)
     actor, record = read_actor(source)
     record, curve = portable(record), read_curve(source.parent / "curve.csv")
     name = short_name(record)
-    out = SHIPPED / name if args.ship else args.out or source.parent
+    out = shelf() / name if args.ship else args.out or source.parent
     result = judged(Policy(actor, record), args.episodes, args.robots)
     out.mkdir(parents=True, exist_ok=True)
     write_npz(actor, record, out / "policy.npz")

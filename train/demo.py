@@ -12,7 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from evaluate import load_policy, report
+from evaluate import load_learner, report
 from ppo import Job, Trained, available_threads, train
 from record import record
 from settings import config_file, load_settings
@@ -28,7 +28,7 @@ def obtain_policy(args: argparse.Namespace) -> Path:
     policy = args.out / "policy.zip"
     resume = None
     if policy.exists() and not args.fresh:
-        _, record = load_policy(policy)
+        _, record = load_learner(policy)
         if record["finished"] and record["env"] == args.env:
             print(f"Using the policy trained earlier: {policy}, {record['steps']:,} steps. --fresh trains a new one.")
             return policy
@@ -76,7 +76,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def show(policy: Path, episodes: int, out: Path) -> None:
     """Print how good a policy is, on every transmission level, and write its rollout; the last line is the page."""
-    model, about = load_policy(policy)
+    model, about = load_learner(policy)
     results = transfer(model, about, episodes=episodes)
     entry = {"transmission": about["transmission"], "results": results}
     print(f"\nJudged on {about['transmission']} transmissions:\n{report(results[about['transmission']])}")

@@ -15,10 +15,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from policy_file import Policy
 
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
+from ce_gym.policies import Policy
 
 Array = NDArray[np.float64]
 

@@ -17,21 +17,21 @@ from typing import Any
 import numpy as np
 from console import add_json_argument, positive, print_result, run
 from effort import effort
-from policy_file import WHERE, Policy, PolicyError, locate, read_policy
 from pushes import push_envelope, push_table
 from stable_baselines3 import PPO
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
+from ce_gym.policies import WHERE, Policy, PolicyError, load_policy, locate_policy
 
 EVALUATION_SEED = 1_000_000
 """Far from training seeds, so that a policy is judged on commands and starts it has not met."""
 
 
-def load_policy(path: str | Path) -> tuple[PPO, dict[str, Any]]:
+def load_learner(path: str | Path) -> tuple[PPO, dict[str, Any]]:
     """Read a policy with all that training it on needs, and the record that training wrote beside it.
 
     Only for files you trust: Stable-Baselines3 unpickles objects, which can run any code. To judge or show a policy,
-    `policy_file.read_policy` reads its weights and nothing else.
+    `ce_gym.load_policy` reads its weights and nothing else.
 
     Args:
         path: Of the policy, `<name>.zip`, or of its folder; its record is `<name>.json`.
@@ -42,7 +42,7 @@ def load_policy(path: str | Path) -> tuple[PPO, dict[str, Any]]:
     Raises:
         PolicyError: If one of the two files is missing or damaged.
     """
-    policy = locate(path).with_suffix(".zip")
+    policy = locate_policy(path).with_suffix(".zip")
     for file in (policy, policy.with_suffix(".json")):
         if not file.exists():
             raise PolicyError(
@@ -198,7 +198,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _judge(args: argparse.Namespace) -> int:
     """Do everything that the command line asks for."""
-    model = read_policy(args.policy, args.transmission)
+    model = load_policy(args.policy, args.transmission)
     kwargs = env_kwargs(model.record, args.transmission)
     result: dict[str, Any] = evaluate(model, model.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
     if found := effort(model, episodes=min(args.episodes, 32), seed=args.seed, **kwargs):

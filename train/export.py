@@ -18,30 +18,23 @@ from typing import Any
 
 import onnx
 from onnx import TensorProto, helper, numpy_helper
-from policy_file import METADATA, Actor, PolicyError, read_actor
 
-OPERATORS = {"Tanh": "Tanh", "ELU": "Elu", "ReLU": "Relu", "SELU": "Selu", "Sigmoid": "Sigmoid", "Softplus": "Softplus"}
-"""ONNX operator of each activation, by its name in torch.nn, where their defaults agree."""
+from ce_gym.policies import RECORD_KEY, Actor, PolicyError, read_actor
 
 OPSET, IR_VERSION = 17, 8
 """Old enough for the runtimes that robots carry."""
 
 
 def to_onnx(actor: Actor, record: dict[str, Any]) -> onnx.ModelProto:
-    """Return an actor as an ONNX model, the record in its metadata.
-
-    Raises:
-        PolicyError: If ONNX has no counterpart of the activation.
-    """
-    if actor.activation not in OPERATORS:
-        raise PolicyError(f"activation {actor.activation!r}; expected one of {', '.join(OPERATORS)}")
+    """Return an actor as an ONNX model, the record in its metadata."""
+    activation = actor.activation.capitalize()  # ONNX and torch.nn differ in capitals only
     nodes, constants, value = [], [], "obs"
     for i, (weight, bias) in enumerate(actor.layers):
         if i:
-            nodes.append(helper.make_node(OPERATORS[actor.activation], [value], [f"active_{i}"]))
+            nodes.append(helper.make_node(activation, [value], [f"active_{i}"]))
             value = f"active_{i}"
         nodes.append(helper.make_node("Gemm", [value, f"weight_{i}", f"bias_{i}"], [f"linear_{i}"], transB=1))
-        constants += [numpy_helper.from_array(x.numpy(), f"{n}_{i}") for n, x in (("weight", weight), ("bias", bias))]
+        constants += [numpy_helper.from_array(x, f"{n}_{i}") for n, x in (("weight", weight), ("bias", bias))]
         value = f"linear_{i}"
     limits = [helper.make_tensor(name, TensorProto.FLOAT, (), [x]) for name, x in (("low", -1.0), ("high", 1.0))]
     nodes.append(helper.make_node("Clip", [value, "low", "high"], ["actions"]))
@@ -58,7 +51,7 @@ def to_onnx(actor: Actor, record: dict[str, Any]) -> onnx.ModelProto:
 
 def add_record(model: onnx.ModelProto, record: dict[str, Any]) -> None:
     """Put the record of a policy into a model's metadata, and its contract once more, entry by entry."""
-    entries = {METADATA: record, **record["contract"]}
+    entries = {RECORD_KEY: record, **record["contract"]}
     helper.set_model_props(model, {k: x if isinstance(x, str) else json.dumps(x) for k, x in entries.items()})
 
 

@@ -26,9 +26,9 @@ from typing import Any
 import gymnasium
 import torch
 from callbacks import AdaptiveLearningRate, Checkpoints, Curve, EpisodeLog, ProgressBar, StopInOrder, read_curve
-from evaluate import PolicyError, evaluate, load_policy, report
+from evaluate import PolicyError, evaluate, load_learner, report
 from learner import ThreadedPPO
-from settings import Settings, SettingsError, config_file, load_settings
+from settings import Settings, config_file, load_settings
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import FloatSchedule
@@ -139,7 +139,7 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
     s = job.settings
     network = {
         "net_arch": list(s.hidden),
-        "activation_fn": _activation(s.activation),
+        "activation_fn": getattr(torch.nn, s.activation),
         "log_std_init": float(torch.tensor(s.initial_std).log()),
         "ortho_init": True,
     }
@@ -170,14 +170,6 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
     if s.target_kl:  # go on with the rate it had been adapted to
         model.lr_schedule = FloatSchedule(model.policy.optimizer.param_groups[0]["lr"])
     return model
-
-
-def _activation(name: str) -> type[torch.nn.Module]:
-    """The activation called `name`."""
-    found = getattr(torch.nn, name, None)
-    if not (isinstance(found, type) and issubclass(found, torch.nn.Module)):
-        raise SettingsError(f"activation: {name!r}; expected a module of torch.nn, such as Tanh or ELU")
-    return found
 
 
 def _record(model: PPO, envs: SB3VecEnv, job: Job, seconds: float) -> dict[str, Any]:
@@ -234,7 +226,7 @@ def jobs(args: argparse.Namespace) -> list[Job]:
     Raises:
         ValueError: If the command line, a settings file or a policy cannot be used.
     """
-    record = load_policy(args.resume)[1] if args.resume else {}
+    record = load_learner(args.resume)[1] if args.resume else {}
     env_id = args.env or record.get("env")
     if not env_id:
         raise ValueError("--env: missing; expected an environment id, or --resume with a policy")

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from policy_file import Policy
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
+from ce_gym.policies import Policy
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Changes of velocity [m/s]; 0 shows how many would have stayed on their feet anyway."""

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from console import run
 from evaluate import EVALUATION_SEED, env_kwargs
-from policy_file import SHIPPED, WHERE, Policy, locate, read_policy
 from stable_baselines3 import PPO
 
+from ce_gym.policies import WHERE, Policy, load_policy, locate_policy, shelf
 from ce_gym.viewer import SHOW, Rollout, Script, drive, write_html
 
 
@@ -76,10 +76,10 @@ def main(argv: list[str] | None = None) -> int:
 def _work(args: argparse.Namespace) -> int:
     """Record, and write both files."""
     script = [(t, (vx, vy, yaw)) for t, vx, vy, yaw in args.command] if args.command else SHOW
-    policy = locate(args.policy)
-    beside = Path(f"{policy.parent.name}.npz") if SHIPPED in policy.parents else policy.parent / "rollout.npz"
+    policy = locate_policy(args.policy)
+    beside = Path(f"{policy.parent.name}.npz") if shelf() in policy.parents else policy.parent / "rollout.npz"
     out = args.out or beside
-    model = read_policy(policy, args.transmission)
+    model = load_policy(policy, args.transmission)
     kwargs = env_kwargs(model.record, args.transmission)
     rollout = record(model, model.record["env"], script, seed=args.seed, **kwargs)
     rollout.save(out)

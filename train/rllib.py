@@ -20,15 +20,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import ray
-import torch
 from export import to_onnx, write
-from policy_file import Actor, PolicyError
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from settings import Settings, SettingsError, config_file, load_settings
 
 import ce_gym  # noqa: F401  (registers the environments in this process)
+from ce_gym.policies import Actor, PolicyError
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
@@ -106,7 +105,7 @@ def actor_of(algo: Algorithm, activation: str) -> Actor:
     """Return the layers of an algorithm's actor, the mean of its actions; `activation` as in torch.nn."""
     weights = next(iter(algo.learner_group.get_weights().values()))
     layers = [
-        (torch.tensor(weights[name]), torch.tensor(weights[name.removesuffix("weight") + "bias"]))
+        (np.asarray(weights[name], np.float32), np.asarray(weights[name.removesuffix("weight") + "bias"], np.float32))
         for name in weights
         if name.endswith("weight") and ("actor_encoder" in name or name.startswith("pi."))
     ]

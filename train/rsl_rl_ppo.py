@@ -21,11 +21,11 @@ import gymnasium
 import torch
 from evaluate import evaluate, report
 from export import to_onnx, write
-from policy_file import Actor, read_policy
 from rsl_rl.runners import OnPolicyRunner
 from settings import Settings, config_file, load_settings
 
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
+from ce_gym.policies import Actor, load_policy
 
 
 def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def actor_of(runner: OnPolicyRunner, activation: str) -> Actor:
     """Return the layers of a runner's actor; `activation` as in torch.nn."""
     modules = runner.alg.get_policy().mlp.modules()
     linear = [module for module in modules if isinstance(module, torch.nn.Linear)]
-    return Actor(tuple((x.weight.detach().cpu(), x.bias.detach().cpu()) for x in linear), activation)
+    return Actor(tuple((x.weight.detach().cpu().numpy(), x.bias.detach().cpu().numpy()) for x in linear), activation)
 
 
 def record_of(envs: RslRlVecEnv, env_id: str, env_kwargs: dict[str, Any], settings: Settings) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def main(argv: list[str] | None = None) -> int:
         runner = train(envs, settings, args.seed, out)
         record = record_of(envs, args.env, kwargs, settings)
         write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
-        policy = read_policy(out / "policy.onnx")
+        policy = load_policy(out / "policy.onnx")
         print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))
     except (ValueError, gymnasium.error.Error) as error:
         print(f"rsl_rl_ppo.py: {error}", file=sys.stderr)

@@ -14,6 +14,11 @@ from typing import Any
 
 import yaml
 
+from ce_gym.policies import ACTIVATIONS
+
+Activation = str
+"""One of those with which a policy can be run without its learner."""
+
 CONFIG_FOLDER = Path(__file__).parent / "config"
 
 
@@ -32,7 +37,7 @@ class Settings:
         minibatches: Parts into which the collected steps are divided.
         epochs: Times each update goes over the collected steps.
         hidden: Sizes of the hidden layers, the same for policy and value.
-        activation: Name of a module of `torch.nn`, such as Tanh or ELU.
+        activation: Tanh, ReLU, ELU, SELU, Sigmoid or Softplus, as in `torch.nn`.
         initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
         learning_rate: Of Adam, at the start.
         target_kl: KL divergence of one update that the learning rate is adapted to; 0 keeps the rate fixed.
@@ -50,7 +55,7 @@ class Settings:
     minibatches: int
     epochs: int
     hidden: tuple[int, ...]
-    activation: str
+    activation: Activation
     initial_std: float
     learning_rate: float
     target_kl: float
@@ -133,13 +138,19 @@ def _convert(source: str, key: str, value: Any, kind: str) -> Any:
             if not 0 <= number < float("inf"):
                 raise ValueError
             return number
-        if kind == "str":
-            return str(value)
+        if kind == "Activation":
+            if value not in ACTIVATIONS:
+                raise ValueError
+            return value
         return tuple(_convert(source, key, size, "int") for size in value)
     except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, SettingsError):
             raise
-        wanted = {"int": "a positive whole number", "float": "a number >= 0"}.get(kind, "a list of layer sizes")
+        wanted = {
+            "int": "a positive whole number",
+            "float": "a number >= 0",
+            "Activation": f"one of {', '.join(ACTIVATIONS)}",
+        }.get(kind, "a list of layer sizes")
         raise SettingsError(f"{source}: {key}: {value!r}; expected {wanted}") from None
 
 

@@ -19,10 +19,10 @@ import numpy as np
 from console import add_json_argument, positive, print_result, run
 from evaluate import EVALUATION_SEED, env_kwargs, planar_velocity, tracking
 from numpy.typing import NDArray
-from policy_file import WHERE, Policy, PolicyError, read_policy
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
 from ce_gym.bench.mujoco_twin import MujocoTwin
+from ce_gym.policies import WHERE, Policy, PolicyError, load_policy
 
 STEADY = {"push_period": 0.0, "randomise": {}, "latency": (0, 0), "heading": False, "command_period": 1e6}
 """What is left out of the comparison, as MuJoCo knows nothing of it; commands come from here."""
@@ -267,7 +267,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Compare, print, and say whether it passed."""
-    policy = read_policy(args.policy)
+    policy = load_policy(args.policy)
     result = compare(policy, episodes=args.episodes, seconds=args.seconds, every=args.every, seed=args.seed)
     print_result(result, table(result), args.json)
     return 0 if result["passed"] else 1

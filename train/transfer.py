@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from console import Table, markdown, positive, print_result, run
 from evaluate import EVALUATION_SEED, add_arguments, env_kwargs, evaluate
-from policy_file import WHERE, Policy, PolicyError, locate, read_policy
 from settings import Settings, config_file, load_settings
 from stable_baselines3 import PPO
+
+from ce_gym.policies import WHERE, Policy, PolicyError, load_policy, locate_policy
 
 LEVELS = ("exact", "coupled", "armature", "none")
 """Transmission levels, from what is kept in full to what is ignored."""
@@ -142,7 +143,7 @@ def train_missing(args: argparse.Namespace) -> list[Path]:
 
 def _checked(policy: Path, env: str, level: str, seed: int, settings: Settings) -> dict[str, Any]:
     """The record of a policy trained earlier, if it is the one asked for."""
-    record = read_policy(policy).record
+    record = load_policy(policy).record
     asked = {"env": env, "transmission": level, "seed": seed, "settings": json.loads(json.dumps(settings.as_dict()))}
     for key, value in asked.items():
         if record[key] != value:
@@ -169,7 +170,7 @@ def judge(policies: Iterable[Path], episodes: int, seed: int) -> dict[str, Any]:
     """
     judged, names = [], {}
     for path in policies:
-        model = read_policy(path)
+        model = load_policy(path)
         record = model.record
         names[_task(record)] = path
         if len(names) > 1:
@@ -240,7 +241,7 @@ def _work(args: argparse.Namespace) -> int:
 
     args.threads = args.threads or available_threads()
     try:
-        policies = train_missing(args) if args.train else [locate(path) for path in args.policies]
+        policies = train_missing(args) if args.train else [locate_policy(path) for path in args.policies]
     except KeyboardInterrupt:
         print("transfer.py: interrupted; the same command goes on", file=sys.stderr)
         return 130

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import time
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +18,7 @@ from ce_gym.compile.cuda.source import BLOCK, emit_source
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.rounds import round_stages
 from ce_gym.envs.setup import make_program
-from ce_gym.model import InertiaWarning, robots
+from ce_gym.model import robots
 from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device, Emulated, device_named
 
@@ -44,7 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
-    warnings.simplefilter("ignore", InertiaWarning)
     report, missing = Report("gpu"), list[tuple[str, str, str]]()
     device, reason = _device()
     report.machine["GPU"] = gpu_speed.name_of(device) if not reason else f"none: {reason}"

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from ce_gym.bench import machine, mujoco_settings, peak, speed_batch, speed_robo
 from ce_gym.bench.report import Cell, Report, Requirement, Table
 from ce_gym.bench.timing import Competitor, Timing, interleaved, ratio
 from ce_gym.dynamics.model import Model
-from ce_gym.model import InertiaWarning, Robot, load_robot, robots
+from ce_gym.model import Robot, load_robot, robots
 from ce_gym.sim import Simulator
 
 LEVELS = ("armature", "exact")
@@ -54,7 +53,6 @@ def run(arguments: argparse.Namespace) -> Report:
     if arguments.quick:
         arguments.robots, arguments.levels = [arguments.robot], LEVELS
         arguments.batches, arguments.rounds = [n for n in arguments.batches if n <= 512], 3
-    warnings.simplefilter("ignore", InertiaWarning)
     stepping.quiet()
     arguments.out.mkdir(parents=True, exist_ok=True)
     report = Report("speed")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
+from fnmatch import fnmatch
 from functools import cache
 
 import numpy as np
@@ -26,7 +27,8 @@ def check_robot(robot: Robot) -> None:
         RobotError: Something cannot be.
 
     Warns:
-        InertiaWarning: An inertia violates the triangle inequality; said once per process and robot.
+        InertiaWarning: An inertia violates the triangle inequality, and the robot does not say that it is kept
+            knowingly; said once per process and robot.
     """
     file = robot.source or robot.name
     _check_tree(robot, file)
@@ -39,9 +41,19 @@ def check_robot(robot: Robot) -> None:
     _check_contacts(robot, file)
     _check_motors(robot, file)
     _check_pose_and_gains(robot, file)
-    impossible = tuple(body.name for body in robot.bodies if violates_triangle_inequality(body))
-    if impossible:
-        _warn_of_inertia(robot.name, impossible)
+    _check_inertia(robot, file)
+
+
+def _check_inertia(robot: Robot, file: str) -> None:
+    """Warn of figures that no rigid body can have, unless they are kept knowingly."""
+    impossible = [body.name for body in robot.bodies if violates_triangle_inequality(body)]
+    for pattern in robot.kept_inertia:
+        if not any(fnmatch(name, pattern) for name in impossible):
+            expected = f"one of {', '.join(impossible)}" if impossible else "nothing: no inertia is impossible"
+            raise bad(file, "kept_inertia", pattern, expected)
+    unknowing = [name for name in impossible if not any(fnmatch(name, pattern) for pattern in robot.kept_inertia)]
+    if unknowing:
+        _warn_of_inertia(robot.name, tuple(unknowing))
 
 
 def _dependent(robot: Robot) -> set[str]:
@@ -191,5 +203,5 @@ def _check_unique(file: str, key: str, names: Iterable[str]) -> None:
 def _warn_of_inertia(robot: str, bodies: tuple[str, ...]) -> None:
     """Warn once: the cache keeps the second call with the same arguments from running."""
     names = ", ".join(bodies)
-    message = f"{robot}: the inertia of {names} violates the triangle inequality; it is kept as published"
+    message = f"{robot}: the inertia of {names} violates the triangle inequality; it is kept as it is"
     warnings.warn(message, InertiaWarning, stacklevel=2)

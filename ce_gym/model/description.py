@@ -319,6 +319,7 @@ class Robot:
             the ways in which closed loops can be assembled; those not named are near zero [rad or m].
         gravity: Acceleration of free fall in the world frame [m/s^2].
         tasks: For each task that wants something else on this robot, pairs (name of a figure of the task, value).
+        kept_inertia: Patterns of names of bodies whose published inertia no rigid body can have, and is kept knowingly.
         source: The file it was read from, for messages.
         notes: Facts a user should know, such as repaired figures.
     """
@@ -335,6 +336,7 @@ class Robot:
     assembly: tuple[tuple[str, float], ...] = ()
     gravity: Vec3 = (0.0, 0.0, -9.81)
     tasks: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()
+    kept_inertia: tuple[str, ...] = field(default=(), compare=False)
     source: str = field(default="", compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
 

@@ -21,7 +21,7 @@ class RobotError(ValueError):
 
 
 class InertiaWarning(UserWarning):
-    """A published inertia that no rigid body can have; it is kept as published."""
+    """An inertia that no rigid body can have; it is used as it is."""
 
 
 class LossyImportWarning(UserWarning):

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
-
 from ce_gym.model.clusters import cluster_tree
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import InertiaWarning
 from ce_gym.model.load import load_robot, robots
 from ce_gym.model.table import Cell, table_text
 
@@ -15,9 +12,7 @@ COLUMNS = ("robot", "base", "bodies", "joints", "rotors", "clusters", "mass [kg]
 
 def robot_table() -> str:
     """Return a line for each robot: base, bodies with rotors, independent joints, rotors, clusters, mass."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InertiaWarning)  # said when a robot is used, not when all are listed
-        return table_text(COLUMNS, [robot_row(load_robot(name)) for name in robots()])
+    return table_text(COLUMNS, [robot_row(load_robot(name)) for name in robots()])
 
 
 def robot_row(robot: Robot) -> tuple[Cell, ...]:

@@ -32,7 +32,7 @@ from ce_gym.model.urdf_elements import unit_axis
 from ce_gym.model.yaml_constraints import coefficients, frame_named, read_constraints
 
 _KEYS = (
-    *("name", "urdf", "base", "sources", "notes", "gravity"),
+    *("name", "urdf", "base", "sources", "notes", "kept_inertia", "gravity"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
 )
 _ROTOR_KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
@@ -75,6 +75,7 @@ def robot_from_yaml(path: Path) -> Robot:
         assembly=file.section("assembly").numbers(),
         gravity=vec3(file.vector("gravity", 3, (0.0, 0.0, -9.81))),
         tasks=tuple((name, frozen(task.items())) for name, task in file.section("tasks").sections()),
+        kept_inertia=file.texts("kept_inertia"),
         source=str(path),
         notes=(*tree.notes, *file.texts("notes")),
     )

@@ -11,13 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ce_gym.policies import WHERE, find_policy, locate_policy
 from ce_gym.viewer.console import examples
 
 if TYPE_CHECKING:
     from ce_gym.viewer.rollout import Rollout
 
 LEVELS = ("exact", "coupled", "armature", "none")
-WHERE = "a policy's file (policy.zip, .npz, .onnx), the folder that has it, or the name of a shipped policy"
 
 
 def add_view_command(subparsers: Any) -> None:
@@ -32,7 +32,7 @@ def add_view_command(subparsers: Any) -> None:
         ),
     )
     parser.add_argument(
-        "rollouts", nargs="+", type=Path, metavar="ROLLOUT", help=f"a recorded rollout (.npz); or {WHERE}"
+        "rollouts", nargs="+", type=Path, metavar="ROLLOUT", help=f"a recorded rollout (.npz); or a policy: {WHERE}"
     )
     parser.add_argument("--overlay", action="store_true", help="draw all in one place, all but the first as ghosts")
     _add_page_arguments(parser, "beside the first rollout, here for policies")
@@ -100,11 +100,10 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
 
 def view(args: argparse.Namespace) -> int:
     """Run `view`; return its exit code."""
-    from ce_gym.viewer.policies import policy_file
     from ce_gym.viewer.rollout import Rollout
     from ce_gym.viewer.walk import walk
 
-    policies = [policy_file(path) for path in args.rollouts]
+    policies = [find_policy(path) for path in args.rollouts]
     rollouts = [walk(p)[0] if p else Rollout.load(path) for p, path in zip(policies, args.rollouts, strict=True)]
     beside = args.rollouts[0].with_suffix(".html")
     return _present(rollouts, args, _page_of(policies[0]) if policies[0] else beside, overlay=args.overlay)
@@ -113,12 +112,9 @@ def view(args: argparse.Namespace) -> int:
 def play(args: argparse.Namespace) -> int:
     """Run `play`; return its exit code."""
     from ce_gym.viewer.errors import ViewerError
-    from ce_gym.viewer.policies import policy_file
     from ce_gym.viewer.walk import SHOW, walk
 
-    file = policy_file(args.policy)
-    if file is None:
-        raise ViewerError(f"{args.policy}: no such policy; expected {WHERE}")
+    file = locate_policy(args.policy)
     if args.robots > 1 and len(args.transmission) > 1:
         raise ViewerError(f"--robots {args.robots}: expected 1, or one level of --transmission")
     script = [(time, (x, y, turn)) for time, x, y, turn in args.command] if args.command else SHOW

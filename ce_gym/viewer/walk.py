@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from ce_gym.policies import load_policy
 from ce_gym.viewer.errors import ViewerError
-from ce_gym.viewer.policies import read_policy
 from ce_gym.viewer.recording import Act, record_lanes
 from ce_gym.viewer.rollout import Rollout
 
@@ -80,12 +80,14 @@ def walk(file: Path, script: Script = SHOW, **options: Any) -> list[Rollout]:
         **options: See `drive_many`; anything else replaces what the policy was trained with, such as `transmission`.
 
     Raises:
-        ViewerError: If the file is damaged or no policy, or its environment is unknown.
+        PolicyError: If the file is damaged or no policy.
+        ViewerError: If its environment is unknown.
     """
     from ce_gym import environment_ids
 
-    act, record = read_policy(file)
+    policy = load_policy(file)
+    record = policy.record
     if record["env"] not in environment_ids():
         raise ViewerError(f"{file}: environment {record['env']!r}; expected one of this package's (see `list`)")
     kwargs: Mapping[str, Any] = {"robots": 1, "label": file.resolve().parent.name, **record["env_kwargs"], **options}
-    return drive_many(act, record["env"], script, **kwargs)
+    return drive_many(lambda observation: policy.predict(observation)[0], record["env"], script, **kwargs)

@@ -20,8 +20,9 @@ MAY_IMPORT = {
     "sim": {"model", "dynamics", "compile"},
     "envs": {"model", "dynamics", "compile", "sim"},
     "adapters": {"envs"},
-    "viewer": {"model", "dynamics", "sim", "envs"},
-    "bench": {"model", "dynamics", "compile", "sim", "envs", "adapters", "viewer"},
+    "policies": {"model"},
+    "viewer": {"model", "dynamics", "sim", "envs", "policies"},
+    "bench": {"model", "dynamics", "compile", "sim", "envs", "adapters", "policies", "viewer"},
 }
 
 
@@ -95,7 +96,7 @@ def test_import_is_light():
 
 
 def test_training_scripts_use_public_names_only():
-    public = {"ce_gym", "ce_gym.adapters", "ce_gym.viewer", "ce_gym.bench.mujoco_twin"}
+    public = {"ce_gym", "ce_gym.adapters", "ce_gym.policies", "ce_gym.viewer", "ce_gym.bench.mujoco_twin"}
     public |= {f"ce_gym.adapters.{name}" for name in ("sb3", "sb3_asymmetric", "rsl_rl")}
     for path in (PACKAGE.parent / "train").glob("*.py"):
         ours = {m for m in imported_modules(path) if m.split(".")[0] == "ce_gym"}

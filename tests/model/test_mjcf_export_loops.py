@@ -27,7 +27,6 @@ from ce_gym.model.mechanism import LEVELS
 from ce_gym.model.mjcf_export import to_mjcf
 from ce_gym.model.reference_pose import reference_pose
 
-pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 TOLERANCE = 1e-9
 STIFF = {"solref": (0.002, 1.0), "solimp": (0.9999, 0.9999, 0.001, 0.5, 2.0)}
 

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,11 @@ import pytest
 import yaml
 
 import ce_gym.model
-from ce_gym.model import InertiaWarning, Robot, cluster_tree, load_robot, robots
-from ce_gym.model.checks import _warn_of_inertia
+from ce_gym.model import InertiaWarning, Robot, RobotError, cluster_tree, load_robot, robots
+from ce_gym.model.checks import _warn_of_inertia, check_robot
 
 FACTS = Path(__file__).resolve().parents[1] / "data" / "facts"
 NAMES = ["mini_cheetah", "mit_humanoid_leg"]
-
-pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
 
 @pytest.fixture(params=NAMES)
@@ -150,13 +149,30 @@ def test_second_load_is_equal_and_hashes_alike(name):
     assert set(NAMES) <= set(robots())
 
 
-def test_published_inertia_is_warned_about_once():
+def test_impossible_inertia_is_warned_about_once_unless_it_is_kept_knowingly():
+    robot = load_robot("mini_cheetah")
+    unknowing = replace(robot, kept_inertia=("H*_hip_link",))
     _warn_of_inertia.cache_clear()
-    with pytest.warns(InertiaWarning, match=r"mini_cheetah.*HR_hip_link.*triangle"):
-        load_robot("mini_cheetah")
+    with pytest.warns(InertiaWarning, match=r"mini_cheetah: the inertia of FR_hip_link, FL_hip_link violates"):
+        check_robot(unknowing)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        load_robot("mini_cheetah")
+        check_robot(unknowing)
+        _warn_of_inertia.cache_clear()
+        check_robot(robot)
+
+
+def test_no_robot_that_is_shipped_warns():
+    _warn_of_inertia.cache_clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in robots():
+            load_robot(name)
+
+
+def test_inertia_that_is_kept_must_be_impossible():
+    with pytest.raises(RobotError, match=r"kept_inertia is 'HR_knee_link': expected one of HR_hip_link"):
+        check_robot(replace(load_robot("mini_cheetah"), kept_inertia=("HR_knee_link",)))
 
 
 @pytest.mark.parametrize("inside", [True, False], ids=["wheel", "checkout"])

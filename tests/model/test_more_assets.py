@@ -16,8 +16,6 @@ from ce_gym.model.description import ContactSphere
 FACTS = Path(__file__).resolve().parents[1] / "data" / "facts"
 NAMES = {"mit_humanoid": "mit_humanoid", "jvrc1": "jvrc1_symmetric"}
 
-pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
-
 
 @pytest.fixture(scope="module", params=list(NAMES))
 def robot(request) -> Robot:

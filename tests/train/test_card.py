@@ -1,23 +1,21 @@
 """Cards of policies, policies as small safe files, and where they are found."""
 
 import json
-import pickle
 import shlex
 import shutil
 import zipfile
 from pathlib import Path
 
 import numpy as np
-import policy_file
 import pytest
 from card import card, command, main, portable, short_name
 from evaluate import main as evaluate_main
-from policy_file import PolicyError, locate, read_actor, read_policy, write_npz
 from ppo import Job, jobs, parser, train
 from record import main as record_main
 from settings import config_file, load_settings
 
 import ce_gym
+from ce_gym.policies import PolicyError, load_policy, locate_policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
 SMALL = ["num_envs=32", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]", "steps=1000"]
@@ -34,8 +32,7 @@ def run(tmp_path_factory):
 @pytest.fixture
 def shelf(tmp_path, monkeypatch):
     """Where shipped policies lie, for one test."""
-    for module in ("policy_file", "card", "record"):
-        monkeypatch.setattr(f"{module}.SHIPPED", tmp_path / "policies")
+    monkeypatch.setattr("ce_gym.policies.places.assets_folder", lambda: tmp_path)
     return tmp_path / "policies"
 
 
@@ -43,11 +40,11 @@ def test_a_shipped_policy_is_found_by_name(run, shelf, monkeypatch, capsys):
     assert main([str(run), "--ship", "--episodes", "2", "--robots", "0"]) == 0
     folder = shelf / "mini_cheetah_velocity_exact"
     assert {file.name for file in folder.iterdir()} == {"policy.npz", "card.md", "curve.png"}
-    assert policy_file.shipped() == ["mini_cheetah_velocity_exact"]
+    assert ce_gym.shipped_policies() == ["mini_cheetah_velocity_exact"]
     obs = np.random.default_rng(0).standard_normal((64, 48)).astype(np.float32)
-    expected = read_policy(run / "policy.zip").predict(obs)[0]
+    expected = load_policy(run / "policy.zip").predict(obs)[0]
     for name in ("mini_cheetah_velocity_exact", "mini_cheetah_velocity", folder, folder / "policy.npz"):
-        np.testing.assert_array_equal(read_policy(name).predict(obs)[0], expected)
+        np.testing.assert_array_equal(load_policy(name).predict(obs)[0], expected)
     assert sum(file.stat().st_size for file in folder.iterdir()) < 200_000
     assert folder.joinpath("policy.npz").stat().st_size < 0.5 * (run / "policy.zip").stat().st_size
     text = (folder / "card.md").read_text()
@@ -62,7 +59,7 @@ def test_a_shipped_policy_is_found_by_name(run, shelf, monkeypatch, capsys):
 
 
 def test_the_command_on_the_card_makes_the_same_job(run):
-    record = read_policy(run).record
+    record = load_policy(run).record
     words = shlex.split(command(record))
     assert words[:2] == ["python", "train/ppo.py"]
     (job,) = jobs(parser().parse_args(words[2:]))
@@ -74,7 +71,7 @@ def test_the_command_on_the_card_makes_the_same_job(run):
 
 
 def test_a_run_that_a_deadline_ended_is_repeated_that_long(run):
-    record = read_policy(run).record
+    record = load_policy(run).record
     (job,) = jobs(parser().parse_args(shlex.split(command(record | {"steps": 512}))[2:]))
     assert job.settings.steps == 512
 
@@ -83,13 +80,13 @@ def test_a_run_that_a_deadline_ended_is_repeated_that_long(run):
     ("change", "words"), [({"resumed_from": "x.zip"}, "resumed from x.zip"), ({"env_kwargs": {"dt": 0.002}}, "dt")]
 )
 def test_what_no_command_repeats_is_said(run, change, words):
-    record = read_policy(run).record | change
+    record = load_policy(run).record | change
     with pytest.raises(PolicyError, match=words):
         command(record)
 
 
 def test_a_card_says_what_was_measured(run):
-    record = read_policy(run).record
+    record = load_policy(run).record
     figures = {"forward_error": 0.123, "lateral_error": 0.2, "yaw_rate_error": 0.3, "falls": 0.456, "reward": 7.0}
     figures |= {"episodes": 12, "velocity_error": 0.321}
     pushes = {"command": [0.5, 0, 0], "speeds": [1.0], "directions": [0.0], "survived": [[0.25]]}
@@ -105,58 +102,19 @@ def test_a_card_says_what_was_measured(run):
 
 
 def test_no_path_of_this_machine_is_shipped(run):
-    record = portable(read_policy(run).record | {"resumed_from": "/home/somebody/runs/policy.zip"})
+    record = portable(load_policy(run).record | {"resumed_from": "/home/somebody/runs/policy.zip"})
     assert record["resumed_from"] == "policy.zip"
-
-
-class Bomb:
-    def __reduce__(self):
-        return (Path.touch, (Path("exploded"),))
-
-
-def test_a_small_policy_file_runs_no_code(run, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_npz(*read_actor(run), tmp_path / "policy.npz")
-    with np.load("policy.npz") as file:
-        arrays = dict(file)
-    for name in ("record", "weight_0"):
-        np.savez("bad.npz", **arrays | {name: np.array([Bomb()], dtype=object)})
-        with pytest.raises(PolicyError, match=r"bad\.npz"):
-            read_policy("bad.npz")
-    (tmp_path / "bad.npz").write_bytes(pickle.dumps(Bomb()))
-    with pytest.raises(PolicyError, match=r"bad\.npz"):
-        read_policy("bad.npz")
-    assert not Path("exploded").exists()
-
-
-def test_damage_is_told_in_one_line(run, tmp_path):
-    file = tmp_path / "policy.npz"
-    write_npz(*read_actor(run), file)
-    whole = file.read_bytes()
-    with np.load(file) as opened:
-        arrays = dict(opened)
-    for content in (b"", b"nothing", whole[: len(whole) // 2]):
-        file.write_bytes(content)
-        with pytest.raises(PolicyError, match=r"policy\.npz: no weights"):
-            read_policy(file)
-    for name, bad in (("weight_1", arrays["weight_1"][:, 1:]), ("weight_2", arrays["weight_2"][:-1])):
-        np.savez(file, **arrays | {name: bad})
-        with pytest.raises(PolicyError, match="a layer takes"):
-            read_policy(file)
-    np.savez(file, **{name: arrays[name] for name in ("record", "weight_0", "bias_0")})
-    with pytest.raises(PolicyError, match="gives 32 numbers; expected the 12"):
-        read_policy(file)
 
 
 def test_what_is_not_there_is_told_with_what_is(shelf, run, tmp_path):
     shutil.copytree(run, tmp_path / "copy")
-    assert locate(tmp_path / "copy") == tmp_path / "copy" / "policy.zip"
-    assert locate(tmp_path / "copy" / "policy") == tmp_path / "copy" / "policy.zip"
+    assert locate_policy(tmp_path / "copy") == tmp_path / "copy" / "policy.zip"
+    assert locate_policy(tmp_path / "copy" / "policy") == tmp_path / "copy" / "policy.zip"
     (shelf / "dog_walk_none").mkdir(parents=True)
     (shelf / "dog_walk_none" / "policy.npz").touch()
     for name in ("cat_walk", str(tmp_path)):
         with pytest.raises(PolicyError, match=r"no such policy; expected .* \(there are: dog_walk_none\)") as caught:
-            locate(name)
+            locate_policy(name)
         assert "\n" not in str(caught.value)
 
 

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from demo import main as demo_main
-from evaluate import load_policy
+from evaluate import load_learner
 from record import main as record_main
 from record import record
 from stable_baselines3 import PPO
@@ -50,7 +50,7 @@ def test_the_rollout_has_states_forces_and_commands(demo):
 def test_fresh_trains_again(demo, capsys):
     assert demo_main([*QUICK, "--fresh", "--seed", "4", "--out", str(demo)]) == 0
     assert "Training from nothing" in capsys.readouterr().out
-    assert load_policy(demo / "policy.zip")[1]["seed"] == 4
+    assert load_learner(demo / "policy.zip")[1]["seed"] == 4
 
 
 def test_a_robot_follows_the_script():

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 from effort import Drives, effort, largest_power
-from policy_file import Policy
 from pushes import push_envelope, push_table
 
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
+from ce_gym.policies import Policy
 
 WALKING = "ce_gym/MiniCheetahVelocity-v0"
 

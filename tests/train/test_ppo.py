@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from callbacks import AdaptiveLearningRate, read_curve
-from evaluate import evaluate, load_policy
+from evaluate import evaluate, load_learner
 from evaluate import main as evaluate_main
 from point_mass import ID
 from ppo import Job, main, train
@@ -59,7 +59,7 @@ def test_it_learns(trained):
 
 
 def test_the_record_says_what_was_trained(trained):
-    model, record = load_policy(trained.policy)
+    model, record = load_learner(trained.policy)
     assert model.num_timesteps == record["steps"] >= 30_000
     assert (record["env"], record["transmission"], record["observation_size"], record["action_size"]) == (
         ID,
@@ -72,7 +72,7 @@ def test_the_record_says_what_was_trained(trained):
 
 def test_the_saved_policy_acts_as_the_trained_one(trained):
     obs = np.random.default_rng(0).standard_normal((16, 2)).astype(np.float32)
-    saved, _ = load_policy(trained.policy)
+    saved, _ = load_learner(trained.policy)
     expected, _ = trained.model.predict(obs, deterministic=True)
     np.testing.assert_array_equal(saved.predict(obs, deterministic=True)[0], expected)
 
@@ -80,7 +80,7 @@ def test_the_saved_policy_acts_as_the_trained_one(trained):
 def test_checkpoints_are_policies(trained):
     checkpoints = sorted((trained.policy.parent / "checkpoints").glob("*.zip"))
     assert len(checkpoints) >= 5
-    assert load_policy(checkpoints[0])[1]["steps"] < 30_000
+    assert load_learner(checkpoints[0])[1]["steps"] < 30_000
     assert not list(trained.policy.parent.rglob(".*"))
 
 
@@ -123,7 +123,7 @@ def test_resume_takes_the_environment_from_the_record(trained, tmp_path, capsys)
     code = main(["--resume", str(trained.policy), "--steps", "31e3", "--out", str(tmp_path), *FAST])
     assert code == 0
     assert "forward speed error" in capsys.readouterr().out
-    assert load_policy(tmp_path / "policy.zip")[1]["env"] == ID
+    assert load_learner(tmp_path / "policy.zip")[1]["env"] == ID
 
 
 def test_the_deadline_stops_training_and_saves(tmp_path):
@@ -146,12 +146,12 @@ def test_ctrl_c_saves_a_usable_policy(tmp_path, capsys):
     code = main(["--env", ID, "--steps", "1e9", "--out", str(tmp_path), *FAST])
     assert code == 130
     assert "--resume" in capsys.readouterr().out
-    assert load_policy(tmp_path / "policy.zip")[0].num_timesteps > 0
+    assert load_learner(tmp_path / "policy.zip")[0].num_timesteps > 0
 
 
 def test_several_seeds_write_several_policies(tmp_path):
     assert main(["--env", ID, "--steps", "600", "--seeds", "0", "1", "--out", str(tmp_path), *FAST]) == 0
-    first, second = (load_policy(tmp_path / f"seed_{seed}" / "policy.zip")[0] for seed in (0, 1))
+    first, second = (load_learner(tmp_path / f"seed_{seed}" / "policy.zip")[0] for seed in (0, 1))
     weights = [model.policy.state_dict()["action_net.weight"] for model in (first, second)]
     assert not np.array_equal(*weights)
 

@@ -10,11 +10,11 @@ import torch
 from evaluate import evaluate
 from evaluate import main as evaluate_main
 from point_mass import ID
-from policy_file import Policy, read_policy
 from rsl_rl_ppo import actor_of, main, record_of, train
 from settings import config_file, load_settings
 
 from ce_gym.adapters.rsl_rl import make_rsl_rl_vec_env
+from ce_gym.policies import Policy, load_policy
 
 SMALL = ["num_envs=64", "rollout=16", "hidden=[16]", "epochs=4", "minibatches=2", "learning_rate=1e-2", "target_kl=0"]
 SMALL += ["gamma=0.9"]
@@ -48,7 +48,7 @@ def test_the_program_leaves_a_policy_with_its_contract(tmp_path, capsys):
     arguments = ["--env", ID, "--steps", "3e3", "--episodes", "4", "--out", str(tmp_path), "--set", *SMALL]
     assert main(arguments) == 0
     assert capsys.readouterr().out.strip().splitlines()[-1] == str(tmp_path / "policy.onnx")
-    assert read_policy(tmp_path / "policy.onnx").record["env"] == ID
+    assert load_policy(tmp_path / "policy.onnx").record["env"] == ID
     assert json.loads((tmp_path / "policy.json").read_text())["joints"] == ["slider"]
     assert evaluate_main([str(tmp_path / "policy.onnx"), "--episodes", "4"]) == 0
     assert list(tmp_path.glob("model_*.pt"))

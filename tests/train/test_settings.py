@@ -34,6 +34,7 @@ def test_the_command_line_wins():
         ("hidden=64", "hidden: 64; expected a list"),
         ("hidden=[a]", "hidden: 'a'; expected a positive"),
         ("gamma", "expected KEY=VALUE"),
+        ("activation=GELU", "activation: 'GELU'; expected one of Tanh"),
     ],
 )
 def test_a_bad_override_is_one_line(override, words):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mujoco")
-from policy_file import Policy
 from ppo import Job, train
 from settings import config_file, load_settings
 from sim2sim import MujocoWorld, OurWorld, course, main, play, table, verdicts
@@ -15,6 +14,7 @@ from sim2sim import MujocoWorld, OurWorld, course, main, play, table, verdicts
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.bench.mujoco_twin import MujocoTwin
+from ce_gym.policies import Policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
 NEVER = 10**9

@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from point_mass import ID
-from policy_file import read_policy
 from ppo import train as really_train
 from transfer import LEVELS, interval, main, summary, table
+
+from ce_gym.policies import load_policy
 
 SMALL = ["--train", "--env", ID, "--steps", "600", "--seeds", "0", "1", "--threads", "1", "--episodes", "4"]
 
@@ -36,7 +37,7 @@ def trainings(monkeypatch):
 def test_every_level_and_seed_is_trained_on_its_own(runs):
     for level in ("exact", "none"):
         for seed in (0, 1):
-            record = read_policy(runs / level / f"seed_{seed}").record
+            record = load_policy(runs / level / f"seed_{seed}").record
             assert (record["transmission"], record["seed"]) == (level, seed)
     result = json.loads((runs / "transfer.json").read_text())
     assert [entry["transmission"] for entry in result["policies"]] == ["exact", "exact", "none", "none"]

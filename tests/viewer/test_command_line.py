@@ -74,7 +74,7 @@ def test_browser_opens_only_if_asked_and_possible(
         (["view", "nowhere.npz"], "nowhere.npz: no such file"),
         (["view", __file__], "test_command_line.py: cannot be read as a rollout"),
         (["inspect", "nobody"], "nobody"),
-        (["play", "nowhere"], "nowhere: no such policy; expected a policy's file"),
+        (["play", "nowhere"], "nowhere: no such policy; expected a file (policy.zip"),
         (["play", __file__], "no such policy"),
         (["inspect", ROBOT, "--transmission", "sloppy"], "sloppy"),
     ],

@@ -1,0 +1,26 @@
+"""Trained policies: found by name, read without running code that they may carry, run by numpy.
+
+Knows file formats and where shipped policies lie; knows no environments, learners, robots or tasks.
+"""
+
+from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
+from ce_gym.policies.errors import LevelWarning, PolicyError
+from ce_gym.policies.files import RECORD_KEY, load_policy, read_actor, write_npz
+from ce_gym.policies.places import WHERE, find_policy, locate_policy, shelf, shipped_policies
+
+__all__ = [
+    "ACTIVATIONS",
+    "RECORD_KEY",
+    "WHERE",
+    "Actor",
+    "LevelWarning",
+    "Policy",
+    "PolicyError",
+    "find_policy",
+    "load_policy",
+    "locate_policy",
+    "read_actor",
+    "shelf",
+    "shipped_policies",
+    "write_npz",
+]

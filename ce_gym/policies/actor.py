@@ -1,0 +1,80 @@
+"""The network that acts: linear layers with an activation in between, run by numpy. Knows no files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.policies.errors import PolicyError
+
+Array = NDArray[np.float32]
+
+ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {
+    "Tanh": np.tanh,
+    "ReLU": lambda x: np.maximum(x, 0),
+    "ELU": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+    "SELU": lambda x: 1.0507009873554805 * np.where(x > 0, x, 1.6732632423543772 * np.expm1(np.minimum(x, 0))),
+    "Sigmoid": lambda x: 0.5 * (1 + np.tanh(0.5 * x)),
+    "Softplus": lambda x: np.logaddexp(x, np.float32(0)),
+}  # fmt: skip
+"""By their names in torch.nn, with the defaults that they have there."""
+
+
+@dataclass(frozen=True)
+class Actor:
+    """The layers that turn observations into mean actions.
+
+    Attributes:
+        layers: Weight (n_out, n_in) and bias (n_out,) of each linear layer.
+        activation: One of `ACTIVATIONS`, applied between layers.
+    """
+
+    layers: tuple[tuple[Array, Array], ...]
+    activation: str
+
+    def __call__(self, observations: NDArray) -> Array:
+        """Return actions in [-1, 1], shape (n, n_actions), for observations (n, n_obs); `n` may be missing."""
+        activate = ACTIVATIONS[self.activation]
+        x = np.asarray(observations, np.float32)
+        for i, (weight, bias) in enumerate(self.layers):
+            x = (activate(x) if i else x) @ weight.T + bias
+        return np.clip(x, -1.0, 1.0).astype(np.float32, copy=False)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy that can act, in the shape in which Stable-Baselines3 and its tools expect one.
+
+    Attributes:
+        act: Actions (n, n_actions) for observations (n, n_obs), float32; `n` may be missing.
+        record: What training wrote: `env`, `env_kwargs`, `transmission`, `contract`, seed, settings and so on.
+    """
+
+    act: Callable[[NDArray], Array]
+    record: dict[str, Any]
+
+    def predict(
+        self, observation: Any, state: None = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Array, None]:
+        """Return the mean action, shape (n, n_actions) or (n_actions,), and no state.
+
+        Args:
+            observation: An array (n, n_obs) or (n_obs,), or a dictionary that has one as "policy".
+            state: Of recurrent policies in Stable-Baselines3; not used.
+            episode_start: Likewise.
+            deterministic: Must be True: a policy file has mean actions only.
+
+        Raises:
+            PolicyError: If the observation has another size than the policy, or actions are to be drawn at random.
+        """
+        if not deterministic:
+            raise PolicyError("deterministic=False; expected True: a policy file has mean actions only")
+        rows = observation["policy"] if isinstance(observation, Mapping) else observation
+        size = self.record["observation_size"]
+        if np.shape(rows)[-1:] != (size,):
+            raise PolicyError(f"observation of shape {np.shape(rows)}; expected {size} numbers, as in training")
+        return self.act(rows), None

@@ -1,0 +1,60 @@
+"""Where policies lie: in files, in folders of training runs, and among the assets. Opens none but to tell its kind."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+from ce_gym.model import assets_folder
+from ce_gym.policies.errors import PolicyError
+
+FORMATS = (".zip", ".npz", ".onnx")
+"""Kinds of policy files, in the order in which a folder is searched: what training wrote goes before copies of it."""
+
+WHERE = "a file (policy.zip, .npz or .onnx), the folder of a training run, or the name of a shipped policy"
+"""What `locate_policy` takes, for help texts."""
+
+
+def shelf() -> Path:
+    """Return where shipped policies lie: a folder each, named `<robot>_<task>_<level>`."""
+    return assets_folder() / "policies"
+
+
+def shipped_policies() -> list[str]:
+    """Return the names of the policies that come with the package."""
+    return sorted(file.parent.name for file in shelf().glob("*/policy.npz"))
+
+
+def find_policy(path: str | Path) -> Path | None:
+    """Return the file of a policy, None if `path` means none; see `locate_policy`."""
+    path = Path(path)
+    if path.suffix in FORMATS:
+        return path if path.is_file() and not _is_other_npz(path) else None
+    folders = [path, *([shelf() / path, shelf() / f"{path}_exact"] if len(path.parts) == 1 else [])]
+    files = [folder / f"policy{suffix}" for folder in folders for suffix in FORMATS]
+    return next((file for file in (*files, path.with_name(f"{path.name}.zip")) if file.is_file()), None)
+
+
+def locate_policy(path: str | Path) -> Path:
+    """Return the file of a policy.
+
+    Args:
+        path: A file; a folder that has one; or the name of a shipped policy, whose level may be left out if it is
+            exact.
+
+    Raises:
+        PolicyError: If there is none.
+    """
+    file = find_policy(path)
+    if file is None:
+        known = ", ".join(shipped_policies()) or "none yet"
+        raise PolicyError(f"{path}: no such policy; expected {WHERE} (there are: {known})")
+    return file
+
+
+def _is_other_npz(path: Path) -> bool:
+    """Whether a file is a whole npz that holds something else, such as a rollout."""
+    if path.suffix != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as arrays:
+        return "record.npy" not in arrays.namelist()
