@@ -91,6 +91,11 @@ def make_field(terrain: Mapping[str, Any]) -> Terrain:
     return Terrain(np.pad(heights, 1, mode="edge"), cell, (-cell, -cell))
 
 
+def field_of(terrain: Mapping[str, Any]) -> Terrain | None:
+    """Return the field of a task's ground, None if that is flat; `terrain` is what `checked_terrain` returns."""
+    return None if terrain["kind"] == "flat" else make_field(terrain)
+
+
 def _heights(terrain: Mapping[str, Any], difficulty: NDArray, side: NDArray, from_middle: NDArray) -> NDArray:
     """Height of places by the difficulty and side (1 pyramid, -1 pit) of their tile and how far off its middle."""
     if terrain["kind"] == "rough":

@@ -2,7 +2,7 @@
 
 The rooms that draw lie above this one, so this file does not know them: `use_renderers` is told the name of a module
 that has a function for each render mode, and that module is imported when an environment is made with one. May know
-batches and Gymnasium's logger.
+batches, fields and Gymnasium's logger.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from gymnasium import logger
 from numpy.typing import NDArray
 
 from ce_gym.envs.batch import Batch
+from ce_gym.envs.fields import field_of
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -38,7 +39,8 @@ def use_renderers(module: str) -> None:
 
     Args:
         module: Name of a module with a function for each render mode, which takes a model, positions in a typical
-            pose, shape (nq,), and the keywords width [pixels], height [pixels] and fps [1/s], and returns a `Renderer`.
+            pose, shape (nq,), and the keywords width [pixels], height [pixels], fps [1/s] and terrain (None if flat),
+            and returns a `Renderer`.
     """
     _home[:] = [module]
 
@@ -68,7 +70,10 @@ class Screen:
         if mode is not None:
             model, fps = batch.program.model, 1 / batch.program.control_dt
             make: Any = getattr(import_module(_home[0]), mode)
-            self._renderer = make(model, model.standing_q, width=int(width), height=int(height), fps=fps)
+            ground = field_of(batch.program.task.terrain)
+            self._renderer = make(
+                model, model.standing_q, width=int(width), height=int(height), fps=fps, terrain=ground
+            )
 
     def frames(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each environment; or show the first one and return None."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ce_gym.model.description import Robot
 from ce_gym.viewer import tracks
 from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.ground import level
 from ce_gym.viewer.robot import body_paths, extent
 from ce_gym.viewer.rollout import Rollout
 from ce_gym.viewer.three import Command, transform
@@ -50,6 +51,7 @@ class Actor:
         positions: Of all bodies, in the robot's order [m], shape (F, n_bodies, 3).
         rotations: Shape (F, n_bodies, 3, 3).
         contact_names: Of the contacts whose forces were recorded.
+        levels: Mean height of the ground about the robot [m], shape (F,).
     """
 
     def __init__(self, rollout: Rollout, model: PosedModel, path: str, max_fps: float) -> None:
@@ -65,6 +67,7 @@ class Actor:
         self.positions, self.rotations = np.asarray(positions)[:, order], np.asarray(rotations)[:, order]
         self.contact_names = self._contact_names()
         self.low, self.high = extent(self.robot, self.positions[0], self.rotations[0])
+        self.levels = level(rollout.ground, self.middle, self.radius / 2)
 
     def _contact_names(self) -> tuple[str, ...]:
         """Return the name of each contact that the rollout has forces of."""
@@ -96,7 +99,7 @@ class Actor:
         (x, y, _), (forward, left, _) = self.positions[0, 0], self.rotations[0, 0, :, 0]
         length = float(np.hypot(forward, left)) or 1.0
         c, s = (forward / length, left / length) if forward or left else (1.0, 0.0)
-        return transform([x, y, 0.0], [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return transform([x, y, self.levels[0]], [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def clips(self, end: float) -> Iterator[Command]:
         """Animate every body against its parent until `end` [s]."""

@@ -23,6 +23,7 @@ FORCE_COLOR = (0.90, 0.20, 0.24)
 COMMAND_COLOR = (0.13, 0.65, 0.35)
 VELOCITY_COLOR = (0.15, 0.42, 0.85)
 HIDDEN = 1e-4  # scale of an arrow that should not be seen; zero would make its matrix singular
+HEAD = 0.2  # length of the head over that of the arrow
 LONGEST = 2.0  # as a multiple of the robot's radius, so that an impact does not leave the picture
 
 
@@ -46,9 +47,11 @@ class Arrow:
 
     def commands(self) -> Iterator[Command]:
         """Draw a shaft and a head that together reach from 0 to 1 along z."""
-        shaft, head = three.cylinder(0.45 * self.thickness, 0.72), three.cylinder(self.thickness, 0.28, top=0.0)
-        yield three.mesh(f"{self.path}/shaft", shaft, self.color, three.transform([0, 0, 0.36]) @ three.Y_TO_Z)
-        yield three.mesh(f"{self.path}/head", head, self.color, three.transform([0, 0, 0.86]) @ three.Y_TO_Z)
+        shaft = three.cylinder(0.45 * self.thickness, 1.0 - HEAD)
+        head = three.cylinder(self.thickness, HEAD, top=0.0)
+        middle = three.transform([0, 0, (1.0 - HEAD) / 2]), three.transform([0, 0, 1.0 - HEAD / 2])
+        yield three.mesh(f"{self.path}/shaft", shaft, self.color, middle[0] @ three.Y_TO_Z)
+        yield three.mesh(f"{self.path}/head", head, self.color, middle[1] @ three.Y_TO_Z)
         for part in ("shaft", "head"):
             yield three.set_property(f"{self.path}/{part}/<object>", "castShadow", False)
 

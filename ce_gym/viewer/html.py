@@ -59,8 +59,10 @@ def page(
         title=html.escape(title),
         legend=_legend(actors),
         meshcat=code,
-        plots=_source("plots.js"),
-        player=_source("player.js"),
+        ground=source("ground.js"),
+        belts=source("belts.js"),
+        plots=source("plots.js"),
+        player=source("player.js"),
         commands=json.dumps(commands),
         data=_data(actors, plot, ghosts=spacing == 0),
         frame=repr(max(rollouts[0].dt, 1.0 / max_fps)),
@@ -87,12 +89,13 @@ def meshcat_code() -> str:
     return Path(spec.origin).with_name("viewer").joinpath("dist", "main.min.js").read_text(encoding="utf-8")
 
 
-def _source(name: str) -> str:
+def source(name: str) -> str:
+    """Return the text of a file of the page."""
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def _template(name: str) -> string.Template:
-    return string.Template(_source(name))
+    return string.Template(source(name))
 
 
 def _data(actors: Sequence[Actor], plot: Sequence[str], *, ghosts: bool) -> str:

@@ -1,8 +1,7 @@
 """Pictures of a robot as arrays, traced on the processor: no display, no OpenGL, nothing but pip packages.
 
-Embree (through embreex, the binding that trimesh keeps) finds what each ray meets; the ground and the sky need no
-tracing. A picture depends on the pose alone, not on what was drawn before. Knows posed models and scene commands;
-knows no rollouts, no environments.
+Embree finds what each ray meets; flat ground and the sky need no tracing. A picture depends on the pose alone, not on
+what was drawn before. Knows posed models, terrain and scene commands; knows no rollouts, no environments.
 """
 
 from __future__ import annotations
@@ -12,14 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.actor import PosedModel
-from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.ground import clear_view, level
+from ce_gym.viewer.picture_ground import Field
 from ce_gym.viewer.picture_mesh import mesh_of
 from ce_gym.viewer.robot import body_paths, extent, robot_commands
-from ce_gym.viewer.stage import FIELD_OF_VIEW, HORIZON, ZENITH
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating[Any]]  # single precision, for speed
+from ce_gym.viewer.stage import FADING, FIELD_OF_VIEW, HORIZON, STEEP, ZENITH
+from ce_gym.viewer.tracing import Array, Embree, Floats
 
 VIEW = np.array([0.62, -0.80, 0.30])  # from the robot towards the camera: front right, a little above
 SUN = np.array([0.45, -0.55, 1.0]) / np.linalg.norm([0.45, -0.55, 1.0])
@@ -32,41 +31,14 @@ CORNERS = np.array([[-0.3, 0.3], [0.3, -0.3]])  # where more rays go through a p
 CLOSE = 1e-4  # a shadow's ray starts this far off its surface [m]
 
 
-class _Embree:
-    """The few calls of embreex that a picture takes."""
-
-    def __init__(self) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore import EmbreeDevice
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError:
-            raise ViewerError.missing_embreex() from None
-        self._new, self._add, self._device = EmbreeScene, TriangleMesh, EmbreeDevice()
-
-    def scene(self, vertices: Array, triangles: NDArray[np.int32]) -> Any:
-        """Return what rays are sent into: vertices (n, 3) and triangles (m, 3)."""
-        scene = self._new(self._device)
-        self._add(scene, vertices.astype(np.float32), triangles)
-        return scene
-
-    @staticmethod
-    def meet(scene: Any, starts: Floats, rays: Floats) -> dict[str, NDArray[Any]]:
-        """Return for each ray `primID`, its first triangle or -1, the distance `tfar` and the place `u`, `v` on it."""
-        return scene.run(starts, rays, output=1)
-
-    @staticmethod
-    def meets(scene: Any, starts: Floats, rays: Floats) -> NDArray[np.bool_]:
-        """Return whether each ray meets anything."""
-        return scene.run(starts, rays, query="OCCLUDED") >= 0
-
-
 class _Stage(NamedTuple):
-    """The robot in one pose, and where it is."""
+    """The robot in one pose, where it is and from where it is seen."""
 
     scene: Any  # what rays are sent into
     normals: Floats  # of the vertices, in the world
     centre: Floats  # the origin of the scene against the pattern of the ground, x and y, in squares
+    eye: Floats  # the camera [m]
+    axes: Array  # rows: the camera's x, y, z in the world
 
 
 class _Backdrop(NamedTuple):
@@ -75,6 +47,7 @@ class _Backdrop(NamedTuple):
     distance: Floats  # to the ground [m], infinite for rays that miss it, shape (...)
     x: Floats  # where that is, in squares of the ground, shape (...)
     y: Floats
+    height: Floats  # of it [m]
     footprint: Floats  # edge of the ground that a pixel covers there, in squares, shape (...)
     light: Floats  # colour of a light square in the haze, or of the sky, shape (..., 3)
     contrast: Floats  # from there to the colour of a dark square, shape (..., 3)
@@ -93,13 +66,17 @@ class Picture:
         q: Positions in a typical pose, shape (nq,); they set how far the camera is away.
         width: Of the picture [pixels].
         height: Of the picture [pixels].
+        terrain: The ground, the plane z = 0 if None.
 
     Raises:
         ViewerError: embreex is not installed.
     """
 
-    def __init__(self, model: PosedModel, q: Array, *, width: int = 640, height: int = 480) -> None:
-        self._embree = _Embree()
+    def __init__(
+        self, model: PosedModel, q: Array, *, width: int = 640, height: int = 480, terrain: Terrain | None = None
+    ) -> None:
+        self._embree = Embree()
+        self._field = Field(self._embree, terrain) if terrain else None
         self._model = model
         robot = model.robot
         names = model.body_names
@@ -110,16 +87,16 @@ class Picture:
         self._root = order[0]
         low, high = extent(robot, np.asarray(positions)[order], np.asarray(rotations)[order])
         self._fixed = None if robot.floating else (low + high)[:2] / 2
-        radius = max(float(np.linalg.norm(high - low)) / 2, 0.05)
+        radius = self._radius = max(float(np.linalg.norm(high - low)) / 2, 0.05)
         tangent = np.tan(np.radians(FIELD_OF_VIEW / 2))
         back = VIEW / np.linalg.norm(VIEW)
         self._far = FAR * 1.3 * radius / np.sin(np.arctan(tangent)) * max(1.0, height / width)
         self._eye = np.array([0.0, 0.0, (low + high)[2] / 2]) + self._far / FAR * back
-        right = np.array([-back[1], back[0], 0.0]) / np.hypot(back[0], back[1])
-        self._axes = np.stack([right, np.cross(back, right), back])  # rows: the camera's x, y, z in the world
+        self._middle = float((low + high)[2] / 2)
         self._size, self._focus = (width, height), height / 2 / tangent
         self._pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
-        self._rays = self._directions(self._pixels)
+        self._axes = _axes(back)
+        self._rays = self._directions(self._pixels, self._axes)
         self._backdrop = self._behind(self._rays)
 
     def draw(self, q: Array) -> NDArray[np.uint8]:
@@ -127,22 +104,32 @@ class Picture:
         positions, rotations = (np.asarray(rows[0]) for rows in self._model.body_poses(np.asarray(q, float)[None]))
         centre = np.zeros(3)
         centre[:2] = positions[self._root, :2] if self._fixed is None else self._fixed
+        if self._field is not None:
+            centre[2] = level(self._field.terrain, centre[None, :2], self._radius / 2)[0]
         mesh = self._mesh
         turn = rotations[mesh.bodies]
         vertices = np.einsum("nij,nj->ni", turn, mesh.vertices) + (positions - centre)[mesh.bodies]
         normals = np.einsum("nij,nj->ni", turn, mesh.normals).astype(np.float32)
         on_tiles = (centre[:2] / TILE % 2).astype(np.float32)
-        stage = _Stage(self._embree.scene(vertices, mesh.triangles), normals, on_tiles)
-        image = self._background(self._backdrop, stage)
-        window = self._window(vertices)
+        eye, axes, pixels, behind = self._eye, self._axes, self._rays, self._backdrop
+        lowest = 0.0
+        if self._field is not None:
+            lowest = self._field.lowest(centre[:2]) - centre[2]
+            eye = self._clear(centre)
+            if (eye != self._eye).any():
+                axes = _axes(eye - [0.0, 0.0, self._middle])
+                pixels = self._directions(self._pixels, axes)
+            behind = self._land(pixels, eye, centre)
+        stage = _Stage(self._embree.scene(vertices, mesh.triangles), normals, on_tiles, eye.astype(np.float32), axes)
+        image = self._background(behind, stage)
+        window = self._window(vertices, stage, lowest)
         part = image[window]  # a view
-        backdrop = self._backdrop.part(window)
-        colors, thing = self._trace(stage, self._rays[window].reshape(-1, 3), backdrop, part.reshape(-1, 3))
+        colors, thing = self._trace(stage, pixels[window].reshape(-1, 3), behind.part(window), part.reshape(-1, 3))
         part[:] = colors.reshape(part.shape)
         edges = _outline(thing.reshape(part.shape[:2]))
         if edges.any():  # more rays where neighbours differ, so that edges are smooth
-            rays = self._directions((self._pixels[window][edges][:, None] + CORNERS).reshape(-1, 2))
-            backdrop = self._behind(rays)
+            rays = self._directions((self._pixels[window][edges][:, None] + CORNERS).reshape(-1, 2), axes)
+            backdrop = self._behind(rays) if self._field is None else self._land(rays, eye, centre)
             colors, _ = self._trace(stage, rays, backdrop, self._background(backdrop, stage))
             part[edges] = (part[edges] + colors.reshape(-1, len(CORNERS), 3).sum(1)) / (1 + len(CORNERS))
         return (255 * image + 0.5).astype(np.uint8)
@@ -150,11 +137,17 @@ class Picture:
     def close(self) -> None:
         """Do nothing: arrays are all there is."""
 
-    def _directions(self, pixels: NDArray[Any]) -> Floats:
+    def _clear(self, centre: Array) -> Array:
+        """Return from where the camera sees the robot, above the ground and against the centre, shape (3,)."""
+        assert self._field is not None
+        target = centre + [0.0, 0.0, self._middle]
+        return clear_view(self._field.terrain, target, centre + self._eye, self._radius / 4) - centre
+
+    def _directions(self, pixels: NDArray[Any], axes: Array) -> Floats:
         """Return unit vectors from the camera through pixels (x, y), shape (..., 2)."""
         width, height = self._size
         x, y = pixels[..., 0] + 0.5 - width / 2, height / 2 - 0.5 - pixels[..., 1]
-        rays = np.stack([x, y, np.full(x.shape, -self._focus)], -1) @ self._axes
+        rays = np.stack([x, y, np.full(x.shape, -self._focus)], -1) @ axes
         return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
 
     def _behind(self, rays: Floats) -> _Backdrop:
@@ -167,21 +160,45 @@ class Picture:
         # A pixel covers this much ground across the ray, and more along it; the squares are averaged over both.
         footprint = reach / self._focus * (1 + 1 / slope) / 2 / TILE
         haze = np.clip(distance / self._far, 0, 1)[..., None] ** 2
-        blend = np.clip(rays[..., 2:], 0, 1) ** 0.6
-        sky = blend * np.array(ZENITH) + (1 - blend) * np.array(HORIZON)
+        sky = _sky(rays)
         light = TILES[0] + haze * (sky - TILES[0])
-        found = (distance, x, y, footprint, light, (1 - haze) * (TILES[1] - TILES[0]))
+        found = (distance, x, y, np.zeros_like(x), footprint, light, (1 - haze) * (TILES[1] - TILES[0]))
         return _Backdrop(*(values.astype(np.float32) for values in found))
+
+    def _land(self, rays: Floats, eye: Array, centre: Array) -> _Backdrop:
+        """Return what rays, shape (..., 3), meet behind the robot where the ground is not flat."""
+        assert self._field is not None
+        many = rays.reshape(-1, 3)
+        met = self._field.meet(centre, eye, many)
+        hit = np.isfinite(met.distance)
+        reach = np.where(hit, met.distance, 0)
+        x, y, z = (eye.astype(np.float32) + reach[:, None] * many).T
+        facing = np.maximum(np.abs((met.normals * many).sum(1)), 0.02)
+        footprint = reach / self._focus * (1 + 1 / facing) / 2 / TILE
+        fade = np.clip((met.away - FADING) / (1 - FADING), 0, 1)
+        haze = np.where(hit, np.maximum(fade * fade * (3 - 2 * fade), np.clip(reach / self._far, 0, 1) ** 2), 1)[
+            :, None
+        ]
+        steep = 1 - STEEP * np.sqrt(np.maximum(1 - met.normals[:, 2] ** 2, 0))
+        lit = (
+            _light(met.normals, np.ones(len(many), bool)) / _light(np.array([[0, 0, 1.0]]), np.ones(1, bool))
+        ) * steep
+        sky = _sky(many)
+        light = lit[:, None] * TILES[0] * (1 - haze) + haze * sky
+        contrast = lit[:, None] * (1 - haze) * (TILES[1] - TILES[0])
+        found = (met.distance, x / TILE, y / TILE, z, footprint, light, contrast)
+        shapes = [(*rays.shape[:-1], *values.shape[1:]) for values in found]
+        return _Backdrop(*(np.reshape(v, shape).astype(np.float32) for v, shape in zip(found, shapes, strict=True)))
 
     def _background(self, backdrop: _Backdrop, stage: _Stage) -> Floats:
         """Return the colours of ground and sky, shape (..., 3)."""
         x, y = backdrop.x + stage.centre[0], backdrop.y + stage.centre[1]
         return backdrop.light + _dark_share(x, y, backdrop.footprint)[..., None] * backdrop.contrast
 
-    def _window(self, vertices: Array) -> tuple[slice, slice]:
-        """Return the rows and columns that may show the robot or its shadow."""
-        onto_ground = vertices - np.maximum(vertices[:, 2:], 0) / SUN[2] * SUN
-        seen = (np.concatenate([vertices, onto_ground]) - self._eye) @ self._axes.T
+    def _window(self, vertices: Array, stage: _Stage, lowest: float) -> tuple[slice, slice]:
+        """Return the rows and columns that may show the robot or its shadow, on ground nowhere below `lowest` [m]."""
+        onto_ground = vertices - np.maximum(vertices[:, 2:] - lowest, 0) / SUN[2] * SUN
+        seen = (np.concatenate([vertices, onto_ground]) - stage.eye) @ stage.axes.T
         width, height = self._size
         if (seen[:, 2] > -1e-3).any():  # something is beside or behind the camera
             return slice(None), slice(None)
@@ -194,30 +211,47 @@ class Picture:
         self, stage: _Stage, rays: Floats, backdrop: _Backdrop, background: Floats
     ) -> tuple[Floats, NDArray[np.intp]]:
         """Return what rays from the camera show, shape (n, 3), and a number for the thing they meet, shape (n,)."""
-        eye = self._eye.astype(np.float32)
-        found = self._embree.meet(stage.scene, np.broadcast_to(eye, rays.shape), rays)
+        found = self._embree.meet(stage.scene, np.broadcast_to(stage.eye, rays.shape), rays)
         triangle = found["primID"]
         hit = (triangle >= 0) & (found["tfar"] < backdrop.distance)
         triangle, u, v = triangle[hit], found["u"][hit, None], found["v"][hit, None]
         a, b, c = stage.normals[self._mesh.triangles[triangle]].swapaxes(0, 1)
         normal = (1 - u - v) * a + u * b + v * c
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        surface = eye + found["tfar"][hit, None] * rays[hit] + CLOSE * normal
+        surface = stage.eye + found["tfar"][hit, None] * rays[hit] + CLOSE * normal
         ground = ~hit & np.isfinite(backdrop.distance)
         x, y = backdrop.x[ground] * np.float32(TILE), backdrop.y[ground] * np.float32(TILE)
-        spots = np.column_stack([x, y, np.full(len(x), CLOSE, np.float32)])
+        spots = np.column_stack([x, y, backdrop.height[ground] + np.float32(CLOSE)])
         starts = np.concatenate([surface, spots])
         dark = self._embree.meets(stage.scene, starts, np.broadcast_to(SUN.astype(np.float32), starts.shape))
         sunny, shadow = ~dark[: len(surface)], np.zeros(len(rays), bool)
         shadow[ground] = dark[len(surface) :]
-        light = SUNLIGHT * sunny * np.clip(normal @ SUN, 0, None)
-        light += BOUNCE + (SKYLIGHT - BOUNCE) * (1 + normal[:, 2]) / 2
+        light = _light(normal, sunny)
         colors = background.copy()
         colors[shadow] *= SHADE
         colors[hit] = np.clip(self._mesh.colors[triangle] * light[:, None], 0, 1)
         thing = np.where(shadow, -1, -2)
         thing[hit] = self._mesh.solids[triangle]
         return colors, thing
+
+
+def _axes(back: Array) -> Array:
+    """Return the camera's x, y, z in the world as rows, shape (3, 3); `back` points from what is seen to the camera."""
+    back = back / np.linalg.norm(back)
+    right = np.array([-back[1], back[0], 0.0]) / np.hypot(back[0], back[1])
+    return np.array([right, np.cross(back, right), back], float)
+
+
+def _sky(rays: Floats) -> Floats:
+    """Return the colour of the sky along rays, both shape (..., 3)."""
+    blend = np.clip(rays[..., 2:], 0, 1) ** 0.6
+    return blend * np.array(ZENITH) + (1 - blend) * np.array(HORIZON)
+
+
+def _light(normals: Floats, sunny: NDArray[np.bool_]) -> Floats:
+    """Return how bright surfaces are, shape (n,): normals (n, 3), and whether the sun shines on them, shape (n,)."""
+    direct = SUNLIGHT * sunny * np.clip(normals @ SUN, 0, None)
+    return direct + BOUNCE + (SKYLIGHT - BOUNCE) * (1 + normals[:, 2]) / 2
 
 
 def _outline(thing: NDArray[np.intp]) -> NDArray[np.bool_]:

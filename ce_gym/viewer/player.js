@@ -1,4 +1,5 @@
-// The controls of the page. Expects commands, data, FRAME and HORIZON, meshcat's viewer and plots.js.
+// The controls of the page. Expects commands, data, FRAME and HORIZON, meshcat's viewer,
+// ground.js, belts.js and plots.js.
 
 const find = id => document.getElementById(id);
 const robots = unpackRobots(data.robots);
@@ -14,7 +15,9 @@ for (const command of commands) {
   viewer.handle_command_bytearray(Uint8Array.from(atob(command), c => c.charCodeAt(0)));
 }
 viewer.scene.fog = new MeshCat.THREE.Fog(HORIZON, 8, 40);
+viewer.gui.domElement.hidden = true;  // meshcat's own panel, by the key C
 const node = path => viewer.scene_tree.find(path.split("/").filter(Boolean));
+findBelts();
 
 // Time.
 const animator = viewer.animator;
@@ -26,6 +29,7 @@ function seek(time) {
   animator.display_progress(Math.max(0, Math.min(animator.duration, time)));
 }
 function toggle() { animator.playing ? animator.pause() : animator.play(); }
+function panel() { viewer.gui.domElement.hidden = !viewer.gui.domElement.hidden; }
 function step(frames) { seek(animator.time + frames * FRAME); }
 
 find("play").onclick = toggle;
@@ -33,7 +37,7 @@ find("time").oninput = event => seek(Number(event.target.value));
 find("speed").onchange = event => { animator.mixer.timeScale = Number(event.target.value); };
 document.addEventListener("keydown", event => {
   if (event.target.tagName === "SELECT") return;
-  const keys = { " ": toggle, ArrowLeft: () => step(-1), ArrowRight: () => step(1), Home: () => seek(0) };
+  const keys = { " ": toggle, ArrowLeft: () => step(-1), ArrowRight: () => step(1), Home: () => seek(0), c: panel };
   if (event.key in keys) { event.preventDefault(); keys[event.key](); }
 });
 
@@ -105,6 +109,8 @@ for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
 }
 
 function refresh() {
+  moveFields();
+  if (find("xray").checked) moveBelts();
   find("play").innerHTML = animator.playing ? "&#10074;&#10074;" : "&#9654;";
   if (document.activeElement !== find("time") || animator.playing) find("time").value = animator.time;
   find("clock").value = animator.time.toFixed(2) + " / " + animator.duration.toFixed(2) + " s";

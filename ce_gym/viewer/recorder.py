@@ -1,4 +1,4 @@
-"""Collects the frames of a rollout while something runs. Knows rollouts; knows nothing of what runs."""
+"""Collects the frames of a rollout. Knows rollouts and terrain; knows nothing of what runs meanwhile."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ce_gym.sim.terrain import Terrain
+from ce_gym.viewer.ground import around
 from ce_gym.viewer.rollout import Rollout, RolloutError
 
 Array = NDArray[np.float64]
@@ -24,6 +26,7 @@ class Recorder:
         info: Anything else worth keeping, as text.
         contact_names: Which contacts the forces belong to; empty means all of the robot's.
         signal_names: Of what else is recorded for plots.
+        terrain: The ground, of which the part around the robot's path is kept; None if it is flat.
     """
 
     def __init__(
@@ -36,7 +39,9 @@ class Recorder:
         info: Mapping[str, str] | None = None,
         contact_names: Sequence[str] = (),
         signal_names: Sequence[str] = (),
+        terrain: Terrain | None = None,
     ) -> None:
+        self._terrain = terrain
         self._fixed: dict[str, Any] = {
             "robot": robot,
             "transmission": transmission,
@@ -85,7 +90,13 @@ class Recorder:
         if not self._frames:
             raise RolloutError("nothing was recorded: expected at least one frame")
         arrays: dict[str, Any] = {name: _stack(name, self._frames) for name in self._frames[0]}
-        return Rollout(**self._fixed, **arrays)
+        return Rollout(**self._fixed, **arrays, ground=self._ground(arrays["q"], arrays["v"]))
+
+    def _ground(self, q: Array, v: Array) -> Terrain | None:
+        if self._terrain is None:
+            return None
+        floats = q.shape[1] == v.shape[1] + 1  # of a base that moves, the quaternion has one number more
+        return around(self._terrain, q[:, :2] if floats else np.zeros((1, 2)))
 
 
 def _stack(name: str, frames: list[dict[str, Any]]) -> Array:

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ce_gym.envs.fields import field_of
 from ce_gym.envs.shell import BatchShell
 from ce_gym.envs.single import recorded_state
 from ce_gym.model import Robot, robots
+from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.recorder import Recorder
 from ce_gym.viewer.rollout import Rollout
@@ -82,7 +84,8 @@ def record_lanes(
     for lane in lanes:
         if not 0 <= lane < batch.num_envs:
             raise ViewerError(f"lane {lane}: expected 0 to {batch.num_envs - 1}")
-    recorders = {lane: _recorder(native, label, info or {}) for lane in lanes}
+    field = field_of(batch.program.task.terrain)
+    recorders = {lane: _recorder(native, field, label, info or {}) for lane in lanes}
     told = None if commands is None else np.asarray(commands, float)
     observation, _ = env.reset(seed=seed)
     rewards, running = np.zeros((batch.num_envs, 1 + len(batch.program.reward_terms))), set(lanes)
@@ -104,7 +107,7 @@ def record_lanes(
     return [recorder.rollout() for recorder in recorders.values()]
 
 
-def _recorder(native: BatchShell, label: str, info: Mapping[str, str]) -> Recorder:
+def _recorder(native: BatchShell, field: Terrain | None, label: str, info: Mapping[str, str]) -> Recorder:
     model = native.batch.program.model
     names = ("reward", *(f"reward: {name}" for name in native.batch.program.reward_terms))
     return Recorder(
@@ -115,6 +118,7 @@ def _recorder(native: BatchShell, label: str, info: Mapping[str, str]) -> Record
         info={"task": native.task, **info},
         contact_names=native.contact_names,
         signal_names=names,
+        terrain=field,
     )
 
 

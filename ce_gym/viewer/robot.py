@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.description import Placement, Robot, Shape
-from ce_gym.viewer import three
-from ce_gym.viewer.belts import belt_shapes
+from ce_gym.model.description import Body, Placement, Robot, Shape
+from ce_gym.viewer import three, tracks
+from ce_gym.viewer.belts import Part, belt_parts
 from ce_gym.viewer.stand_ins import DARK, LIGHT, rotor_discs, shapes_of
 from ce_gym.viewer.three import Color, Command
 
@@ -38,9 +38,9 @@ def robot_commands(robot: Robot, root: str, *, tint: Color | None = None, opacit
         tint: One colour for everything, in place of the shapes' own.
         opacity: Factor on the opacity of everything, 0..1.
     """
-    paths, shapes, inside = body_paths(robot, root), shapes_of(robot), belt_shapes(robot)
+    paths, shapes, inside = body_paths(robot, root), shapes_of(robot), belt_parts(robot)
     for name, disc in rotor_discs(robot).items():
-        inside.setdefault(name, []).append(disc)
+        inside.setdefault(name, []).append(Part(disc, ()))
     for body in robot.bodies:
         for index, shape in enumerate(shapes[body.name]):
             color = tint or shape.color
@@ -49,17 +49,37 @@ def robot_commands(robot: Robot, root: str, *, tint: Color | None = None, opacit
             if body.kind == "rotor" and shape.type == "cylinder":
                 yield _spoke_command(f"{path}_spoke", shape, color, opacity)
         if body.name in inside:
-            yield from _hidden(f"{paths[body.name]}/inside", inside[body.name], tint, opacity)
+            path = f"{paths[body.name]}/inside"
+            for index, part in enumerate(inside[body.name]):
+                yield from _part_commands(f"{path}/part_{index}", part, robot, paths, tint, opacity)
+            yield three.set_property(path, "visible", False)
 
 
-def _hidden(path: str, shapes: list[Shape], tint: Color | None, opacity: float) -> Iterator[Command]:
-    """Draw rotors, pulleys and belts for whoever looks through the links."""
-    for index, shape in enumerate(shapes):
-        color = tint or shape.color
-        yield _shape_command(f"{path}/part_{index}", shape, color, opacity)
-        if shape.type == "cylinder":
-            yield _spoke_command(f"{path}/spoke_{index}", shape, color, opacity)
-    yield three.set_property(path, "visible", False)
+def _part_commands(
+    path: str, part: Part, robot: Robot, paths: dict[str, str], tint: Color | None, opacity: float
+) -> Iterator[Command]:
+    """Draw a rotor, pulley or strand for whoever looks through the links."""
+    color = tint or part.shape.color
+    command = _shape_command(path, part.shape, color, opacity)
+    if part.links:  # moved by belts.js
+        length, width, height = part.shape.size if part.shape.type == "box" else (0.0, 0.0, 0.0)
+        command["object"]["object"]["userData"] = {
+            "belt": {
+                "links": [_joint(robot.body(name), paths[name], sign) for name, sign in part.links],
+                "axis": [] if part.axis is None else part.axis.tolist(),
+                "reach": part.reach,
+                **{"length": length, "width": width, "height": height},
+            }
+        }
+    yield command
+    if part.shape.type == "cylinder":
+        yield _spoke_command(f"{path}/spoke", part.shape, color, opacity)
+
+
+def _joint(body: Body, path: str, sign: int) -> Command:
+    """Return what the page needs to find a joint's angle from the pose of the link that it moves."""
+    rest = tracks.quaternions(np.array(body.placement.rotation)).tolist()
+    return {"path": path, "rest": rest, "axis": list(body.joint.axis), "sign": sign}
 
 
 def _shape_command(path: str, shape: Shape, color: Color, opacity: float) -> Command:

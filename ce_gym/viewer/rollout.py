@@ -1,7 +1,7 @@
 """Recorded rollouts: what a robot did, frame by frame, as one small file.
 
-A rollout names its robot and holds arrays; poses of bodies are computed from it when it is shown. Knows numpy and
-files; knows no dynamics and no way of drawing.
+A rollout names its robot and holds arrays; poses of bodies are computed from it when it is shown. Knows numpy,
+files and terrain; knows no dynamics and no way of drawing.
 """
 
 from __future__ import annotations
@@ -17,8 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.sim.terrain import Terrain
+from ce_gym.viewer.ground import Heights
+
 FORMAT = "ce_gym rollout"
-VERSION = 2
+VERSION = 3
+READABLE = (2, 3)  # version 2 knew no ground but the flat
 
 ARRAYS = {"times": 1, "q": 2, "v": 2, "contact_forces": 3, "commands": 2, "torques": 2, "signals": 2}
 """What a rollout consists of: the number of axes of each array, the first of which is time."""
@@ -53,6 +57,7 @@ class Rollout:
         info: Anything else worth keeping, as text.
         contact_names: Which contacts the forces belong to, for simulations of some contacts only; empty means all of
             the robot's, in its order.
+        ground: The ground around the robot's path, see `ce_gym.viewer.ground.around`; None if it is flat.
     """
 
     robot: str
@@ -69,6 +74,7 @@ class Rollout:
     label: str = ""
     info: Mapping[str, str] = field(default_factory=dict)
     contact_names: Sequence[str] = ()
+    ground: Terrain | None = None
 
     def __post_init__(self) -> None:
         frames = np.size(self.times)
@@ -113,6 +119,10 @@ class Rollout:
             "contact_names": list(self.contact_names),
             "signal_names": list(self.signal_names),
         }
+        ground: dict[str, Any] = {}
+        if self.ground is not None:
+            ground["ground"], low, step = Heights.of(self.ground)
+            header["ground"] = {"cell": self.ground.cell, "origin": self.ground.origin, "low": low, "step": step}
         path = Path(path)
         # An open file, since numpy would append .npz to a name that lacks it.
         with path.open("wb") as file:
@@ -121,6 +131,7 @@ class Rollout:
                 header=np.array(json.dumps(header)),
                 times=self.times,
                 **{name: getattr(self, name).astype(np.float32) for name in ARRAYS if name != "times"},
+                **ground,
             )
         return path
 
@@ -134,9 +145,10 @@ class Rollout:
         entries = _read_entries(Path(path))
         try:
             header = _read_header(entries.pop("header"))
+            ground = _read_ground(header.pop("ground"), entries.get("ground"))
             if missing := [name for name in ARRAYS if name not in entries]:
                 raise RolloutError(f"has no {', '.join(missing)}; expected {', '.join(ARRAYS)}")
-            return cls(**header, **{name: entries[name] for name in ARRAYS})
+            return cls(**header, **{name: entries[name] for name in ARRAYS}, ground=ground)
         except RolloutError as error:
             raise RolloutError(f"{path}: {error}") from None
 
@@ -192,8 +204,8 @@ def _read_header(entry: NDArray[Any]) -> dict[str, Any]:
     if not isinstance(header, dict) or header.pop("format", None) != FORMAT:
         raise RolloutError(f"not a ce_gym rollout; expected a header with format {FORMAT!r}")
     version = header.pop("version", None)
-    if version != VERSION:
-        raise RolloutError(f"version is {version!r}; this ce_gym reads version {VERSION}")
+    if version not in READABLE:
+        raise RolloutError(f"version is {version!r}; this ce_gym reads versions {', '.join(map(str, READABLE))}")
     expected = {
         "robot": str,
         "transmission": str,
@@ -208,4 +220,19 @@ def _read_header(entry: NDArray[Any]) -> dict[str, Any]:
             raise RolloutError(
                 f"header key {key!r} is {header.get(key)!r}; expected {getattr(kind, '__name__', 'a number')}"
             )
-    return {key: header[key] for key in expected}
+    return {key: header[key] for key in expected} | {"ground": header.get("ground")}
+
+
+def _read_ground(figures: Any, numbers: Any) -> Terrain | None:
+    """Return the ground that a header's figures and an entry describe; None if there is none."""
+    if figures is None:
+        return None
+    try:
+        if numbers.dtype != np.uint16:
+            raise RolloutError(f"ground has numbers of type {numbers.dtype}; expected uint16")
+        heights = Heights(numbers, float(figures["low"]), float(figures["step"])).metres()
+        return Terrain(heights, figures["cell"], figures["origin"])
+    except RolloutError:
+        raise
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise RolloutError(f"ground is damaged ({error}); expected heights with cell, origin, low and step") from None

@@ -12,12 +12,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer import arrows, three, tracks
 from ce_gym.viewer.actor import Actor, PosedModel, smooth
 from ce_gym.viewer.errors import ViewerError
-from ce_gym.viewer.robot import robot_commands
+from ce_gym.viewer.ground import around, clear_view, reach
+from ce_gym.viewer.robot import body_paths, robot_commands
 from ce_gym.viewer.rollout import Rollout
-from ce_gym.viewer.stage import camera_commands, stage_commands
+from ce_gym.viewer.stage import camera_commands, eye, field_command, stage_commands
 from ce_gym.viewer.three import Color, Command
 
 Array = NDArray[np.float64]
@@ -26,6 +28,7 @@ ROOT = "/world"
 GHOST_TINTS: tuple[Color, ...] = ((0.90, 0.45, 0.25), (0.25, 0.55, 0.85), (0.35, 0.65, 0.35))
 GHOST_OPACITY = 0.4
 ROW = 4  # so many stand in one row; more stand in a square
+APART = 3.0  # distance of robots that stand apart, each on ground of its own, in radii
 FOLLOW_SECONDS = 0.8  # the camera averages the robots' path over this time [s]
 
 
@@ -60,9 +63,11 @@ def build_scene(actors: Sequence[Actor], *, spacing: float | None = None) -> lis
         spacing: Distance between neighbours [m]; zero draws all but the first as ghosts in the same place. By default
             neighbours keep clear of each other. Robots that stand apart all start towards the same side, x.
     """
-    poses = places(actors, 1.6 * max(actor.radius for actor in actors) if spacing is None else spacing)
+    if spacing is None:
+        spacing = (1.6 if _all_flat(actors) else APART) * max(actor.radius for actor in actors)
+    poses = places(actors, spacing)
     end = max(max(actor.times[-1], actor.rollout.dt) for actor in actors)
-    commands = [*_stage(actors, poses)]
+    commands = [*_stage(actors, poses), *_fields(actors, poses, spacing)]
     clips = [_follow(actors, poses, end)]
     for index, actor in enumerate(actors):
         ghost = index > 0 and spacing == 0
@@ -103,14 +108,49 @@ def _stage(actors: Sequence[Actor], poses: Sequence[Array]) -> Iterator[Command]
     starts = np.array([_moved(actor.middle[:1], pose)[0] for actor, pose in zip(actors, poses, strict=True)])
     radius = max(actor.radius for actor in actors) + float(np.linalg.norm(np.ptp(starts, 0))) / 2
     corners = np.concatenate(paths)
-    yield from stage_commands(corners.min(0), corners.max(0), root=ROOT, radius=radius)
-    yield three.set_transform(ROOT, three.transform([0.0, 0.0, -_height(actors)]))
-    yield from camera_commands(radius)
+    flat, height = _all_flat(actors), _height(actors)
+    yield from stage_commands(corners.min(0), corners.max(0), root=ROOT, radius=radius, flat=flat)
+    yield three.set_transform(ROOT, three.transform([0.0, 0.0, -height]))
+    place = eye(radius)
+    if len(actors) == 1 or np.ptp(starts, 0).max() == 0:
+        place[2] = _sight(actors[0], height, radius, place)
+    yield from camera_commands(place)
+
+
+def _sight(actor: Actor, height: float, radius: float, place: Array) -> float:
+    """Return how high the camera must be for the ground never to come between it and the robot [m]."""
+    ground, frames, turn = actor.rollout.ground, slice(None, None, 10), actor.start[:3, :3]
+    targets = np.column_stack([actor.middle, actor.levels + height])[frames]
+    return max(float(clear_view(ground, at, at + turn @ place, radius / 4)[2] - at[2]) for at in targets)
+
+
+def _all_flat(actors: Sequence[Actor]) -> bool:
+    return all(actor.rollout.ground is None for actor in actors)
+
+
+def _fields(actors: Sequence[Actor], poses: Sequence[Array], spacing: float) -> Iterator[Command]:
+    """Draw the ground where it is not flat: one piece for ghosts, else a disc that goes along with each robot."""
+    if _all_flat(actors):
+        return
+    bases = [body_paths(actor.robot, actor.path)[actor.robot.bodies[0].name] for actor in actors]
+    grounds = [actor.rollout.ground or around(Terrain.flat(), actor.middle) for actor in actors]
+    if len(actors) > 1 and spacing > 0:
+        for index, actor in enumerate(actors):
+            far = min(spacing / 2, reach(grounds[index], actor.middle))
+            piece = around(grounds[index], actor.middle, far)
+            yield field_command(f"{ROOT}/ground_{index}", piece, [bases[index]], far, fading=0.8)
+            yield three.set_transform(f"{ROOT}/ground_{index}", poses[index])
+        return
+    everywhere = np.concatenate([actor.middle for actor in actors])
+    widest = max(grounds, key=lambda ground: reach(ground, everywhere))
+    yield field_command(f"{ROOT}/ground", widest, bases, reach(widest, actors[0].middle))
+    yield three.set_transform(f"{ROOT}/ground", poses[0])
 
 
 def _height(actors: Sequence[Actor]) -> float:
-    """Return the height of the middle of the robots [m], which the camera looks at."""
-    return float(min(actor.low[2] for actor in actors) + max(actor.high[2] for actor in actors)) / 2
+    """Return the height of the middle of the robots above the ground where they start [m]; the camera looks there."""
+    low = min(actor.low[2] - actor.levels[0] for actor in actors)
+    return float(low + max(actor.high[2] - actor.levels[0] for actor in actors)) / 2
 
 
 def _moved(points: Array, pose: Array) -> Array:
@@ -122,9 +162,10 @@ def _follow(actors: Sequence[Actor], poses: Sequence[Array], end: float) -> Comm
     """Move the world against the mean path of the robots' middles, so that they stay before the camera."""
     times = max((actor.times for actor in actors), key=len)
     middles = [_moved(actor.middle, pose) for actor, pose in zip(actors, poses, strict=True)]
-    pairs = zip(actors, middles, strict=True)
-    paths = [[np.interp(times, actor.times, middle[:, axis]) for axis in (0, 1)] for actor, middle in pairs]
+    levels = [actor.levels + pose[2, 3] for actor, pose in zip(actors, poses, strict=True)]
+    paths = [
+        [np.interp(times, actor.times, values) for values in (*middle.T, height)]
+        for actor, middle, height in zip(actors, middles, levels, strict=True)
+    ]
     centre = smooth(np.mean(paths, 0).T, times, FOLLOW_SECONDS)
-    return tracks.moving(
-        ROOT, times, end, {"position": np.column_stack([-centre, np.full(len(times), -_height(actors))])}
-    )
+    return tracks.moving(ROOT, times, end, {"position": -centre - [0.0, 0.0, _height(actors)]})

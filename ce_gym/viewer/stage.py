@@ -1,13 +1,16 @@
-"""What surrounds the robot: ground, sky, lights and camera. Knows three.js commands and lengths; knows no robots."""
+"""What surrounds the robot: ground, sky, lights and camera. Knows three.js commands and terrain; knows no robots."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer import three
+from ce_gym.viewer.ground import as_json
 from ce_gym.viewer.three import Command
 
 HORIZON = (0.91, 0.93, 0.95)
@@ -16,6 +19,8 @@ TILE = 1.0  # edge of the square that the ground's image repeats over [m]
 GROUND_MARGIN = 45.0  # beyond it the sky's dome hides the ground anyway [m]
 SKY_RADIUS = 45.0
 FIELD_OF_VIEW = 35.0  # vertical [degrees]
+FADING = 0.4  # from this share of what is drawn of it, ground that is not flat fades into the horizon
+STEEP = 0.5  # how much darker than level ground a vertical face of it is, besides light and shadow
 
 _MESHCAT_OWN = (
     "/Grid",
@@ -29,7 +34,7 @@ _MESHCAT_OWN = (
 
 
 def stage_commands(
-    low: NDArray[np.float64], high: NDArray[np.float64], *, root: str, radius: float
+    low: NDArray[np.float64], high: NDArray[np.float64], *, root: str, radius: float, flat: bool = True
 ) -> Iterator[Command]:
     """Set the stage.
 
@@ -38,24 +43,47 @@ def stage_commands(
         high: Largest x and y [m].
         root: Scene path that moves with the robots' world; the ground goes there.
         radius: Size of what is looked at [m].
+        flat: Whether the ground is the plane z = 0; other ground comes by `field_command`.
     """
     for path in _MESHCAT_OWN:
         yield three.set_property(path, "visible", False)
-    yield _ground(f"{root}/ground", low, high)
+    if flat:
+        yield _ground(f"{root}/ground", low, high)
     yield _sky("/sky")
     yield from _lights(radius)
 
 
-def camera_commands(radius: float, aspect: float = 1.6) -> Iterator[Command]:
-    """Look at a ball of `radius` [m] around the origin from the front right, a little from above.
+def eye(radius: float, aspect: float = 1.6) -> NDArray[np.float64]:
+    """Return from where a ball of `radius` [m] around the origin is looked at [m], shape (3,).
+
+    That is from the front right, a little above.
+    """
+    return 1.3 * radius / np.sin(np.radians(FIELD_OF_VIEW / 2)) * max(1.0, 1.0 / aspect) * _unit([0.62, -0.80, 0.30])
+
+
+def camera_commands(place: NDArray[np.float64]) -> Iterator[Command]:
+    """Look at the origin from a place [m], shape (3,).
 
     meshcat's camera turns about the origin whatever is done to it, so what is looked at is brought there.
     """
-    distance = 1.3 * radius / np.sin(np.radians(FIELD_OF_VIEW / 2)) * max(1.0, 1.0 / aspect)
-    x, y, z = (distance * _unit([0.62, -0.80, 0.30])).tolist()
+    x, y, z = place.tolist()
     lens = "/Cameras/default/rotated/<object>"
     yield three.set_property(lens, "fov", FIELD_OF_VIEW)
     yield three.set_property(lens, "position", [x, z, -y])  # this node of meshcat's has y up
+
+
+def field_command(path: str, ground: Terrain, bodies: Sequence[str], reach: float, fading: float = FADING) -> Command:
+    """Return the command that draws ground that is not flat; `ground.js` gives it its shape.
+
+    Args:
+        path: Scene path, in the frame of the robots' worlds.
+        ground: A piece of it.
+        bodies: Scene paths of the bodies around which it is drawn.
+        reach: How far around them [m].
+        fading: Share of that from which on it fades into the horizon.
+    """
+    told = {**as_json(ground), "bodies": list(bodies), "reach": float(reach), "fading": fading, "steep": STEEP}
+    return _tiled(path, three.plane(TILE, TILE), np.eye(4), userData={"field": told})
 
 
 def _unit(vector: list[float]) -> NDArray[np.float64]:
@@ -67,16 +95,12 @@ def _ground(path: str, low: NDArray[np.float64], high: NDArray[np.float64]) -> C
     first = np.floor(low - GROUND_MARGIN)
     edges = np.ceil(high + GROUND_MARGIN) - first
     pose = three.transform([*(first + edges / 2), 0.0])
-    return three.textured(
-        path,
-        three.plane(*edges),
-        ground_image(),
-        pose,
-        repeat=edges / TILE,
-        type="MeshStandardMaterial",
-        roughness=1.0,
-        metalness=0.0,
-    )
+    return _tiled(path, three.plane(*edges), pose, repeat=edges / TILE)
+
+
+def _tiled(path: str, geometry: Command, pose: NDArray[np.float64], **options: Any) -> Command:
+    look = {"type": "MeshStandardMaterial", "roughness": 1.0, "metalness": 0.0}
+    return three.textured(path, geometry, ground_image(), pose, **look, **options)
 
 
 def ground_image(size: int = 256) -> NDArray[np.uint8]:

@@ -110,8 +110,10 @@ def textured(path: str, geometry: Command, pixels: NDArray[np.uint8], matrix: Ar
         geometry: As returned by `box` and its fellows.
         pixels: Red, green, blue, shape (height, width, 3).
         matrix: Pose, shape (4, 4).
-        options: "repeat" (times in each direction, default (1, 1)); anything else belongs to the material.
+        options: "repeat" (times in each direction, default (1, 1)) and "userData", which scripts in the page may read;
+            anything else belongs to the material.
     """
+    more = {"userData": options.pop("userData")} if "userData" in options else {}
     repeat = [float(times) for times in options.pop("repeat", (1, 1))]
     texture = {
         "image": f"{path}:image",
@@ -123,7 +125,8 @@ def textured(path: str, geometry: Command, pixels: NDArray[np.uint8], matrix: Ar
     }
     url = "data:image/png;base64," + base64.b64encode(png(pixels)).decode()
     material = {"map": f"{path}:texture", "color": 0xFFFFFF, **options}
-    return set_object(path, "Mesh", matrix, geometry=geometry, material=material, texture=texture, image={"url": url})
+    parts = {"geometry": geometry, "material": material, "texture": texture, "image": {"url": url}}
+    return set_object(path, "Mesh", matrix, **parts, **more)
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:

@@ -1,7 +1,7 @@
 """A live window: meshcat's page at this machine's loopback, to which poses are sent as they come.
 
 Nothing is opened and nothing waits: where no browser looks, drawing costs next to nothing. Knows posed models, scene
-commands and how to serve a page; knows no environments.
+commands, terrain and how to serve a page; knows no environments.
 """
 
 from __future__ import annotations
@@ -19,17 +19,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer import three
 from ce_gym.viewer.actor import PosedModel
-from ce_gym.viewer.html import meshcat_code
+from ce_gym.viewer.ground import around, level, reach
+from ce_gym.viewer.html import meshcat_code, source
 from ce_gym.viewer.live import serve
 from ce_gym.viewer.robot import body_paths, extent, robot_commands
-from ce_gym.viewer.stage import HORIZON, TILE, camera_commands, stage_commands
+from ce_gym.viewer.stage import HORIZON, TILE, camera_commands, eye, field_command, stage_commands
 
 Array = NDArray[np.float64]
 
 _PAGE = Path(__file__).with_name("window.html")
-_ROBOT, _STAGE = "/robot", "/stage"
+_ROBOT, _STAGE, _FIELD = "/robot", "/stage", "/robot/ground"
+BLOCK = 4.0  # edge of the squares of the world that share a piece of ground that is not flat [m]
 
 
 class Window:
@@ -41,20 +44,23 @@ class Window:
         model: The robot and its forward kinematics.
         q: Positions in a typical pose, shape (nq,); they set how far the camera is away.
         fps: Poses in a second of real time: drawing waits for it while somebody looks [1/s].
+        terrain: The ground, the plane z = 0 if None.
 
     Raises:
         ViewerError: meshcat is not installed.
     """
 
-    def __init__(self, model: PosedModel, q: Array, *, fps: float) -> None:
+    def __init__(self, model: PosedModel, q: Array, *, fps: float, terrain: Terrain | None = None) -> None:
         self._model, self._robot, self._period = model, model.robot, 1 / fps
         self._paths = body_paths(self._robot, _ROBOT)
         self._index = {body.name: model.body_names.index(body.name) for body in self._robot.bodies}
         positions, rotations = (np.asarray(rows[0]) for rows in model.body_poses(np.asarray(q, float)[None]))
         order = list(self._index.values())
         low, high = extent(self._robot, positions[order], rotations[order])
+        self._radius, self._terrain = max(float(np.linalg.norm(high - low)) / 2, 0.05), terrain
+        self._block, self._ground, self._grounds = (0, 0), b"", 0  # the piece of ground, as an event, and its number
         self._middle, self._height = (low + high)[:2] / 2, float(low[2] + high[2]) / 2
-        self._text = self._page(low, high)
+        self._text = self._page()
         self._news = threading.Condition()
         self._event, self._count, self._watchers, self._closed = b"", 0, 0, False
         self._due = 0.0
@@ -70,6 +76,7 @@ class Window:
             print(f"watch at {self.url}", flush=True)
         positions, rotations = (np.asarray(rows[0]) for rows in self._model.body_poses(np.asarray(q, float)[None]))
         event = f"data: {json.dumps(self._moves(positions, rotations))}\n\n".encode()
+        self._look_around(self._place(positions))
         with self._news:
             self._event, self._count = event, self._count + 1
             self._news.notify_all()
@@ -85,16 +92,17 @@ class Window:
             self._news.notify_all()
         self._running.close()
 
-    def _page(self, low: Array, high: Array) -> str:
+    def _page(self) -> str:
         code = meshcat_code()
-        radius = max(float(np.linalg.norm(high - low)) / 2, 0.05)
-        here = np.zeros(2)
-        commands = [*robot_commands(self._robot, _ROBOT), *stage_commands(here, here, root=_STAGE, radius=radius)]
-        commands += camera_commands(radius)
+        here, flat = np.zeros(2), self._terrain is None
+        commands = [*robot_commands(self._robot, _ROBOT)]
+        commands += stage_commands(here, here, root=_STAGE, radius=self._radius, flat=flat)
+        commands += camera_commands(eye(self._radius))
         packed = [base64.b64encode(three.pack(command)).decode() for command in commands]
         return string.Template(_PAGE.read_text(encoding="utf-8")).substitute(
             title=html.escape(self._robot.name),
             meshcat=code,
+            ground=source("ground.js"),
             commands=json.dumps(packed),
             horizon=three.hex_color(HORIZON),
         )
@@ -102,9 +110,10 @@ class Window:
     def _moves(self, positions: Array, rotations: Array) -> dict[str, list[float]]:
         """Return the matrix of each path that moves: bodies against their parents, the world under the camera."""
         poses = {name: three.transform(positions[i], rotations[i]) for name, i in self._index.items()}
-        x, y = positions[self._index[self._robot.bodies[0].name], :2] if self._robot.floating else self._middle
+        x, y = place = self._place(positions)
+        z = level(self._terrain, place[None], self._radius / 2)[0]
         matrices = {
-            _ROBOT: three.transform([-x, -y, -self._height]),
+            _ROBOT: three.transform([-x, -y, -self._height - z]),
             _STAGE: three.transform([-(x % TILE), -(y % TILE), -self._height]),  # the same everywhere, so it never ends
         }
         for body in self._robot.bodies:
@@ -112,9 +121,26 @@ class Window:
             matrices[self._paths[body.name]] = pose if body.parent is None else np.linalg.inv(poses[body.parent]) @ pose
         return {path: np.round(matrix.T.ravel(), 6).tolist() for path, matrix in matrices.items()}
 
+    def _place(self, positions: Array) -> Array:
+        """Return where the robot is [m], shape (2,)."""
+        return positions[self._index[self._robot.bodies[0].name], :2] if self._robot.floating else self._middle
+
+    def _look_around(self, place: Array) -> None:
+        """Let the page have the ground around a place [m], shape (2,), if it is not flat and new to it."""
+        row, column = np.floor(place / BLOCK).astype(int).tolist()
+        if self._terrain is None or (self._grounds and self._block == (row, column)):
+            return
+        block = BLOCK * np.array([[row, column], [row + 1, column + 1]])
+        ground = around(self._terrain, block)
+        root = self._paths[self._robot.bodies[0].name]
+        command = field_command(_FIELD, ground, [root], reach(ground, block))
+        with self._news:
+            self._block, self._grounds = (row, column), self._grounds + 1
+            self._ground = f"event: ground\ndata: {json.dumps(command)}\n\n".encode()
+
     def _events(self) -> Iterator[bytes]:
         """Yield the newest poses to one browser until the window is closed."""
-        seen = 0
+        seen = grounds = 0
         with self._news:
             self._watchers += 1
         try:
@@ -126,6 +152,8 @@ class Window:
                     if self._closed:
                         return
                     event, seen = (self._event, self._count) if self._count > seen else (b":\n\n", seen)
+                    if self._grounds > grounds:
+                        event, grounds = self._ground + event, self._grounds
                 yield event
         finally:
             with self._news:

@@ -18,9 +18,11 @@ from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers.vector import RecordVideo as RecordVideos
 
 import ce_gym
+from ce_gym.envs.fields import checked_terrain, make_field
 from ce_gym.viewer import ViewerError
 
 ENV = "ce_gym/MiniCheetahVelocity-v0"
+ROBOT = "mini_cheetah"
 SMALL = {"width": 80, "height": 60}
 
 
@@ -90,6 +92,92 @@ def test_the_camera_follows_and_the_floor_passes_by(env):
 def test_a_robot_below_the_ground_is_hidden_by_it(env):
     below = with_q(env, 2, -0.5)
     np.testing.assert_array_equal(below, with_q(env, 2, -0.8))
+
+
+ROUGH = {"kind": "rough", "amplitude": 0.08, "levels": 2, "columns": 2, "size": 4.0, "curriculum": False}
+
+
+@pytest.fixture(scope="module")
+def field_of_stairs():
+    """A pit of stairs, its middle at (2, 2), and a pyramid, its middle at (2, 6)."""
+    return make_field(checked_terrain({"kind": "stairs", "levels": 2, "columns": 2, "size": 4.0, "rise": 0.2}))
+
+
+def standing_on(terrain, model, x: float, y: float) -> np.ndarray:
+    q = model.standing_q.copy()
+    q[:3] += [x, y, terrain.at(x, y)[0]]
+    return q
+
+
+def test_ground_that_is_not_flat_is_seen(field_of_stairs):
+    """Steps change the picture around the robot; the robot itself stays where flat ground has it."""
+    pytest.importorskip("embreex")
+    from ce_gym.viewer.picture import Picture
+
+    model = ce_gym.Model(ROBOT)
+    stairs = Picture(model, model.standing_q, terrain=field_of_stairs, **SMALL)
+    level = Picture(model, model.standing_q, terrain=ce_gym.Terrain.flat(), **SMALL)
+    flat = Picture(model, model.standing_q, **SMALL)
+    q = standing_on(ce_gym.Terrain.flat(), model, 2.0, 2.0)
+    one, other = level.draw(q).astype(int), flat.draw(q).astype(int)
+    near = np.s_[24:]  # below the horizon: farther away the one ends and the other does not
+    assert np.abs(one - other)[near].max(-1).mean() < 4
+    high = stairs.draw(standing_on(field_of_stairs, model, 7.3, 2.0)).astype(int)
+    assert (np.abs(high - one)[near].max(-1) > 12).mean() > 0.1
+    dark = [np.argwhere(picture[10:50].mean(-1) < 80).mean(0) for picture in (high, one)]  # the torso and the legs
+    np.testing.assert_allclose(*dark, atol=3)
+
+
+def test_a_picture_on_a_field_depends_on_the_pose_alone(field_of_stairs):
+    pytest.importorskip("embreex")
+    from ce_gym.viewer.picture import Picture
+
+    model = ce_gym.Model(ROBOT)
+    stairs = Picture(model, model.standing_q, terrain=field_of_stairs, **SMALL)
+    q = standing_on(field_of_stairs, model, 6.3, 2.1)
+    first = stairs.draw(q)
+    stairs.draw(standing_on(field_of_stairs, model, 3.0, 5.0))
+    np.testing.assert_array_equal(stairs.draw(q), first)
+
+
+def test_a_robot_in_a_pit_is_not_hidden_by_its_rim():
+    """It is seen as large as on flat ground, to a fifth; the camera goes up for that."""
+    pytest.importorskip("embreex")
+    from ce_gym.viewer.picture import Picture
+
+    model = ce_gym.Model(ROBOT)
+    pit = ce_gym.Terrain.from_function(lambda x, y: np.clip(0.6 * (np.hypot(x, y) - 0.4), 0, 1), 0.1, 12.0)
+
+    def size(terrain) -> float:
+        picture = Picture(model, model.standing_q, terrain=terrain, **SMALL)
+        q = standing_on(terrain, model, 0.0, 0.0)
+        gone = q + 500.0 * (np.arange(model.nq) == 2)
+        return (np.abs(picture.draw(q).astype(int) - picture.draw(gone)).max(-1) > 40).mean()
+
+    assert size(pit) > 0.8 * size(ce_gym.Terrain.flat())
+
+
+def test_environments_show_their_ground(capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("embreex")
+    pytest.importorskip("meshcat")
+    rough = make(terrain=ROUGH, **SMALL)
+    rough.reset(seed=1)
+    pictures = [rough.render()]
+    rough.batch.write("q", rough.batch.rows("q") + 0.5 * (np.arange(rough.model.nq) == 0))
+    pictures.append(rough.render())
+    assert (pictures[0] != pictures[1]).any(-1).mean() > 0.2
+    env = make("human", terrain=ROUGH)
+    env.reset(seed=1)
+    url = capsys.readouterr().out.split()[-1]
+    with urllib.request.urlopen(url + "events", timeout=5) as events:
+        assert events.readline() == b"event: ground\n"
+        command = json.loads(events.readline()[len("data: ") :])
+        assert command["object"]["object"]["userData"]["field"]["reach"] > 1.0
+        events.readline()
+        moves = json.loads(events.readline()[len("data: ") :])
+        x, y = env.batch.rows("q")[0, :2]
+        np.testing.assert_allclose(moves["/robot"][12:14], [-x, -y], atol=1e-6)
+        env.close()
 
 
 @pytest.mark.parametrize("robot", ["mit_humanoid", "jvrc1", "four_bar"])

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from chromium import PROGRAM, Chromium
 
+from ce_gym import Terrain
 from ce_gym.dynamics import Model
 from ce_gym.viewer import Rollout, write_html
+from ce_gym.viewer.ground import around
 from ce_gym.viewer.html import page
 from ce_gym.viewer.live import serve
 
@@ -217,3 +220,76 @@ def test_the_live_page_is_the_same(twins: list[Rollout]) -> None:
         browser.until("animator.time > 0.1")
         assert browser.errors == []
         assert all(asked.startswith((url, "data:")) for asked in browser.requests)
+
+
+@pytest.fixture(scope="module")
+def on_stones(twins: list[Rollout], tmp_path_factory: pytest.TempPathFactory):
+    """The first robot and its ghost on rough ground."""
+    places = np.concatenate([twin.q[:, :2] for twin in twins])
+    ground = around(Terrain.rough(seed=0, amplitude=0.05, size=20.0), places, margin=3.0)
+    raised = []
+    for twin in twins:
+        q = twin.q.copy()
+        q[:, 2] += ground.at(q[:, 0], q[:, 1])[:, 0]
+        raised.append(replace(twin, q=q, ground=ground))
+    file = write_html(raised, tmp_path_factory.mktemp("stones") / "stones.html", spacing=0.0)
+    with Chromium(file.as_uri() + "#t=1", size=(700, 500)) as browser:
+        browser.until("fields.length === 1")
+        yield browser, ground
+
+
+def test_the_ground_is_where_the_model_says(on_stones) -> None:
+    browser, ground = on_stones
+    assert browser.errors == []
+    numbers = browser.run("Array.from(fields[0].mesh.geometry.attributes.position.array).slice(0, 3 * 20000)")
+    x, y, z = np.reshape(numbers, (-1, 3)).T
+    np.testing.assert_allclose(z, ground.at(x, y)[:, 0], atol=1e-5)
+    followed = browser.run("fields[0].places.map(place => place.toArray())")
+    bases = browser.run("fields[0].bodies.map(path => node(path).object.position.toArray().slice(0, 2))")
+    np.testing.assert_allclose(followed, bases)
+    same = "node('/world/ground').object.matrixWorld.equals(node('/world/0').object.matrixWorld)"
+    assert browser.run(f"(() => {{ viewer.scene.updateMatrixWorld(); return {same}; }})()")
+
+
+def test_the_ground_is_seen_and_its_relief(on_stones, tmp_path: Path) -> None:
+    browser, _ = on_stones
+    click(browser, "#charts")
+    stones = pixels(browser, tmp_path / "stones.png")
+    browser.run("fields[0].mesh.visible = false; viewer.set_dirty()")
+    none = pixels(browser, tmp_path / "none.png")
+    browser.run("fields[0].mesh.visible = true; viewer.set_dirty()")
+    below = np.s_[220:400]  # of the horizon
+    assert (np.abs(stones - none)[below].max(-1) > 4).mean() > 0.8
+    shown = stones[330:400, :200].mean(-1)
+    assert shown.std() > 3
+    assert shown.mean() > 150  # in daylight
+
+
+def test_belts_run_with_the_knee(at_rest: Chromium, twins: list[Rollout]) -> None:
+    click(at_rest, "#xray")
+    strands = "belts.filter(one => one.userData.belt.row && one.userData.belt.links[0].path.startsWith('/world/0'))"
+    assert at_rest.run(f"{strands}.length") == 8
+    found = []
+    for frame in (50, 51):
+        at_rest.run(f"seek({frame * STEP})")
+        at_rest.settle()
+        told = "[belt.row.position.x, belt.pitch, belt.reach, belt.links[0].path]"
+        found.append(at_rest.run(f"{strands}.map(({{userData: {{belt}}}}) => {told})"))
+    click(at_rest, "#xray")
+    model = Model(ROBOT)
+    for (before, pitch, reach, path), (after, *_) in zip(*found, strict=True):
+        joint = 7 + list(model.robot.independent).index(path.rpartition("/")[2])
+        turned = twins[0].q[51, joint] - twins[0].q[50, joint]
+        moved = (after - before - reach * turned + pitch / 2) % pitch - pitch / 2  # whole marks look the same
+        assert moved == pytest.approx(0, abs=1e-6)
+        assert abs(reach * turned) > 1e-4
+
+
+def test_meshcats_own_panel_is_away_until_asked_for(at_rest: Chromium) -> None:
+    shown = "getComputedStyle(viewer.gui.domElement).display !== 'none'"
+    press = "document.dispatchEvent(new KeyboardEvent('keydown', { key: 'c', bubbles: true }))"
+    assert not at_rest.run(shown)
+    at_rest.run(press)
+    assert at_rest.run(shown)
+    at_rest.run(press)
+    assert not at_rest.run(shown)

@@ -11,14 +11,17 @@ import threading
 import urllib.error
 import urllib.request
 import webbrowser
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ce_gym import Terrain
 from ce_gym.__main__ import main
 from ce_gym.viewer import Rollout
+from ce_gym.viewer.ground import MOST, around
 
 pytest.importorskip("meshcat")
 
@@ -53,6 +56,18 @@ def test_view_writes_where_it_is_told(standing: Path, tmp_path: Path) -> None:
     assert main(["view", str(standing), str(standing), "--overlay", "--title", "Twins", "--html", str(target)]) == 0
     assert "<title>Twins</title>" in target.read_text(encoding="utf-8")
     assert target.stat().st_size < 6e6
+
+
+def test_ground_and_a_ghost_are_small(standing: Path, tmp_path: Path) -> None:
+    """The worst ground: random heights over the whole of the path, as many as are kept."""
+    rollout = Rollout.load(standing)
+    rough = around(Terrain.rough(seed=0, amplitude=0.05, cell=0.05, size=40.0), rollout.q[:, :2])
+    assert rough.heights.size > 0.7 * MOST
+    twins = [replace(rollout, ground=rough).save(tmp_path / f"{name}.npz") for name in ("one", "two")]
+    target = tmp_path / "two.html"
+    assert main(["view", *map(str, twins), "--overlay", "--html", str(target)]) == 0
+    assert target.stat().st_size < 6e6
+    assert twins[0].stat().st_size < standing.stat().st_size + 2 * MOST + 1000
 
 
 @pytest.mark.parametrize(("display", "asked", "opened"), [("", True, 0), (":0", True, 1), (":0", False, 0)])

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from hopper import make_rollout
 
+from ce_gym import Terrain
 from ce_gym.viewer import Recorder, Rollout, RolloutError
 
+GROUND = {"cell": 0.1, "origin": [0, 0], "low": 0.0, "step": 0.0}
 ARRAYS = ("times", "q", "v", "contact_forces", "commands", "torques", "signals")
 
 
@@ -40,6 +42,35 @@ def test_file_is_small(tmp_path: Path) -> None:
     rollout = make_rollout(1000)
     values = sum(getattr(rollout, name).size for name in ARRAYS)
     assert rollout.save(tmp_path / "walk.npz").stat().st_size < 4 * values + 8 * len(rollout) + 4000
+
+
+def test_ground_is_kept(tmp_path: Path) -> None:
+    ground = Terrain.rough(seed=0, amplitude=0.05, size=4.0)
+    path = make_rollout(ground=ground).save(tmp_path / "walk.npz")
+    loaded = Rollout.load(path).ground
+    assert loaded is not None
+    assert (loaded.cell, loaded.origin) == (ground.cell, ground.origin)
+    np.testing.assert_allclose(loaded.heights, ground.heights, atol=0.1 / 65535)
+    assert (
+        path.stat().st_size < make_rollout().save(tmp_path / "flat.npz").stat().st_size + 2 * ground.heights.size + 500
+    )
+
+
+def test_files_of_the_version_before_are_read(tmp_path: Path) -> None:
+    loaded = Rollout.load(rewritten(tmp_path / "walk.npz", header={"version": 2}))
+    assert loaded.ground is None
+    np.testing.assert_allclose(loaded.q, make_rollout().q, rtol=1e-6)
+
+
+def test_a_recorder_keeps_the_ground_around_the_path() -> None:
+    terrain = Terrain.rough(seed=0, amplitude=0.05, size=60.0)
+    recorder, path = Recorder("hopper", "exact", 0.1, terrain=terrain), np.linspace([5.0, -3.0], [9.0, -3.0], 20)
+    for k, place in enumerate(path):
+        recorder.add(0.1 * k, [*place, 0.3, 1, 0, 0, 0], np.zeros(6))
+    ground = recorder.rollout().ground
+    assert ground is not None
+    assert ground.heights.size < 0.3 * terrain.heights.size
+    np.testing.assert_allclose(ground.at(*path.T), terrain.at(*path.T), atol=1e-12)
 
 
 def test_recorder_copies_what_it_is_given() -> None:
@@ -143,11 +174,20 @@ def single_array(path: Path) -> Path:
             lambda path: rewritten(path, drop=("header",)),
             "not a ce_gym rollout; expected an npz with an entry 'header'",
         ),
-        (lambda path: rewritten(path, header={"version": 1}), "version is 1; this ce_gym reads version 2"),
+        (lambda path: rewritten(path, header={"version": 1}), "version is 1; this ce_gym reads versions 2, 3"),
         (lambda path: rewritten(path, header={"format": "other"}), "expected a header"),
         (lambda path: rewritten(path, header={"robot": 3}), "header key 'robot' is 3; expected str"),
         (lambda path: rewritten(path, header={"dt": "x"}), "header key 'dt' is 'x'; expected a number"),
         (lambda path: rewritten(path, text="{"), "expected a header"),
+        (lambda path: rewritten(path, header={"ground": {"cell": 0.1}}), "ground is damaged"),
+        (
+            lambda path: rewritten(path, header={"ground": GROUND}, ground=np.zeros((3, 3))),
+            "type float64; expected uint16",
+        ),
+        (
+            lambda path: rewritten(path, header={"ground": GROUND | {"cell": -1}}, ground=np.zeros((3, 3), np.uint16)),
+            "ground is damaged .cell=-1",
+        ),
         (lambda path: rewritten(path, q=np.full((50, 6), np.inf)), "q has a number that is not finite"),
         (lambda path: rewritten(path, q=np.array("text")), "q is not an array of numbers"),
     ],

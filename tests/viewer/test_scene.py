@@ -10,9 +10,11 @@ from hopper import StandIn, make_robot, make_rollout
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ce_gym import Terrain
 from ce_gym.model.description import ContactSphere
 from ce_gym.viewer import Rollout, ViewerError, three, tracks
 from ce_gym.viewer.arrows import HIDDEN
+from ce_gym.viewer.ground import around
 from ce_gym.viewer.scene import ROOT, make_actors, places
 from ce_gym.viewer.scene import build_scene as build_scene_of_actors
 from ce_gym.viewer.stand_ins import frame_along, rotor_discs
@@ -167,6 +169,58 @@ def test_high_rates_are_thinned() -> None:
 def test_one_frame_is_enough() -> None:
     commands = build_scene([make_rollout(1)], [StandIn(make_robot())])
     assert commands[-1]["animations"][0]["clip"]["tracks"][0]["times"].tolist() == [0.0, 0.02]
+
+
+def fields_of(commands: list[dict]) -> dict[str, dict]:
+    found = [c for c in commands if c["type"] == "set_object" and "userData" in c["object"]["object"]]
+    return {c["path"]: c["object"]["object"]["userData"].get("field") for c in found}
+
+
+def on(terrain: Terrain, **changes: object) -> Rollout:
+    """The rollout, raised to the ground under it."""
+    rollout = make_rollout(**changes)
+    rollout.q[:, 2] += terrain.at(rollout.q[:, 0], rollout.q[:, 1])[:, 0]
+    return replace(rollout, ground=around(terrain, rollout.q[:, :2]))
+
+
+def test_ground_that_is_not_flat_takes_the_place_of_the_plane(scene: list[dict]) -> None:
+    assert fields_of(scene) == {}
+    assert f"{ROOT}/ground" in objects(scene, ROOT)
+    model = StandIn(make_robot())
+    slope = Terrain.slope(0.3, heading=1.0)
+    commands = build_scene([on(slope)], [model])
+    (path, field), *others = fields_of(commands).items()
+    assert (path, others) == (f"{ROOT}/ground", [])
+    assert field["bodies"] == [f"{ROOT}/0/base"]
+    assert 8.0 <= field["reach"] <= 9.0  # to a cell, 1 m here
+    # The robot stands as before, and the ground is put where the robot's world is.
+    placed = {c["path"]: c["matrix"] for c in commands if c["type"] == "set_transform"}
+    assert placed[path] == placed[f"{ROOT}/0"]
+    first = world(clips_of(commands), f"{ROOT}/0/base", 0)
+    np.testing.assert_allclose(first[:3, 3], on(slope).q[0, :3], atol=1e-9)
+
+
+def test_the_camera_climbs_with_the_robot(scene: list[dict]) -> None:
+    slope = Terrain.slope(0.3)
+    shift = clips_of(build_scene([on(slope)], [StandIn(make_robot())]))[ROOT]["position"]
+    flat = clips_of(scene)[ROOT]["position"]
+    np.testing.assert_allclose(shift[:, :2], flat[:, :2], atol=1e-9)
+    climbed = np.tan(0.3) * (make_rollout().q[:, 0] - make_rollout().q[0, 0])
+    np.testing.assert_allclose(shift[:, 2], flat[0, 2] - climbed, atol=1e-9)
+
+
+def test_ghosts_share_ground_and_neighbours_have_their_own() -> None:
+    models, terrain = [StandIn(make_robot())] * 2, Terrain.rough(seed=0, amplitude=0.02, size=30.0)
+    rollouts = [on(terrain), on(terrain, q=make_rollout().q + [0.1, 0.2, 0, 0, 0, 0])]
+    (field,) = fields_of(build_scene(rollouts, models, spacing=0.0)).values()
+    assert field["bodies"] == [f"{ROOT}/0/base", f"{ROOT}/1/base"]
+    apart = fields_of(build_scene(rollouts, models))
+    assert [field["bodies"] for field in apart.values()] == [[f"{ROOT}/0/base"], [f"{ROOT}/1/base"]]
+    actors = make_actors(rollouts, models)
+    assert all(field["reach"] == pytest.approx(1.5 * actors[0].radius) for field in apart.values())  # no two meet
+    mixed = fields_of(build_scene([rollouts[0], make_rollout()], models))
+    flat = mixed[f"{ROOT}/ground_1"]
+    assert (flat["low"], flat["step"]) == (0.0, 0.0)
 
 
 def objects(commands: list[dict], under: str) -> dict[str, str]:
