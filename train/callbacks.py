@@ -124,6 +124,24 @@ class AdaptiveLearningRate(_Quiet):
         self.model.lr_schedule = FloatSchedule(float(np.clip(rate, *self.limits)))
 
 
+class EntropySchedule(_Quiet):
+    """Changes the weight of the entropy bonus in proportion to the steps done.
+
+    Args:
+        start: Weight before the first step.
+        end: Weight after the last one.
+        steps: Steps in all.
+    """
+
+    def __init__(self, start: float, end: float, steps: int) -> None:
+        super().__init__()
+        self.start, self.end, self.steps = start, end, steps
+
+    def _on_rollout_start(self) -> None:
+        done = min(self.num_timesteps / self.steps, 1.0)
+        self.model.ent_coef = self.start + done * (self.end - self.start)  # type: ignore[attr-defined]  # of PPO
+
+
 class Checkpoints(_Quiet):
     """Saves the policy between updates, every so many steps.
 

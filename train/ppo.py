@@ -25,7 +25,16 @@ from typing import Any
 
 import gymnasium
 import torch
-from callbacks import AdaptiveLearningRate, Checkpoints, Curve, EpisodeLog, ProgressBar, StopInOrder, read_curve
+from callbacks import (
+    AdaptiveLearningRate,
+    Checkpoints,
+    Curve,
+    EntropySchedule,
+    EpisodeLog,
+    ProgressBar,
+    StopInOrder,
+    read_curve,
+)
 from evaluate import PolicyError, evaluate, load_learner, report
 from learner import ThreadedPPO
 from settings import Settings, config_file, load_settings
@@ -121,6 +130,7 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
     with StopInOrder(job.seconds) as stop:
         callbacks = [stop, Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog()]
         callbacks += [Curve(job.out / "curve.csv", earlier), ProgressBar(settings.steps)]
+        callbacks.append(EntropySchedule(settings.entropy, settings.final_entropy, settings.steps))
         if settings.target_kl:
             callbacks.append(AdaptiveLearningRate(settings.target_kl))
         if before < settings.steps:

@@ -44,7 +44,9 @@ class Settings:
         gamma: Discount per step.
         gae_lambda: Of generalised advantage estimation.
         clip: Clipping range of PPO's probability ratio.
-        entropy: Weight of the entropy bonus.
+        entropy: Weight of the entropy bonus at the start.
+        final_entropy: At the end, linear in between. Zero lets the noise die out, so that the mean action, by which a
+            policy is judged, is what was trained.
         value: Weight of the value loss.
         max_grad_norm: Gradients are clipped to this norm.
     """
@@ -63,6 +65,7 @@ class Settings:
     gae_lambda: float
     clip: float
     entropy: float
+    final_entropy: float
     value: float
     max_grad_norm: float
 
