@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 EXTRAS := viewer,video,train,export,rsl-rl,gpu,bench,docs,dev
 
-.PHONY: help venv demo test lint types docs wheel clean
+.PHONY: help venv demo test lint types docs links wheel clean
 
 help:
 	@echo "make demo    train Mini Cheetah to walk, then write a rollout to look at in a browser (a few minutes)"
@@ -12,12 +12,15 @@ help:
 	@echo "make lint    ruff: style and format"
 	@echo "make types   pyright: types"
 	@echo "make docs    this documentation as HTML in docs/_build/html; a warning is an error"
+	@echo "make links   follow the links of README and docs that lead out into the web"
 	@echo "make wheel   build sdist and wheel into dist/"
 	@echo "make venv    create .venv with everything the others need"
 	@echo "make clean   remove .venv and build output"
 
 # The stamp makes a second run skip installation until the metadata changes.
 .venv/installed: pyproject.toml constraints.txt
+	@test -x $(BIN)/python || $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and \
+		"make: $(PYTHON) is Python %d.%d; expected 3.11 or newer: make venv PYTHON=python3.11" % v[:2])'
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
@@ -41,6 +44,9 @@ types: .venv/installed
 docs: .venv/installed
 	$(BIN)/python -m sphinx -W --keep-going --nitpicky -q -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
+
+links: .venv/installed
+	$(BIN)/python -m sphinx -q -b linkcheck docs docs/_build/links
 
 wheel: .venv/installed
 	$(BIN)/python -m build --outdir dist

@@ -6,9 +6,11 @@ built without learners and viewers. Knows Sphinx, and `ce_gym` only by name.
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
@@ -48,6 +50,10 @@ html_css_files = ["ce_gym.css"]
 html_copy_source = html_show_sourcelink = False
 pygments_style, pygments_dark_style = "friendly", "github-dark"
 
+# `make links` follows links out of these pages, and those of README, which is none of them.
+linkcheck_timeout, linkcheck_retries, linkcheck_workers = 20, 2, 4
+linkcheck_anchors = False  # many sites write theirs by script
+
 # Docstrings are Google's; a name in backticks is code.
 default_role = "literal"
 autodoc_member_order = "bysource"
@@ -71,3 +77,14 @@ _BARE += r"|Observations|VecEnvIndices|VecEnvStepReturn|EzPickle|Generic|Env|Vec
 _BARE += r"|Device)"
 _INNER = r"ce_gym\.(sim\.devices|envs\.(shell|program|batch|terms)|model\.mechanism|dynamics\.kinematics)\..*"
 nitpick_ignore_regex = [(r"py:.*", pattern) for pattern in (_ELSEWHERE, _BARE, _INNER)]
+
+
+def setup(app: Any) -> None:
+    """Show README to the builder that follows links."""
+
+    def add_readme(app: Any, name: str, source: list[str]) -> None:
+        if app.builder.name == "linkcheck" and name == app.config.root_doc:
+            text = (HERE.parent / "README.md").read_text(encoding="utf-8")
+            source[0] += "\n\n" + "\n".join(f"<{url}>" for url in re.findall(r"\]\((https?://[^)\s]+)\)", text))
+
+    app.connect("source-read", add_readme)

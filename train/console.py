@@ -15,6 +15,9 @@ from typing import Any
 
 import gymnasium
 
+EXTRAS = {"mujoco": "mjcf", "meshcat": "viewer", "onnx": "export"}
+"""What brings packages that a program needs for a part of its work."""
+
 Table = list[list[str]]
 """Rows of cells, the heading first."""
 
@@ -25,6 +28,13 @@ def run(program: str, work: Callable[[], int]) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: print(f"{program}: warning: {message}", file=sys.stderr)
             return work()
+    except ModuleNotFoundError as error:
+        package = str(error.name).split(".")[0]
+        if package == "ce_gym":
+            raise
+        how = f"ce_gym[{EXTRAS[package]}]" if package in EXTRAS else package
+        print(f'{program}: needs {package}, which is not installed: pip install "{how}"', file=sys.stderr)
+        return 2
     except OSError as error:
         print(f"{program}: {error.filename}: {error.strerror or error}", file=sys.stderr)
         return 2

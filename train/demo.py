@@ -9,16 +9,17 @@ Uses public names of ce_gym only.
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from evaluate import load_learner, report
+import numpy as np
+from console import run
+from evaluate import EVALUATION_SEED, load_learner, report
 from ppo import Job, Trained, available_threads, train
-from record import record
 from settings import config_file, load_settings
 from transfer import summary, table, transfer
 
-from ce_gym.viewer import write_html
+from ce_gym.policies import load_policy
+from ce_gym.viewer import Rollout, walk, write_html
 
 ENV = "ce_gym/MiniCheetahVelocity-v0"
 
@@ -66,26 +67,39 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes to judge it by (default 256)")
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     args = parser.parse_args(argv)
-    try:
-        show(obtain_policy(args), args.episodes, args.out)
-    except ValueError as error:
-        print(f"demo.py: {error}", file=sys.stderr)
-        return 2
+    return run("demo.py", lambda: show(obtain_policy(args), args.episodes, args.out))
+
+
+def show(policy: Path, episodes: int, out: Path) -> int:
+    """Print how good a policy is, on every transmission level, and write its rollout; the last line is the page.
+
+    The page also shows, as a ghost, what becomes of the policy without rotors, or of one that was trained on a
+    simplified level when nothing is left out.
+    """
+    model = load_policy(policy)
+    level = model.record["transmission"]
+    results = transfer(model, model.record, episodes=episodes)
+    entry = {"transmission": level, "results": results}
+    print(f"\nJudged on {level} transmissions:\n{report(results[level])}")
+    print(f"\nThe same policy on every transmission level:\n{table(summary([entry]))}")
+    (rollout,), (ghost,) = (
+        walk(policy, seed=EVALUATION_SEED, transmission=shown, label=f"{shown} transmissions, {what}")
+        for shown, what in ((level, "as trained"), ("none" if level == "exact" else "exact", "the ghost"))
+    )
+    page = out / f"{rollout.robot}.html"
+    rollout.save(page.with_suffix(".npz"))
+    write_html([rollout, ghost], page, spacing=0.0)
+    print(f"\nRecorded {rollout.duration:.1f} s. {parting(rollout, ghost)}")
+    print(f"Open this page in a browser:\n{page.resolve()}")
     return 0
 
 
-def show(policy: Path, episodes: int, out: Path) -> None:
-    """Print how good a policy is, on every transmission level, and write its rollout; the last line is the page."""
-    model, about = load_learner(policy)
-    results = transfer(model, about, episodes=episodes)
-    entry = {"transmission": about["transmission"], "results": results}
-    print(f"\nJudged on {about['transmission']} transmissions:\n{report(results[about['transmission']])}")
-    print(f"\nThe same policy on every transmission level:\n{table(summary([entry]))}")
-    rollout = record(model, about["env"], label=f"{about['transmission']}, seed {about['seed']}", **about["env_kwargs"])
-    page = out / f"{rollout.robot}.html"
-    rollout.save(page.with_suffix(".npz"))
-    write_html([rollout], page)
-    print(f"\nRecorded {rollout.duration:.1f} s. Open this page in a browser:\n{page.resolve()}")
+def parting(rollout: Rollout, ghost: Rollout) -> str:
+    """Return a sentence that says what the ghost is, and how far it is away when either of the two ends."""
+    last = min(len(rollout), len(ghost)) - 1
+    distance = np.linalg.norm(rollout.q[last, :2] - ghost.q[last, :2])
+    what = f"The ghost is the same policy from the same seed on {ghost.transmission} transmissions"
+    return f"{what}; after {rollout.times[last]:.1f} s it is {distance:.2f} m away."
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ from evaluate import EVALUATION_SEED, env_kwargs, planar_velocity, tracking
 from numpy.typing import NDArray
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
-from ce_gym.bench.mujoco_twin import MujocoTwin
 from ce_gym.policies import WHERE, Policy, PolicyError, load_policy
 
 STEADY = {"push_period": 0.0, "randomise": {}, "latency": (0, 0), "heading": False, "command_period": 1e6}
@@ -89,6 +88,8 @@ class MujocoWorld:
     """
 
     def __init__(self, native: Any, obs: Any, level: str) -> None:
+        from ce_gym.bench.mujoco_twin import MujocoTwin
+
         self.native, self.contract = native, native.contract()
         action = self.contract["action"]
         if action["kind"] != "joint_pd":
@@ -185,7 +186,12 @@ def compare(
     Returns:
         simulations: the result of `play` by the name of the simulation; verdict: see `verdicts`; passed: whether all
         of them are.
+
+    Raises:
+        ModuleNotFoundError: MuJoCo is not installed.
     """
+    import ce_gym.bench.mujoco_twin  # noqa: F401  # where MuJoCo is missing: told before our own simulation, not after
+
     record, results = policy.record, {}
     for level in dict.fromkeys((record["transmission"], "exact", "armature")):
         envs, obs, given = _environment(record, level, episodes, seconds, every, seed)

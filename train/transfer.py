@@ -100,7 +100,7 @@ def table(found: dict[str, Any]) -> str:
             name = level + (" *" if level == trained else "")
             rows.append([trained, name, *(shown(cell[key], form) for _, key, form in COLUMNS)])
     counts = ", ".join(f"{trained} {next(iter(row.values()))['falls']['n']}" for trained, row in found.items())
-    note = "\\* trained on this level; errors are mean absolute, over every step"
+    note = "`*`: trained on this level; errors are mean absolute, over every step"
     if several:
         note += f"; mean over seeds with its 95 % confidence interval (seeds: {counts})"
     return f"{markdown(rows)}\n\n{note}"

@@ -197,6 +197,14 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwa
 
     Raises:
         gymnasium.error.Error: If the id is unknown or has no native vector environment.
+
+    Examples:
+        >>> envs = make_sb3_vec_env("ce_gym/MiniCheetahVelocity-v0", num_envs=64)
+        >>> envs.reset().shape
+        (64, 48)
+        >>> observations, rewards, dones, infos = envs.step(np.zeros((64, 12), np.float32))
+        >>> print(rewards.shape, dones.any())
+        (64,) False
     """
     mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
     options = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}

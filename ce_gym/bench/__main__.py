@@ -44,10 +44,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the report to a JSON file")
-    benchmark = importlib.import_module(f"ce_gym.bench.{name}")
-    benchmark.add_arguments(parser)
-    arguments = parser.parse_args(rest)
-    report = benchmark.run(arguments)
+    try:
+        benchmark = importlib.import_module(f"ce_gym.bench.{name}")
+        benchmark.add_arguments(parser)
+        arguments = parser.parse_args(rest)
+        report = benchmark.run(arguments)
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith("ce_gym"):
+            raise
+        missing = f"{name} needs {error.name}, which is not installed"
+        print(f'ce_gym.bench: {missing}: pip install "ce_gym[bench]"', file=sys.stderr)
+        return 2
     print(report.as_text())
     if arguments.json:
         arguments.json.write_text(report.as_json(), encoding="utf-8")

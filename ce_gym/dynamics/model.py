@@ -43,6 +43,13 @@ class Model:
 
     Raises:
         RobotError: If the robot file or the level is not valid.
+
+    Examples:
+        >>> model = ce_gym.Model("tello", transmission="exact")
+        >>> model
+        Model('tello', transmission='exact', nq=17, nv=16)
+        >>> model.mass_matrix(np.tile(model.standing_q, (100, 1))).shape
+        (100, 16, 16)
     """
 
     def __init__(
@@ -157,6 +164,12 @@ class Model:
 
         Source: CE-ABA, Chignoli, Adrian, Kim, Wensing, "A Propagation Perspective on Recursive Forward Dynamics for
         Systems with Kinematic Loops", arXiv:2311.13732, Algorithm 1.
+
+        Examples:
+            >>> model = ce_gym.Model("mini_cheetah")
+            >>> vdot = model.forward_dynamics(model.standing_q, np.zeros(model.nv), np.zeros(model.nv))
+            >>> print(f"{vdot[5]:.2f} m/s²")
+            -9.81 m/s²
         """
         if wrenches is None:
             return self._evaluate("forward_dynamics", q, v, tau)[0][..., 0]

@@ -35,6 +35,11 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
 
     Raises:
         RobotError: The file is wrong, the robot lacks what the tasks need, or another robot has the ids already.
+
+    Examples:
+        >>> ids = ce_gym.register_robot(ce_gym.load_robot("tello").source, name="my_robot")
+        >>> print(ids[0], ids[3])
+        ce_gym/MyRobotVelocity-v0 ce_gym/MyRobotVelocity-Armature-v0
     """
     file = Path(path).resolve()
     robot = load_robot(file)

@@ -17,7 +17,12 @@ def camel_case(name: str) -> str:
 
 
 def environment_ids() -> dict[str, dict[str, str]]:
-    """Return the arguments that each id stands for. An id without a level is the exact one."""
+    """Return the arguments that each id stands for. An id without a level is the exact one.
+
+    Examples:
+        >>> ce_gym.environment_ids()["ce_gym/TelloVelocity-None-v0"]
+        {'robot': 'tello', 'task': 'velocity', 'transmission': 'none'}
+    """
     ids = {}
     for robot in ROBOTS:
         for task in TASKS:

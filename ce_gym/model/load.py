@@ -33,6 +33,11 @@ def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = 
 
     Raises:
         RobotError: There is no such robot, or its description is wrong; one line that says where and how.
+
+    Examples:
+        >>> robot = ce_gym.load_robot("tello")
+        >>> print(len(robot.bodies), "bodies,", len(list(robot.rotors())), f"of them rotors, {robot.total_mass:.1f} kg")
+        27 bodies, 10 of them rotors, 10.4 kg
     """
     path = Path(name_or_path)
     if isinstance(name_or_path, str) and not path.suffix and len(path.parts) <= 1:
@@ -59,7 +64,12 @@ def _from_urdf(path: Path, floating: bool | None) -> Robot:
 
 
 def robots() -> list[str]:
-    """Return the names of the robots that come with the package."""
+    """Return the names of the robots that come with the package.
+
+    Examples:
+        >>> "mini_cheetah" in ce_gym.robots()
+        True
+    """
     return sorted(path.stem for path in assets_folder().glob("*/*.yaml") if path.stem == path.parent.name)
 
 

@@ -54,6 +54,11 @@ def load_policy(path: str | Path, transmission: str | None = None) -> Policy:
 
     Raises:
         PolicyError: If a file is missing, damaged or of another kind.
+
+    Examples:
+        >>> policy = ce_gym.load_policy("mini_cheetah_velocity")
+        >>> print(policy.record["env"], policy.predict(np.zeros(48))[0].shape)
+        ce_gym/MiniCheetahVelocity-v0 (12,)
     """
     file = locate_policy(path)
     policy = _read_onnx(file) if file.suffix == ".onnx" else Policy(*read_actor(file))

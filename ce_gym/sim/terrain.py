@@ -26,6 +26,13 @@ class Terrain:
 
     Raises:
         ValueError: If a figure is out of range or the heights are no such array.
+
+    Examples:
+        Before, in the middle of and after five steps of 10 cm:
+
+        >>> stairs = ce_gym.Terrain.stairs(rise=0.1, tread=0.3, count=5, start=1.0)
+        >>> print(stairs.at([0.0, 1.75, 9.0], 0.0)[:, 0].round(3))
+        [0.  0.3 0.5]
     """
 
     heights: NDArray

@@ -14,13 +14,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ce_gym.viewer.driving import SHOW, Script, drive, drive_many, walk
     from ce_gym.viewer.errors import ViewerError
     from ce_gym.viewer.html import write_html
     from ce_gym.viewer.live import show
     from ce_gym.viewer.recorder import Recorder
     from ce_gym.viewer.recording import record, record_lanes
     from ce_gym.viewer.rollout import Rollout, RolloutError
-    from ce_gym.viewer.walk import SHOW, Script, drive, drive_many
 
 __all__ = [
     "SHOW",
@@ -34,14 +34,16 @@ __all__ = [
     "record",
     "record_lanes",
     "show",
+    "walk",
     "write_html",
 ]
 
 _HOMES = {
-    "SHOW": "walk",
-    "Script": "walk",
-    "drive": "walk",
-    "drive_many": "walk",
+    "SHOW": "driving",
+    "Script": "driving",
+    "drive": "driving",
+    "drive_many": "driving",
+    "walk": "driving",
     "record": "recording",
     "record_lanes": "recording",
     "Recorder": "recorder",

@@ -100,8 +100,8 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
 
 def view(args: argparse.Namespace) -> int:
     """Run `view`; return its exit code."""
+    from ce_gym.viewer.driving import walk
     from ce_gym.viewer.rollout import Rollout
-    from ce_gym.viewer.walk import walk
 
     policies = [find_policy(path) for path in args.rollouts]
     rollouts = [walk(p)[0] if p else Rollout.load(path) for p, path in zip(policies, args.rollouts, strict=True)]
@@ -111,8 +111,8 @@ def view(args: argparse.Namespace) -> int:
 
 def play(args: argparse.Namespace) -> int:
     """Run `play`; return its exit code."""
+    from ce_gym.viewer.driving import SHOW, walk
     from ce_gym.viewer.errors import ViewerError
-    from ce_gym.viewer.walk import SHOW, walk
 
     file = locate_policy(args.policy)
     if args.robots > 1 and len(args.transmission) > 1:

@@ -44,6 +44,12 @@ def record(env: Any, act: Act, seconds: float, *, lane: int = 0, **options: Any)
 
     Raises:
         ViewerError: It is no environment of ce_gym, or there is no such lane.
+
+    Examples:
+        >>> env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0")
+        >>> rollout = record(env, lambda observation: np.zeros(12, np.float32), seconds=1.0, seed=0)
+        >>> print(len(rollout), rollout.q.shape)
+        50 (50, 19)
     """
     return record_lanes(env, act, seconds, lanes=(lane,), **options)[0]
 

@@ -21,6 +21,15 @@ def test_an_unknown_name_is_one_line(capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_what_is_not_installed_is_one_line():
+    code = "import sys; sys.modules['mujoco'] = None; from ce_gym.bench.__main__ import main; sys.exit(main(['speed']))"
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert finished.returncode == 2
+    assert finished.stderr == (
+        'ce_gym.bench: speed needs mujoco, which is not installed: pip install "ce_gym[bench]"\n'
+    )
+
+
 @pytest.mark.parametrize("name", command.BENCHMARKS)
 def test_every_benchmark_has_help(name, capsys):
     pytest.importorskip("mujoco")

@@ -71,8 +71,27 @@ def commands(page: Path) -> Iterator[str]:
     yield from (" ".join(code.split()) for code in re.findall(r"`((?:python|make|pip|cp) [^`]+)`", prose))
 
 
+def targets(page: Path) -> Iterator[str]:
+    """Iterate over what links and pictures of a page lead to."""
+    yield from re.findall(r"\]\(([^)\s]+)\)", BLOCK.sub("", page.read_text(encoding="utf-8")))
+
+
 def links(page: Path) -> Iterator[str]:
     """Iterate over the targets of links and pictures that stay in the repository, without their anchors."""
-    for target in re.findall(r"\]\(([^)\s]+)\)", BLOCK.sub("", page.read_text(encoding="utf-8"))):
+    for target in targets(page):
         if not re.match(r"[a-z]+:", target) and not target.startswith("#"):
             yield target.split("#")[0]
+
+
+def anchors(page: Path) -> set[str]:
+    """Return what can stand behind `#` in a link to a page: its headings, as GitHub and MyST shorten them."""
+    found: dict[str, int] = {}
+    for title in re.findall(r"^#+ (.+)$", BLOCK.sub("", page.read_text(encoding="utf-8")), re.MULTILINE):
+        name = re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-")
+        found[name] = found.get(name, -1) + 1
+    return set(found) | {f"{name}-{i}" for name, last in found.items() for i in range(1, last + 1)}
+
+
+def addresses(text: str) -> list[str]:
+    """Return the web addresses in a text, and what was meant to be one."""
+    return [found.rstrip(".,;:") for found in re.findall(r"(?:\b(?!file:)\w+://|\bwww\.)[^\s<>\"'`)\]]*", text)]

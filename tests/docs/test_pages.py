@@ -10,13 +10,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from pages import PAGES, ROOT, links, name_of
+from pages import ROOT
 
 import ce_gym
 import ce_gym.model
 import ce_gym.viewer
 
-HAND_WRITTEN = [page for page in PAGES if page.parent == ROOT]
 PUBLIC = (ce_gym, ce_gym.model, ce_gym.viewer)
 
 
@@ -71,13 +70,6 @@ def test_what_returns_arrays_says_their_shape():
             if not name.startswith("_") and "Array" in hint and "shape" not in document:
                 silent.append(f"{owner.__name__}.{name}")
     assert not silent
-
-
-@pytest.mark.parametrize("page", HAND_WRITTEN, ids=name_of)
-def test_links_lead_somewhere(page: Path):
-    """Those of the other pages are checked by Sphinx."""
-    broken = [target for target in links(page) if not (page.parent / target).exists()]
-    assert not broken
 
 
 def test_the_reference_imports_what_it_names():

@@ -1,13 +1,13 @@
 """Recording and the demonstration, on the toy task and on a robot's environment."""
 
+import re
+
 import gymnasium
 import numpy as np
 import pytest
 from demo import main as demo_main
+from demo import parting
 from evaluate import load_learner
-from record import main as record_main
-from record import record
-from stable_baselines3 import PPO
 
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
@@ -34,7 +34,27 @@ def test_the_last_line_is_the_page(demo, capsys):
         assert level in output
     page = output.strip().splitlines()[-1]
     assert page == str((demo / "mini_cheetah.html").resolve())
-    assert (demo / "mini_cheetah.html").stat().st_size > 10_000
+    assert 10_000 < (demo / "mini_cheetah.html").stat().st_size <= 6e6
+    assert output.count("The ghost is the same policy from the same seed on none transmissions; after") == 1
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_policy_without_rotors_as_a_ghost(demo):
+    """Robots of the page are what its plots are of: the trained policy first, then its ghost."""
+    page = (demo / "mini_cheetah.html").read_text(encoding="utf-8")
+    robots = re.findall(r'"name": "([^"]*)", "color": "[^"]*", "ghost": (true|false)', page)
+    assert robots == [("exact transmissions, as trained", "false"), ("none transmissions, the ghost", "true")]
+
+
+def test_the_distance_is_that_when_one_of_them_ends():
+    def walk(level, frames, speed):
+        times = 0.02 * np.arange(frames)
+        q = np.zeros((frames, 19))
+        q[:, 0], q[:, 2] = speed * times, 9.0
+        return Rollout("mini_cheetah", level, 0.02, times, q, np.zeros((frames, 18)))
+
+    said = parting(walk("exact", 101, 1.0), walk("none", 51, 0.5))
+    assert said.endswith("from the same seed on none transmissions; after 1.0 s it is 0.50 m away.")
 
 
 @pytest.mark.slow
@@ -51,26 +71,6 @@ def test_fresh_trains_again(demo, capsys):
     assert demo_main([*QUICK, "--fresh", "--seed", "4", "--out", str(demo)]) == 0
     assert "Training from nothing" in capsys.readouterr().out
     assert load_learner(demo / "policy.zip")[1]["seed"] == 4
-
-
-def test_a_robot_follows_the_script():
-    """An untrained policy stands long enough to see the commands of the script arrive."""
-    envs = make_sb3_vec_env(ROBOT_ENV, 1)
-    model = PPO("MlpPolicy", envs, device="cpu", seed=0)
-    model.policy.action_net.weight.data.zero_()
-    rollout = record(model, ROBOT_ENV, [(0.2, (0.0, 0.0, 0.0)), (0.2, (0.7, -0.1, 0.3))], transmission="armature")
-    assert len(rollout) == 20
-    assert rollout.transmission == "armature"
-    np.testing.assert_allclose(rollout.commands[[0, 9]], 0.0)
-    np.testing.assert_allclose(rollout.commands[[10, 19]], [[0.7, -0.1, 0.3]] * 2, rtol=1e-6)
-    assert np.ptp(rollout.q[:, 2]) < 0.2
-
-
-def test_record_writes_both_files(demo, tmp_path):
-    out = tmp_path / "walk.npz"
-    assert record_main([str(demo / "policy.zip"), "--command", "0.5", "0.4", "0", "0", "--out", str(out)]) == 0
-    assert len(Rollout.load(out)) <= 25
-    assert out.with_suffix(".html").exists()
 
 
 def test_the_adapter_hands_on_what_the_robot_environment_says():

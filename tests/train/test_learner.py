@@ -1,8 +1,11 @@
 """The threaded learner computes what Stable-Baselines3's own computes, on any number of threads."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
+from callbacks import EntropySchedule
 from learner import ThreadedPPO
 from point_mass import ID
 from stable_baselines3 import PPO
@@ -55,3 +58,12 @@ def test_it_is_ppo_on_dictionaries_too():
     kwargs = {"policy": AsymmetricPolicy, "obs_mode": "dict"}
     ours, theirs = (weights(cls, **kwargs)[0] for cls in (ThreadedPPO, PPO))
     np.testing.assert_allclose(ours, theirs, atol=5e-5)
+
+
+def test_the_entropy_bonus_fades_in_proportion_to_steps():
+    schedule = EntropySchedule(0.003, 0.001, 1000)
+    schedule.model = SimpleNamespace(ent_coef=None)
+    for steps, weight in ((0, 0.003), (500, 0.002), (1000, 0.001), (1500, 0.001)):
+        schedule.num_timesteps = steps
+        schedule.on_rollout_start()
+        assert schedule.model.ent_coef == pytest.approx(weight)

@@ -1,6 +1,7 @@
 """A policy acts in MuJoCo: same start, same observations, same commands, same judgement."""
 
 import json
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -178,3 +179,11 @@ def test_mistakes_are_one_line(tmp_path, capsys):
         MujocoTwin(ce_gym.load_robot("mini_cheetah"), "none", 1)
     with pytest.raises(ValueError, match="expected 'joint_pd'"):
         world("armature", actions="joint_torque")
+
+
+def test_without_mujoco_it_says_what_to_install(monkeypatch, capsys):
+    for name in ("mujoco", "ce_gym.bench.mujoco_twin", "ce_gym.bench.mujoco_peer", "ce_gym.bench.mujoco_settings"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    assert main(["mini_cheetah_velocity"]) == 2
+    assert capsys.readouterr().err == ('sim2sim.py: needs mujoco, which is not installed: pip install "ce_gym[mjcf]"\n')

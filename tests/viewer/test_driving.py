@@ -12,7 +12,7 @@ import ce_gym
 from ce_gym.__main__ import main
 from ce_gym.policies import find_policy
 from ce_gym.viewer import Rollout, drive
-from ce_gym.viewer.walk import walk
+from ce_gym.viewer.driving import walk
 
 
 def test_a_policy_is_run_where_it_was_trained(tmp_path: Path) -> None:
@@ -21,6 +21,14 @@ def test_a_policy_is_run_where_it_was_trained(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.unique(rollout.commands[:, 0]), [0.0, 0.5, 0.8, 1.0], rtol=1e-6)
     assert len(rollout) == 850
     assert np.ptp(rollout.q[:, 2]) < 0.2
+
+
+def test_a_robot_is_told_what_the_script_says() -> None:
+    script = [(0.2, (0.0, 0.0, 0.0)), (0.2, (0.7, -0.1, 0.3))]
+    rollout = drive(lambda obs: np.zeros((1, 12), np.float32), ENV, script, transmission="armature")
+    assert (len(rollout), rollout.transmission) == (20, "armature")
+    np.testing.assert_allclose(rollout.commands[[0, 9]], 0.0)
+    np.testing.assert_allclose(rollout.commands[[10, 19]], [[0.7, -0.1, 0.3]] * 2, rtol=1e-6)
 
 
 def test_recording_ends_with_a_fall() -> None:

@@ -1,0 +1,188 @@
+"""What people install: sdist and wheel are whole and small, and the wheel works by itself.
+
+The wheel goes into an empty environment, next to links to what it says it depends on and nothing else, and is used from
+another folder with its files read-only. Knows the files of the repository; `ce_gym` only as others see it.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import tarfile
+import zipfile
+from collections.abc import Iterator
+from importlib.metadata import Distribution, distribution
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from pages import ROOT, commands, links
+
+from ce_gym.viewer import Rollout
+
+pytestmark = pytest.mark.slow
+
+STEP = """
+import gymnasium, numpy as np, ce_gym
+from ce_gym.model import assets_folder
+
+env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0")
+policy = ce_gym.load_policy("mini_cheetah_velocity")
+observation, _ = env.reset(seed=0)
+observation, reward, *_ = env.step(policy.predict(observation)[0])
+assert np.isfinite(observation).all() and np.isfinite(reward)
+print(ce_gym.__file__, assets_folder(), sep="\\n")
+"""
+
+
+def run(command: list[str | Path], **options) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+def checked(command: list[str | Path], **options) -> str:
+    result = run(command, **options)
+    assert result.returncode == 0, f"{shlex.join(map(str, command))}\n{result.stdout[-2000:]}\n{result.stderr[-3000:]}"
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """Folder with the sdist, the wheel made from it, and in `direct` the wheel made from the checkout."""
+    out = tmp_path_factory.mktemp("dist")
+    # Without hatchling here, `build` has pip fetch it.
+    command = [sys.executable, "-m", "build", *(["--no-isolation"] if find_spec("hatchling") else [])]
+    checked([*command, "--outdir", out, ROOT])
+    checked([*command, "--wheel", "--outdir", out / "direct", ROOT])
+    return out
+
+
+def only(folder: Path, pattern: str) -> Path:
+    (found,) = folder.glob(pattern)
+    return found
+
+
+def files_of(wheel: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def sources(folder: str) -> set[str]:
+    """Files below a folder of the repository that are no leftovers of running them."""
+    return {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+def test_wheel_has_all_code_and_assets_and_is_small(built: Path):
+    """At most 5 MB; robots and trained policies come along."""
+    wheel = only(built, "*.whl")
+    assert wheel.stat().st_size <= 5e6
+    names = {name for name in files_of(wheel) if ".dist-info/" not in name}
+    assert names == sources("ce_gym") | {f"ce_gym/{name}" for name in sources("assets")}
+    for kind in ("mini_cheetah/mini_cheetah.urdf", "policies/mini_cheetah_velocity_exact/policy.npz"):
+        assert f"ce_gym/assets/{kind}" in names
+
+
+def test_sdist_and_checkout_make_the_same_wheel(built: Path):
+    assert files_of(only(built, "*.whl")) == files_of(only(built / "direct", "*.whl"))
+
+
+def test_sdist_has_what_the_readme_names(built: Path):
+    """All that README links to or runs, and what these need; what a user of the checkout has written stays away."""
+    with tarfile.open(only(built, "*.tar.gz")) as archive:
+        names = {name.split("/", 1)[1] for name in archive.getnames()}
+    assert {name for name in names if "/" not in name} == {
+        ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile", "PKG-INFO", "README.md",
+        "constraints.txt", "pyproject.toml",
+    }  # fmt: skip
+    assert {name.split("/")[0] for name in names if "/" in name} == {
+        ".ci", "assets", "ce_gym", "docs", "tests", "train",
+    }  # fmt: skip
+    words = {word for command in commands(ROOT / "README.md") for word in shlex.split(command, comments=True)}
+    scripts = {word for word in words if word.endswith(".py")}
+    assert scripts, "README runs no script of the repository"
+    assert scripts | set(links(ROOT / "README.md")) <= names
+    for folder in ("assets", "ce_gym", "train", "tests"):
+        assert sources(folder) <= names
+
+
+def dependencies(of: Distribution, found: dict[str, Distribution] | None = None) -> dict[str, Distribution]:
+    """What a distribution needs without extras, and what that needs, by name."""
+    found = {} if found is None else found
+    for requirement in map(Requirement, of.requires or ()):
+        wanted = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        if wanted and requirement.name not in found:
+            found[requirement.name] = distribution(requirement.name)
+            dependencies(found[requirement.name], found)
+    return found
+
+
+def link(one: Distribution, site: Path) -> None:
+    """Make a distribution importable from another folder of packages."""
+    for top in {file.parts[0] for file in one.files or ()} - {"..", "__pycache__"}:
+        if not (site / top).exists():
+            (site / top).symlink_to(Path(str(one.locate_file(top))))
+
+
+def everything(folder: Path) -> dict[str, int]:
+    """Files below a folder, links not followed, and when they were changed."""
+    return {
+        str(path.relative_to(folder)): path.lstat().st_mtime_ns
+        for path in folder.rglob("*")
+        if not path.is_symlink() and path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def python(built: Path, tmp_path_factory) -> Iterator[Path]:
+    """Interpreter of an environment with the wheel, read-only, and what it depends on."""
+    venv = tmp_path_factory.mktemp("user") / "venv"
+    checked([sys.executable, "-m", "venv", "--without-pip", venv])
+    interpreter = venv / "bin" / "python"
+    pip = [sys.executable, "-m", "pip", "--python", interpreter]
+    checked([*pip, "install", "--no-deps", "--no-index", only(built, "*.whl")])
+    site = only(venv, "lib/python*/site-packages")
+    for one in dependencies(Distribution.at(only(site, "ce_gym-*.dist-info"))).values():
+        link(one, site)
+    folders = [site, site / "ce_gym", *(path for path in (site / "ce_gym").rglob("*") if path.is_dir())]
+    before = everything(site / "ce_gym")
+    for folder in folders:
+        folder.chmod(0o555)
+    yield interpreter
+    for folder in folders:
+        folder.chmod(0o755)
+    assert everything(site / "ce_gym") == before  # an administrator may write where nobody may
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> dict:
+    """An empty folder and a bare environment to run things in."""
+    return {"cwd": tmp_path, "env": {"PATH": os.defpath, "HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path)}}
+
+
+def test_the_wheel_steps_an_environment(python: Path, elsewhere: dict):
+    """With a policy that came along, from another folder; its kernel is kept in the user's cache."""
+    package, assets = map(Path, checked([python, "-c", STEP], **elsewhere).splitlines())
+    assert package.is_relative_to(python.parents[1])
+    assert assets == package.parent / "assets"
+    assert any((elsewhere["cwd"] / "home" / ".cache" / "ce_gym").iterdir())
+
+
+def test_the_wheel_brings_the_command(python: Path, elsewhere: dict):
+    for command in ([python, "-m", "ce_gym"], [python.with_name("ce-gym")]):
+        output = checked([*command, "list"], **elsewhere)
+        assert "tello_with_arms" in output
+        assert "ce_gym/Jvrc1Velocity-None-v0" in output
+
+
+def test_what_needs_an_extra_says_which(python: Path, elsewhere: dict):
+    still = Rollout("four_bar", "exact", dt=0.02, times=[0.0, 0.02], q=[[1.5], [1.5]], v=[[0.0], [0.0]])
+    still.save(elsewhere["cwd"] / "still.npz")
+    result = run([python, "-m", "ce_gym", "view", "still.npz"], **elsewhere)
+    assert result.returncode == 2
+    assert 'pip install "ce_gym[viewer]"' in result.stderr.splitlines()[-1]
