@@ -61,9 +61,9 @@ class Extrapolated:
         coarse = implicit_step(scene, state, target, dt)
         half = implicit_step(scene, state, target, dt / 2)
         fine = implicit_step(looked_up_from(scene, coarse.solved.kinematics), half.state, target, dt / 2)
+        fine.error = ca.norm_2(fine.state.v - coarse.state.v)
         floating = scene.mechanism.robot.floating
         fine.state.q, fine.state.v = beyond(coarse.state, fine.state, floating)
-        fine.error = ca.norm_2(fine.state.v - coarse.state.v) / 2
         fine.torque = (half.torque + fine.torque) / 2
         fine.contact_forces = (half.contact_forces + fine.contact_forces) / 2
         fine.solved = coarse.solved

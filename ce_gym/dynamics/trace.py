@@ -92,7 +92,7 @@ def extrapolation_function(mechanism: Mechanism, options: StepOptions, outputs: 
     results["diverged_next"] = ca.if_else(sane, 0, 1)
     for name, size in outputs.items():
         if name == "error":
-            results[name] = ca.norm_2(v_fine - coarse.v) / 2
+            results[name] = ca.norm_2(v_fine - coarse.v)
             continue
         told = {stage: SX.sym(name, size) for stage in ("coarse", "half", "fine")}
         if name in AT_START:

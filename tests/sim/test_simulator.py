@@ -38,18 +38,23 @@ def run(model: Model, start, rows=slice(None), threads: int = 1, dtype: str = "f
 @pytest.mark.parametrize(("level", "method"), [*((level, "euler") for level in LEVELS), ("exact", "extrapolated")])
 def test_kernel_follows_the_traced_step(level: str, method: str, start):
     model = Model("mini_cheetah", level)
-    sim = run(model, start, method=method)
-    function = step_function(model.mechanism, sim.options, ("torque", "contact_forces"))
+    outputs = ("torque", "contact_forces", "motor_speed", *(["error"] if method == "extrapolated" else []))
+    sim = run(model, start, method=method, outputs=outputs)
+    function = step_function(model.mechanism, sim.options, outputs)
     q, v, target = start
     for i in (0, 7, 39):
         n = len(sim.contact_names)
         state = (q[i], v[i], sim._resting_load(q[i]), np.zeros(2 * n), 0.0)
         for _ in range(10):
-            *state, torque, forces = function(*state, target[i])
-        np.testing.assert_allclose(sim.q[i], np.array(state[0]).ravel(), rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(sim.v[i], np.array(state[1]).ravel(), rtol=1e-7, atol=1e-7)
-        np.testing.assert_allclose(sim.torque[i], np.array(torque).ravel(), rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(sim.contact_forces[i].ravel(), np.array(forces).ravel(), rtol=1e-5, atol=1e-4)
+            results = [np.array(result).ravel() for result in function(*state, target[i])]
+            state, told = results[:5], dict(zip(outputs, results[5:], strict=True))
+        np.testing.assert_allclose(sim.q[i], state[0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(sim.v[i], state[1], rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(sim.torque[i], told["torque"], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(sim.contact_forces[i].ravel(), told["contact_forces"], rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(sim.motor_speed[i], told["motor_speed"], rtol=1e-6, atol=1e-6)
+        if "error" in told:
+            np.testing.assert_allclose(sim.error[i], told["error"], rtol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
