@@ -14,6 +14,7 @@ from pathlib import Path
 from ce_gym.bench.accuracy_coulomb import PUSHES, distance_table
 from ce_gym.bench.accuracy_curves import OUR_STEPS, PEER_STEPS, Comparison, Measured, comparisons, measure
 from ce_gym.bench.accuracy_scenarios import SCENES
+from ce_gym.bench.progress import shown
 from ce_gym.bench.report import Cell, Report, Requirement, Table, cell_text
 
 REQUIRED = 20.0
@@ -40,7 +41,7 @@ def run(arguments: argparse.Namespace) -> Report:
     if arguments.quick:
         ours, theirs, rounds = QUICK_STEPS, QUICK_STEPS, 1
     measured = []
-    for name in arguments.scenes or (QUICK_SCENES if arguments.quick else SCENES):
+    for name in shown(arguments.scenes or (QUICK_SCENES if arguments.quick else SCENES), "scenes"):
         measured.append(measure(SCENES[name](), ours, theirs, rounds))
         write_csv(out / "accuracy.csv", measured)
     tables = [time_table(measured), reference_table(measured)]

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ce_gym.bench import gpu_agreement, gpu_speed
+from ce_gym.bench.progress import shown
 from ce_gym.bench.report import Report, Requirement, Table
 from ce_gym.compile.cuda import CudaUnavailable, nvrtc
 from ce_gym.compile.cuda.source import BLOCK, emit_source
@@ -80,7 +81,7 @@ def _speed(
         ("times as fast as MuJoCo Warp", required["warp"], _warp),
         ("learning to walk, rsl_rl", "", _learning),
     ]
-    for what, bar, measure in rows:
+    for what, bar, measure in shown(rows, "measurements"):
         if reason:
             missing.append((what, bar, reason))
             continue

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.bench.progress import shown
 from ce_gym.bench.report import Report, Requirement, Table
 
 NUM_ENVS = 64
@@ -67,7 +68,7 @@ def run(arguments: argparse.Namespace) -> Report:
     rng, accounts, memory = np.random.default_rng(arguments.seed), {name: Account() for name in ids}, []
     end = time.monotonic() + 60 * arguments.minutes
     while len(memory) <= WARM_UP or time.monotonic() < end:
-        for name in ids:
+        for name in shown(ids, f"round {len(memory) + 1}"):
             soak(name, arguments.steps, rng, accounts[name])
             if time.monotonic() > end and len(memory) > WARM_UP:
                 break

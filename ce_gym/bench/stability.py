@@ -7,12 +7,14 @@ The parts are in stability_grid.py (the map), stability_cases.py (tests of small
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 
 import numpy as np
 
 from ce_gym.bench import stability_grid as grid
 from ce_gym.bench import stability_plots, stability_robots
+from ce_gym.bench.progress import shown
 from ce_gym.bench.report import Cell, Report, Requirement, Table
 from ce_gym.bench.stability_cases import CASES
 from ce_gym.dynamics.model import Model
@@ -48,7 +50,9 @@ def run(arguments: argparse.Namespace) -> Report:
     if "map" not in arguments.skip:
         steps = (0.002, 0.01) if quick else arguments.dt
         patience, collapse = (30.0, 1.0) if quick else (PATIENCE, COLLAPSE)
-        maps = {name: [grid.measure(m, dt, patience, collapse) for dt in steps] for name, m in models.items()}
+        maps: dict[str, list[grid.Map]] = {name: [] for name in models}
+        for name, dt in shown(list(itertools.product(models, steps)), "map"):
+            maps[name].append(grid.measure(models[name], dt, patience, collapse))
         report_map(report, maps)
         if arguments.picture:
             stability_plots.draw(maps, arguments.picture)
@@ -99,7 +103,7 @@ def report_map(report: Report, maps: dict[str, list[grid.Map]]) -> None:
 
 def report_cases(report: Report) -> None:
     """Add the tests of small mechanisms."""
-    cases = [case() for case in CASES]
+    cases = [case() for case in shown(CASES, "cases")]
     rows = tuple((c.source, c.name, c.required, c.measured, c.met) for c in cases)
     report.tables.append(Table("Cases", ("test of", "case", "required", "measured", "met"), rows))
     report.requirements += [Requirement(f"{c.name}: {c.required}", c.measured, c.met) for c in cases]
@@ -109,7 +113,7 @@ def report_robots(report: Report, models: dict[str, Model], standing: float, fuz
     """Add the endurance of whole robots."""
     rows: list[tuple[Cell, ...]] = []
     lost, given_up, spun, drift, quiet = 0, 0, 0, 0.0, 0.0
-    for name, model in models.items():
+    for name, model in shown(models.items(), "robots"):
         stood = stability_robots.stand(model, standing)
         diverged, energy = stability_robots.spin(model)
         levels = [Model(model.robot, level) for level in LEVELS]

@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from ce_gym.bench.progress import shown
+
 
 @dataclass(frozen=True)
 class Competitor:
@@ -84,10 +86,10 @@ def interleaved(
     Returns:
         Timing of one unit of work, by name.
     """
-    for competitor in competitors.values():
+    for competitor in shown(competitors.values(), "first run"):
         competitor.run()
     seconds: dict[str, list[float]] = {name: [] for name in competitors}
-    for _ in range(rounds):
+    for _ in shown(range(rounds), "rounds"):
         for name, competitor in competitors.items():
             start = clock()
             competitor.run()

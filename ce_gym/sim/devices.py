@@ -109,7 +109,9 @@ class Cuda:
         import torch
 
         _, size, num_envs = array.shape
-        rows = rows if isinstance(rows, torch.Tensor) else np.array(rows, float)  # torch warns of arrays it may not write
+        rows = (
+            rows if isinstance(rows, torch.Tensor) else np.array(rows, float)
+        )  # torch warns of arrays it may not write
         values = torch.as_tensor(rows, dtype=array.dtype, device=array.device).expand(num_envs, size).T
         if mask is None:
             array[0] = values
