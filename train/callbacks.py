@@ -7,6 +7,7 @@ environments report; knows nothing of robots or tasks.
 from __future__ import annotations
 
 import csv
+import math
 import signal
 import sys
 import time
@@ -140,6 +141,25 @@ class EntropySchedule(_Quiet):
     def _on_rollout_start(self) -> None:
         done = min(self.num_timesteps / self.steps, 1.0)
         self.model.ent_coef = self.start + done * (self.end - self.start)  # type: ignore[attr-defined]  # of PPO
+
+
+class NoiseSchedule(_Quiet):
+    """Changes the standard deviation of the actions by the same factor in every step.
+
+    Args:
+        start: Before the first step.
+        end: After the last one.
+        steps: Steps in all.
+    """
+
+    def __init__(self, start: float, end: float, steps: int) -> None:
+        super().__init__()
+        self.start, self.end, self.steps = start, end, steps
+
+    def _on_rollout_start(self) -> None:
+        done = min(self.num_timesteps / self.steps, 1.0)
+        log_std: Any = self.model.policy.log_std
+        log_std.data.fill_((1 - done) * math.log(self.start) + done * math.log(self.end))
 
 
 class Checkpoints(_Quiet):

@@ -31,6 +31,7 @@ from callbacks import (
     Curve,
     EntropySchedule,
     EpisodeLog,
+    NoiseSchedule,
     ProgressBar,
     StopInOrder,
     read_curve,
@@ -131,6 +132,8 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
         callbacks = [stop, Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog()]
         callbacks += [Curve(job.out / "curve.csv", earlier), ProgressBar(settings.steps)]
         callbacks.append(EntropySchedule(settings.entropy, settings.final_entropy, settings.steps))
+        if settings.final_std:
+            callbacks.append(NoiseSchedule(settings.initial_std, settings.final_std, settings.steps))
         if settings.target_kl:
             callbacks.append(AdaptiveLearningRate(settings.target_kl))
         if before < settings.steps:

@@ -31,7 +31,7 @@ from ce_gym.policies import Actor, PolicyError
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
-    """Return RLlib's PPO with our settings.
+    """Return RLlib's PPO with our settings, but for `final_std`: the noise is learned.
 
     Args:
         env_id: Registered environment id.

@@ -39,14 +39,15 @@ class Settings:
         hidden: Sizes of the hidden layers, the same for policy and value.
         activation: Tanh, ReLU, ELU, SELU, Sigmoid or Softplus, as in `torch.nn`.
         initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
+        final_std: At the end, geometric in between; 0 lets the learner choose it on the way. Where the mean action, by
+            which a policy is judged, falls more often than the noisy ones of training, noise did the balancing.
         learning_rate: Of Adam, at the start.
         target_kl: KL divergence of one update that the learning rate is adapted to; 0 keeps the rate fixed.
         gamma: Discount per step.
         gae_lambda: Of generalised advantage estimation.
         clip: Clipping range of PPO's probability ratio.
         entropy: Weight of the entropy bonus at the start.
-        final_entropy: At the end, linear in between. Zero lets the noise die out, so that the mean action, by which a
-            policy is judged, is what was trained.
+        final_entropy: At the end, linear in between.
         value: Weight of the value loss.
         max_grad_norm: Gradients are clipped to this norm.
     """
@@ -59,6 +60,7 @@ class Settings:
     hidden: tuple[int, ...]
     activation: Activation
     initial_std: float
+    final_std: float
     learning_rate: float
     target_kl: float
     gamma: float

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from callbacks import EntropySchedule
+from callbacks import EntropySchedule, NoiseSchedule
 from learner import ThreadedPPO
 from point_mass import ID
 from stable_baselines3 import PPO
@@ -58,6 +58,15 @@ def test_it_is_ppo_on_dictionaries_too():
     kwargs = {"policy": AsymmetricPolicy, "obs_mode": "dict"}
     ours, theirs = (weights(cls, **kwargs)[0] for cls in (ThreadedPPO, PPO))
     np.testing.assert_allclose(ours, theirs, atol=5e-5)
+
+
+def test_the_noise_shrinks_by_the_same_factor_in_every_step():
+    schedule = NoiseSchedule(0.6, 0.006, 1000)
+    schedule.model = SimpleNamespace(policy=SimpleNamespace(log_std=torch.zeros(3)))
+    for steps, std in ((0, 0.6), (500, 0.06), (1000, 0.006), (1500, 0.006)):
+        schedule.num_timesteps = steps
+        schedule.on_rollout_start()
+        np.testing.assert_allclose(schedule.model.policy.log_std.exp(), std, rtol=1e-6)
 
 
 def test_the_entropy_bonus_fades_in_proportion_to_steps():
