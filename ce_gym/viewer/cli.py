@@ -113,8 +113,10 @@ def play(args: argparse.Namespace) -> int:
     """Run `play`; return its exit code."""
     from ce_gym.viewer.driving import SHOW, walk
     from ce_gym.viewer.errors import ViewerError
+    from ce_gym.viewer.html import meshcat_code
 
     file = locate_policy(args.policy)
+    meshcat_code()  # a missing meshcat is told before all else, not after the simulation
     if args.robots > 1 and len(args.transmission) > 1:
         raise ViewerError(f"--robots {args.robots}: expected 1, or one level of --transmission")
     script = [(time, (x, y, turn)) for time, x, y, turn in args.command] if args.command else SHOW

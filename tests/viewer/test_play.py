@@ -54,3 +54,12 @@ def test_unknown_environment_is_one_line(tmp_path: Path, capsys: pytest.CaptureF
     error = capsys.readouterr().err
     assert "environment 'CartPole-v1'; expected one of this package's" in error
     assert error.count("\n") == 1
+
+
+def test_a_missing_meshcat_is_told_before_anything_is_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("ce_gym.viewer.driving.drive_many", lambda *_, **__: pytest.fail("simulated"))
+    assert main(["play", str(write_small(tmp_path / "policy.npz"))]) == 2
+    assert "needs meshcat" in capsys.readouterr().err
