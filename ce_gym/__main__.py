@@ -94,8 +94,10 @@ def _list(args: argparse.Namespace) -> int:
     from ce_gym import environment_ids, shipped_policies
     from ce_gym.model.listing import robot_table
 
-    print(f"Robots:\n{robot_table()}\n\nEnvironments:")
-    print("\n".join(f"  {name}" for name in environment_ids()))
+    names = [name for name in environment_ids() if name.count("-") == 1]
+    print(f"Robots:\n{robot_table()}\n")
+    print("Environments, each also at one level: -Exact (the default), -Coupled, -Armature or -None before -v0:")
+    print("\n".join(f"  {name}" for name in names))
     print("\nPolicies, for `play`:")
     print("\n".join(f"  {name}" for name in shipped_policies()))
     return 0

@@ -47,8 +47,8 @@ def add_play_command(subparsers: Any) -> None:
         description="Let a trained policy drive robots through a list of commands, and show them: several transmission "
         "levels\nas ghosts of the first, from the same seed, or many robots in a square.",
         epilog=examples(
-            "play demo",
-            "play demo --transmission exact armature",
+            "play mini_cheetah_velocity",
+            "play mit_humanoid_velocity --transmission exact none",
             "play demo --robots 16 --command 5 0.8 0 0 --command 5 0.5 0 1",
         ),
     )
