@@ -177,7 +177,7 @@ def test_the_wheel_brings_the_command(python: Path, elsewhere: dict):
     for command in ([python, "-m", "ce_gym"], [python.with_name("ce-gym")]):
         output = checked([*command, "list"], **elsewhere)
         assert "tello_with_arms" in output
-        assert "ce_gym/Jvrc1Velocity-None-v0" in output
+        assert "ce_gym/Jvrc1Velocity-v0" in output
 
 
 def test_what_needs_an_extra_says_which(python: Path, elsewhere: dict):
