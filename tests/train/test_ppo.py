@@ -217,7 +217,7 @@ def test_learning_rate_follows_the_divergence(kl, factor):
     assert callback.model.lr_schedule(1.0) == pytest.approx(1e-3 * factor)
 
 
-@pytest.mark.parametrize("script", ["ppo", "evaluate", "transfer", "record", "demo", "export", "sim2sim", "card"])
+@pytest.mark.parametrize("script", ["ppo", "evaluate", "transfer", "demo", "export", "sim2sim", "card"])
 def test_every_script_explains_itself(script):
     command = [sys.executable, str(ROOT / "train" / f"{script}.py"), "--help"]
     run = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
