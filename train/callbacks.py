@@ -125,12 +125,12 @@ class AdaptiveLearningRate(_Quiet):
         self.model.lr_schedule = FloatSchedule(float(np.clip(rate, *self.limits)))
 
 
-class EntropySchedule(_Quiet):
-    """Changes the weight of the entropy bonus in proportion to the steps done.
+class _Schedule(_Quiet):
+    """Changes something between rollouts by the share of the training that is done.
 
     Args:
-        start: Weight before the first step.
-        end: Weight after the last one.
+        start: Its value before the first step.
+        end: Its value after the last one.
         steps: Steps in all.
     """
 
@@ -139,25 +139,23 @@ class EntropySchedule(_Quiet):
         self.start, self.end, self.steps = start, end, steps
 
     def _on_rollout_start(self) -> None:
-        done = min(self.num_timesteps / self.steps, 1.0)
+        self._set(min(self.num_timesteps / self.steps, 1.0))
+
+    def _set(self, done: float) -> None:
+        raise NotImplementedError
+
+
+class EntropySchedule(_Schedule):
+    """Changes the weight of the entropy bonus in proportion to the steps done."""
+
+    def _set(self, done: float) -> None:
         self.model.ent_coef = self.start + done * (self.end - self.start)  # type: ignore[attr-defined]  # of PPO
 
 
-class NoiseSchedule(_Quiet):
-    """Changes the standard deviation of the actions by the same factor in every step.
+class NoiseSchedule(_Schedule):
+    """Changes the standard deviation of the actions by the same factor in every step."""
 
-    Args:
-        start: Before the first step.
-        end: After the last one.
-        steps: Steps in all.
-    """
-
-    def __init__(self, start: float, end: float, steps: int) -> None:
-        super().__init__()
-        self.start, self.end, self.steps = start, end, steps
-
-    def _on_rollout_start(self) -> None:
-        done = min(self.num_timesteps / self.steps, 1.0)
+    def _set(self, done: float) -> None:
         log_std: Any = self.model.policy.log_std
         log_std.data.fill_((1 - done) * math.log(self.start) + done * math.log(self.end))
 

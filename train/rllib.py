@@ -31,7 +31,7 @@ from ce_gym.policies import Actor, PolicyError
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
-    """Return RLlib's PPO with our settings, but for `final_std`: the noise is learned.
+    """Return RLlib's PPO with our settings, but for `final_std` and `final_entropy`: exploration has no schedule here.
 
     Args:
         env_id: Registered environment id.
@@ -65,7 +65,7 @@ def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: i
             gamma=s.gamma,
             lambda_=s.gae_lambda,
             clip_param=s.clip,
-            entropy_coeff=[[0, s.entropy], [s.steps, s.final_entropy]],
+            entropy_coeff=s.entropy,
             vf_loss_coeff=s.value,
             vf_clip_param=float("inf"),
             grad_clip=s.max_grad_norm,

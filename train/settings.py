@@ -39,8 +39,8 @@ class Settings:
         hidden: Sizes of the hidden layers, the same for policy and value.
         activation: Tanh, ReLU, ELU, SELU, Sigmoid or Softplus, as in `torch.nn`.
         initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
-        final_std: At the end, geometric in between; 0 lets the learner choose it on the way. Where the mean action, by
-            which a policy is judged, falls more often than the noisy ones of training, noise did the balancing.
+        final_std: At the end, geometric in between; 0 lets the learner choose it on the way. Of use where robots fall
+            by the mean action, by which policies are judged, that stood with the noise of training.
         learning_rate: Of Adam, at the start.
         target_kl: KL divergence of one update that the learning rate is adapted to; 0 keeps the rate fixed.
         gamma: Discount per step.

@@ -53,8 +53,11 @@ def locate_policy(path: str | Path) -> Path:
 
 
 def _is_other_npz(path: Path) -> bool:
-    """Whether a file is a whole npz that holds something else, such as a rollout."""
+    """Whether a file is a readable npz that holds something else, such as a rollout."""
     if path.suffix != ".npz" or not zipfile.is_zipfile(path):
         return False
-    with zipfile.ZipFile(path) as arrays:
-        return "record.npy" not in arrays.namelist()
+    try:
+        with zipfile.ZipFile(path) as arrays:
+            return "record.npy" not in arrays.namelist()
+    except zipfile.BadZipFile:  # whoever reads it says so
+        return False
