@@ -1,8 +1,8 @@
 """One CasADi SX function as straight-line vector code.
 
-Knows CasADi's instruction list and the vector builder. Every instruction becomes one value, in the order that
-`ordering` chooses. Loads are emitted at first use and stores at the very end, so outputs may share their memory with
-inputs.
+Knows CasADi's instruction list and the vector builder. Every operation of the function's `graph` becomes one value, in
+the order that `ordering` chooses. Loads are emitted at first use and stores at the very end, so outputs may share their
+memory with inputs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 import casadi
 
 from ce_gym.compile import math as vector_math
-from ce_gym.compile.ordering import operands_of, ordered
+from ce_gym.compile.graph import CHOICE, MINUS_PRODUCT, PRODUCT_MINUS, PRODUCT_PLUS, graph_of
+from ce_gym.compile.ordering import ordered
 from ce_gym.compile.vector import Value, VectorBuilder
 
 
@@ -30,7 +31,8 @@ def lower_function(
     Raises:
         NotImplementedError: for an operation that has no vector form.
     """
-    lowering = _Lowering(v, function)
+    graph = graph_of(function)
+    lowering = _Lowering(v, function.name())
     loads = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
     places = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
     results = [[v.const(0.0)] * function.numel_out(i) for i in range(function.n_out())]
@@ -40,8 +42,8 @@ def lower_function(
     def value(k: int) -> Value:
         """Result of instruction k: done already, or an input or a constant met for the first time."""
         if k not in values:
-            if function.instruction_id(k) == casadi.OP_CONST:
-                values[k] = lowering.constant(function.instruction_constant(k))
+            if k in graph.constants:
+                values[k] = lowering.constant(graph.constants[k])
             else:
                 which, nonzero = function.instruction_input(k)
                 place = which, loads[which][nonzero]
@@ -50,13 +52,12 @@ def lower_function(
                 values[k] = loaded[place]
         return values[k]
 
-    operands = operands_of(function)
-    for k in ordered(function, operands):
-        values[k] = lowering.operation(k, [value(a) for a in operands[k]])
-    for k in range(function.n_instructions()):
-        if function.instruction_id(k) == casadi.OP_OUTPUT:
+    for k in ordered(graph):
+        values[k] = lowering.operation(graph.ops[k], [value(a) for a in graph.operands[k]])
+    for k, op in enumerate(graph.ops):
+        if op == casadi.OP_OUTPUT:
             which, nonzero = function.instruction_output(k)
-            results[which][places[which][nonzero]] = value(operands[k][0])
+            results[which][places[which][nonzero]] = value(graph.operands[k][0])
     for pointer, stored in zip(outputs, results, strict=True):
         for position, result in enumerate(stored):
             v.store(result, pointer, position)
@@ -71,9 +72,9 @@ def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:
 class _Lowering:
     """Emits operations and remembers what else is known about their results."""
 
-    def __init__(self, v: VectorBuilder, function: casadi.Function):
+    def __init__(self, v: VectorBuilder, name: str):
         self.v = v
-        self.function = function
+        self.name = name
         self.masks: dict[Value, Value] = {}
         self.numbers: dict[Value, float] = {}
         self.sines: dict[Value, tuple[Value, Value]] = {}
@@ -84,13 +85,12 @@ class _Lowering:
         self.numbers[value] = number
         return value
 
-    def operation(self, k: int, operands: Sequence[Value]) -> Value:
-        """Emit instruction k, an arithmetic operation."""
-        op = self.function.instruction_id(k)
+    def operation(self, op: int, operands: Sequence[Value]) -> Value:
+        """Emit one operation."""
         if op not in OPERATIONS:
             raise NotImplementedError(
-                f"function {self.function.name()!r}, instruction {k}: {_name_of(op)} has no vector form; "
-                f"expected one of {', '.join(sorted(map(_name_of, OPERATIONS)))}"
+                f"function {self.name!r}: {_name_of(op)} has no vector form; "
+                f"expected one of {', '.join(sorted(_name_of(known) for known in OPERATIONS if known >= 0))}"
             )
         return OPERATIONS[op](self, *operands)
 
@@ -151,6 +151,10 @@ def _comparison(sign: str) -> Operation:
 
 
 OPERATIONS: dict[int, Operation] = {
+    CHOICE: lambda s, c, a, b: s.v.select(s.mask(c), a, b),
+    PRODUCT_PLUS: _builder("fma"),
+    PRODUCT_MINUS: lambda s, a, b, c: s.v.fma(a, b, s.v.neg(c)),
+    MINUS_PRODUCT: lambda s, a, b, c: s.v.fma(s.v.neg(a), b, c),
     casadi.OP_ASSIGN: lambda s, x: x,
     casadi.OP_ADD: _builder("add"),
     casadi.OP_SUB: _builder("sub"),

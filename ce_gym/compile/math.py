@@ -68,12 +68,11 @@ def split(number: Fraction, dtype: str, parts: int) -> list[float]:
 def _nearest_integer(v: VectorBuilder, x: Value, factor: float) -> tuple[Value, Value]:
     """Nearest integer of `factor * x` as a float, and bits whose lowest ones are that integer's.
 
-    Adding 1.5 * 2^mantissa_bits leaves no room for a fraction: the sum's last bits are the integer. No fast-math flag
-    is set here, for with `reassoc` the two steps would cancel.
+    Adding 1.5 * 2^mantissa_bits leaves no room for a fraction: the sum's last bits are the integer.
     """
     shift = v.const(1.5 * 2.0 ** MANTISSA_BITS[v.dtype])
     shifted = v.fma(x, v.const(factor), shift)
-    return v.builder.fsub(shifted, shift), v.to_bits(shifted)
+    return v.sub(shifted, shift), v.to_bits(shifted)
 
 
 def sin_cos(v: VectorBuilder, x: Value) -> tuple[Value, Value]:
@@ -82,8 +81,8 @@ def sin_cos(v: VectorBuilder, x: Value) -> tuple[Value, Value]:
     r = x
     for part in split(PI / 2, v.dtype, 3):  # the first step is exact: the leading digits cancel
         r = v.fma(quarters, v.const(-part), r)
-    z = v.builder.fmul(r, r)
-    sine = v.fma(v.builder.fmul(r, z), v.polynomial(z, SINE[v.dtype]), r)
+    z = v.mul(r, r)
+    sine = v.fma(v.mul(r, z), v.polynomial(z, SINE[v.dtype]), r)
     cosine = v.fma(z, v.fma(z, v.polynomial(z, COSINE[v.dtype]), v.const(-0.5)), v.const(1.0))
     odd = v.is_odd(bits)
     next_bits = v.builder.add(bits, v.int_const(1))
@@ -110,13 +109,13 @@ def exp(v: VectorBuilder, x: Value) -> Value:
     r = x
     for part in split(LN2, v.dtype, 2):
         r = v.fma(exponent, v.const(-part), r)
-    mantissa_value = v.fma(v.builder.fmul(r, r), v.polynomial(r, EXPONENTIAL[v.dtype]), r)
-    result = v.builder.fadd(mantissa_value, v.const(1.0))
+    mantissa_value = v.fma(v.mul(r, r), v.polynomial(r, EXPONENTIAL[v.dtype]), r)
+    result = v.add(mantissa_value, v.const(1.0))
     whole = v.builder.sub(bits, v.int_const(_bits_of(1.5 * 2.0**mantissa, v.dtype)))
     half = v.builder.ashr(whole, v.int_const(1))  # in two factors: 2^1024 and 2^-1074 have no normal float
     for part in (half, v.builder.sub(whole, half)):
         biased = v.builder.add(part, v.int_const(bias))
-        result = v.builder.fmul(result, v.from_bits(v.builder.shl(biased, v.int_const(mantissa))))
+        result = v.mul(result, v.from_bits(v.builder.shl(biased, v.int_const(mantissa))))
     return result
 
 
@@ -124,22 +123,22 @@ def log(v: VectorBuilder, x: Value) -> Value:
     """Natural logarithm; -inf at 0, NaN below."""
     mantissa, bias = MANTISSA_BITS[v.dtype], EXPONENT_BIAS[v.dtype]
     tiny = v.compare("<", x, v.const(2.0 ** (1 - bias)))
-    normal = v.select(tiny, v.builder.fmul(x, v.const(2.0 ** (mantissa + 2))), x)
+    normal = v.select(tiny, v.mul(x, v.const(2.0 ** (mantissa + 2))), x)
     bits = v.to_bits(normal)
     offset = v.builder.sub(bits, v.int_const(_bits_of(0.5**0.5, v.dtype)))
     exponent = v.builder.ashr(offset, v.int_const(mantissa))
     m = v.from_bits(v.builder.sub(bits, v.builder.shl(exponent, v.int_const(mantissa))))
     k = v.builder.sitofp(exponent, v.float_type)
-    k = v.select(tiny, v.builder.fsub(k, v.const(mantissa + 2.0)), k)
-    f = v.builder.fsub(m, v.const(1.0))
-    s = v.builder.fdiv(f, v.builder.fadd(f, v.const(2.0)))
-    z = v.builder.fmul(s, s)
-    series = v.builder.fmul(z, v.polynomial(z, LOGARITHM[v.dtype]))
-    half_square = v.builder.fmul(v.builder.fmul(f, f), v.const(0.5))
+    k = v.select(tiny, v.sub(k, v.const(mantissa + 2.0)), k)
+    f = v.sub(m, v.const(1.0))
+    s = v.div(f, v.add(f, v.const(2.0)))
+    z = v.mul(s, s)
+    series = v.mul(z, v.polynomial(z, LOGARITHM[v.dtype]))
+    half_square = v.mul(v.mul(f, f), v.const(0.5))
     ln2_high, ln2_low = _short_ln2(v.dtype)
-    correction = v.fma(s, v.builder.fadd(half_square, series), v.builder.fmul(k, v.const(ln2_low)))
-    rest = v.builder.fsub(v.builder.fsub(half_square, correction), f)
-    result = v.builder.fsub(v.builder.fmul(k, v.const(ln2_high)), rest)
+    correction = v.fma(s, v.add(half_square, series), v.mul(k, v.const(ln2_low)))
+    rest = v.sub(v.sub(half_square, correction), f)
+    result = v.sub(v.mul(k, v.const(ln2_high)), rest)
     at_most_zero = v.select(v.compare("==", x, v.const(0.0)), v.const(-inf), v.const(nan))
     result = v.select(v.compare(">", x, v.const(0.0)), result, at_most_zero)
     return v.select(v.compare("==", x, v.const(inf)), v.const(inf), result)
@@ -160,19 +159,19 @@ def atan2(v: VectorBuilder, y: Value, x: Value) -> Value:
     high = v.select(steep, steep_side, flat_side)
     # Above 1/2 the angle is taken from the diagonal: atan(low/high) = pi/4 + atan((low - high)/(low + high)). From
     # there on the difference is exact.
-    wide = v.compare(">", low, v.builder.fmul(high, v.const(0.5)))
-    numerator = v.select(wide, v.builder.fsub(low, high), low)
-    denominator = v.select(wide, v.builder.fadd(low, high), high)
+    wide = v.compare(">", low, v.mul(high, v.const(0.5)))
+    numerator = v.select(wide, v.sub(low, high), low)
+    denominator = v.select(wide, v.add(low, high), high)
     at_origin = v.compare("==", denominator, v.const(0.0))
     denominator = v.select(at_origin, v.const(1.0), denominator)
-    t = v.builder.fdiv(numerator, denominator)
+    t = v.div(numerator, denominator)
     # t + rest is the quotient to twice the digits; `lost` is what the sum low + high was rounded by.
-    lost = v.select(wide, v.builder.fsub(low, v.builder.fsub(denominator, high)), v.const(0.0))
+    lost = v.select(wide, v.sub(low, v.sub(denominator, high)), v.const(0.0))
     remaining = v.fma(v.neg(t), lost, v.fma(v.neg(t), denominator, numerator))
-    rest = v.builder.fdiv(remaining, denominator)
+    rest = v.div(remaining, denominator)
     rest = v.select(v.compare("<", denominator, v.const(inf)), rest, v.const(0.0))
-    z = v.builder.fmul(t, t)
-    angle = v.builder.fadd(t, v.fma(v.builder.fmul(t, z), v.polynomial(z, ARCTANGENT[v.dtype]), rest))
+    z = v.mul(t, t)
+    angle = v.add(t, v.fma(v.mul(t, z), v.polynomial(z, ARCTANGENT[v.dtype]), rest))
     # The angle is `turn +- angle` with turn a multiple of pi/4: pi/2 - and pi - change its sign and add to the turn.
     turn = v.select(wide, v.const(0.25), v.const(0.0))
     turn, angle = _reflect(v, steep, 0.5, turn, angle)
@@ -186,7 +185,7 @@ def atan2(v: VectorBuilder, y: Value, x: Value) -> Value:
 def _reflect(v: VectorBuilder, mask: Value, by: float, turn: Value, angle: Value) -> tuple[Value, Value]:
     """`by * pi - (turn * pi + angle)` where the mask is true."""
     return (
-        v.select(mask, v.builder.fsub(v.const(by), turn), turn),
+        v.select(mask, v.sub(v.const(by), turn), turn),
         v.select(mask, v.neg(angle), angle),
     )
 
@@ -214,23 +213,23 @@ def _cathetus(v: VectorBuilder, x: Value) -> Value:
 def tan(v: VectorBuilder, x: Value) -> Value:
     """Tangent."""
     sine, cosine = sin_cos(v, x)
-    return v.builder.fdiv(sine, cosine)
+    return v.div(sine, cosine)
 
 
 def tanh(v: VectorBuilder, x: Value) -> Value:
     """Hyperbolic tangent: a polynomial below 0.625, the exponential above."""
-    z = v.builder.fmul(x, x)
-    near = v.fma(v.builder.fmul(x, z), v.polynomial(z, HYPERBOLIC_TANGENT[v.dtype]), x)
+    z = v.mul(x, x)
+    near = v.fma(v.mul(x, z), v.polynomial(z, HYPERBOLIC_TANGENT[v.dtype]), x)
     magnitude = v.intrinsic("fabs", x)
-    grown = v.builder.fadd(exp(v, v.builder.fadd(magnitude, magnitude)), v.const(1.0))
-    far = v.builder.fsub(v.const(1.0), v.builder.fdiv(v.const(2.0), grown))
+    grown = v.add(exp(v, v.add(magnitude, magnitude)), v.const(1.0))
+    far = v.sub(v.const(1.0), v.div(v.const(2.0), grown))
     far = v.intrinsic("copysign", far, x)
     return v.select(v.compare("<", magnitude, v.const(0.625)), near, far)
 
 
 def power(v: VectorBuilder, x: Value, y: Value) -> Value:
     """Power, x to the y, for x >= 0, as exp(y log x): the relative error grows with |y log x|."""
-    result = exp(v, v.builder.fmul(y, log(v, x)))
+    result = exp(v, v.mul(y, log(v, x)))
     return v.select(v.compare("==", y, v.const(0.0)), v.const(1.0), result)
 
 
@@ -249,7 +248,7 @@ def integer_power(v: VectorBuilder, x: Value, exponent: int) -> Value:
 
 def remainder(v: VectorBuilder, x: Value, y: Value, rounding: str) -> Value:
     """`x - n y` with n = x/y rounded by `trunc` (C's fmod) or `rint` (C's remainder); exact while |n| < 2^mantissa."""
-    quotient = v.intrinsic(rounding, v.builder.fdiv(x, y))
+    quotient = v.intrinsic(rounding, v.div(x, y))
     return v.fma(v.neg(quotient), y, x)
 
 

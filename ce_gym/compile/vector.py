@@ -19,12 +19,11 @@ Value: TypeAlias = Any
 Builder: TypeAlias = Any
 """An llvmlite IRBuilder, for the same reason."""
 
-ARITHMETIC_FLAGS = ("contract", "arcp", "nsz")
-"""Fast-math freedom of traced arithmetic. Never nnan or ninf: they would delete the test for a diverged state."""
-
 
 class VectorBuilder:
     """Emits instructions on vectors of `lanes` floats of one dtype at the end of one LLVM block.
+
+    No instruction has fast-math flags: LLVM may not fuse, reorder or replace any; what is emitted is what is rounded.
 
     Attributes:
         builder: the llvmlite builder.
@@ -65,19 +64,19 @@ class VectorBuilder:
 
     def add(self, a: Value, b: Value) -> Value:
         """Sum."""
-        return self.builder.fadd(a, b, flags=ARITHMETIC_FLAGS)
+        return self.builder.fadd(a, b)
 
     def sub(self, a: Value, b: Value) -> Value:
         """Difference."""
-        return self.builder.fsub(a, b, flags=ARITHMETIC_FLAGS)
+        return self.builder.fsub(a, b)
 
     def mul(self, a: Value, b: Value) -> Value:
-        """Product; it may be contracted with a following sum."""
-        return self.builder.fmul(a, b, flags=ARITHMETIC_FLAGS)
+        """Product."""
+        return self.builder.fmul(a, b)
 
     def div(self, a: Value, b: Value) -> Value:
         """Quotient."""
-        return self.builder.fdiv(a, b, flags=ARITHMETIC_FLAGS)
+        return self.builder.fdiv(a, b)
 
     def neg(self, a: Value) -> Value:
         """Sign changed."""

@@ -1,5 +1,8 @@
 """Kernels as CUDA C: run by the processor against the LLVM kernels of the same programs, and compiled for real GPUs."""
 
+import re
+from collections import Counter
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -44,8 +47,7 @@ def test_look_up(dtype, needs_host_compiler):
     places[0, :3] = [np.nan, np.inf, -np.inf]
     rows = {"t": rng.normal(size=(7, 9)), "f": np.tile([0.5, -0.5, 0.75], (N, 1)), "p": places}
     llvm, cuda = run_both(program, {name: row.astype(dtype) for name, row in rows.items()}, dtype)
-    tolerance = {"float64": 1e-13, "float32": 3e-5}[dtype]
-    np.testing.assert_allclose(cuda["found"], llvm["found"], rtol=tolerance, atol=tolerance)
+    np.testing.assert_array_equal(cuda["found"], llvm["found"])
     assert np.isfinite(cuda["found"][1:]).all()
 
 
@@ -149,7 +151,7 @@ def test_a_long_function_with_several_callers_stands_once(needs_host_compiler):
     assert text.count("void logistic_0(") == 1
     assert "__noinline__ void logistic_0(" in text
     llvm, cuda = run_both(program, {"a": np.linspace(0.1, 0.9, N)[:, None]}, "float64")
-    np.testing.assert_allclose(cuda["c"], llvm["c"], rtol=1e-13)
+    np.testing.assert_array_equal(cuda["c"], llvm["c"])
 
 
 @pytest.fixture
@@ -213,6 +215,33 @@ def test_every_operation_compiles(dtype, needs_compiler):
     program = Program("all", buffers, (Call(function, ("x", "y"), ("out",)), Lookup("t", "f", "p", "g")))
     _, usage = nvrtc.compile_cubin(emit_source([program], dtype).text, "sm_90")
     assert usage.spill_loads == 0
+
+
+def ptx_of(text):
+    """The virtual machine's assembly, which says of every operation how it is rounded, with the options of kernels."""
+    from cuda.bindings import nvrtc as raw
+    from cuda.core import ProgramOptions
+
+    options = ProgramOptions(arch="sm_90", **nvrtc.OPTIONS).as_bytes("nvrtc")
+    error, program = raw.nvrtcCreateProgram(text.encode(), b"", 0, [], [])
+    assert not int(error)
+    assert not int(raw.nvrtcCompileProgram(program, len(options), options)[0])
+    ptx = bytearray(raw.nvrtcGetPTXSize(program)[1])
+    raw.nvrtcGetPTX(program, ptx)
+    return ptx.decode()
+
+
+def test_the_compiler_fuses_nothing_by_itself(needs_compiler):
+    """The only fused multiply-adds are those in the text, and what is not fused says how it is rounded."""
+    x, y, z = ca.SX.sym("x"), ca.SX.sym("y"), ca.SX.sym("z")
+    product = x * y
+    function = ca.Function("f", [x, y, z], [ca.vertcat(product + z, product - z, y * z + x)])
+    buffers = tuple(Buffer(name, 1, "tiles") for name in "xyz") + (Buffer("out", 3, "tiles"),)
+    source = emit_source([Program("ptx", buffers, (Call(function, ("x", "y", "z"), ("out",)),))], "float32")
+    assert source.text.count("fmaf(") == 1
+    lines = ptx_of(source.text).splitlines()
+    used = Counter(line.split()[0] for line in lines if re.match(r"\s+(add|sub|mul|fma)\S*\.f32", line))
+    assert used == {"mul.rn.f32": 1, "add.rn.f32": 1, "sub.rn.f32": 1, "fma.rn.f32": 1}
 
 
 def test_what_the_compiler_refuses_is_one_line(needs_compiler):

@@ -1,9 +1,9 @@
 """The order of operations is a valid one, and one with which fewer spilled values are loaded than in CasADi's own."""
 
-import casadi as ca
 import pytest
 
-from ce_gym.compile.ordering import NO_OPERATION, TWINS, operands_of, ordered
+from ce_gym.compile.graph import NO_OPERATION, graph_of
+from ce_gym.compile.ordering import TWINS, ordered
 from ce_gym.dynamics.model import Model
 
 FEWER = 0.79
@@ -12,11 +12,11 @@ FEWER = 0.79
 
 @pytest.fixture(scope="module")
 def dynamics():
-    return Model("mini_cheetah").casadi_function("forward_dynamics")
+    return graph_of(Model("mini_cheetah").casadi_function("forward_dynamics"))
 
 
-def operations(function):
-    return [k for k in range(function.n_instructions()) if function.instruction_id(k) not in NO_OPERATION]
+def operations(graph):
+    return [k for k, op in enumerate(graph.ops) if op not in NO_OPERATION]
 
 
 def reloads(order, operands, registers=28):
@@ -38,34 +38,21 @@ def reloads(order, operands, registers=28):
     return count
 
 
-def test_operands_are_the_instructions_that_made_them():
-    x, y = ca.SX.sym("x"), ca.SX.sym("y")
-    function = ca.Function("f", [x, y], [ca.sin(x) * y + 2.0])
-    operands = operands_of(function)
-    names = [function.instruction_id(k) for k in range(function.n_instructions())]
-    product = names.index(ca.OP_MUL)
-    assert {names[a] for a in operands[product]} == {ca.OP_SIN, ca.OP_INPUT}
-    assert [names[a] for a in operands[names.index(ca.OP_OUTPUT)]] == [ca.OP_ADD]
-
-
 def test_every_operation_comes_once_and_after_its_operands(dynamics):
-    operands = operands_of(dynamics)
-    order = ordered(dynamics, operands)
+    operands, order = dynamics.operands, ordered(dynamics)
     assert sorted(order) == operations(dynamics)
     place = {k: i for i, k in enumerate(order)}
     assert all(place[a] < place[k] for k in order for a in operands[k] if a in place)
 
 
 def test_fewer_spilled_values_are_loaded_than_in_casadis_order(dynamics):
-    operands = operands_of(dynamics)
-    own = reloads(operations(dynamics), operands)
-    assert reloads(ordered(dynamics, operands), operands) < FEWER * own
+    own = reloads(operations(dynamics), dynamics.operands)
+    assert reloads(ordered(dynamics), dynamics.operands) < FEWER * own
 
 
 def test_sine_and_cosine_of_an_angle_are_done_together(dynamics):
-    operands = operands_of(dynamics)
-    order = ordered(dynamics, operands)
-    turns = [k for k in order if dynamics.instruction_id(k) in TWINS]
+    operands, order = dynamics.operands, ordered(dynamics)
+    turns = [k for k in order if dynamics.ops[k] in TWINS]
     assert len(turns) == 24
     assert all(operands[a] == operands[b] for a, b in zip(turns[::2], turns[1::2], strict=True))
     places = [order.index(k) for k in turns]
@@ -73,5 +60,4 @@ def test_sine_and_cosine_of_an_angle_are_done_together(dynamics):
 
 
 def test_the_order_is_the_same_every_time(dynamics):
-    operands = operands_of(dynamics)
-    assert ordered(dynamics, operands) == ordered(dynamics, operands)
+    assert ordered(dynamics) == ordered(dynamics)

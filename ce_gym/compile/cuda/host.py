@@ -35,16 +35,6 @@ static double __longlong_as_double(long long a) { double b; memcpy(&b, &a, 8); r
 static long long __double_as_longlong(double a) { long long b; memcpy(&b, &a, 8); return b; }
 static float __int_as_float(int a) { float b; memcpy(&b, &a, 4); return b; }
 static int __float_as_int(float a) { int b; memcpy(&b, &a, 4); return b; }
-static double __dadd_rn(double a, double b) { return a + b; }
-static double __dsub_rn(double a, double b) { return a - b; }
-static double __dmul_rn(double a, double b) { return a * b; }
-static double __ddiv_rn(double a, double b) { return a / b; }
-static double __fma_rn(double a, double b, double c) { return fma(a, b, c); }
-static float __fadd_rn(float a, float b) { return a + b; }
-static float __fsub_rn(float a, float b) { return a - b; }
-static float __fmul_rn(float a, float b) { return a * b; }
-static float __fdiv_rn(float a, float b) { return a / b; }
-static float __fmaf_rn(float a, float b, float c) { return fmaf(a, b, c); }
 """
 
 OPTIONS = ("-std=c++17", "-O0", "-w", "-ffp-contract=off", "-shared", "-fPIC")

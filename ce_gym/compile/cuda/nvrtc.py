@@ -12,7 +12,9 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-STANDARD = "c++17"
+OPTIONS = {"std": "c++17", "fma": False, "prec_div": True, "prec_sqrt": True, "ftz": False, "disable_warnings": True}
+"""Every operation is rounded to nearest and by itself: which products and sums are rounded together is settled before,
+for every device alike (`ce_gym.compile.graph`)."""
 REGISTERS = 65536
 """32-bit registers of a multiprocessor, on every architecture from sm_70 to sm_120."""
 WARPS = {"80": 64, "86": 48, "87": 48, "89": 48, "90": 64, "100": 64, "120": 48}
@@ -85,7 +87,7 @@ def compile_cubin(text: str, arch: str) -> tuple[bytes, Usage]:
     compiler_version()
     from cuda.core import Program, ProgramOptions
 
-    options = ProgramOptions(arch=arch, std=STANDARD, ptxas_options="-v", disable_warnings=True)
+    options = ProgramOptions(arch=arch, ptxas_options="-v", **OPTIONS)
     log = io.StringIO()
     try:
         code = Program(text, "c++", options).compile("cubin", logs=log)

@@ -1,9 +1,8 @@
 """The builder that writes CUDA C: the methods of `ce_gym.compile.vector.VectorBuilder`, one robot to a thread.
 
 `lowering` and `math` emit through either builder, so the order of operations, the polynomials and their coefficients
-stand once. What LLVM may contract, the text leaves to the compiler; quotients, which LLVM may turn into products, are
-written as products with a reciprocal. What must be rounded operation by operation is written with the intrinsics that
-no compiler fuses (`__dadd_rn`).
+stand once. Every operation is rounded by itself: the text must be compiled without contraction of sums and products
+(`nvrtc` does), and then gives the processor's numbers, bit for bit.
 
 Knows CUDA C's names; nothing of CasADi, kernels or GPUs.
 """
@@ -16,8 +15,6 @@ import numpy as np
 
 WIDTH = {"float64": 64, "float32": 32}
 SIGNED = {64: "long long", 32: "int"}
-ROUNDED = {"fadd": "add", "fsub": "sub", "fmul": "mul", "fdiv": "div"}
-"""Operations that are rounded by themselves, and their part of an intrinsic's name."""
 INTEGER = {"add": "+", "sub": "-", "and_": "&", "or_": "|", "xor": "^", "shl": "<<"}
 """Operations on bits, some of them on masks too."""
 NAMES = {"minnum": "fmin", "maxnum": "fmax"}
@@ -57,7 +54,6 @@ class Writer:
         self.dtype, self.bits = dtype, WIDTH[dtype]
         self.builder = _Instructions(self)
         self.lines: list[str] = []
-        self._reciprocals: dict[str, Term] = {}
 
     def let(self, kind: str, expression: str) -> Term:
         """Name the value of an expression."""
@@ -88,15 +84,12 @@ class Writer:
         return self.let("real", f"{a} - {b}")
 
     def mul(self, a: Term, b: Term) -> Term:
-        """Product; the compiler may contract it with a following sum."""
+        """Product."""
         return self.let("real", f"{a} * {b}")
 
     def div(self, a: Term, b: Term) -> Term:
-        """Quotient: a product with the reciprocal, which is taken once of each divisor."""
-        one = self.const(1.0)
-        if b not in self._reciprocals:
-            self._reciprocals[b] = self.let("real", f"{one} / {b}")
-        return self._reciprocals[b] if a == one else self.mul(a, self._reciprocals[b])
+        """Quotient."""
+        return self.let("real", f"{a} / {b}")
 
     def neg(self, a: Term) -> Term:
         """Sign changed."""
@@ -104,15 +97,10 @@ class Writer:
 
     def fma(self, a: Term, b: Term, c: Term) -> Term:
         """`a * b + c`, rounded once."""
-        return self.let("real", f"{self.rounded('fma')}({a}, {b}, {c})")
-
-    def rounded(self, name: str) -> str:
-        """Name of the intrinsic that rounds once, to nearest."""
-        prefix = "__d" if self.bits == 64 else "__f"
-        return f"__{name}{'' if self.bits == 64 else 'f'}_rn" if name == "fma" else f"{prefix}{name}_rn"
+        return self.intrinsic("fma", a, b, c)
 
     def intrinsic(self, name: str, *operands: Term) -> Term:
-        """One of C's functions, such as sqrt, fabs, floor, minnum, copysign."""
+        """One of C's functions, such as fma, sqrt, fabs, floor, minnum, copysign."""
         suffix = "" if self.bits == 64 else "f"
         return self.let("real", f"{NAMES.get(name, name)}{suffix}({', '.join(operands)})")
 
@@ -165,8 +153,6 @@ class _Instructions:
 
     def __getattr__(self, name: str):
         w = self._writer
-        if name in ROUNDED:
-            return lambda a, b: w.let("real", f"{w.rounded(ROUNDED[name])}({a}, {b})")
         if name in INTEGER:
             return lambda a, b: w.let(a.kind, f"{a} {INTEGER[name]} {b}")
         raise AttributeError(f"{name!r} has no CUDA form")

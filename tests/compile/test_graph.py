@@ -1,0 +1,114 @@
+"""What is done to a trace before compilers see it: every rewriting by its operations and by its values."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ce_gym.compile.graph import (
+    ABSORBED,
+    CHOICE,
+    MINUS_PRODUCT,
+    NO_OPERATION,
+    PRODUCT_MINUS,
+    PRODUCT_PLUS,
+    graph_of,
+)
+from ce_gym.dynamics.model import Model
+
+X, Y, Z = (ca.SX.sym(name) for name in "xyz")
+
+
+def rewritten(*values):
+    """Function of x, y and z, and the operations that are left of it, sorted."""
+    function = ca.Function("f", [X, Y, Z], [ca.vertcat(*values)])
+    return function, sorted(op for op in graph_of(function).ops if op not in NO_OPERATION)
+
+
+def check(function, evaluate, tolerance=1e-15):
+    """Compare with CasADi's own evaluation."""
+    rows = np.random.default_rng(0).uniform(-2, 2, (3, 17, 1))
+    (value,) = evaluate(function, *rows)
+    exact = [np.array(function(*row)).ravel() for row in rows.transpose(1, 0, 2)]
+    np.testing.assert_allclose(value, exact, rtol=tolerance, atol=tolerance)
+
+
+def test_operands_are_the_instructions_that_made_them():
+    function = ca.Function("f", [X, Y], [ca.sin(X) * (Y + 2.0)])
+    graph = graph_of(function)
+    product = graph.ops.index(ca.OP_MUL)
+    assert {graph.ops[a] for a in graph.operands[product]} == {ca.OP_SIN, ca.OP_ADD}
+    assert [graph.ops[a] for a in graph.operands[graph.ops.index(ca.OP_OUTPUT)]] == [ca.OP_MUL]
+    assert list(graph.constants.values()) == [2.0]
+
+
+@pytest.mark.parametrize(
+    ("value", "op"),
+    [(X * Y + Z, PRODUCT_PLUS), (Z + X**2, PRODUCT_PLUS), (X * Y - Z, PRODUCT_MINUS), (Z - X * Y, MINUS_PRODUCT)],
+)
+def test_a_product_is_rounded_with_its_sum(value, op, evaluate):
+    function, ops = rewritten(value)
+    assert ops == [op]
+    check(function, evaluate)
+
+
+def test_a_sum_takes_one_product_and_a_product_with_more_users_none(evaluate):
+    function, ops = rewritten(X * Y + Y * Z)
+    assert ops == sorted([ca.OP_MUL, PRODUCT_PLUS])
+    check(function, evaluate)
+    product = X * Y
+    function, ops = rewritten(product + Z, product - Z)
+    assert ops == sorted([ca.OP_MUL, ca.OP_ADD, ca.OP_SUB])
+    check(function, evaluate)
+
+
+def test_the_last_product_of_two_is_fused(evaluate):
+    """Of x y = 1 - 2^-60, which rounds to 1, and its opposite: the sum of both, rounded first, would be 0."""
+    function, _ = rewritten(X * Y + Y * Z)
+    x, y = 1 + 2.0**-30, 1 - 2.0**-30
+    (value,) = evaluate(function, *(np.full((1, 1), number) for number in (x, y, -x)))
+    assert value[0, 0] == 2.0**-60
+
+
+def test_quotients_of_one_divisor_share_its_reciprocal(evaluate):
+    function, ops = rewritten(X / Y, Z / Y, 3 / Y)
+    assert ops == sorted([ca.OP_INV, ca.OP_MUL, ca.OP_MUL, ca.OP_MUL])
+    check(function, evaluate)
+    assert rewritten(X / Y, 1 / Y)[1] == sorted([ca.OP_INV, ca.OP_MUL])
+    assert rewritten(X / Y)[1] == [ca.OP_DIV]
+
+
+def test_quotients_by_a_constant_are_products(evaluate):
+    divisor = ca.SX(3.0)
+    function, ops = rewritten(X / divisor + Y)
+    assert ops == [PRODUCT_PLUS]
+    check(function, evaluate)
+
+
+def test_a_choice_is_one_operation(evaluate):
+    function, ops = rewritten(ca.if_else(X < Y, Y, Z))
+    assert ops == sorted([ca.OP_LT, ca.OP_NOT, CHOICE])
+    check(function, evaluate)
+    condition = X < Y
+    part = ca.if_else(condition, Y, 0)
+    both, ops = rewritten(part + ca.if_else(ca.logic_not(condition), Z, 0), part)
+    assert ops == sorted([ca.OP_LT, ca.OP_NOT, ca.OP_IF_ELSE_ZERO, CHOICE])
+    check(both, evaluate)
+
+
+def test_a_sum_with_what_may_be_zero_is_a_choice(evaluate):
+    part = ca.if_else(X < Y, X * Y, 0)
+    for value, op in ((Z + part, PRODUCT_PLUS), (Z - part, MINUS_PRODUCT)):
+        function, ops = rewritten(value)
+        assert ops == sorted([ca.OP_LT, CHOICE, op])
+        check(function, evaluate)
+    function, ops = rewritten(part - Z)  # its other part would have to change sign
+    assert ops == sorted([ca.OP_LT, ca.OP_IF_ELSE_ZERO, ca.OP_MUL, ca.OP_SUB])
+    check(function, evaluate)
+
+
+def test_a_step_takes_far_fewer_operations():
+    function = Model("mini_cheetah").casadi_function("forward_dynamics")
+    graph = graph_of(function)
+    before = sum(function.instruction_id(k) not in NO_OPERATION for k in range(function.n_instructions()))
+    assert sum(op not in NO_OPERATION for op in graph.ops) < 0.75 * before
+    assert ABSORBED in graph.ops

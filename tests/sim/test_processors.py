@@ -1,0 +1,50 @@
+"""The same numbers on another kind of processor: a kernel compiled for one with other vectors, run by this one."""
+
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import hashlib
+import numpy as np
+import ce_gym
+
+for robot in ("mini_cheetah", "six_bar"):
+    model = ce_gym.Model(robot)
+    sim = ce_gym.Simulator(model, 21, dtype="{dtype}")
+    joints, rng = len(model.joint_links), np.random.default_rng(0)
+    for _ in range(50):
+        sim.step(model.standing_q[-joints:] + 0.3 * rng.normal(size=(21, joints)), n_substeps=2)
+    assert sim.n_diverged == 0
+    print(hashlib.sha256(np.ascontiguousarray(sim.q).tobytes() + np.ascontiguousarray(sim.v).tobytes()).hexdigest())
+"""
+
+HASWELL = {
+    "NUMBA_CPU_NAME": "haswell",
+    "NUMBA_CPU_FEATURES": "",
+    "OPENBLAS_CORETYPE": "Haswell",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
+}
+"""What makes numba, numpy and its linear algebra do as on a processor of 2013."""
+
+
+def hashes(dtype, folder, **environment):
+    """What the script prints in a process of its own: one line for each robot."""
+    given = os.environ | {"CE_GYM_CACHE_DIR": str(folder)} | environment
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT.format(dtype=dtype)], env=given, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="compiles for a processor of 2013, x86-64")
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_short_vectors_give_the_numbers_of_long_ones(dtype, tmp_path):
+    """A hundred sub-steps with contacts, by AVX2 as by what this processor has (AVX-512, where the test says most)."""
+    here = hashes(dtype, tmp_path / "here")
+    assert len(set(here)) == 2
+    assert hashes(dtype, tmp_path / "haswell", **HASWELL) == here
