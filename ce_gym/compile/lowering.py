@@ -112,6 +112,12 @@ class _Lowering:
             self.masks[value] = self.v.compare("!=", value, self.v.const(0.0))
         return self.masks[value]
 
+    def differ(self, a: Value, b: Value) -> Value:
+        """Whether two values differ; of two that are masks already, by a bit each."""
+        if a in self.masks and b in self.masks:
+            return self.truth(self.v.builder.xor(self.masks[a], self.masks[b]))
+        return self.truth(self.v.compare("!=", a, b))
+
     def sign(self, x: Value) -> Value:
         """-1, 1, or x itself where it is neither negative nor positive."""
         v, zero = self.v, self.v.const(0.0)
@@ -190,7 +196,7 @@ OPERATIONS: dict[int, Operation] = {
     casadi.OP_LT: _comparison("<"),
     casadi.OP_LE: _comparison("<="),
     casadi.OP_EQ: _comparison("=="),
-    casadi.OP_NE: _comparison("!="),
+    casadi.OP_NE: _Lowering.differ,
     casadi.OP_NOT: lambda s, a: s.truth(s.v.builder.not_(s.mask(a))),
     casadi.OP_AND: lambda s, a, b: s.truth(s.v.builder.and_(s.mask(a), s.mask(b))),
     casadi.OP_OR: lambda s, a, b: s.truth(s.v.builder.or_(s.mask(a), s.mask(b))),

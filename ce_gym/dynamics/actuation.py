@@ -1,7 +1,10 @@
 """Forces on the independent coordinates, linearly implicit in the step: motors, damping, joint limits.
 
 Each is `tau - slope @ ydd` with the force taken one step ahead, exactly as in contact.py; the slope joins `D` of the
-cluster. A saturated motor gives a constant torque and has no slope.
+cluster. A saturated motor gives a constant torque and has no slope. Whether it is saturated depends on the
+acceleration, and that on it: an attempt at a step goes by what is asked for at no acceleration, or by what the attempt
+before has found, and says afterwards whether that was right (`MotorForce.found`). It matters where links are light:
+what is beyond the limit at first may be little by the end of the step, and full torque over a whole step a blow.
 
 Controllers ask for torques at the joints. "Ideal" motors deliver them up to the joints' limits. "Limited" motors are
 the ones the robot has: their torques `tau_m` and speeds `W yd` belong to rotors, with `W` the rows of the constraint
@@ -12,12 +15,12 @@ level. May know CasADi, descriptions, mechanisms and kinematics.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
 from ce_gym.dynamics.kinematics import Kinematics
-from ce_gym.dynamics.scene import Scene
+from ce_gym.dynamics.scene import Scene, StepOptions
 from ce_gym.dynamics.spatial import SX
 from ce_gym.model.description import Motor, Robot
 from ce_gym.model.mechanism import Mechanism
@@ -45,6 +48,108 @@ class JointForce:
         return JointForce(self.tau + other.tau, self.slope + other.slope)
 
 
+@dataclass
+class Limited:
+    """A torque that is kept within limits, of a joint or of a motor.
+
+    Attributes:
+        asked: What is asked for at zero acceleration [N m or N], and how it answers: `tau - slope @ ydd`.
+        high, low: Limits likewise; a torque-speed line answers to accelerations too.
+        expected: What it is judged by, see `found`.
+    """
+
+    asked: JointForce
+    high: JointForce
+    low: JointForce
+    expected: SX
+
+    @property
+    def answers(self) -> bool:
+        """Whether accelerations have a say in it at all."""
+        return any(ca.sparsify(force.slope).nnz() for force in (self.asked, self.high, self.low))
+
+    @property
+    def at_high(self) -> SX:
+        """1 if it is taken to be at its upper limit, else 0."""
+        return self.expected > self.high.tau
+
+    @property
+    def at_low(self) -> SX:
+        """1 if it is taken to be at its lower limit, else 0."""
+        return self.expected < self.low.tau
+
+    @property
+    def free(self) -> SX:
+        """1 if what is asked for is given, else 0."""
+        return ca.logic_not(ca.logic_or(self.at_high, self.at_low))
+
+    @property
+    def given(self) -> SX:
+        """What is given at zero acceleration [N m or N]."""
+        return ca.if_else(self.at_high, self.high.tau, ca.if_else(self.at_low, self.low.tau, self.asked.tau))
+
+    def found(self, ydd: SX) -> Limited:
+        """Return it judged by what will be asked for at the end of the step, given the accelerations.
+
+        What is expected then is beyond a limit as far as what is asked for will be. It never goes from beyond one limit
+        to beyond the other: what is between has not been tried then.
+        """
+        asked = self.asked.tau - self.asked.slope @ ydd
+        if ca.sparsify(self.high.slope).nnz() or ca.sparsify(self.low.slope).nnz():
+            over = asked - (self.high.tau - self.high.slope @ ydd)
+            under = self.low.tau - self.low.slope @ ydd - asked
+            within = ca.fmax(self.low.tau, ca.fmin(self.high.tau, asked))
+            asked = ca.if_else(over > 0, self.high.tau + over, ca.if_else(under > 0, self.low.tau - under, within))
+        kept = ca.if_else(self.at_low, ca.fmin(asked, self.high.tau), asked)
+        return replace(self, expected=ca.if_else(self.at_high, ca.fmax(asked, self.low.tau), kept))
+
+
+@dataclass
+class MotorForce(JointForce):
+    """What motors deliver to the joints.
+
+    Attributes:
+        limited: All torques that are kept within limits, at the places of `limit_count`.
+    """
+
+    limited: dict[int, Limited]
+
+    def found(self, ydd: SX, n_hints: int) -> tuple[SX, SX]:
+        """Return hints for another attempt, and 1 if a torque did not do what it was taken to do, else 0."""
+        hints, misjudged = SX(n_hints, 1), SX(0)
+        for place, one in self.limited.items():
+            if one.answers:
+                after = one.found(ydd)
+                hints[place] = after.expected
+                elsewhere = ca.logic_or(after.at_high != one.at_high, after.at_low != one.at_low)
+                misjudged = ca.logic_or(misjudged, elsewhere)
+        if n_hints:
+            hints[-1] = 1
+        return hints, misjudged
+
+
+def limited(asked: JointForce, high: JointForce, low: JointForce, hints: SX, place: int) -> Limited:
+    """Return a torque judged as the attempt before has found it, or, if there was none, at zero acceleration."""
+    one = Limited(asked, high, low, asked.tau)
+    return replace(one, expected=ca.if_else(hints[-1] > 0, hints[place], asked.tau)) if one.answers else one
+
+
+def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
+    """Return how many torques an attempt may be wrong about: those of all joints, and after them those of all motors.
+
+    Last comes whether there was an attempt before. They have limits, and they or their limits answer to accelerations;
+    if there are none of the kind, 0.
+    """
+    robot = mechanism.robot
+    motors = robot.motors if options.motors == "limited" or options.control.startswith("motor") else ()
+    joints = [robot.body(name).joint.torque for name in robot.independent]
+    asked = options.control.endswith("position") and any(
+        map(math.isfinite, (*joints, *(motor.torque for motor in motors)))
+    )
+    lines = options.motors == "limited" and any(math.isfinite(motor.velocity) for motor in motors)
+    return len(joints) + len(motors) + 1 if asked or lines else 0
+
+
 def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce:
     """Return what the motors are asked for at the joints: a torque, or a proportional-derivative position control."""
     if scene.options.control == "torque":
@@ -53,30 +158,32 @@ def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce
     return JointForce(scene.figures.kp * (target - y) - damping * yd, ca.diag(dt * damping))
 
 
-def motor_forces(scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float) -> JointForce:
+def motor_forces(scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float, hints: SX) -> MotorForce:
     """Return what the motors deliver of the torques they are asked for."""
     strength = scene.figures.strength
-    force = JointForce(strength * asked.tau, strength * asked.slope)
+    force = MotorForce(strength * asked.tau, strength * asked.slope, {})
     actuated = actuated_clusters(scene.mechanism, kinematics) if scene.options.motors == "limited" else []
     for cluster in actuated:
-        rows = cluster.rows
-        local = JointForce(force.tau[rows], force.slope[rows, rows])
-        local = _through_motors(local, cluster, yd, strength, dt)
-        force.tau[rows], force.slope[rows, rows] = local.tau, local.slope
+        rows, to_motors = cluster.rows, _effort_matrix(cluster.W)
+        shares = JointForce(to_motors @ force.tau[rows], to_motors @ force.slope[rows, rows] @ to_motors.T)
+        deliver(force, shares, cluster, yd, strength, dt, hints)
     driven = {row for cluster in actuated for row in cluster.rows}
-    return within_joint_limits(scene, force, [row for row in range(yd.numel()) if row not in driven])
+    return within_joint_limits(scene, force, [row for row in range(yd.numel()) if row not in driven], hints)
 
 
-def within_joint_limits(scene: Scene, force: JointForce, rows: list[int]) -> JointForce:
+def within_joint_limits(scene: Scene, force: MotorForce, rows: list[int], hints: SX) -> MotorForce:
     """Return a force of the motors that the joints `rows` limit; it is changed in place."""
     robot, strength = scene.mechanism.robot, scene.figures.strength
     for row in rows:
         limit = robot.body(robot.independent[row]).joint.torque
         if not math.isinf(limit):
-            tau, limit = force.tau[row], strength * limit
-            force.slope[row, row] = ca.if_else(ca.fabs(tau) > limit, 0, force.slope[row, row])
-            force.tau[row] = ca.fmax(-limit, ca.fmin(limit, tau))
-    return JointForce(force.tau, ca.sparsify(force.slope))
+            asked, still = JointForce(force.tau[row], force.slope[row, :]), SX(1, force.tau.numel())
+            ends = JointForce(strength * limit, still), JointForce(-strength * limit, still)
+            one = force.limited[row] = limited(asked, *ends, hints, row)
+            force.slope[row, row] = ca.if_else(one.free, force.slope[row, row], 0)
+            force.tau[row] = one.given
+    force.slope = ca.sparsify(force.slope)
+    return force
 
 
 @dataclass
@@ -86,6 +193,7 @@ class Actuated:
     Attributes:
         rows: Its rows of `y`, d of them.
         motors: Its motors.
+        places: Where they are among all motors of the robot.
         angles: Of the motors' rotors [rad], shape (n_motors,).
         W: Speeds of the motors for unit velocities of the independent joints, shape (n_motors, d) (footnote on general
             actuation of arXiv:2311.13732); torques of motors go the other way, `tau = W^T tau_m`.
@@ -93,6 +201,7 @@ class Actuated:
 
     rows: list[int]
     motors: list[Motor]
+    places: list[int]
     angles: SX
     W: SX
 
@@ -104,33 +213,47 @@ def actuated_clusters(mechanism: Mechanism, kinematics: Kinematics) -> list[Actu
     for cluster, rows, coordinates in zip(
         mechanism.tree.clusters, kinematics.rows, kinematics.coordinates, strict=True
     ):
-        motors = [motor for motor in mechanism.robot.motors if motor.rotor in cluster.bodies]
+        places = [i for i, motor in enumerate(mechanism.robot.motors) if motor.rotor in cluster.bodies]
+        motors = [mechanism.robot.motors[i] for i in places]
         if motors and coordinates is not None:
             turning = [coordinates.index[motor.rotor] for motor in motors]
             W = ca.sparsify(coordinates.G[turning, :])
-            found.append(Actuated([row - first for row in rows], motors, coordinates.q[turning], W))
+            found.append(Actuated([row - first for row in rows], motors, places, coordinates.q[turning], W))
     return found
 
 
-def _through_motors(asked: JointForce, cluster: Actuated, yd: SX, strength: SX, dt: float) -> JointForce:
-    """Share joint torques out to motors and carry back to the joints what those deliver."""
-    to_motors = _effort_matrix(cluster.W)
-    shares = JointForce(to_motors @ asked.tau, to_motors @ asked.slope @ to_motors.T)
-    return delivered(shares, cluster, yd, strength, dt)
+def deliver(
+    force: MotorForce, asked: JointForce, cluster: Actuated, yd: SX, strength: SX, dt: float, hints: SX
+) -> None:
+    """Limit the torques that motors of a cluster are asked for, take friction off each, and carry the sum to `force`.
 
-
-def delivered(asked: JointForce, cluster: Actuated, yd: SX, strength: SX, dt: float) -> JointForce:
-    """Limit the torques that motors are asked for, take friction off each, and carry the sum to the joints."""
-    W, motors, speed = cluster.W, cluster.motors, cluster.W @ yd[cluster.rows]
-    tau, slope = SX(asked.tau), asked.slope
+    Args:
+        force: What all motors deliver; the cluster's part is put in.
+        asked: Of the motors [N m], shape (n_motors,).
+        cluster: The cluster.
+        yd: Velocities of all independent joints, shape (nj,).
+        strength: Of all motors, as a multiple of what they should have.
+        dt: Length of the step [s].
+        hints: What the attempt before has found, shape (limit_count,).
+    """
+    W, motors, rows = cluster.W, cluster.motors, cluster.rows
+    speed, tau, slope = W @ yd[rows], SX(asked.tau), asked.slope
+    turning = SX(len(motors), yd.numel())
+    turning[:, rows] = W
     free, own = SX.eye(len(motors)), SX(len(motors), len(motors))
     for i, motor in enumerate(motors):
         if math.isfinite(motor.torque) or math.isfinite(motor.velocity):
-            tau[i], free[i, i], own[i, i] = _limited(motor, tau[i], speed[i], strength, dt)
+            place = yd.numel() + cluster.places[i]
+            (high, forwards), (low, backwards) = _limits(motor, speed[i], strength, dt)
+            ends = (JointForce(high, forwards * turning[i, :]), JointForce(low, backwards * turning[i, :]))
+            one = limited(JointForce(tau[i], slope[i, :] @ turning), *ends, hints, place)
+            force.limited[place] = one
+            tau[i], free[i, i] = one.given, one.free
+            own[i, i] = ca.if_else(one.at_high, forwards, ca.if_else(one.at_low, backwards, 0))
         drag = motor.damping + (motor.friction / ca.sqrt(speed[i] ** 2 + COULOMB_SPEED**2) if motor.friction else 0)
         tau[i] -= drag * speed[i]
         own[i, i] += dt * drag
-    return JointForce(W.T @ tau, W.T @ (free @ slope @ free + own) @ W)
+    force.tau[rows], force.slope[rows, rows] = W.T @ tau, W.T @ (free @ slope @ free + own) @ W
 
 
 def _effort_matrix(W: SX) -> SX:
@@ -141,26 +264,23 @@ def _effort_matrix(W: SX) -> SX:
     return W @ ca.inv(W.T @ W) if n > d else ca.inv(W @ W.T) @ W
 
 
-def _limited(motor: Motor, tau: SX, speed: SX, strength: SX, dt: float) -> tuple[SX, SX, SX]:
-    """Return the torque that a motor can give of what it is asked for [N m], and how it answers to its acceleration.
+def _limits(motor: Motor, speed: SX, strength: SX, dt: float) -> tuple[tuple[SX, SX], tuple[SX, SX]]:
+    """Return the largest and the smallest torque of a motor [N m], and how each falls with acceleration [kg m^2].
 
     The current allows `torque`; the voltage `stall (1 - speed / velocity)` forwards and `stall (1 + speed / velocity)`
     backwards, the torque-speed line, but never makes a motor brake. A motor on the line is taken along it to the speed
     at the end of the step, or it would overshoot its no-load speed wherever a step is long.
-
-    Returns:
-        The torque; 1 if it is what was asked for, else 0; and the slope of the line if the motor is on it [kg m^2].
     """
     limit = strength * motor.torque if math.isfinite(motor.torque) else SX(math.inf)
     stall = strength * (motor.torque if motor.stall is None else motor.stall)
     if math.isinf(motor.velocity) or math.isinf(motor.torque if motor.stall is None else motor.stall):
-        return ca.fmax(-limit, ca.fmin(limit, tau)), ca.fabs(tau) <= limit, SX(0)
-    forwards, backwards = stall * (1 - speed / motor.velocity), stall * (1 + speed / motor.velocity)
-    high, low = ca.fmax(0, ca.fmin(limit, forwards)), -ca.fmax(0, ca.fmin(limit, backwards))
-    given = ca.fmax(low, ca.fmin(high, tau))
-    line = ca.if_else(tau > 0, forwards, backwards)
-    on_line = ca.logic_and(given != tau, ca.logic_and(line > 0, line <= limit))
-    return given, given == tau, ca.if_else(on_line, dt * stall / motor.velocity, 0)
+        return (limit, SX(0)), (-limit, SX(0))
+    ends = []
+    for side in (1, -1):
+        line = stall * (1 - side * speed / motor.velocity)
+        on_line = ca.logic_and(line > 0, line <= limit)
+        ends.append((side * ca.fmax(0, ca.fmin(limit, line)), ca.if_else(on_line, dt * stall / motor.velocity, 0)))
+    return ends[0], ends[1]
 
 
 def passive_forces(robot: Robot, y: SX, yd: SX, dt: float) -> JointForce:

@@ -280,7 +280,7 @@ class Contact:
         """Return 1 if the contact did not do what it was taken to do, given its gain in velocity; else 0.
 
         One taken to slip has turned round, one taken to stick has left the cone, one taken to stay away is in the
-        ground, or one above it was pulled down.
+        ground, or one above it was pulled down. A safe attempt is never misjudged: there is nothing safer to try.
         """
         cone, _, x, size = self._trial(gain)
         tolerance = CONE_TOLERANCE + SECOND_TOLERANCE * self.hint.attempts
@@ -288,7 +288,8 @@ class Contact:
         slid = ca.if_else(ca.sumsqr(response.slip) > 0.5, ca.dot(response.slip, x) < cone, out_of_cone)
         arrived = self.touch.depth - self.dt * self._closing(gain) > 0
         pulled = ca.logic_and(self.above, self.normal_after(gain) < -CONE_FLOOR)
-        return ca.logic_or(slid, ca.if_else(self.there, pulled, arrived))
+        wrong = ca.logic_or(slid, ca.if_else(self.there, pulled, arrived))
+        return ca.logic_and(wrong, ca.logic_not(self.hint.last))
 
     def hint_after(self, gain: SX, slip: SX) -> SX:
         """Return the hint for another attempt, shape (Hint.SIZE,)."""

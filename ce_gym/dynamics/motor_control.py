@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.actuation import (
     Actuated,
     JointForce,
+    MotorForce,
     actuated_clusters,
     controller,
-    delivered,
+    deliver,
     motor_forces,
     within_joint_limits,
 )
@@ -39,7 +40,9 @@ from ce_gym.model.description import Motor
 from ce_gym.model.mechanism import Mechanism
 
 
-def commanded_forces(scene: Scene, kinematics: Kinematics, y: SX, yd: SX, target: SX, dt: float) -> JointForce:
+def commanded_forces(
+    scene: Scene, kinematics: Kinematics, y: SX, yd: SX, target: SX, dt: float, hints: SX
+) -> MotorForce:
     """Return what the motors deliver to the joints.
 
     Args:
@@ -49,9 +52,10 @@ def commanded_forces(scene: Scene, kinematics: Kinematics, y: SX, yd: SX, target
         yd: Their velocities, shape (nj,).
         target: See `target_names`, shape (n_targets,).
         dt: Length of the step [s].
+        hints: What the attempt before has found of limited torques, shape (limit_count,).
     """
     if scene.options.control in ("position", "torque"):
-        return motor_forces(scene, kinematics, controller(scene, y, yd, target, dt), yd, dt)
+        return motor_forces(scene, kinematics, controller(scene, y, yd, target, dt), yd, dt, hints)
     position, strength = scene.options.control == "motor_position", scene.figures.strength
     names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.independent
     undriven = [row for row, name in enumerate(joints) if name in names]
@@ -67,9 +71,8 @@ def commanded_forces(scene: Scene, kinematics: Kinematics, y: SX, yd: SX, target
         if scene.options.motors == "ideal":
             cluster = replace(cluster, motors=[Motor(motor.rotor, motor.torque) for motor in cluster.motors])
         asked = JointForce(strength * asked.tau, ca.diag(strength * asked.slope))
-        local = delivered(asked, cluster, yd, strength, dt)
-        force.tau[cluster.rows], force.slope[cluster.rows, cluster.rows] = local.tau, local.slope
-    return within_joint_limits(scene, force, undriven)
+        deliver(force, asked, cluster, yd, strength, dt, hints)
+    return within_joint_limits(scene, force, undriven, hints)
 
 
 def motor_springs(scene: Scene, kinematics: Kinematics, y: SX, target: SX) -> tuple[SX, SX]:
@@ -115,10 +118,10 @@ def _gains(scene: Scene, cluster: Actuated) -> tuple[SX, SX]:
 
 def _joint_forces(
     scene: Scene, y: SX, yd: SX, target: SX, dt: float, names: tuple[str, ...], rows: list[int]
-) -> JointForce:
+) -> MotorForce:
     """Return what is asked of the joints that no motor drives, and nothing of the others."""
     n, strength = y.numel(), scene.figures.strength
-    force = JointForce(SX(n, 1), SX(n, n))
+    force = MotorForce(SX(n, 1), SX(n, n), {})
     joints = scene.mechanism.robot.independent
     control = "position" if scene.options.control == "motor_position" else "torque"
     full = SX.zeros(n)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from ce_gym.dynamics.actuation import JointForce, passive_forces
+from ce_gym.dynamics.actuation import JointForce, MotorForce, limit_count, passive_forces
 from ce_gym.dynamics.ce_aba import (
     BodyTerms,
     JointTerms,
@@ -47,7 +47,7 @@ class Solved:
 
     kinematics: Kinematics
     vdot: SX
-    motors: JointForce
+    motors: MotorForce
     contacts: list[Contact]
     responses: list[ContactResponse]
     gains: list[SX]
@@ -61,13 +61,14 @@ def solve(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Solve
         state: At the start of the step.
         target: Targets or torques of what `target_names` says, shape (n_targets,).
         dt: Length of the step [s].
-        hints: What the attempt before has found, shape (Hint.SIZE, n_contacts); zero for the first.
+        hints: What the attempt before has found, shape (hint_count,): of the contacts, Hint.SIZE each, then of the
+            limited torques; zero for the first.
     """
     mechanism, n = scene.mechanism, len(scene.mechanism.robot.independent)
     y, yd = state.q[state.q.shape[0] - n :], state.v[state.v.shape[0] - n :]
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
 
-    motors = commanded_forces(scene, kinematics, y, yd, target, dt)
+    motors = commanded_forces(scene, kinematics, y, yd, target, dt, hints[Hint.SIZE * len(scene.options.contacts) :])
     joints = on_coordinates(mechanism, motors + passive_forces(mechanism.robot, y, yd, dt))
     contacts = touching(scene, kinematics, state, dt, hints)
     if scene.options.friction == "secant":
@@ -95,7 +96,7 @@ class Stepped:
         solved: How it came about.
         torque: Motor torque at each joint, mean over the step [N m or N], shape (nj,).
         contact_forces: Mean force on each contact over the step, world axes [N], shape (3, n_contacts).
-        misjudged: 1 if a contact did not do what it was taken to do, else 0.
+        misjudged: 1 if a contact or a motor did not do what it was taken to do, else 0.
         hints: What to make another attempt with, if misjudged; else what this one was made with.
         error: Estimate of the error of the step in `v` [rad/s or m/s]; 0 for a method that has none.
     """
@@ -124,38 +125,46 @@ def attempt(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Ste
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
     )
     forces = [R @ r.force_after(gain) for R, (_, r, gain) in zip(rotations, triples, strict=True)]
-    misjudged = ca.sum1(stacked([c.misjudged(r, gain) for c, r, gain in triples])) > 0
-    found = ca.horzcat(SX(Hint.SIZE, 0), *[c.hint_after(gain, r.slip) for c, r, gain in triples])
     ydd = solved.vdot[solved.vdot.shape[0] - solved.motors.tau.shape[0] :]
+    at_contacts = Hint.SIZE * len(triples)
+    of_torques, wrong = solved.motors.found(ydd, hints.numel() - at_contacts)
+    misjudged = ca.logic_or(wrong, ca.sum1(stacked([c.misjudged(r, gain) for c, r, gain in triples])) > 0)
+    of_contacts = stacked([c.hint_after(gain, r.slip) for c, r, gain in triples])
+    # A robot that was judged well makes the same step again if its tile does; torques found as they were taken to be.
+    of_contacts = ca.if_else(misjudged, of_contacts, hints[:at_contacts])
     return Stepped(
         state=after,
         solved=solved,
         torque=solved.motors.tau - solved.motors.slope @ ydd,
         contact_forces=ca.horzcat(SX(3, 0), *forces),
         misjudged=misjudged,
-        hints=ca.if_else(misjudged, found, hints),
+        hints=ca.vertcat(of_contacts, of_torques),
         error=SX(0),
     )
 
 
 def implicit_step(scene: Scene, state: State, target: SX, dt: float) -> Stepped:
-    """Advance one robot by one linearly implicit Euler step, with further attempts where contacts call for it."""
+    """Advance one robot by one linearly implicit Euler step, with further attempts where it was misjudged."""
     stepped = attempt(scene, state, target, dt, no_hints(scene))
-    for _ in range(further_attempts(scene.options)):
+    for _ in range(further_attempts(scene.mechanism, scene.options)):
         stepped = attempt(scene, state, target, dt, stepped.hints)
     return stepped
 
 
-def further_attempts(options: StepOptions) -> int:
-    """Return how many attempts at a step may follow the first."""
-    if options.friction == "secant" or not options.contacts:
-        return 0
-    return 2
+def further_attempts(mechanism: Mechanism, options: StepOptions) -> int:
+    """Return how many attempts at a step may follow the first: for limited torques, or else for contacts alone."""
+    contacts = options.contacts and options.friction != "secant"
+    return 4 if limit_count(mechanism, options) else 2 if contacts else 0
 
 
 def no_hints(scene: Scene) -> SX:
     """Return the hints of a first attempt."""
-    return SX(Hint.SIZE, len(scene.options.contacts))
+    return SX(hint_count(scene.mechanism, scene.options), 1)
+
+
+def hint_count(mechanism: Mechanism, options: StepOptions) -> int:
+    """Return how many numbers an attempt leaves for the next."""
+    return Hint.SIZE * len(options.contacts) + limit_count(mechanism, options)
 
 
 def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float, hints: SX) -> list[Contact]:
@@ -170,8 +179,9 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float, hint
                 height += ca.dot(slope, body.point_position(position)[:2] - scene.looked_up[:, i])
             normal = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
+        hint = Hint.of(hints[Hint.SIZE * i : Hint.SIZE * (i + 1)])
         touch = touch_ground(body, position, sphere.radius, height, normal, state.load[i], anchor)
-        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, dt, Hint.of(hints[:, i])))
+        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, dt, hint))
     return contacts
 
 

@@ -11,7 +11,6 @@ import casadi as ca
 
 from ce_gym.dynamics.actuation import actuated_clusters
 from ce_gym.dynamics.closure import closures
-from ce_gym.dynamics.contact import Hint
 from ce_gym.dynamics.energy import mechanical_energy
 from ce_gym.dynamics.functions import loop_gap, loop_state, traced
 from ce_gym.dynamics.kinematics import Kinematics, outward_velocity_pass
@@ -19,7 +18,7 @@ from ce_gym.dynamics.methods import METHODS, beyond
 from ce_gym.dynamics.parameters import parameter_defaults
 from ce_gym.dynamics.scene import State, StepOptions, make_scene, symbolic_state, target_names
 from ce_gym.dynamics.spatial import SX
-from ce_gym.dynamics.step import Stepped, attempt, stacked
+from ce_gym.dynamics.step import Stepped, attempt, hint_count, stacked
 from ce_gym.model.mechanism import Mechanism
 
 LOST_LOOP = 1e-5
@@ -56,14 +55,14 @@ def attempt_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[
 
     Returns:
         Function (*state, diverged, *given, hints) -> (*state, diverged, hints, misjudged, *outputs), see
-        `step_function`; hints are zero at first, shape (Hint.SIZE * n_contacts,).
+        `step_function`; hints are zero at first, shape (hint_count,).
     """
-    given, hints = _Given(mechanism, options), SX.sym("hints", Hint.SIZE, len(options.contacts))
+    given, hints = _Given(mechanism, options), SX.sym("hints", hint_count(mechanism, options))
     stepped = attempt(given.scene, given.state, given.target, given.dt, hints)
     results = given.results(stepped, outputs)
     kept = {name: results.pop(name) for name in list(results) if name.endswith("_next")}
-    kept |= {"hints_next": ca.vec(stepped.hints), "misjudged": stepped.misjudged}
-    return traced("attempt", given.inputs() | {"hints": ca.vec(hints)}, kept | results)
+    kept |= {"hints_next": stepped.hints, "misjudged": stepped.misjudged}
+    return traced("attempt", given.inputs() | {"hints": hints}, kept | results)
 
 
 def extrapolation_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:

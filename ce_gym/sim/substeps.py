@@ -35,7 +35,7 @@ def substeps(
         field, and outputs; further buffers, for scratch and on a field the table `HEIGHTS`; and the steps. An output
         that is empty for this robot is left out.
     """
-    more = further_attempts(options) if options.method in ("euler", "extrapolated") else 0
+    more = further_attempts(mechanism, options) if options.method in ("euler", "extrapolated") else 0
     trace = attempt_function if more else step_function
     function = trace(mechanism, options, outputs)
     if empty := [name for name in outputs if not function.numel_out(name)]:

@@ -1,7 +1,7 @@
 """Emitted CUDA C run by the processor: the same text, through a C++ compiler and a few lines that stand in for CUDA's.
 
 For tests and for comparisons where there is no GPU; a user never needs it. It shows that the arithmetic, the copying
-and the order of stages are right, not how a GPU rounds (its compiler fuses products and sums) nor how fast it is.
+and the order of stages are right, not that a GPU rounds as IEEE 754 says, nor how fast it is.
 Knows the text of sources and how to call a shared library.
 """
 
