@@ -103,7 +103,7 @@ class SceneReport:
         layers: Of a sub-step, in the order in which they are added; they sum to the sub-step.
         once: What is done once in each environment step: the action; then, in the order in which they are added,
             bookkeeping and the terms of the task.
-        sometimes: What is done only if some robot of a tile needs it: a second attempt, a reset.
+        sometimes: What is done only if some robot of a tile needs it: another attempt, a reset.
         left_out: What each feature would add to a sub-step; less than 0 if it would save.
         terms_left_out: What each term would add to an environment step.
     """
@@ -151,8 +151,8 @@ def report_scene(env_id: str, **arguments: Any) -> SceneReport:
     program = make_program(**{**gymnasium.spec(env_id).kwargs, **arguments})
     outputs = ("torque", "contact_forces") if program.contact_forces else ("torque",)
     whole = SubStep(program.model, program.options, outputs)
-    again = [c.function for c in whole.calls if c.only_if]
-    sometimes = [("second attempt at a sub-step", f) for f in again] + [("reset", program.function("begin"))]
+    again = dict.fromkeys(call.function for call in whole.calls if call.only_if)
+    sometimes = [("another attempt at a sub-step", f) for f in again] + [("reset", program.function("begin"))]
     return SceneReport(
         name=env_id,
         program=program,
