@@ -17,7 +17,7 @@ OPERATIONS = {"fadd": 1, "fsub": 1, "fmul": 1, "fdiv": 1, "llvm.fma": 2, "llvm.s
 def floating_point_operations(function: casadi.Function, dtype: str = "float64") -> int:
     """Return how many operations one lane takes: sums, products, quotients and roots, polynomials of sines included.
 
-    They are counted before the optimiser fuses and shares them.
+    They are counted as emitted, multiply-adds twice, before the optimiser shares what is equal.
 
     Args:
         function: An SX function.

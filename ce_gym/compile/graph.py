@@ -2,7 +2,7 @@
 
 Compilers fuse products with sums and turn quotients into products where they are allowed to. Which ones is their own
 affair, and so are the last digits of the result. Here it is done once for all targets, and none is allowed to do more:
-what is left are operations of IEEE 754, so that processors of every kind and GPUs give the same numbers, bit for bit.
+what is left are operations of IEEE 754: processors and GPUs that keep to it give the same numbers, bit for bit.
 The rewritings leave seven tenths of the operations of a step. Knows CasADi's instruction list.
 """
 

@@ -9,7 +9,7 @@ what is beyond the limit at first may be little by the end of the step, and full
 Controllers ask for torques at the joints. "Ideal" motors deliver them up to the joints' limits. "Limited" motors are
 the ones the robot has: their torques `tau_m` and speeds `W yd` belong to rotors, with `W` the rows of the constraint
 Jacobian, and what they do to the joints is `W^T tau_m`. Limits and friction there do not depend on the transmission
-level. May know CasADi, descriptions, mechanisms and kinematics.
+level. May know CasADi, descriptions, mechanisms, scenes and kinematics.
 """
 
 from __future__ import annotations
@@ -62,6 +62,12 @@ class Limited:
     high: JointForce
     low: JointForce
     expected: SX
+
+    @staticmethod
+    def judged(asked: JointForce, high: JointForce, low: JointForce, hints: SX, place: int) -> Limited:
+        """Return a torque as the attempt before has found it, or, if there was none, judged at zero acceleration."""
+        one = Limited(asked, high, low, asked.tau)
+        return replace(one, expected=ca.if_else(hints[-1] > 0, hints[place], asked.tau)) if one.answers else one
 
     @property
     def answers(self) -> bool:
@@ -128,12 +134,6 @@ class MotorForce(JointForce):
         return hints, misjudged
 
 
-def limited(asked: JointForce, high: JointForce, low: JointForce, hints: SX, place: int) -> Limited:
-    """Return a torque judged as the attempt before has found it, or, if there was none, at zero acceleration."""
-    one = Limited(asked, high, low, asked.tau)
-    return replace(one, expected=ca.if_else(hints[-1] > 0, hints[place], asked.tau)) if one.answers else one
-
-
 def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many torques an attempt may be wrong about: those of all joints, and after them those of all motors.
 
@@ -179,7 +179,7 @@ def within_joint_limits(scene: Scene, force: MotorForce, rows: list[int], hints:
         if not math.isinf(limit):
             asked, still = JointForce(force.tau[row], force.slope[row, :]), SX(1, force.tau.numel())
             ends = JointForce(strength * limit, still), JointForce(-strength * limit, still)
-            one = force.limited[row] = limited(asked, *ends, hints, row)
+            one = force.limited[row] = Limited.judged(asked, *ends, hints, row)
             force.slope[row, row] = ca.if_else(one.free, force.slope[row, row], 0)
             force.tau[row] = one.given
     force.slope = ca.sparsify(force.slope)
@@ -246,7 +246,7 @@ def deliver(
             place = yd.numel() + cluster.places[i]
             (high, forwards), (low, backwards) = _limits(motor, speed[i], strength, dt)
             ends = (JointForce(high, forwards * turning[i, :]), JointForce(low, backwards * turning[i, :]))
-            one = limited(JointForce(tau[i], slope[i, :] @ turning), *ends, hints, place)
+            one = Limited.judged(JointForce(tau[i], slope[i, :] @ turning), *ends, hints, place)
             force.limited[place] = one
             tau[i], free[i, i] = one.given, one.free
             own[i, i] = ca.if_else(one.at_high, forwards, ca.if_else(one.at_low, backwards, 0))

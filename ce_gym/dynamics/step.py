@@ -97,7 +97,7 @@ class Stepped:
         torque: Motor torque at each joint, mean over the step [N m or N], shape (nj,).
         contact_forces: Mean force on each contact over the step, world axes [N], shape (3, n_contacts).
         misjudged: 1 if a contact or a motor did not do what it was taken to do, else 0.
-        hints: What to make another attempt with, if misjudged; else what this one was made with.
+        hints: What to make another attempt with; if not misjudged, one that comes to the same.
         error: Estimate of the error of the step in `v` [rad/s or m/s]; 0 for a method that has none.
     """
 
