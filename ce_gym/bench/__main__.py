@@ -15,7 +15,8 @@ from pathlib import Path
 from ce_gym.viewer.console import Parser
 
 BENCHMARKS = (
-    "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak", "gpu"
+    "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak", "gpu",
+    "digests",
 )  # fmt: skip
 
 
@@ -58,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(report.as_text())
     if arguments.json:
         arguments.json.write_text(report.as_json(), encoding="utf-8")
-    return 0
+    return int(report.failed)
 
 
 if __name__ == "__main__":

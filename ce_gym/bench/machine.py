@@ -17,7 +17,7 @@ def describe() -> dict[str, str]:
     return {
         "processor": processor(),
         "cores": str(usable_cores()),
-        "system": f"{platform.system()} {platform.release()}",
+        "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
         "date": datetime.date.today().isoformat(),
         "python": platform.python_version(),
         **versions,

@@ -69,12 +69,13 @@ class Requirement:
 
 @dataclass
 class Report:
-    """Tables, requirements and remarks of one run, on one machine."""
+    """Tables, requirements and remarks of one run, on one machine; `failed` asks for a non-zero exit status."""
 
     name: str
     tables: list[Table] = field(default_factory=list)
     requirements: list[Requirement] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    failed: bool = False
     machine: dict[str, str] = field(default_factory=machine.describe)
 
     def as_text(self) -> str:
