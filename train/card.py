@@ -16,11 +16,11 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from callbacks import read_curve
 from console import Table, add_json_argument, markdown, positive, print_result, run
 from effort import effort
 from evaluate import EVALUATION_SEED, evaluate
 from pictures import draw_curve
+from progress import read_curve
 from pushes import direction_name, push_envelope
 from settings import config_file, load_settings
 from transfer import LEVELS

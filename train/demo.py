@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from console import run
 from evaluate import EVALUATION_SEED, load_learner, report
-from ppo import Job, Trained, available_threads, train
+from job import Job, Trained, available_threads
+from ppo import train
 from settings import config_file, load_settings
 from transfer import summary, table, transfer
 

@@ -118,7 +118,8 @@ def train_missing(args: argparse.Namespace) -> list[Path]:
         ValueError: If the folder has a policy that was trained in another way, or settings are wrong.
         KeyboardInterrupt: After Ctrl-C; what is trained so far is kept and gone on from next time.
     """
-    from ppo import Job, train
+    from job import Job
+    from ppo import train
 
     path = config_file(args.env)
     settings = load_settings(path, [f"steps={args.steps}"] if args.steps else [])
@@ -237,7 +238,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Train if asked to, judge, and write."""
-    from ppo import available_threads
+    from job import available_threads
 
     args.threads = args.threads or available_threads()
     try:

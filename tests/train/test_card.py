@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from card import card, command, main, portable, short_name
 from evaluate import main as evaluate_main
-from ppo import Job, jobs, parser, train
+from job import Job, jobs, parser
+from ppo import train
 from settings import config_file, load_settings
 
 import ce_gym

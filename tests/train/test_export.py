@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from evaluate import evaluate, load_learner
 from evaluate import main as evaluate_main
+from job import Job
 from point_mass import ID
-from ppo import Job, train
+from ppo import train
 from settings import config_file, load_settings
 
 import ce_gym

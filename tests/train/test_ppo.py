@@ -13,11 +13,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from callbacks import AdaptiveLearningRate, read_curve
+from callbacks import AdaptiveLearningRate
 from evaluate import evaluate, load_learner
 from evaluate import main as evaluate_main
+from job import Job
 from point_mass import ID
-from ppo import Job, main, train
+from ppo import main, train
+from progress import read_curve
 from settings import config_file, load_settings
 from stable_baselines3 import PPO
 from transfer import LEVELS

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mujoco")
-from ppo import Job, train
+from job import Job
+from ppo import train
 from settings import config_file, load_settings
 from sim2sim import MujocoWorld, OurWorld, course, main, play, table, verdicts
 

@@ -1,0 +1,210 @@
+"""Training runs, whoever learns: what the command line asks for, what is written beside a policy, what is said.
+
+A learner is a program that has `train(job) -> Trained`; `main` here does all else. Knows settings and policies, no
+learner; no robots, no tasks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+from settings import Settings, config_file, load_settings
+
+from ce_gym.policies import load_policy
+
+CHECKPOINTS = 10
+"""Checkpoints per training run."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training run.
+
+    Attributes:
+        env_id: Registered environment id.
+        settings: What shapes learning.
+        out: Folder to write to.
+        env_kwargs: Given to the environment.
+        seed: Of the policy's initial weights, the exploration and the environments.
+        threads: Processor threads for physics and for learning, which take turns.
+        resume: A policy to go on from.
+        seconds: Longest time to train [s]; the steps done by then are kept.
+        tensorboard: Whether to write TensorBoard logs.
+    """
+
+    env_id: str
+    settings: Settings
+    out: Path
+    env_kwargs: dict[str, Any]
+    seed: int = 0
+    threads: int = 1
+    resume: Path | None = None
+    seconds: float = float("inf")
+    tensorboard: bool = True
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a training run leaves.
+
+    Attributes:
+        model: The policy; its `predict` is that of Stable-Baselines3.
+        record: What is written beside it.
+        policy: Path of the policy.
+        interrupted: Whether Ctrl-C ended training early.
+    """
+
+    model: Any
+    record: dict[str, Any]
+    policy: Path
+    interrupted: bool
+
+
+def make_record(job: Job, native: Any, steps: int, seconds: float, packages: tuple[str, ...]) -> dict[str, Any]:
+    """Return what somebody needs to know to use or repeat a policy.
+
+    Args:
+        job: The training run.
+        native: The environment, unwrapped.
+        steps: Environment steps done.
+        seconds: Time that they took.
+        packages: Whose versions matter, beside those of ce_gym, gymnasium, numpy and Python.
+    """
+    seen, action = native.single_observation_space, native.single_action_space.shape
+    observation = seen["policy"].shape if isinstance(seen, gymnasium.spaces.Dict) else seen.shape
+    return {
+        "env": job.env_id,
+        "transmission": native.model.transmission,
+        "env_kwargs": job.env_kwargs,
+        "observation_size": observation[0] if observation else 0,
+        "action_size": action[0] if action else 0,
+        "activation": job.settings.activation,
+        "contract": native.contract(),
+        "steps": steps,
+        "seed": job.seed,
+        "resumed_from": str(job.resume) if job.resume else None,
+        "training_seconds": round(seconds, 1),
+        "settings": job.settings.as_dict(),
+        "date": time.strftime("%Y-%m-%d"),
+        "versions": {name: _version(name) for name in ("ce_gym", "gymnasium", *packages, "numpy")}
+        | {"python": platform.python_version()},
+    }
+
+
+def _version(package: str) -> str:
+    """Version of an installed package; a source tree that is only on the path has none."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def available_threads() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def jobs(args: argparse.Namespace) -> list[Job]:
+    """The training runs a command line asks for.
+
+    Raises:
+        ValueError: If the command line, a settings file or a policy cannot be used.
+    """
+    record = load_policy(args.resume).record if args.resume else {}
+    env_id = args.env or record.get("env")
+    if not env_id:
+        raise ValueError("--env: missing; expected an environment id, or --resume with a policy")
+    overrides = list(args.set)
+    overrides += [f"steps={args.steps}"] if args.steps else []
+    overrides += [f"num_envs={args.num_envs}"] if args.num_envs else []
+    path = args.config or config_file(env_id)
+    settings = load_settings(path, overrides)
+    kwargs = dict(record.get("env_kwargs", {}))
+    kwargs |= {"transmission": args.transmission} if args.transmission else {}
+    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
+    out = args.out or Path("runs") / "-".join([path.stem, *([args.transmission] if args.transmission else [])])
+    seeds = args.seeds or [args.seed]
+    return [
+        Job(
+            env_id=env_id,
+            settings=settings,
+            out=out / f"seed_{seed}" if len(seeds) > 1 else out,
+            env_kwargs=kwargs,
+            seed=seed,
+            threads=args.threads,
+            resume=args.resume,
+            seconds=60.0 * args.minutes,
+            tensorboard=args.tensorboard,
+        )
+        for seed in seeds
+    ]
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line of every learner."""
+    result = argparse.ArgumentParser(
+        description="Train a policy with PPO. Ctrl-C stops in good order and saves; --resume goes on.",
+        epilog="Settings not named here are in the settings file; --set KEY=VALUE changes any of them.",
+    )
+    what = result.add_argument_group("what to train")
+    what.add_argument("--env", metavar="ID", help="environment id, such as ce_gym/MiniCheetahVelocity-v0")
+    what.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
+    what.add_argument(
+        "--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees, such as base_height"
+    )
+    what.add_argument(
+        "--resume", type=Path, metavar="FILE", help="policy to go on from; --steps counts its steps too"
+    )  # fmt: skip
+    what.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    what.add_argument("--seeds", type=int, nargs="+", metavar="N", help="several seeds, one run after the other")
+    how = result.add_argument_group("how")
+    how.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the one in train/config)")
+    how.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change, such as gamma=0.98")
+    how.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
+    how.add_argument("--num-envs", metavar="N", help="environments stepped at once")
+    how.add_argument(
+        "--minutes", type=float, default=float("inf"), metavar="M", help="stop after so long at the latest"
+    )
+    how.add_argument("--threads", type=int, default=available_threads(), metavar="N", help="default: all processors")
+    where = result.add_argument_group("where to")
+    where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")
+    where.add_argument("--no-tensorboard", dest="tensorboard", action="store_false", help="write no TensorBoard logs")
+    where.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes of the evaluation at the end")
+    return result
+
+
+def main(program: str, train: Callable[[Job], Trained], argv: list[str] | None = None) -> int:
+    """Train every seed asked for, evaluate each policy, and say where it lies.
+
+    Args:
+        program: Name of the learner's file, for messages.
+        train: What learns.
+        argv: Arguments of the command line.
+    """
+    from evaluate import evaluate, report  # what judges is not needed before
+
+    args = parser().parse_args(argv)
+    try:
+        for job in jobs(args):
+            print(f"training {job.env_id}, seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", flush=True)
+            trained = train(job)
+            print(f"saved {trained.policy} after {trained.record['steps']:,} steps", flush=True)
+            if trained.interrupted:
+                print(f"interrupted; go on with: python train/{program} --resume {trained.policy}")
+                return 130
+            result = evaluate(trained.model, job.env_id, episodes=args.episodes, **job.env_kwargs)
+            print(report(result), flush=True)
+    except (ValueError, gymnasium.error.Error) as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 2
+    return 0

@@ -1,0 +1,182 @@
+"""What happens beside learning, whoever learns: the curve, the progress bar, schedules, stopping in good order.
+
+Knows the `episode` entries that environments report; knows no learner, no robots, no tasks.
+"""
+
+from __future__ import annotations
+
+import csv
+import signal
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+from tqdm import tqdm
+
+CURVE: tuple[str, ...] = ("steps", "seconds", "reward", "length")
+"""Columns of a learning curve."""
+
+
+def episode_means(episodes: Iterable[Mapping[str, float]] | None) -> dict[str, float]:
+    """Mean of every entry of recent episodes, without the clock `t`; empty before the first episode ends."""
+    recent = list(episodes or ())
+    if not recent:
+        return {}
+    return {key: float(np.mean([episode[key] for episode in recent])) for key in recent[-1] if key != "t"}
+
+
+class Curve:
+    """Writes how learning goes into a small CSV file: steps, seconds, mean reward and length of recent episodes.
+
+    A learner's own log begins anew when training goes on from a policy; this one keeps what came before.
+
+    Args:
+        file: To write, a row after every rollout.
+        before: Rows of the training that led to the policy gone on from, see `read_curve`.
+        steps: Steps done so far; rows beyond them are dropped.
+    """
+
+    def __init__(self, file: Path, before: list[dict[str, float]], steps: int = 0) -> None:
+        rows = [row for row in before if row["steps"] <= steps]
+        self.file, self.started = file, time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
+        self._write(rows, "w")
+
+    def add(self, steps: int, means: Mapping[str, float]) -> None:
+        """Write one row; none before the first episode ends."""
+        if means:
+            seconds = round(time.perf_counter() - self.started, 2)
+            values = (steps, seconds, round(means["r"], 4), round(means["l"], 2))
+            self._write([dict(zip(CURVE, values, strict=True))], "a")
+
+    def _write(self, rows: list[dict[str, float]], mode: str) -> None:
+        with self.file.open(mode, newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, CURVE)
+            if mode == "w":
+                writer.writeheader()
+            writer.writerows(rows)
+
+
+def read_curve(file: Path) -> list[dict[str, float]]:
+    """Return the rows of a learning curve; none if there is no such file.
+
+    Raises:
+        ValueError: If it is something else.
+    """
+    if not file.exists():
+        return []
+    try:
+        with file.open(newline="", encoding="utf-8") as lines:
+            return [{key: float(row[key]) for key in CURVE} for row in csv.DictReader(lines)]
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise ValueError(f"{file}: expected the columns {', '.join(CURVE)}, numbers in each row") from None
+
+
+def adapted_rate(rate: float, kl: float, target: float, limits: tuple[float, float] = (1e-5, 1e-2)) -> float:
+    """Return the learning rate that keeps the KL divergence of an update near a target.
+
+    The rule of Schulman et al. 2017 (arXiv:1707.06347, section 4) as legged-robot learners use it: outside half and
+    twice the target, change the rate by a factor of 1.5.
+
+    Args:
+        rate: Of the update that has just ended.
+        kl: Its mean divergence.
+        target: Desired divergence.
+        limits: Smallest and largest learning rate.
+    """
+    factor = 1 / 1.5 if kl > 2.0 * target else 1.5 if kl < 0.5 * target else 1.0
+    return float(np.clip(rate * factor, *limits))
+
+
+def linear(start: float, end: float, done: float) -> float:
+    """Return a value that changes in proportion to the share of training that is done."""
+    return start + done * (end - start)
+
+
+def geometric(start: float, end: float, done: float) -> float:
+    """Return a value that changes by the same factor in every step, by the share of training that is done."""
+    return float(np.exp(linear(np.log(start), np.log(end), done)))
+
+
+class StopInOrder:
+    """Ends training at a deadline or at Ctrl-C, at a moment when the policy is whole.
+
+    A second Ctrl-C interrupts at once. Use as a context manager around learning.
+
+    Args:
+        seconds: Longest time to train [s].
+
+    Attributes:
+        interrupted: Whether Ctrl-C ended training.
+    """
+
+    def __init__(self, seconds: float = float("inf")) -> None:
+        self.seconds, self.interrupted = seconds, False
+
+    def __enter__(self) -> StopInOrder:
+        self._previous = signal.signal(signal.SIGINT, self._on_interrupt)
+        self._deadline = time.monotonic() + self.seconds
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._previous)
+
+    def _on_interrupt(self, _signal: int, _frame: FrameType | None) -> None:
+        if self.interrupted:
+            raise KeyboardInterrupt
+        self.interrupted = True
+
+    @property
+    def due(self) -> bool:
+        """Whether to stop now."""
+        return self.interrupted or time.monotonic() >= self._deadline
+
+
+class ProgressBar:
+    """Steps, speed and time left, with the figures of recent episodes and where the time goes.
+
+    "physics" is time inside the environment, "policy" the rest of collection, "learning" all else.
+
+    Args:
+        total: Steps at which training ends.
+        steps: Steps done so far.
+    """
+
+    def __init__(self, total: int, steps: int = 0) -> None:
+        interval = 0.5 if sys.stderr.isatty() else 10.0  # a log file gets a line now and then
+        form = "{percentage:3.0f}% |{bar:20}| {n_fmt}/{total_fmt} steps, {rate_fmt}, {remaining} left {postfix}"
+        self.total = total
+        self.bar = tqdm(
+            total=total, initial=steps, unit=" steps", unit_scale=True, mininterval=interval,
+            bar_format=form, dynamic_ncols=True, smoothing=0.05,
+        )  # fmt: skip
+        self.started = time.perf_counter()
+
+    def advance(self, steps: int) -> None:
+        """Show that so many steps are done."""
+        self.bar.update(min(steps, self.total) - self.bar.n)
+
+    def describe(self, means: Mapping[str, float], physics: float, collecting: float) -> None:
+        """Show the means of recent episodes and the seconds spent in physics and in collection as a whole."""
+        self.bar.set_postfix_str(f"| {self._figures(means)} | {self._shares(physics, collecting)}", refresh=False)
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        self.bar.close()
+
+    def _figures(self, means: Mapping[str, float]) -> str:
+        if not means:
+            return "no episode has ended yet"
+        metrics = [
+            (key.split("/", 1)[1].replace("_", " "), x) for key, x in means.items() if key.startswith("metrics/")
+        ]
+        shown = [("reward", means["r"]), ("length", means["l"]), *metrics[:2]]
+        return ", ".join(f"{name} {value:.3g}" for name, value in shown)
+
+    def _shares(self, physics: float, collecting: float) -> str:
+        """Where the time went since training began."""
+        total = time.perf_counter() - self.started
+        parts = {"physics": physics, "policy": collecting - physics, "learning": total - collecting}
+        return " ".join(f"{name} {100 * seconds / total:.0f}%" for name, seconds in parts.items())
