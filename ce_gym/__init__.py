@@ -7,12 +7,12 @@
 `Terrain` is ground for it that is not flat.
 """
 
+from ce_gym.diagnostics.scene_text import scene_report
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.custom import register_robot
 from ce_gym.envs.registration import environment_ids, register_environments
 from ce_gym.envs.rendering import use_renderers
-from ce_gym.envs.scene_text import scene_report
-from ce_gym.envs.terms import metric, observation, reward, termination
+from ce_gym.envs.terms.registry import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
 from ce_gym.policies import LevelWarning, Policy, PolicyError, load_policy, shipped_policies
 from ce_gym.sim.simulator import Simulator

@@ -104,8 +104,8 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _inspect(args: argparse.Namespace) -> int:
+    from ce_gym.diagnostics.transmission_text import transmission_report
     from ce_gym.dynamics import Model
-    from ce_gym.dynamics.report_text import transmission_report
 
     if re.fullmatch(r"ce_gym/.*-v\d+", args.name):
         return _inspect_environment(args)
@@ -117,7 +117,7 @@ def _inspect(args: argparse.Namespace) -> int:
 
 def _inspect_environment(args: argparse.Namespace) -> int:
     from ce_gym import environment_ids
-    from ce_gym.envs.scene_text import scene_report
+    from ce_gym.diagnostics.scene_text import scene_report
     from ce_gym.model import RobotError
 
     if args.name not in environment_ids():

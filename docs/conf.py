@@ -75,7 +75,7 @@ _BARE = (
 )
 _BARE += r"|Observations|VecEnvIndices|VecEnvStepReturn|EzPickle|Generic|Env|VectorEnv|Literal.*|optional|float64|bool_"
 _BARE += r"|Device)"
-_INNER = r"ce_gym\.(sim\.devices|envs\.(shell|program|batch|terms)|model\.mechanism|dynamics\.kinematics)\..*"
+_INNER = r"ce_gym\.(sim\.devices|envs\.(base|runtime|terms)|model\.mechanism|dynamics\.recursion)\..*"
 nitpick_ignore_regex = [(r"py:.*", pattern) for pattern in (_ELSEWHERE, _BARE, _INNER)]
 
 

@@ -1,7 +1,8 @@
 """The command `python -m ce_gym.bench`: lists the benchmarks, or runs one and prints its report.
 
-A benchmark is a module of this package with `add_arguments(parser)` and `run(arguments) -> Report`; the first line of
-its docstring is its entry in the list. Knows nothing of what they measure, and imports only the one it runs.
+A benchmark is a module of this package, or the module `benchmark` of a package in it, with
+`add_arguments(parser)` and `run(arguments) -> Report`; the first line of its docstring is its entry in the list. Only
+the one that runs is imported.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 from ce_gym.viewer.console import Parser
 
@@ -22,8 +24,19 @@ BENCHMARKS = (
 
 def summary(name: str) -> str:
     """Return the first docstring line of a benchmark, without importing it."""
-    source = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+    source = _source(name).read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
+
+
+def load(name: str) -> ModuleType:
+    """Import a benchmark."""
+    inside = "" if _source(name).stem == name else ".benchmark"
+    return importlib.import_module(f"ce_gym.bench.{name}{inside}")
+
+
+def _source(name: str) -> Path:
+    alone = Path(__file__).with_name(f"{name}.py")
+    return alone if alone.exists() else Path(__file__).with_name(name) / "benchmark.py"
 
 
 def listing() -> str:
@@ -46,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the report to a JSON file")
     try:
-        benchmark = importlib.import_module(f"ce_gym.bench.{name}")
+        benchmark = load(name)
         benchmark.add_arguments(parser)
         arguments = parser.parse_args(rest)
         report = benchmark.run(arguments)

@@ -14,7 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from ce_gym.bench.report import Report, Requirement, Table
+from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot, load_robot
 from ce_gym.model.description import Mat3

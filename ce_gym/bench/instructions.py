@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 
-from ce_gym.bench.report import Cell, Report, Requirement, Table
+from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import LinearConstraint, load_robot, robots
 from ce_gym.model.mechanism import is_axisymmetric

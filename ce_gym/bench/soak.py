@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.progress import shown
-from ce_gym.bench.report import Report, Requirement, Table
+from ce_gym.bench.measure.progress import shown
+from ce_gym.bench.measure.report import Report, Requirement, Table
 
 NUM_ENVS = 64
 """Robots in a batch."""

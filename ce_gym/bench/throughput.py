@@ -11,9 +11,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from ce_gym.bench import machine
-from ce_gym.bench.report import Report, Requirement, Table
-from ce_gym.bench.timing import Competitor, interleaved
+from ce_gym.bench.measure import machine
+from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.bench.measure.timing import Competitor, interleaved
 
 LEVELS = ("exact", "armature")
 DTYPES = ("float64", "float32")

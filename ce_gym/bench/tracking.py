@@ -14,7 +14,7 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.report import Report, Requirement, Table
+from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import load_robot
 

@@ -93,6 +93,6 @@ class _Source:
 
     def emit(self, builder: Any, arguments: tuple) -> None:
         """Emit the work on one tile."""
-        from ce_gym.compile.tile import emit_tile
+        from ce_gym.compile.lowering.tile import emit_tile
 
         emit_tile(builder, self.get(), self.layout(), arguments)

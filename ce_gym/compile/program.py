@@ -62,7 +62,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Lookup:
-    """A smooth surface over a table, looked up at points of every lane; see `ce_gym.compile.lookup` for the surface.
+    """A smooth surface over a table, looked up at points of every lane; see `compile/lowering/lookup.py`.
 
     Attributes:
         table: a `table` buffer. Entry (i, j) belongs to the place `x = x0 + i cell`, `y = y0 + j cell`.

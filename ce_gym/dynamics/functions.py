@@ -11,20 +11,20 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 import numpy as np
 
-from ce_gym.dynamics.assembly import linear_rows, nonlinear_rows
-from ce_gym.dynamics.ce_aba import (
+from ce_gym.dynamics.algebra.spatial import SX, axis_rotation, cross
+from ce_gym.dynamics.constraints.assembly import linear_rows, nonlinear_rows
+from ce_gym.dynamics.constraints.closure import closures, reference_guess
+from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
+from ce_gym.dynamics.constraints.residuals import gap as constraint_gap
+from ce_gym.dynamics.recursion.ce_aba import (
     BodyTerms,
     JointTerms,
     gravity_acceleration,
     inward_inertia_pass,
     outward_acceleration_pass,
 )
-from ce_gym.dynamics.ce_rnea import inverse_dynamics, outward_acceleration
-from ce_gym.dynamics.closure import closures, reference_guess
-from ce_gym.dynamics.constraints import ClusterCoordinates
-from ce_gym.dynamics.kinematics import Kinematics, constant, is_free, outward_velocity_pass
-from ce_gym.dynamics.residuals import gap as constraint_gap
-from ce_gym.dynamics.spatial import SX, axis_rotation, cross
+from ce_gym.dynamics.recursion.ce_rnea import inverse_dynamics, outward_acceleration
+from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free, outward_velocity_pass
 from ce_gym.model.description import LinearConstraint
 from ce_gym.model.mechanism import Mechanism
 

@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.dynamics.batched import evaluate
-from ce_gym.dynamics.closure import closures, loop_report, reference_guess
-from ce_gym.dynamics.continuation import follow
+from ce_gym.dynamics.algebra.batched import evaluate
+from ce_gym.dynamics.constraints.closure import closures, loop_report, reference_guess
+from ce_gym.dynamics.constraints.continuation import follow
 from ce_gym.dynamics.functions import FUNCTIONS
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import gymnasium
 
-from ce_gym.envs.tasks import TASKS
+from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import bad
 from ce_gym.model.load import load_robot

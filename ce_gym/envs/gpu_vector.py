@@ -10,9 +10,9 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ce_gym.envs.gpu_batch import GpuBatch
-from ce_gym.envs.setup import checked_dtype, make_program
-from ce_gym.envs.shell import BatchShell
+from ce_gym.envs.base import BatchShell
+from ce_gym.envs.runtime.gpu_batch import GpuBatch
+from ce_gym.envs.runtime.setup import checked_dtype, make_program
 from ce_gym.envs.single import checked_seed, recorded_state, spaces
 from ce_gym.sim.devices import Device
 
@@ -35,7 +35,7 @@ class GpuVectorEnv(BatchShell, VectorEnv[Any, Any, Any]):
         obs_mode: "vector", or "dict" for `{"policy": ..., "critic": ...}`, where the critic may see more.
         render_mode: None; robots on a GPU are recorded through `state()`.
         dtype: "float32" or "float64" for physics.
-        **kwargs: See `ce_gym.envs.setup.make_program`.
+        **kwargs: See `ce_gym.envs.runtime.setup.make_program`.
 
     Raises:
         ValueError: If there is no such GPU, or an argument is not one of the choices; one line.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gymnasium
 
-from ce_gym.envs.tasks import TASKS
+from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.mechanism import LEVELS
 
 ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1")

@@ -14,8 +14,8 @@ import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
-from ce_gym.envs.batch import Batch
-from ce_gym.envs.fields import field_of
+from ce_gym.envs.runtime.batch import Batch
+from ce_gym.envs.task.terrain_tiles import field_of
 
 RENDER_MODES = ("human", "rgb_array")
 

@@ -11,10 +11,10 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from ce_gym.envs.program import OBSERVATION_BOUND, TaskProgram
+from ce_gym.envs.base import BatchShell
 from ce_gym.envs.rendering import RENDER_MODES, Screen
-from ce_gym.envs.setup import make_batch
-from ce_gym.envs.shell import BatchShell
+from ce_gym.envs.runtime.program import OBSERVATION_BOUND, TaskProgram
+from ce_gym.envs.runtime.setup import make_batch
 
 
 class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]], EzPickle):
@@ -35,7 +35,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         render_mode: None; "rgb_array", for pictures as arrays; or "human", for a live page at this machine's loopback.
         width: Of a picture [pixels].
         height: Of a picture [pixels].
-        **kwargs: See `ce_gym.envs.setup.make_batch`.
+        **kwargs: See `ce_gym.envs.runtime.setup.make_batch`.
     """
 
     metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES]}  # noqa: RUF012  (Gymnasium's own declaration)

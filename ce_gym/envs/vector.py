@@ -11,11 +11,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ce_gym.envs.base import BatchShell
 from ce_gym.envs.rendering import RENDER_MODES, Screen
-from ce_gym.envs.setup import make_batch
-from ce_gym.envs.shell import BatchShell
+from ce_gym.envs.runtime.setup import make_batch
 from ce_gym.envs.single import checked_action, checked_seed, recorded_state, shown, spaces
-from ce_gym.envs.task_values import checked_value
+from ce_gym.envs.task.checks import checked_value
 from ce_gym.sim.devices import Device, device_named
 
 Observations = NDArray[np.float32]
@@ -46,7 +46,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         render_mode: None; "rgb_array", for a picture of every environment; or "human", for a live page of the first.
         width: Of a picture [pixels].
         height: Of a picture [pixels].
-        **kwargs: See `ce_gym.envs.setup.make_batch`.
+        **kwargs: See `ce_gym.envs.runtime.setup.make_batch`.
 
     Raises:
         ValueError: If an argument is not one of the choices.

@@ -1,6 +1,6 @@
 """What a robot is, where it is read from, and how its bodies cluster."""
 
-from ce_gym.model.checks import check_robot
+from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
 from ce_gym.model.constraint_functions import constraint_function, register_constraint
 from ce_gym.model.description import (

@@ -10,12 +10,12 @@ from pathlib import Path
 
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
-from ce_gym.model.mjcf_import import robot_from_mjcf
-from ce_gym.model.reading import read_yaml
-from ce_gym.model.urdf import Base
-from ce_gym.model.urdf_graph import UrdfGraph
-from ce_gym.model.urdf_plus import robot_from_graph
-from ce_gym.model.yaml_file import robot_from_yaml
+from ce_gym.model.formats.mjcf.robot import robot_from_mjcf
+from ce_gym.model.formats.reading import read_yaml
+from ce_gym.model.formats.urdf.graph import UrdfGraph
+from ce_gym.model.formats.urdf.plus import robot_from_graph
+from ce_gym.model.formats.urdf.tree import Base
+from ce_gym.model.formats.yaml.robot import robot_from_yaml
 
 
 def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = None) -> Robot:

@@ -1,7 +1,7 @@
 """`Simulator`: many copies of one robot, stepped together by one compiled kernel.
 
-Holds state arrays and knows when to call the kernel; the physics is `ce_gym.dynamics.step`, the machine code comes from
-`ce_gym.compile`. May know models, dynamics and compile; no tasks.
+Holds state arrays and knows when to call the kernel; the physics is `ce_gym.dynamics.stepping.step`, the
+machine code comes from `ce_gym.compile`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import Buffer, Program
-from ce_gym.dynamics.methods import METHODS
+from ce_gym.dynamics.forces.parameters import parameter_defaults
+from ce_gym.dynamics.forces.scene import Control, Friction, Motors, StepOptions, target_names
 from ce_gym.dynamics.model import Model
-from ce_gym.dynamics.parameters import parameter_defaults
-from ce_gym.dynamics.scene import Control, Friction, Motors, StepOptions, target_names
-from ce_gym.dynamics.trace import OUTPUTS
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.trace import OUTPUTS
 from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
 from ce_gym.sim.devices import Array, Device, Processor, device_named, to_numpy
 from ce_gym.sim.retry import Retry
@@ -214,7 +214,7 @@ class Simulator:
         Args:
             name: "gravity", "friction", "slip_speed", "stiffness", "damping", "kp", "kd", "motor_strength",
                 "rotor_inertia", "ratio", "added_mass:BODY" or "com_shift:BODY"; sizes and units are in
-                `ce_gym.dynamics.parameters.PARAMETERS`.
+                `ce_gym.dynamics.forces.parameters.PARAMETERS`.
             value: Shape (num_envs, size) or (size,) or ().
             mask: Which robots, bool, shape (num_envs,); all of them if None.
 

@@ -9,12 +9,12 @@ from typing import TypeAlias
 import casadi as ca
 
 from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.functions import traced
-from ce_gym.dynamics.ground import places_function, planes_function, touching_function
-from ce_gym.dynamics.scene import StepOptions
-from ce_gym.dynamics.spatial import SX
-from ce_gym.dynamics.step import further_attempts
-from ce_gym.dynamics.trace import attempt_function, extrapolation_function, step_function
+from ce_gym.dynamics.stepping.ground_lookup import places_function, planes_function, touching_function
+from ce_gym.dynamics.stepping.step import further_attempts
+from ce_gym.dynamics.stepping.trace import attempt_function, extrapolation_function, step_function
 from ce_gym.model.mechanism import Mechanism
 
 TIMES = "n_substeps"

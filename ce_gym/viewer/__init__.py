@@ -14,13 +14,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ce_gym.viewer.driving import SHOW, Script, drive, drive_many, walk
     from ce_gym.viewer.errors import ViewerError
-    from ce_gym.viewer.html import write_html
     from ce_gym.viewer.live import show
-    from ce_gym.viewer.recorder import Recorder
-    from ce_gym.viewer.recording import record, record_lanes
-    from ce_gym.viewer.rollout import Rollout, RolloutError
+    from ce_gym.viewer.page.html import write_html
+    from ce_gym.viewer.rollouts.driving import SHOW, Script, drive, drive_many, walk
+    from ce_gym.viewer.rollouts.recorder import Recorder
+    from ce_gym.viewer.rollouts.recording import record, record_lanes
+    from ce_gym.viewer.rollouts.rollout import Rollout, RolloutError
 
 __all__ = [
     "SHOW",
@@ -39,19 +39,19 @@ __all__ = [
 ]
 
 _HOMES = {
-    "SHOW": "driving",
-    "Script": "driving",
-    "drive": "driving",
-    "drive_many": "driving",
-    "walk": "driving",
-    "record": "recording",
-    "record_lanes": "recording",
-    "Recorder": "recorder",
-    "Rollout": "rollout",
-    "RolloutError": "rollout",
+    "SHOW": "rollouts.driving",
+    "Script": "rollouts.driving",
+    "drive": "rollouts.driving",
+    "drive_many": "rollouts.driving",
+    "walk": "rollouts.driving",
+    "record": "rollouts.recording",
+    "record_lanes": "rollouts.recording",
+    "Recorder": "rollouts.recorder",
+    "Rollout": "rollouts.rollout",
+    "RolloutError": "rollouts.rollout",
     "ViewerError": "errors",
     "show": "live",
-    "write_html": "html",
+    "write_html": "page.html",
 }
 
 

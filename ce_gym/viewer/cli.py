@@ -15,7 +15,7 @@ from ce_gym.policies import WHERE, find_policy, locate_policy
 from ce_gym.viewer.console import examples
 
 if TYPE_CHECKING:
-    from ce_gym.viewer.rollout import Rollout
+    from ce_gym.viewer.rollouts.rollout import Rollout
 
 LEVELS = ("exact", "coupled", "armature", "none")
 
@@ -100,8 +100,8 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
 
 def view(args: argparse.Namespace) -> int:
     """Run `view`; return its exit code."""
-    from ce_gym.viewer.driving import walk
-    from ce_gym.viewer.rollout import Rollout
+    from ce_gym.viewer.rollouts.driving import walk
+    from ce_gym.viewer.rollouts.rollout import Rollout
 
     policies = [find_policy(path) for path in args.rollouts]
     rollouts = [walk(p)[0] if p else Rollout.load(path) for p, path in zip(policies, args.rollouts, strict=True)]
@@ -111,9 +111,9 @@ def view(args: argparse.Namespace) -> int:
 
 def play(args: argparse.Namespace) -> int:
     """Run `play`; return its exit code."""
-    from ce_gym.viewer.driving import SHOW, walk
     from ce_gym.viewer.errors import ViewerError
-    from ce_gym.viewer.html import meshcat_code
+    from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.rollouts.driving import SHOW, walk
 
     file = locate_policy(args.policy)
     meshcat_code()  # a missing meshcat is told before all else, not after the simulation

@@ -15,8 +15,8 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from ce_gym.viewer.html import page
-from ce_gym.viewer.rollout import Rollout
+from ce_gym.viewer.page.html import page
+from ce_gym.viewer.rollouts.rollout import Rollout
 
 LOOPBACK = "127.0.0.1"
 
@@ -34,7 +34,7 @@ def show(
         rollouts: What to show; several stand side by side.
         open_browser: Open a browser at the page.
         seconds: Stop by itself after this time [s].
-        options: Title, models, spacing and frame rate; see `ce_gym.viewer.html.page`.
+        options: Title, models, spacing and frame rate; see `ce_gym.viewer.page.html.page`.
 
     Raises:
         ViewerError: meshcat is not installed, or a rollout does not fit its robot.

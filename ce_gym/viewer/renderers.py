@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.sim.terrain import Terrain
-from ce_gym.viewer.actor import PosedModel
+from ce_gym.viewer.page.poses import PosedModel
 
 if TYPE_CHECKING:
-    from ce_gym.viewer.picture import Picture
+    from ce_gym.viewer.raytrace.picture import Picture
     from ce_gym.viewer.window import Window
 
 
@@ -19,7 +19,7 @@ def rgb_array(
     model: PosedModel, q: NDArray[np.float64], *, width: int, height: int, fps: float, terrain: Terrain | None
 ) -> Picture:
     """Return what draws arrays; see `Picture`."""
-    from ce_gym.viewer.picture import Picture
+    from ce_gym.viewer.raytrace.picture import Picture
 
     return Picture(model, q, width=width, height=height, terrain=terrain)
 

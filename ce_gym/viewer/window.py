@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.sim.terrain import Terrain
-from ce_gym.viewer import three
-from ce_gym.viewer.actor import PosedModel
-from ce_gym.viewer.ground import around, level, reach
-from ce_gym.viewer.html import meshcat_code, source
 from ce_gym.viewer.live import serve
-from ce_gym.viewer.robot import body_paths, extent, robot_commands
-from ce_gym.viewer.stage import HORIZON, TILE, camera_commands, eye, field_command, stage_commands
+from ce_gym.viewer.page import three
+from ce_gym.viewer.page.html import meshcat_code, source
+from ce_gym.viewer.page.lights_and_camera import HORIZON, TILE, camera_commands, eye, field_command, stage_commands
+from ce_gym.viewer.page.poses import PosedModel
+from ce_gym.viewer.page.robot import body_paths, extent, robot_commands
+from ce_gym.viewer.rollouts.ground_patch import around, level, reach
 
 Array = NDArray[np.float64]
 

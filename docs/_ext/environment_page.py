@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields
 from typing import Any
 
-from ce_gym.envs.program import OBSERVATION_BOUND, TaskProgram
 from ce_gym.envs.registration import camel_case
-from ce_gym.envs.setup import make_program
-from ce_gym.envs.tasks import Task
-from ce_gym.envs.terms import find_term
+from ce_gym.envs.runtime.program import OBSERVATION_BOUND, TaskProgram
+from ce_gym.envs.runtime.setup import make_program
+from ce_gym.envs.task.tasks import Task
+from ce_gym.envs.terms.registry import find_term
 from ce_gym.model.mechanism import LEVELS
 
 GOALS = {

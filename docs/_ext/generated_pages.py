@@ -24,7 +24,7 @@ from sphinx.application import Sphinx
 
 from ce_gym import InertiaWarning, Model, load_robot, robots
 from ce_gym.envs.registration import ROBOTS
-from ce_gym.envs.tasks import TASKS
+from ce_gym.envs.task.tasks import TASKS
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

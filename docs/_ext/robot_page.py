@@ -17,11 +17,11 @@ from environment_page import percent, table, title
 from numpy.typing import NDArray
 
 from ce_gym import InertiaWarning, Model, Robot, load_robot
-from ce_gym.dynamics.report import TransmissionReport, report_transmissions
-from ce_gym.dynamics.report_text import DROPPED
+from ce_gym.diagnostics.transmission import TransmissionReport, report_transmissions
+from ce_gym.diagnostics.transmission_text import DROPPED
 from ce_gym.envs.registration import ROBOTS
-from ce_gym.envs.tasks import TASKS
-from ce_gym.model.reading import read_yaml
+from ce_gym.envs.task.tasks import TASKS
+from ce_gym.model.formats.reading import read_yaml
 from ce_gym.viewer import ViewerError
 
 ROUNDING = 1e-12
@@ -128,7 +128,7 @@ def _sources(robot: Robot) -> str:
 
 def picture(model: Model, path: Path, page: Path) -> str:
     """Draw a robot in its standing pose, for a page in a folder; nothing if what draws is not installed."""
-    from ce_gym.viewer.picture import Picture
+    from ce_gym.viewer.raytrace.picture import Picture
 
     try:
         pixels = Picture(model, model.standing_q, width=640, height=400).draw(model.standing_q)

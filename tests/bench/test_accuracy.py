@@ -10,11 +10,15 @@ import pytest
 pytest.importorskip("mujoco")
 
 from ce_gym import Model, Simulator
-from ce_gym.bench import accuracy, accuracy_contact, accuracy_coulomb, accuracy_curves, accuracy_references
-from ce_gym.bench.accuracy_curves import Curve, Measured, Point, comparisons, rms_error, time_to
-from ce_gym.bench.accuracy_ours import Ours
-from ce_gym.bench.accuracy_peers import Family, Peer
-from ce_gym.bench.accuracy_scenarios import HOLD, SCENES, Scene
+from ce_gym.bench.accuracy import benchmark as accuracy
+from ce_gym.bench.accuracy import contact as accuracy_contact
+from ce_gym.bench.accuracy import coulomb as accuracy_coulomb
+from ce_gym.bench.accuracy import curves as accuracy_curves
+from ce_gym.bench.accuracy import references as accuracy_references
+from ce_gym.bench.accuracy.curves import Curve, Measured, Point, comparisons, rms_error, time_to
+from ce_gym.bench.accuracy.ours import Ours
+from ce_gym.bench.accuracy.peers import Family, Peer
+from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 

@@ -37,7 +37,7 @@ def test_exactness_costs_no_more_than_required():
 
 def test_bare_robot_has_one_group_of_contacts():
     pytest.importorskip("mujoco")
-    from ce_gym.bench import speed
+    from ce_gym.bench.speed import benchmark as speed
 
     robot = speed.bare(load_robot("mini_cheetah"), "foot")
     assert len(robot.contacts) == 4
@@ -46,7 +46,8 @@ def test_bare_robot_has_one_group_of_contacts():
 
 def test_mujoco_stands_at_its_converged_settings_and_not_with_too_few_iterations():
     pytest.importorskip("mujoco")
-    from ce_gym.bench import mujoco_settings, speed
+    from ce_gym.bench.peers import mujoco_settings
+    from ce_gym.bench.speed import benchmark as speed
 
     robot = speed.bare(load_robot("mini_cheetah"), "foot")
     _, reference = mujoco_settings.watched(robot, "armature", mujoco_settings.Settings(0.001, "Euler"), 4)
@@ -64,7 +65,7 @@ def test_mujoco_stands_at_its_converged_settings_and_not_with_too_few_iterations
 )
 def test_what_counts_as_standing_alike(change, alike):
     pytest.importorskip("mujoco")
-    from ce_gym.bench.stand import Behaviour
+    from ce_gym.bench.peers.stand import Behaviour
 
     reference = Behaviour(finite=True, height=0.9, speed=0.2, contacts=4.0, slip=0.01)
     assert dataclasses.replace(reference, **change).like(reference) is alike
@@ -72,7 +73,8 @@ def test_what_counts_as_standing_alike(change, alike):
 
 def test_ours_stands_like_mujoco():
     pytest.importorskip("mujoco")
-    from ce_gym.bench import mujoco_settings, speed, stand
+    from ce_gym.bench.peers import mujoco_settings, stand
+    from ce_gym.bench.speed import benchmark as speed
     from ce_gym.dynamics.model import Model
     from ce_gym.sim import Simulator
 
@@ -87,7 +89,7 @@ def test_ours_stands_like_mujoco():
 
 def test_forward_dynamics_kernel_computes_forward_dynamics():
     pytest.importorskip("mujoco")
-    from ce_gym.bench import forward
+    from ce_gym.bench.speed import forward
     from ce_gym.compile import aligned_zeros, lane_count
     from ce_gym.dynamics.model import Model
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from ce_gym.bench import __main__ as command
-from ce_gym.bench.digest_cases import Case
-from ce_gym.bench.digests import row
+from ce_gym.bench.digests.benchmark import row
+from ce_gym.bench.digests.cases import Case
 from ce_gym.model.load import assets_folder
 
 ROBOT = "four_bar"

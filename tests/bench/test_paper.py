@@ -6,8 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from ce_gym.bench import paper, paper_counts, paper_reference
-from ce_gym.bench.paper_counts import crossover, increments
+from ce_gym.bench.paper import benchmark as paper
+from ce_gym.bench.paper import counts as paper_counts
+from ce_gym.bench.paper import reference as paper_reference
+from ce_gym.bench.paper.counts import crossover, increments
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 LINEAR = ("link_and_rotor", "belt_pair", "transmission_parallel")

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from ce_gym.bench import machine
-from ce_gym.bench.report import Report, Requirement, Table, cell_text
-from ce_gym.bench.timing import Competitor, Timing, interleaved, ratio
+from ce_gym.bench.measure import machine
+from ce_gym.bench.measure.report import Report, Requirement, Table, cell_text
+from ce_gym.bench.measure.timing import Competitor, Timing, interleaved, ratio
 
 
 def test_columns_are_aligned():

@@ -5,7 +5,7 @@ import argparse
 import pytest
 
 from ce_gym.bench import soak
-from ce_gym.envs.batch import Batch
+from ce_gym.envs.runtime.batch import Batch
 
 IDS = ["ce_gym/MiniCheetahVelocity-v0", "ce_gym/MiniCheetahRun-v0"]
 

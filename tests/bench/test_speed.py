@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ce_gym.bench.report import Table
+from ce_gym.bench.measure.report import Table
 from ce_gym.model import RobotError, load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -16,7 +16,7 @@ X, Y = ca.SX.sym("x"), ca.SX.sym("y")
     [(X * Y + 2, 2), (X / Y - ca.sqrt(X), 3), (ca.fmax(X, -Y), 0), (X**2 + X**2, 2), (ca.fabs(X) * Y, 1)],
 )
 def test_floating_point_operations_are_counted(expression, expected):
-    from ce_gym.compile.counting import floating_point_operations
+    from ce_gym.compile.lowering.counting import floating_point_operations
 
     function = ca.Function("f", [X, Y], [expression])
     assert floating_point_operations(function) == expected
@@ -24,7 +24,7 @@ def test_floating_point_operations_are_counted(expression, expected):
 
 
 def test_polynomials_count_and_are_shorter_in_single_precision():
-    from ce_gym.compile.counting import floating_point_operations
+    from ce_gym.compile.lowering.counting import floating_point_operations
 
     turn = ca.Function("turn", [X], [ca.sin(X), ca.cos(X)])
     # reduction: 4 multiply-adds, 1 difference; 2 products; polynomials of 6 (3) coefficients and 3 multiply-adds
@@ -34,7 +34,7 @@ def test_polynomials_count_and_are_shorter_in_single_precision():
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_the_peak_is_of_multiply_adds_that_are_done(dtype):
-    from ce_gym.bench import peak
+    from ce_gym.bench.speed import peak
     from ce_gym.compile import aligned_zeros, lane_count
 
     arrays = {name: aligned_zeros((1, n, lane_count(dtype)), dtype) for name, n in (("x", peak.CHAINS), ("factor", 2))}
@@ -49,7 +49,7 @@ def test_the_peak_is_of_multiply_adds_that_are_done(dtype):
 @pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid", "jvrc1", "four_bar", "planar_leg_linkage"])
 def test_pinocchio_has_the_same_dynamics(name):
     pytest.importorskip("pinocchio")
-    from ce_gym.bench import pinocchio_peer
+    from ce_gym.bench.peers import pinocchio as pinocchio_peer
     from ce_gym.dynamics.model import Model
 
     robot, rng = load_robot(name), np.random.default_rng(3)
@@ -72,7 +72,7 @@ def test_pinocchio_has_the_same_dynamics(name):
 
 def test_pinocchio_says_what_it_cannot():
     pytest.importorskip("pinocchio")
-    from ce_gym.bench import pinocchio_peer
+    from ce_gym.bench.peers import pinocchio as pinocchio_peer
 
     with pytest.raises(RobotError, match="tello: constraint 'left-hip-rod-1' is none of Pinocchio's") as caught:
         pinocchio_peer.load(load_robot("tello"))
@@ -81,7 +81,9 @@ def test_pinocchio_says_what_it_cannot():
 
 def test_mujoco_on_two_threads_is_mujoco_on_one():
     pytest.importorskip("mujoco")
-    from ce_gym.bench import speed, stand, stepping
+    from ce_gym.bench.peers import stand
+    from ce_gym.bench.speed import benchmark as speed
+    from ce_gym.bench.speed import stepping
 
     robot = speed.bare(load_robot("mini_cheetah"), "foot")
     control = np.repeat(stand.targets(robot, 6, 1, seed=0), 3, axis=1)
@@ -92,7 +94,8 @@ def test_mujoco_on_two_threads_is_mujoco_on_one():
 
 def test_every_figure_of_a_small_robot(tmp_path):
     pytest.importorskip("mujoco")
-    from ce_gym.bench import speed_batch, speed_robots
+    from ce_gym.bench.speed import batch as speed_batch
+    from ce_gym.bench.speed import robots as speed_robots
 
     robot = load_robot("four_bar")
     measured = speed_robots.measure(robot, "exact", num_envs=16, dt=0.005, rounds=1)
@@ -115,7 +118,8 @@ def test_every_figure_of_a_small_robot(tmp_path):
 
 def test_a_peer_that_cannot_is_named(monkeypatch):
     pytest.importorskip("mujoco")
-    from ce_gym.bench import speed_robots, stepping
+    from ce_gym.bench.speed import robots as speed_robots
+    from ce_gym.bench.speed import stepping
 
     def refuse(*_):
         raise RobotError("four_bar: no way to say it")

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from ce_gym.bench import __main__ as command
-from ce_gym.bench import stability, stability_grid, stability_plots
-from ce_gym.bench.report import Report
+from ce_gym.bench.measure.report import Report
+from ce_gym.bench.stability import benchmark as stability
+from ce_gym.bench.stability import grid as stability_grid
+from ce_gym.bench.stability import plots as stability_plots
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 

@@ -30,7 +30,7 @@ assert load_kernel(key, build) is kernel
 x, y = np.linspace(0, 1, 33).reshape(11, 3), np.zeros((11, 3))
 kernel({"x": x, "y": y}, 11)
 print(y.tobytes().hex())
-print("lowering" if "ce_gym.compile.lowering" in sys.modules else "no lowering")
+print("lowering" if "ce_gym.compile.lowering.function" in sys.modules else "no lowering")
 """
 PACKAGE_PARENT = Path(sys.modules["ce_gym.compile"].__path__[0]).parents[1]
 

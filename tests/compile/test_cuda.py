@@ -12,7 +12,7 @@ from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, load_kernel
 from ce_gym.compile.cuda import CudaUnavailable, host_kernel, nvrtc
 from ce_gym.compile.cuda.loading import cached_cubin, kernel_name
 from ce_gym.compile.cuda.source import BLOCK, LONG, emit_source
-from ce_gym.compile.random import uniform
+from ce_gym.compile.lowering.random import uniform
 
 DTYPES = pytest.mark.parametrize("dtype", ["float64", "float32"])
 N = BLOCK + 5

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ce_gym.compile.graph import (
+from ce_gym.compile.lowering.graph import (
     ABSORBED,
     CHOICE,
     MINUS_PRODUCT,

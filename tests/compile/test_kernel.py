@@ -69,7 +69,7 @@ def run(kernel, num_envs, num_threads=1, n_substeps=3, arrays=None):
 
 
 def test_values(kernel):
-    from ce_gym.compile.random import uniform
+    from ce_gym.compile.lowering.random import uniform
 
     num_envs, before = 21, arrays_for(kernel, 21)
     after = run(kernel, num_envs)

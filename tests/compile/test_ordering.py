@@ -2,8 +2,8 @@
 
 import pytest
 
-from ce_gym.compile.graph import NO_OPERATION, graph_of
-from ce_gym.compile.ordering import TWINS, ordered
+from ce_gym.compile.lowering.graph import NO_OPERATION, graph_of
+from ce_gym.compile.lowering.ordering import TWINS, ordered
 from ce_gym.dynamics.model import Model
 
 FEWER = 0.79

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ce_gym.compile import Buffer, Call, Program, load_kernel
-from ce_gym.compile.random import uniform
+from ce_gym.compile.lowering.random import uniform
 
 SIZE = 12
 

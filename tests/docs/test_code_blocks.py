@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import importlib
 import os
 import re
 import shlex
@@ -23,7 +22,7 @@ from pages import PAGES, ROOT, blocks, commands, name_of, script
 
 import ce_gym
 from ce_gym import __main__ as command_line
-from ce_gym.bench.__main__ import BENCHMARKS
+from ce_gym.bench import __main__ as benchmarks
 
 WITH_CODE = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
 COMMANDS = sorted({(name_of(page), command) for page in PAGES for command in commands(page)})
@@ -90,16 +89,19 @@ def check_module(module: str, words: list[str]) -> None:
     assert module in ("ce_gym", "ce_gym.bench")
     named = words if module == "ce_gym.bench" else words[1:]
     if named:
-        assert named[0] in BENCHMARKS
+        assert named[0] in benchmarks.BENCHMARKS
         parser = argparse.ArgumentParser()
         parser.add_argument("--json", metavar="FILE")
-        importlib.import_module(f"ce_gym.bench.{named[0]}").add_arguments(parser)
+        benchmarks.load(named[0]).add_arguments(parser)
         parser.parse_args(named[1:])
 
 
 def check_script(path: Path, words: list[str]) -> None:
     """The script exists, and so do its options and environments; it is read, not imported, because torch is slow."""
-    calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    script = ast.parse(path.read_text())
+    beside = [path.with_name(f"{n.module}.py") for n in ast.walk(script) if isinstance(n, ast.ImportFrom)]
+    trees = [script, *(ast.parse(file.read_text()) for file in beside if file.exists())]
+    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
     adding = [c for c in calls if isinstance(c.func, ast.Attribute) and c.func.attr == "add_argument"]
     options = {a.value for call in adding for a in call.args if isinstance(a, ast.Constant)}
     assert {word for word in words if word.startswith("--")} <= options | {"--help"}

@@ -20,7 +20,7 @@ from ce_gym.model import (
     Robot,
     RodConstraint,
 )
-from ce_gym.model.placement import rotation_from_rpy
+from ce_gym.model.formats.placement import rotation_from_rpy
 
 FACTS = Path(__file__).parents[1] / "data" / "facts"
 

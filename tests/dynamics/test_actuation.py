@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.actuation import COULOMB_SPEED
-from ce_gym.dynamics.scene import StepOptions
-from ce_gym.dynamics.trace import step_function
+from ce_gym.dynamics.forces.actuation import COULOMB_SPEED
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Motor, Placement, Robot, load_robot
 from ce_gym.model.mechanism import LEVELS
 

@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ce_gym.dynamics.contact import Compliance, Contact, ContactResponse, Hint, Touch
-from ce_gym.dynamics.spatial import SX
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.contact import Compliance, Contact, ContactResponse, Hint, Touch
 
 DT, MU, LOAD, BRISTLE, SLIP_SPEED = 0.005, 0.5, 20.0, 1e4, 0.01
 CONE = MU * LOAD

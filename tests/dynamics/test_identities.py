@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.integration import advance
-from ce_gym.dynamics.spatial import SX
+from ce_gym.dynamics.algebra.integration import advance
+from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.model import Robot
 from ce_gym.model.mechanism import LEVELS
 

@@ -11,9 +11,9 @@ from facts import robot_from_facts
 from linkages import four_bar, link, rod_leg, spatial_four_bar
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.closure import closures
-from ce_gym.dynamics.integration import advance
-from ce_gym.dynamics.spatial import SX
+from ce_gym.dynamics.algebra.integration import advance
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.model import (
     FunctionConstraint,
     LinearConstraint,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.methods import METHODS
-from ce_gym.dynamics.scene import StepOptions
-from ce_gym.dynamics.trace import step_function
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Placement, Robot
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.motor_control import standing_motors
-from ce_gym.dynamics.scene import StepOptions
-from ce_gym.dynamics.trace import step_function
+from ce_gym.dynamics.forces.motor_control import standing_motors
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model.mechanism import LEVELS
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")

@@ -11,9 +11,9 @@ import pytest
 
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.parameters import PARAMETERS, parameter_defaults
-from ce_gym.dynamics.scene import StepOptions
-from ce_gym.dynamics.trace import attempt_function, step_function
+from ce_gym.dynamics.forces.parameters import PARAMETERS, parameter_defaults
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.trace import attempt_function, step_function
 from ce_gym.model import LinearConstraint, Robot, load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")

@@ -10,8 +10,8 @@ import pytest
 
 import ce_gym
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.scene import StepOptions
-from ce_gym.dynamics.trace import step_function
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Body, Gains, Inertial, Joint, LinearConstraint, Motor, Placement, Robot
 
 KP, KD, LIMIT, RATIO, DT = 40.0, 1.0, 3.0, 8.0, 0.005

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.scene import StepOptions, state_sizes
-from ce_gym.dynamics.trace import step_function
+from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
+from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.model.mechanism import LEVELS
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ce_gym.envs.custom import register_robot
-from ce_gym.envs.setup import make_program
-from ce_gym.envs.tasks import TASKS
+from ce_gym.envs.runtime.setup import make_program
+from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model import RobotError, assets_folder
 from ce_gym.model.mechanism import LEVELS
 

@@ -8,8 +8,8 @@ import torch
 from ce_gym.compile.cuda import CudaUnavailable, nvrtc
 from ce_gym.compile.cuda.host import host_compiler
 from ce_gym.compile.cuda.source import emit_source
-from ce_gym.envs.rounds import round_stages
-from ce_gym.envs.setup import make_program
+from ce_gym.envs.runtime.fused_step import round_stages
+from ce_gym.envs.runtime.setup import make_program
 from ce_gym.sim.devices import Emulated
 
 ID = "ce_gym/MiniCheetahVelocity-v0"

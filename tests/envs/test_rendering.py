@@ -18,7 +18,7 @@ from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers.vector import RecordVideo as RecordVideos
 
 import ce_gym
-from ce_gym.envs.fields import checked_terrain, make_field
+from ce_gym.envs.task.terrain_tiles import checked_terrain, make_field
 from ce_gym.viewer import ViewerError
 
 ENV = "ce_gym/MiniCheetahVelocity-v0"
@@ -112,7 +112,7 @@ def standing_on(terrain, model, x: float, y: float) -> np.ndarray:
 def test_ground_that_is_not_flat_is_seen(field_of_stairs):
     """Steps change the picture around the robot; the robot itself stays where flat ground has it."""
     pytest.importorskip("embreex")
-    from ce_gym.viewer.picture import Picture
+    from ce_gym.viewer.raytrace.picture import Picture
 
     model = ce_gym.Model(ROBOT)
     stairs = Picture(model, model.standing_q, terrain=field_of_stairs, **SMALL)
@@ -130,7 +130,7 @@ def test_ground_that_is_not_flat_is_seen(field_of_stairs):
 
 def test_a_picture_on_a_field_depends_on_the_pose_alone(field_of_stairs):
     pytest.importorskip("embreex")
-    from ce_gym.viewer.picture import Picture
+    from ce_gym.viewer.raytrace.picture import Picture
 
     model = ce_gym.Model(ROBOT)
     stairs = Picture(model, model.standing_q, terrain=field_of_stairs, **SMALL)
@@ -143,7 +143,7 @@ def test_a_picture_on_a_field_depends_on_the_pose_alone(field_of_stairs):
 def test_a_robot_in_a_pit_is_not_hidden_by_its_rim():
     """It is seen as large as on flat ground, to a fifth; the camera goes up for that."""
     pytest.importorskip("embreex")
-    from ce_gym.viewer.picture import Picture
+    from ce_gym.viewer.raytrace.picture import Picture
 
     model = ce_gym.Model(ROBOT)
     pit = ce_gym.Terrain.from_function(lambda x, y: np.clip(0.6 * (np.hypot(x, y) - 0.4), 0, 1), 0.1, 12.0)
@@ -183,7 +183,7 @@ def test_environments_show_their_ground(capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize("robot", ["mit_humanoid", "jvrc1", "four_bar"])
 def test_every_kind_of_robot_can_be_seen(robot: str):
     pytest.importorskip("embreex")
-    from ce_gym.viewer.picture import Picture
+    from ce_gym.viewer.raytrace.picture import Picture
 
     model = ce_gym.Model(robot)
     picture = Picture(model, model.standing_q, **SMALL)
@@ -315,7 +315,8 @@ def test_a_missing_library_is_one_line_when_the_environment_is_made(mode, librar
 
 
 def test_import_brings_no_renderer():
-    code = "import ce_gym, sys; print([m for m in ('embreex', 'meshcat', 'ce_gym.viewer.picture') if m in sys.modules])"
+    heavy = ("embreex", "meshcat", "ce_gym.viewer.raytrace.picture")
+    code = f"import ce_gym, sys; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 

@@ -9,14 +9,14 @@ import pytest
 
 import ce_gym
 from ce_gym.__main__ import main
+from ce_gym.diagnostics.scene import SceneReport, SubStep, layers, left_out, report_scene
+from ce_gym.diagnostics.scene_text import as_text
+from ce_gym.diagnostics.scene_timing import SceneTimes
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.step import hint_count
-from ce_gym.dynamics.trace import attempt_function, step_function
-from ce_gym.envs.program import TaskProgram
-from ce_gym.envs.scene_report import SceneReport, SubStep, layers, left_out, report_scene
-from ce_gym.envs.scene_text import as_text
-from ce_gym.envs.scene_timing import SceneTimes
-from ce_gym.envs.tasks import VELOCITY
+from ce_gym.dynamics.stepping.step import hint_count
+from ce_gym.dynamics.stepping.trace import attempt_function, step_function
+from ce_gym.envs.runtime.program import TaskProgram
+from ce_gym.envs.task.tasks import VELOCITY
 from ce_gym.model import ContactMaterial
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -168,7 +168,7 @@ def test_text_holds_the_figures(report: SceneReport):
 
 def test_command(capsys, monkeypatch):
     asked = []
-    monkeypatch.setattr("ce_gym.envs.scene_text.scene_report", lambda *a, **k: asked.append((a, k)) or "report")
+    monkeypatch.setattr("ce_gym.diagnostics.scene_text.scene_report", lambda *a, **k: asked.append((a, k)) or "report")
     assert main(["inspect", ENVIRONMENT, "--no-timing"]) == 0
     assert asked == [((ENVIRONMENT,), {"timing": False})]
     assert main(["inspect", "ce_gym/NoSuchRobot-v0"]) == 2

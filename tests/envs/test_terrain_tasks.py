@@ -8,8 +8,8 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 import ce_gym  # noqa: F401 - registers the environments
-from ce_gym.envs.fields import BORDER, PLATFORM, checked_terrain, make_field
-from ce_gym.envs.setup import make_program
+from ce_gym.envs.runtime.setup import make_program
+from ce_gym.envs.task.terrain_tiles import BORDER, PLATFORM, checked_terrain, make_field
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 

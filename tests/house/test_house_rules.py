@@ -17,13 +17,31 @@ MAY_IMPORT = {
     "model": set(),
     "compile": set(),
     "dynamics": {"model"},
+    "export": {"model", "dynamics"},
     "sim": {"model", "dynamics", "compile"},
     "envs": {"model", "dynamics", "compile", "sim"},
+    "diagnostics": {"model", "dynamics", "compile", "sim", "envs"},
     "adapters": {"envs"},
     "policies": {"model"},
     "viewer": {"model", "dynamics", "sim", "envs", "policies"},
-    "bench": {"model", "dynamics", "compile", "sim", "envs", "adapters", "policies", "viewer"},
+    "bench": {
+        "model", "dynamics", "compile", "export", "sim", "envs", "diagnostics", "adapters", "policies", "viewer"
+    },
+}  # fmt: skip
+"""What the modules of a folder may import from other folders."""
+LAYERS = {
+    "model": "errors table description constraint_functions clusters mechanism checks generators formats load listing",
+    "model/formats": "reading placement rotor_rule urdf yaml mjcf",
+    "compile": "arrays program layout lowering cache module threads kernel loading cuda",
+    "dynamics": "algebra constraints recursion forces functions stepping model",
+    "sim": "tiles devices terrain substeps retry simulator",
+    "envs": "terms task runtime policy_spec base rendering single gpu_vector vector registration custom",
+    "viewer": "errors console rollouts page raytrace live window renderers cli",
+    "bench": "measure peers friction instructions tracking soak digests speed throughput paper accuracy stability gpu"
+    " __main__",
 }
+"""What a folder consists of, bottom first: a module imports from its own layer and from those below."""
+MOST_MODULES = 14
 
 
 def imported_modules(path: Path) -> set[str]:
@@ -42,8 +60,20 @@ def room_of(path: Path) -> str:
     return parts[0] if len(parts) > 1 else ""
 
 
+def names_in(folder: Path) -> set[str]:
+    inside = {path.stem for path in folder.glob("*.py")} | {path.parent.name for path in folder.glob("*/__init__.py")}
+    return inside - {"__init__"}
+
+
 def test_every_room_has_a_rule():
     assert {room_of(path) for path in FILES} - {""} == set(MAY_IMPORT)
+    for folder, layers in LAYERS.items():
+        assert names_in(PACKAGE / folder) == set(layers.split()), folder
+
+
+def test_folders_stay_small():
+    for folder in {path.parent for path in FILES}:
+        assert len(names_in(folder)) <= MOST_MODULES, folder
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
@@ -57,6 +87,20 @@ def test_imports_go_one_way(path: Path):
         elif module.startswith("ce_gym."):
             target = module.split(".")[1]
             assert target == room or target in MAY_IMPORT[room], f"{room} must not import {module}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_downwards_inside_a_folder(path: Path):
+    for folder, names in LAYERS.items():
+        inside = path.relative_to(PACKAGE).with_suffix("").as_posix().removeprefix(f"{folder}/").split("/")[0]
+        layers = names.split()
+        if inside not in layers or not path.is_relative_to(PACKAGE / folder):
+            continue
+        prefix = f"ce_gym.{folder.replace('/', '.')}."
+        for module in imported_modules(path):
+            if module.startswith(prefix):
+                target = module.removeprefix(prefix).split(".")[0]
+                assert layers.index(target) <= layers.index(inside), f"{inside} must not import {module}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
@@ -96,7 +140,7 @@ def test_import_is_light():
 
 
 def test_training_scripts_use_public_names_only():
-    public = {"ce_gym", "ce_gym.adapters", "ce_gym.policies", "ce_gym.viewer", "ce_gym.bench.mujoco_twin"}
+    public = {"ce_gym", "ce_gym.adapters", "ce_gym.policies", "ce_gym.viewer", "ce_gym.bench.peers.mujoco_twin"}
     public |= {f"ce_gym.adapters.{name}" for name in ("sb3", "sb3_asymmetric", "rsl_rl")}
     for path in (PACKAGE.parent / "train").glob("*.py"):
         ours = {m for m in imported_modules(path) if m.split(".")[0] == "ce_gym"}

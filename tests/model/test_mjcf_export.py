@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics.model import Model
+from ce_gym.export.mjcf import joint_ties, mass_properties, quaternion, to_mjcf, valid_inertia
 from ce_gym.model import Constraint, LinearConstraint, RobotError, load_robot
 from ce_gym.model.mechanism import LEVELS
-from ce_gym.model.mjcf_export import joint_ties, mass_properties, quaternion, to_mjcf, valid_inertia
 
 ROBOTS = ("mini_cheetah", "mit_humanoid_leg")
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -26,7 +26,7 @@ def random_state(model, rng):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_mujoco_has_the_same_dynamics(name, level):
     pytest.importorskip("mujoco")
-    from ce_gym.bench import mujoco_peer
+    from ce_gym.bench.peers import mujoco as mujoco_peer
 
     robot = load_robot(name)
     model, peer = Model(robot, level), mujoco_peer.load(robot, level)

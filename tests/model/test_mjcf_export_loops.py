@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
+from ce_gym.export.mjcf import to_mjcf
+from ce_gym.export.reference_pose import reference_pose
 from ce_gym.model import (
     Body,
     FunctionConstraint,
@@ -24,8 +26,6 @@ from ce_gym.model import (
     register_constraint,
 )
 from ce_gym.model.mechanism import LEVELS
-from ce_gym.model.mjcf_export import to_mjcf
-from ce_gym.model.reference_pose import reference_pose
 
 TOLERANCE = 1e-9
 STIFF = {"solref": (0.002, 1.0), "solimp": (0.9999, 0.9999, 0.001, 0.5, 2.0)}
@@ -135,7 +135,7 @@ class Peer:
     def __init__(self, robot: Robot, level: str) -> None:
         import mujoco
 
-        from ce_gym.bench import mujoco_peer
+        from ce_gym.bench.peers import mujoco as mujoco_peer
 
         self.mujoco, self.model = mujoco, mujoco_peer.load(robot, level)
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE

@@ -9,11 +9,11 @@ import pytest
 from mjcf_files import ANKLE, BARS, CHAIN, CONNECT, RODS, SEVEN, lump, mjcf
 
 from ce_gym.dynamics import Model
+from ce_gym.export.mjcf import to_mjcf
 from ce_gym.model import LinearConstraint, LoopConstraint, LossyImportWarning, RobotError, RodConstraint, load_robot
-from ce_gym.model.mjcf_export import to_mjcf
 
 mujoco = pytest.importorskip("mujoco")
-from ce_gym.model.mjcf_import import robot_from_mjcf  # noqa: E402
+from ce_gym.model.formats.mjcf.robot import robot_from_mjcf  # noqa: E402
 
 TOLERANCE = 1e-9
 pytestmark = [

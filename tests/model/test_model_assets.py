@@ -15,7 +15,7 @@ import yaml
 
 import ce_gym.model
 from ce_gym.model import InertiaWarning, Robot, RobotError, cluster_tree, load_robot, robots
-from ce_gym.model.checks import _warn_of_inertia, check_robot
+from ce_gym.model.checks.robot import _warn_of_inertia, check_robot
 
 FACTS = Path(__file__).resolve().parents[1] / "data" / "facts"
 NAMES = ["mini_cheetah", "mit_humanoid_leg"]

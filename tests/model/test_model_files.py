@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ce_gym.model import LinearConstraint, Shape, load_robot
-from ce_gym.model.placement import rotation_from_rpy
-from ce_gym.model.urdf import read_urdf
+from ce_gym.model.formats.placement import rotation_from_rpy
+from ce_gym.model.formats.urdf.tree import read_urdf
 
 BLOCK = '<inertial><mass value="{mass}"/><inertia ixx="{x}" ixy="0" ixz="0" iyy="{y}" iyz="0" izz="{z}"/>{o}</inertial>'
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator
-from ce_gym.dynamics.trace import step_function
+from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import ContactMaterial
 from ce_gym.model.mechanism import LEVELS
 

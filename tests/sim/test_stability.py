@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator
-from ce_gym.bench import stability_cases as cases
-from ce_gym.bench import stability_grid as grid
-from ce_gym.bench import stability_robots as robots
-from ce_gym.bench import stability_scenes as scenes
+from ce_gym.bench.stability import cases, grid, robots, scenes
 from ce_gym.model import ContactMaterial
 
 QUICK = (

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator, Terrain
-from ce_gym.dynamics.methods import METHODS
-from ce_gym.dynamics.scene import StepOptions
-from ce_gym.dynamics.trace import attempt_function, step_function
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.trace import attempt_function, step_function
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.sim.substeps import substeps
 

@@ -9,7 +9,7 @@ import pytest
 
 from ce_gym.model import load_robot
 from ce_gym.model.description import LinearConstraint
-from ce_gym.viewer.belts import belt_parts
+from ce_gym.viewer.page.belts import belt_parts
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -12,9 +12,9 @@ from chromium import PROGRAM, Chromium
 from ce_gym import Terrain
 from ce_gym.dynamics import Model
 from ce_gym.viewer import Rollout, write_html
-from ce_gym.viewer.ground import around
-from ce_gym.viewer.html import page
 from ce_gym.viewer.live import serve
+from ce_gym.viewer.page.html import page
+from ce_gym.viewer.rollouts.ground_patch import around
 
 pytest.importorskip("meshcat")
 Image = pytest.importorskip("PIL.Image")

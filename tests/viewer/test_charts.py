@@ -10,8 +10,8 @@ from hopper import StandIn, make_robot, make_rollout
 
 from ce_gym.dynamics import Model
 from ce_gym.viewer import Rollout, ViewerError
-from ce_gym.viewer.charts import charts, chosen
-from ce_gym.viewer.scene import make_actors
+from ce_gym.viewer.page.charts import charts, chosen
+from ce_gym.viewer.page.scene import make_actors
 
 FRAMES = 40
 

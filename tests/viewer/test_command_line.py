@@ -21,7 +21,7 @@ import pytest
 from ce_gym import Terrain
 from ce_gym.__main__ import main
 from ce_gym.viewer import Rollout
-from ce_gym.viewer.ground import MOST, around
+from ce_gym.viewer.rollouts.ground_patch import MOST, around
 
 pytest.importorskip("meshcat")
 

@@ -12,7 +12,7 @@ import ce_gym
 from ce_gym.__main__ import main
 from ce_gym.policies import find_policy
 from ce_gym.viewer import Rollout, drive
-from ce_gym.viewer.driving import walk
+from ce_gym.viewer.rollouts.driving import walk
 
 
 def test_a_policy_is_run_where_it_was_trained(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Terrain
-from ce_gym.viewer import ground
+from ce_gym.viewer.rollouts import ground_patch as ground
 
 PATH = np.column_stack([np.linspace(-2, 4, 30), np.linspace(0, 3, 30)])
 

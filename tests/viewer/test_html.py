@@ -19,9 +19,10 @@ import numpy as np
 import pytest
 from hopper import StandIn, make_robot, make_rollout
 
-from ce_gym.viewer import ViewerError, live, three, write_html
-from ce_gym.viewer.html import page
-from ce_gym.viewer.stage import ground_image
+from ce_gym.viewer import ViewerError, live, write_html
+from ce_gym.viewer.page import three
+from ce_gym.viewer.page.html import page
+from ce_gym.viewer.page.lights_and_camera import ground_image
 
 umsgpack = pytest.importorskip("umsgpack")
 pytest.importorskip("meshcat")
@@ -106,7 +107,7 @@ import subprocess
 def forbidden(*args, **kwargs): raise AssertionError("started a process")
 subprocess.Popen = forbidden
 from hopper import StandIn, make_robot, make_rollout
-from ce_gym.viewer.html import page
+from ce_gym.viewer.page.html import page
 page(make_rollout(), models=[StandIn(make_robot())])
 assert not {"meshcat", "zmq", "IPython", "tornado"} & set(sys.modules)
 """

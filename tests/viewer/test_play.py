@@ -60,6 +60,6 @@ def test_a_missing_meshcat_is_told_before_anything_is_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    monkeypatch.setattr("ce_gym.viewer.driving.drive_many", lambda *_, **__: pytest.fail("simulated"))
+    monkeypatch.setattr("ce_gym.viewer.rollouts.driving.drive_many", lambda *_, **__: pytest.fail("simulated"))
     assert main(["play", str(write_small(tmp_path / "policy.npz"))]) == 2
     assert "needs meshcat" in capsys.readouterr().err

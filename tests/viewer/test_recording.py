@@ -72,7 +72,7 @@ def test_what_cannot_be_recorded_is_one_line(envs) -> None:
 
 
 def test_a_robot_of_ones_own_is_found_again(tmp_path: Path) -> None:
-    from ce_gym.viewer.recording import reference
+    from ce_gym.viewer.rollouts.recording import reference
 
     assert reference(ce_gym.load_robot("mini_cheetah")) == "mini_cheetah"
     source = Path(ce_gym.load_robot("four_bar").source)

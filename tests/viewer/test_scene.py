@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from ce_gym import Terrain
 from ce_gym.model.description import ContactSphere
-from ce_gym.viewer import Rollout, ViewerError, three, tracks
-from ce_gym.viewer.arrows import HIDDEN
-from ce_gym.viewer.ground import around
-from ce_gym.viewer.scene import ROOT, make_actors, places
-from ce_gym.viewer.scene import build_scene as build_scene_of_actors
-from ce_gym.viewer.stand_ins import frame_along, rotor_discs
+from ce_gym.viewer import Rollout, ViewerError
+from ce_gym.viewer.page import animation, three
+from ce_gym.viewer.page.arrows import HIDDEN
+from ce_gym.viewer.page.fallback_shapes import frame_along, rotor_discs
+from ce_gym.viewer.page.scene import ROOT, make_actors, places
+from ce_gym.viewer.page.scene import build_scene as build_scene_of_actors
+from ce_gym.viewer.rollouts.ground_patch import around
 
 
 def build_scene(rollouts: list, models: list, max_fps: float = 50.0, **options: float | None) -> list[dict]:
@@ -28,9 +29,9 @@ def clips_of(commands: list[dict]) -> dict[str, dict[str, np.ndarray]]:
     """Values of every animated path by track name, two rows where a track is constant."""
     assert commands[-1]["type"] == "set_animation"
     result = {}
-    for animation in commands[-1]["animations"]:
-        items = animation["clip"]["tracks"]
-        result[animation["path"]] = {t["name"][1:]: np.reshape(t["values"], (len(t["times"]), -1)) for t in items}
+    for moved in commands[-1]["animations"]:
+        items = moved["clip"]["tracks"]
+        result[moved["path"]] = {t["name"][1:]: np.reshape(t["values"], (len(t["times"]), -1)) for t in items}
     return result
 
 
@@ -280,7 +281,7 @@ def test_what_does_not_fit_is_refused() -> None:
 def test_quaternions_invert_rotations(q: list[float]) -> None:
     unit = np.array(q) / np.linalg.norm(q)
     rotation = matrix_at({"quaternion": unit[None]}, 0)[:3, :3]
-    assert abs(tracks.quaternions(rotation) @ unit) == pytest.approx(1, abs=1e-12)
+    assert abs(animation.quaternions(rotation) @ unit) == pytest.approx(1, abs=1e-12)
 
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3))

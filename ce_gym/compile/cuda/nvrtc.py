@@ -14,7 +14,7 @@ from functools import cache
 
 OPTIONS = {"std": "c++17", "fma": False, "prec_div": True, "prec_sqrt": True, "ftz": False, "disable_warnings": True}
 """Every operation is rounded to nearest and by itself: which products and sums are rounded together is settled before,
-for every device alike (`ce_gym.compile.graph`)."""
+for every device alike (`ce_gym.compile.lowering.graph`)."""
 REGISTERS = 65536
 """32-bit registers of a multiprocessor, on every architecture from sm_70 to sm_120."""
 WARPS = {"80": 64, "86": 48, "87": 48, "89": 48, "90": 64, "100": 64, "120": 48}

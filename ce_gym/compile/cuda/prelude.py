@@ -3,7 +3,7 @@
 C text only. `random` and `lookup` hold the same two formulas for the processor; tests hold them equal.
 """
 
-from ce_gym.compile.random import FIRST_FACTOR, GOLDEN, RANDOM_BITS, SECOND_FACTOR
+from ce_gym.compile.lowering.random import FIRST_FACTOR, GOLDEN, RANDOM_BITS, SECOND_FACTOR
 
 TYPES = {
     "float64": """typedef double real;
@@ -48,7 +48,7 @@ template <int SIZE, class T> __device__ __forceinline__ void write_row(T* to, co
 """
 
 RANDOM = """
-// splitmix64, see ce_gym/compile/random.py.
+// splitmix64, see ce_gym/compile/lowering/random.py.
 __device__ __forceinline__ word mix(word x)
 {{
     x = (x ^ (x >> 30)) * {first:#x}ull;
@@ -72,7 +72,7 @@ template <int SIZE> __device__ __forceinline__ word draw(real* to, word state)
 """
 
 LOOKUP = """
-// One axis of the surface of ce_gym/compile/lookup.py: the first of three entries, their weights and slopes.
+// One axis of the surface of ce_gym/compile/lowering/lookup.py: the first of three entries, their weights and slopes.
 struct Along {
     int first;
     real weight[3], slope[3];

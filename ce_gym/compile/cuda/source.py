@@ -21,7 +21,7 @@ import casadi
 from ce_gym.compile.cuda.prelude import prelude
 from ce_gym.compile.cuda.writer import Writer
 from ce_gym.compile.layout import Layout, layout_of
-from ce_gym.compile.lowering import lower_function
+from ce_gym.compile.lowering.function import lower_function
 from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, check_program
 
 BLOCK, BLOCKS = 128, 2

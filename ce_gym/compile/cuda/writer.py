@@ -1,4 +1,4 @@
-"""The builder that writes CUDA C: the methods of `ce_gym.compile.vector.VectorBuilder`, one robot to a thread.
+"""The builder that writes CUDA C: the methods of `ce_gym.compile.lowering.vector.VectorBuilder`, one robot to a thread.
 
 `lowering` and `math` emit through either builder, so the order of operations, the polynomials and their coefficients
 stand once. Every operation is rounded by itself: the text must be compiled without contraction of sums and products

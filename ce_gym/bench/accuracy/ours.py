@@ -1,0 +1,85 @@
+"""Our side of the accuracy benchmark: the simulator's own kernel, with the length of the step as an input.
+
+One kernel then serves every point of a curve; the code is the one that `Simulator` runs, but for constants that depend
+on the step and can no longer be folded. Knows models and the public parts of sim.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.dynamics.forces.scene import Friction, StepOptions
+from ce_gym.dynamics.model import Model
+from ce_gym.sim.simulator import load_step_kernel
+from ce_gym.sim.tiles import tiles, write_rows
+
+
+class Ours:
+    """A batch of robots that run through a scene, the first of them from exactly the start of the scene.
+
+    Args:
+        scene: The scene.
+        method: Name of a time-stepping method.
+        level: Transmission level.
+        friction: "tangent" or "secant".
+        num_envs: Robots.
+    """
+
+    def __init__(self, scene: Scene, method: str, level: str, friction: Friction, num_envs: int) -> None:
+        self.scene, self.num_envs = scene, num_envs
+        self.model = Model(scene.robot, transmission=level)
+        options = StepOptions(
+            dt=None,
+            control=scene.control,
+            contacts=self.model.contact_names,
+            material=scene.robot.material,
+            friction=friction,
+            method=method,
+            parameters=() if scene.push is None else ("gravity",),
+        )
+        self.kernel = load_step_kernel(self.model, options, (), "float64")
+        self.arrays = {
+            name: tiles(num_envs, buffer.size, "float64")
+            for name, buffer in self.kernel.buffers.items()
+            if buffer.kind == "tiles"
+        }
+        self.starts = self._starts()
+        joints = len(self.model.joint_links)
+        self.targets = [np.ascontiguousarray(np.broadcast_to(row, (num_envs, joints))) for row in scene.drive]
+
+    def run(self, n: int) -> Array:
+        """Run through the scene with `n` sub-steps to a hold; returns positions of the first, (n_holds, nq)."""
+        for name, rows in self.starts.items():
+            write_rows(self.arrays[name], rows)
+        self.arrays["dt"][:] = HOLD / n
+        path = np.empty((self.scene.holds, self.model.nq))
+        for i, target in enumerate(self.targets):
+            if self.scene.push is not None:
+                self.arrays["parameters"][:] = (np.array(self.scene.robot.gravity) + self.scene.push[i])[:, None]
+            self.kernel(self.arrays | {"target": target}, self.num_envs, repeats={"n_substeps": n})
+            path[i] = self.arrays["q"][0, :, 0]
+        if self.arrays["diverged"].max() > 0.5:
+            path[:] = np.nan
+        return path
+
+    def _starts(self) -> dict[str, Array]:
+        """Rows of every state array at the start: robots differ a little, or they would all need the same attempts."""
+        model, scene = self.model, self.scene
+        base = 7 if scene.robot.floating else 0
+        q = np.tile(scene.q, (self.num_envs, 1))
+        noise = scene.spread * np.random.default_rng(0).normal(size=(self.num_envs, model.nq - base + 1))
+        noise[0] = 0.0
+        q[:, base:] += noise[:, 1:]
+        if base:
+            q[:, 2] += noise[:, 0]
+        rows = {"q": q, "v": np.tile(scene.v, (self.num_envs, 1)), "diverged": np.zeros((self.num_envs, 1))}
+        if model.contact_names:
+            centres, _ = model.contact_points(q, rows["v"])
+            radius = np.array([contact.radius for contact in scene.robot.contacts])
+            rows["load"] = scene.robot.material.stiffness * np.maximum(radius - centres[..., 2], 0.0)
+        if "anchor" in self.arrays:
+            rows["anchor"] = np.zeros((self.num_envs, self.arrays["anchor"].shape[1]))
+        if "dependent" in self.arrays:
+            rows["dependent"] = model.dependent_guess(q)
+        return rows

@@ -1,0 +1,137 @@
+# pyright: reportAttributeAccessIssue=false
+"""MuJoCo's side of the accuracy benchmark: the same scene through the project's MJCF export and `mujoco.rollout`.
+
+Knows MuJoCo's Python API and how positions correspond. (MuJoCo's compiled modules carry no types, hence the line
+above.)
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.bench.peers import mujoco_settings
+from ce_gym.bench.peers.mujoco import STATE
+from ce_gym.bench.peers.mujoco_settings import Settings
+from ce_gym.dynamics.model import Model
+
+STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Impedance of equalities held as stiffly as MuJoCo allows, with a time constant of two steps."""
+
+
+mujoco.set_mju_user_warning(lambda _: None)  # it would write to a file; `Peer.diverged` says what matters
+
+
+def compiled(scene: Scene, level: str, stiff: bool = False) -> mujoco.MjModel:
+    """Compile a scene for MuJoCo at a transmission level; torques act on the joints directly, without actuators."""
+    model = mujoco_settings.compiled(scene.robot, level, Settings(1e-3, solimp=STIFF if stiff else None))
+    if scene.control == "torque":
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    return model
+
+
+def initial_state(scene: Scene, model: mujoco.MjModel) -> mujoco.MjData:
+    """Return MuJoCo's data with every joint, rotors included, at the start of the scene."""
+    ours, data = Model(scene.robot), mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    q, v = ours.spanning(scene.q, scene.v)
+    if scene.robot.floating:
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, scene.q[3:7])
+        data.qpos[:7] = q[:7]
+        data.qvel[:3], data.qvel[3:6] = rotation.reshape(3, 3) @ v[3:6], v[:3]
+        q, v = q[7:], v[6:]
+    known = dict(zip(ours.spanning_names, zip(q, v, strict=True), strict=True))
+    for joint in range(1 if scene.robot.floating else 0, model.njnt):
+        address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+        data.qpos[address], data.qvel[dof] = known[model.joint(joint).name]
+    return data
+
+
+def forces(scene: Scene, model: mujoco.MjModel, hold: int) -> Array:
+    """Return applied generalised forces during a hold, MuJoCo's coordinates, shape (nv,)."""
+    force = np.zeros(model.nv)
+    if scene.control == "torque":
+        for name, torque in zip(scene.robot.independent, scene.drive[hold], strict=True):
+            force[model.joint(name).dofadr[0]] = torque
+    if scene.push is not None:  # at the origin of the base, which is its centre of mass
+        force[:3] += model.body_mass[1] * scene.push[hold]
+    return force
+
+
+class Family:
+    """A scene at one transmission level with one way to hold equalities, for MuJoCo.
+
+    Args:
+        scene: The scene.
+        level: Transmission level.
+        stiff: Whether equalities are held as stiffly as the step allows, or by MuJoCo's default.
+    """
+
+    def __init__(self, scene: Scene, level: str, stiff: bool) -> None:
+        self.scene, self.stiff = scene, stiff
+        self.name = f"{level}, stiff equalities" if stiff else level
+        self.model = compiled(scene, level, stiff)
+        self.start = np.empty(mujoco.mj_stateSize(self.model, STATE))
+        mujoco.mj_getState(self.model, initial_state(scene, self.model), self.start, STATE)
+        if scene.control == "torque":
+            self.spec = mujoco.mjtState.mjSTATE_QFRC_APPLIED
+            self.control = np.array([forces(scene, self.model, i) for i in range(scene.holds)])
+        else:
+            self.spec, self.control = mujoco.mjtState.mjSTATE_CTRL, scene.drive
+
+    @property
+    def tied(self) -> bool:
+        """Whether there are equalities to hold."""
+        return self.model.neq > 0
+
+
+class Peer:
+    """One robot of MuJoCo's that runs through a scene.
+
+    Args:
+        family: What it is.
+        integrator: "Euler", "implicitfast" or "RK4".
+        per_hold: Steps to a hold.
+    """
+
+    def __init__(self, family: Family, integrator: str, per_hold: int) -> None:
+        self.family, self.per_hold = family, per_hold
+        self.model = copy.copy(family.model)
+        self.model.opt.timestep = HOLD / per_hold
+        self.model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+        if family.stiff:
+            self.model.eq_solref[:] = (2.0 * HOLD / per_hold, 1.0)
+        self.data = mujoco.MjData(self.model)
+        self.control = np.repeat(family.control, per_hold, axis=0)[None]
+        self.states = np.empty((1, self.control.shape[1], len(family.start)))
+        self.pool = rollout.Rollout(nthread=0)
+
+    def run(self) -> Array:
+        """Run through the scene; returns positions in our coordinates at the end of every hold, (n_holds, nq)."""
+        start, spec = self.family.start, int(self.family.spec)
+        self.data.warning.number[:] = 0
+        mujoco.mj_setState(self.model, self.data, start, STATE)
+        self.data.qacc_warmstart[:] = 0.0
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.pool.rollout(self.model, self.data, start[None], self.control, control_spec=spec, state=self.states)
+        ends = self.states[0, self.per_hold - 1 :: self.per_hold, 1 : 1 + self.model.nq]
+        return positions(self.family.scene, self.model, ends) * (np.nan if self.diverged else 1.0)
+
+    @property
+    def diverged(self) -> bool:
+        """Whether MuJoCo has met a bad state in the last run (it then resets that robot silently)."""
+        bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+        return any(self.data.warning[int(kind)].number > 0 for kind in bad)
+
+
+def positions(scene: Scene, model: mujoco.MjModel, qpos: Array) -> Array:
+    """Return positions in our coordinates, shape (..., nq), for MuJoCo's."""
+    joints = [model.joint(name).qposadr[0] for name in scene.robot.independent]
+    return qpos[..., [*range(7 if scene.robot.floating else 0), *joints]]

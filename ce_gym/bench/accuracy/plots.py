@@ -1,0 +1,74 @@
+"""The picture of the accuracy benchmark: one panel for each scene, error against time. Needs matplotlib.
+
+Lines are ours in blue and green, MuJoCo's in orange, red and grey; the palette is that of Okabe and Ito. Knows curves,
+not how they are measured.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from ce_gym.bench.accuracy.curves import MARGIN, Curve, Measured
+from ce_gym.bench.paper.plots import BLUE, GREEN, GREY, ORANGE, RED, SKY, STYLE, plt
+
+COLUMNS = 4
+OURS = {
+    "euler": ("ce_gym, Euler", SKY, "o-"),
+    "euler, secant": ("ce_gym, Euler, secant friction", GREEN, "v-"),
+    "extrapolated": ("ce_gym, extrapolated", BLUE, "s-"),
+    "rk4": ("ce_gym, RK4", "black", "D-"),
+}
+APPROXIMATE = ("ce_gym, armature or coupled, Euler", GREY, "o-")
+COLORS = {"": ORANGE, "exact": "#CC79A7", "stiff": RED}
+"""MuJoCo's: without rotors, rotors as bodies or loops at its default, and held stiffly."""
+LEVELS = {"": "without rotor bodies", "exact": "rotors and loops as equalities", "stiff": "the same, stiff"}
+MARKERS = {"Euler": "o", "implicitfast": "^", "RK4": "D"}
+
+
+def draw(measured: list[Measured], out: Path) -> Path:
+    """Draw all scenes; returns the file."""
+    rows = math.ceil(len(measured) / COLUMNS)
+    columns = min(COLUMNS, len(measured))
+    style: dict[Any, Any] = {**STYLE, "lines.linewidth": 1.2, "lines.markersize": 3.5}
+    with plt.rc_context(style):
+        size = (1.0 + 3.9 * columns, 1.6 + 3.1 * rows)
+        figure, panels = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+        handles = {}
+        for panel, m in zip(panels.flat, measured, strict=False):
+            for curve in m.curves:
+                label, look = _look(curve)
+                points = [(p.seconds, m.error(p)) for p in curve.points if 0 < m.error(p) < math.inf]
+                if points:
+                    x, y = zip(*points, strict=True)
+                    (handles[label],) = panel.plot([1e6 * t for t in x], y, label=label, **look)
+            floor = MARGIN * m.known(next(c for c in m.curves if c.level == "exact"))
+            panel.axhline(floor, color=GREY, linewidth=0.8, linestyle=":")
+            panel.set(xscale="log", yscale="log", title=m.scene.title, ylim=(floor / 3, None))
+        for panel in list(panels.flat)[len(measured) :]:
+            panel.set_visible(False)
+        for panel in panels[:, 0]:
+            panel.set_ylabel("rms error [m, rad]")
+        for column in range(columns):
+            last = max(r for r in range(rows) if r * columns + column < len(measured))
+            panels[last][column].set_xlabel("time for one simulated second [us]")
+        figure.suptitle("Error against time, one robot on one core (left and below is better)", fontweight="bold")
+        ordered = dict(sorted(handles.items()))
+        figure.legend(list(ordered.values()), list(ordered), loc="outside lower center", ncols=4)
+        path = out / "accuracy.png"
+        figure.savefig(path, dpi=90)
+        plt.close(figure)
+    return path
+
+
+def _look(curve: Curve) -> tuple[str, dict[str, Any]]:
+    """Return label and style of a curve."""
+    if curve.code == "ce_gym":
+        label, color, line = OURS[curve.method] if curve.level == "exact" else APPROXIMATE
+        dashed = curve.level != "exact"
+        return label, {"color": color, "marker": line[0], "linestyle": "--" if dashed else "-", "zorder": 5}
+    kind = "stiff" if "stiff" in curve.level else "exact" if curve.level == "exact" else ""
+    marker = MARKERS[curve.method]
+    label = f"MuJoCo {curve.method}, {LEVELS[kind]}"
+    return label, {"color": COLORS[kind], "marker": marker, "linestyle": "--", "markerfacecolor": "none"}

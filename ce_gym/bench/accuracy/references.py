@@ -1,0 +1,134 @@
+# pyright: reportAttributeAccessIssue=false
+"""What smooth scenes really do, from two codes that share nothing but the description of the robot.
+
+One is our eighth-order method with tiny steps, evaluated by CasADi. The other takes MuJoCo's mass matrix, bias forces
+and equality Jacobian, lets the spanning joints (rotors are bodies) accelerate only in the null space of that Jacobian,
+which MuJoCo itself does not do, and integrates them with the classical fourth-order method, in MuJoCo's coordinates.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from ce_gym.bench.accuracy.peers import compiled, forces, initial_state, positions
+from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.stepping.trace import step_function
+from ce_gym.model.description import LinearConstraint
+
+
+def ours(scene: Scene, n: int, level: str = "exact") -> Array:
+    """Return positions at the end of every hold from rk8 with `n` steps to a hold, shape (n_holds, nq)."""
+    model = Model(scene.robot, transmission=level)
+    step = step_function(model.mechanism, StepOptions(HOLD / n, scene.control, method="rk8"))
+    state = {"q": scene.q, "v": scene.v, "diverged": np.zeros(1)}
+    if "dependent" in step.name_in():
+        state["dependent"] = model.dependent_guess(scene.q)
+    path = []
+    for target in scene.drive:
+        given = {"target": target} if len(target) else {}
+        for _ in range(n):
+            result = step(**state, **given)
+            state = {name: result[f"{name}_next"] for name in state}
+        path.append(np.array(state["q"]).ravel())
+    return np.array(path)
+
+
+def theirs(scene: Scene, n: int) -> Array:
+    """Return the same from MuJoCo's matrices, with `n` classical Runge-Kutta steps to a hold, shape (n_holds, nq)."""
+    system = _Constrained(scene)
+    y, h = np.concatenate([system.data.qpos, system.data.qvel]), HOLD / n
+    path = []
+    for hold in range(scene.holds):
+        for _ in range(n):
+            a = system.rate(y, hold)
+            b = system.rate(y + h / 2 * a, hold)
+            c = system.rate(y + h / 2 * b, hold)
+            d = system.rate(y + h * c, hold)
+            y = system.with_unit_quaternion(y + h / 6 * (a + 2 * b + 2 * c + d))
+        path.append(positions(scene, system.model, y[: system.model.nq]))
+    return np.array(path)
+
+
+class _Constrained:
+    """The equations of motion of a scene from MuJoCo's mass matrix M, bias c and equality Jacobian J.
+
+    M a + c = f + J^T l and J a = -Jdot v, with Jdot v by a central difference along the motion, solved in an
+    orthonormal basis of the null space of J, whose rows may be redundant.
+    """
+
+    STEP = 1e-6
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.model = compiled(scene, "exact")
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        self.data = initial_state(scene, self.model)
+        self.mass = np.zeros((self.model.nv, self.model.nv))
+        loops = any(not isinstance(tie, LinearConstraint) for tie in scene.robot.constraints)
+        self.moving_jacobian = loops
+        self.dofs = [self.model.joint(name).dofadr[0] for name in scene.robot.independent]
+        self.basis: tuple[Array, Array] | None = None
+
+    def rate(self, y: Array, hold: int) -> Array:
+        """Return the time derivative of positions and velocities."""
+        y = self.with_unit_quaternion(y)
+        qpos, qvel, model, data = y[: self.model.nq], y[self.model.nq :], self.model, self.data
+        drift = np.zeros(model.nv)
+        if self.moving_jacobian:
+            ahead, behind = (self._jacobian(qpos + s * self.STEP * self._motion(qpos, qvel)) for s in (1, -1))
+            J = self._jacobian(qpos)
+            inverse = np.linalg.pinv(J, rcond=1e-9)
+            drift = -inverse @ ((ahead - behind) @ qvel) / (2 * self.STEP)
+            basis = _null_space(J)
+        else:
+            if self.basis is None:
+                J = self._jacobian(qpos)
+                self.basis = (_null_space(J), J)
+            basis = self.basis[0]
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_fullM(model, data, self.mass)
+        force = self._force(qpos, qvel, hold) + data.qfrc_passive - data.qfrc_bias - self.mass @ drift
+        a = drift + basis @ np.linalg.solve(basis.T @ self.mass @ basis, basis.T @ force)
+        return np.concatenate([self._motion(qpos, qvel), a])
+
+    def with_unit_quaternion(self, y: Array) -> Array:
+        """Return the state with the quaternion of a floating base scaled to unit length."""
+        if self.scene.robot.floating:
+            y = y.copy()
+            y[3:7] /= np.linalg.norm(y[3:7])
+        return y
+
+    def _force(self, qpos: Array, qvel: Array, hold: int) -> Array:
+        force, scene = forces(self.scene, self.model, hold), self.scene
+        if scene.control == "position":
+            kp, kd = dict(scene.robot.gains.kp), dict(scene.robot.gains.kd)
+            y = positions(scene, self.model, qpos)[7 if scene.robot.floating else 0 :]
+            for i, (name, dof) in enumerate(zip(scene.robot.independent, self.dofs, strict=True)):
+                force[dof] += kp[name] * (scene.drive[hold, i] - y[i]) - kd[name] * qvel[dof]
+        return force
+
+    def _jacobian(self, qpos: Array) -> Array:
+        self.data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self.model, self.data)
+        return self.data.efc_J.reshape(self.data.nefc, self.model.nv).copy()
+
+    def _motion(self, qpos: Array, qvel: Array) -> Array:
+        """Return the time derivative of MuJoCo's positions."""
+        if not self.scene.robot.floating:
+            return qvel
+        w, x, y, z = qpos[3:7]
+        turning = 0.5 * np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) @ qvel[3:6]
+        return np.concatenate([qvel[:3], turning, qvel[6:]])
+
+
+def _null_space(J: Array) -> Array:
+    """Return an orthonormal basis of the null space of J, shape (n, n - rank)."""
+    if not len(J):
+        return np.eye(J.shape[1])
+    _, sizes, rows = np.linalg.svd(J)
+    return rows[int((sizes > 1e-9 * sizes[0]).sum()) :].T

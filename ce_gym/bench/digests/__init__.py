@@ -1,0 +1,1 @@
+"""Which results a change alters."""

@@ -1,0 +1,1 @@
+"""Agreement and speed on a GPU."""

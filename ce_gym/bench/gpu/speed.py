@@ -1,0 +1,120 @@
+"""Rates on a GPU: sub-steps, environment steps, learning. Every function here needs a GPU.
+
+Knows torch, simulators, vector environments and, as a command, the training script.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from ce_gym.bench.measure.report import Report, Table
+from ce_gym.dynamics.model import Model
+from ce_gym.sim import Simulator
+from ce_gym.sim.devices import Device
+
+SUBSTEPS = 20
+"""Sub-steps of a launch; as in the processor's benchmark, targets jump between launches."""
+CALLS = 10
+DT = 0.005
+Rates = dict[str, dict[int, float]]
+"""Name -> size of the batch -> per second."""
+
+
+class Unmeasured(Exception):
+    """Why something was not measured, in one line."""
+
+
+def name_of(device: Device) -> str:
+    """Return the GPU's name."""
+    import torch
+
+    return torch.cuda.get_device_name(device.name)
+
+
+def best_rate(work: Callable[[], object], amount: int, rounds: int) -> float:
+    """Return the highest rate of `rounds`, each waited for; the first, untimed, compiles and warms."""
+    import torch
+
+    seconds = []
+    for _ in range(rounds + 1):
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        work()
+        torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    return amount / min(seconds[1:])
+
+
+def substeps(robot: str, device: Device, sizes: Sequence[int], dtypes: Sequence[str], rounds: int) -> Rates:
+    """Return sub-steps per second of robots that stand on their feet and are told to move about."""
+    import torch
+
+    rates: Rates = {}
+    model = Model(robot, "exact")
+    joints = len(model.joint_links)
+    for dtype in dtypes:
+        for size in sizes:
+            sim = Simulator(model, size, DT, dtype, contacts="foot", outputs=(), device=device)
+            jitter = 0.1 * torch.rand((4, size, joints), device=device.name, dtype=getattr(torch, dtype)) - 0.05
+            targets = torch.as_tensor(model.standing_q[-joints:], device=device.name).to(jitter.dtype) + jitter
+
+            def work(sim: Simulator = sim, targets: Any = targets) -> None:
+                for call in range(CALLS):
+                    sim.step(targets[call % 4], SUBSTEPS)
+
+            rate = best_rate(work, size * CALLS * SUBSTEPS, rounds)
+            if sim.n_diverged:
+                raise Unmeasured(f"{sim.n_diverged} of {size} robots diverged in {dtype}")
+            rates.setdefault(f"ours, {dtype}", {})[size] = rate
+    return rates
+
+
+def environment(robot: str, device: Device, sizes: Sequence[int], dtypes: Sequence[str], rounds: int) -> Rates:
+    """Return environment steps per second of the velocity task, random actions, resets included."""
+    import torch
+
+    from ce_gym.envs.gpu_vector import GpuVectorEnv
+
+    rates: Rates = {}
+    for dtype in dtypes:
+        for size in sizes:
+            envs = GpuVectorEnv(size, device, robot=robot, task="velocity", dtype=dtype)
+            envs.reset(seed=0)
+            actions = 2 * torch.rand((4, size, envs.batch.program.n_actions), device=device.name) - 1
+
+            def work(envs: GpuVectorEnv = envs, actions: Any = actions) -> None:
+                for call in range(CALLS):
+                    envs.step(actions[call % 4])
+
+            rates.setdefault(f"ours, {dtype}", {})[size] = best_rate(work, size * CALLS, rounds)
+    return rates
+
+
+def learning(script: str | None, report: Report) -> None:
+    """Train with rsl_rl on the GPU and add how long it took and what the policy is worth, in the script's words.
+
+    Raises:
+        Unmeasured: If there is no script, or it fails.
+    """
+    if script is None or not Path(script).is_file():
+        raise Unmeasured("takes minutes; ask for it with --train train/rsl_rl_ppo.py")
+    start = time.perf_counter()
+    command = [sys.executable, script, "--env", "ce_gym/MiniCheetahVelocity-v0", "--device", "cuda"]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    if finished.returncode:
+        raise Unmeasured(f"{script} failed: {(finished.stderr.strip().splitlines() or ['no message'])[-1]}")
+    took = time.perf_counter() - start
+    report.remarks.append(f"Learning, {' '.join(command[1:])}: {took:.0f} s with compilation and evaluation.")
+    report.remarks.append("\n".join(finished.stdout.strip().splitlines()[-12:]))
+
+
+def rate_table(title: str, rates: Rates) -> Table:
+    """Return rates by size of the batch, a column for each name."""
+    sizes = sorted({size for by_size in rates.values() for size in by_size})
+    rows = tuple((size, *(by_size.get(size) for by_size in rates.values())) for size in sizes)
+    return Table(title, ("robots", *rates), rows)

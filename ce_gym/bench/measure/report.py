@@ -1,0 +1,112 @@
+"""What a benchmark returns: aligned plain-text tables, the machine and what was required. Knows nothing of robots."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ce_gym.bench.measure import machine
+
+Cell = str | int | float | bool | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of results.
+
+    Attributes:
+        title: Printed above.
+        columns: Headings, with units.
+        rows: One cell for each column; numbers are kept as numbers for JSON.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def as_text(self) -> str:
+        """Return the table with aligned columns: text to the left, numbers to the right."""
+        cells = [[cell_text(cell) for cell in row] for row in self.rows]
+        widths = [max(len(row[i]) for row in [list(self.columns), *cells]) for i in range(len(self.columns))]
+        numeric = [all(not isinstance(row[i], str) for row in self.rows) for i in range(len(self.columns))]
+
+        def line(row: list[str]) -> str:
+            aligned = (x.rjust(w) if right else x.ljust(w) for x, w, right in zip(row, widths, numeric, strict=True))
+            return "  ".join(aligned).rstrip()
+
+        return "\n".join([self.title, "", line(list(self.columns)), line(["-" * w for w in widths]), *map(line, cells)])
+
+    def as_markdown(self) -> str:
+        """Return the table in Markdown, under its title."""
+        cells = [list(self.columns), ["---"] * len(self.columns)]
+        cells += [[cell_text(cell) for cell in row] for row in self.rows]
+        return "\n".join([f"{self.title}:", "", *(f"| {' | '.join(row)} |" for row in cells)])
+
+    def write_csv(self, path: Path) -> None:
+        """Write columns and rows; None becomes an empty cell."""
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(self.columns)
+            writer.writerows(self.rows)
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """A bar that a figure has to reach.
+
+    Attributes:
+        claim: What is required, with the figure required.
+        measured: The figure.
+        met: Whether it is enough.
+    """
+
+    claim: str
+    measured: str
+    met: bool
+
+
+@dataclass
+class Report:
+    """Tables, requirements and remarks of one run, on one machine; `failed` asks for a non-zero exit status."""
+
+    name: str
+    tables: list[Table] = field(default_factory=list)
+    requirements: list[Requirement] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    failed: bool = False
+    machine: dict[str, str] = field(default_factory=machine.describe)
+
+    def as_text(self) -> str:
+        """Return everything as plain text."""
+        parts = ["\n".join(f"{key:>10}: {value}" for key, value in self.machine.items())]
+        parts += [table.as_text() for table in self.tables]
+        if self.requirements:
+            parts.append(
+                "\n".join(f"{'met   ' if r.met else 'MISSED'}  {r.claim}: {r.measured}" for r in self.requirements)
+            )
+        parts += self.remarks
+        return "\n\n".join(parts)
+
+    def as_json(self) -> str:
+        """Return everything as JSON."""
+        content = {
+            "name": self.name,
+            "machine": self.machine,
+            "tables": [{"title": t.title, "columns": t.columns, "rows": t.rows} for t in self.tables],
+            "requirements": [vars(r) for r in self.requirements],
+            "remarks": self.remarks,
+        }
+        return json.dumps(content, indent=2) + "\n"
+
+
+def cell_text(cell: Cell) -> str:
+    """Return a cell as it is printed: four significant digits for a float, nothing for None."""
+    if cell is None:
+        return ""
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if isinstance(cell, float):
+        return f"{cell:.4g}" if abs(cell) < 1e4 or cell != cell else f"{cell:,.0f}"
+    return f"{cell:,}" if isinstance(cell, int) else cell

@@ -1,0 +1,1 @@
+"""Other simulators and dynamics libraries on the same robots."""

@@ -1,0 +1,91 @@
+"""Robots stepped by MuJoCo in our coordinates, so that a policy trained here can act there as it is.
+
+The robots' MJCF has the same gains, torque limits, masses and friction. MuJoCo carries out the position control
+implicitly in the joint velocities (`implicitfast`); contacts are its own. Knows the MuJoCo peer of this room.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.bench.peers.mujoco import Batch, Coordinates
+from ce_gym.bench.peers.mujoco_settings import STIFF, Settings, compiled
+from ce_gym.model import Robot
+
+Array = NDArray[np.float64]
+
+TIMESTEPS = {"armature": 0.002, "exact": 0.001}
+"""MuJoCo's step for each level that can be asked for [s]; rotors on stiff equalities need the shorter one."""
+
+
+class MujocoTwin:
+    """Copies of a robot in MuJoCo.
+
+    Args:
+        robot: With a floating base and no closed loops.
+        level: "armature", reflected inertia as MuJoCo users know it, or "exact", every rotor a body on the stiffest
+            equality that is stable.
+        num_envs: Copies.
+
+    Attributes:
+        robot: The robot.
+        level: The level.
+        diverged: Copies whose state MuJoCo found bad, shape (num_envs,).
+
+    Raises:
+        ValueError: If the level is another one.
+        RobotError: If the robot has closed loops, or MJCF cannot express it.
+    """
+
+    def __init__(self, robot: Robot, level: str, num_envs: int) -> None:
+        if level not in TIMESTEPS:
+            raise ValueError(f"level={level!r}; expected one of {', '.join(TIMESTEPS)}")
+        self.robot, self.level = robot, level
+        impedance = STIFF[0] if level == "exact" else None
+        self.model = compiled(robot, level, Settings(TIMESTEPS[level], solimp=impedance))
+        self._coordinates = Coordinates.of(self.model, robot)
+        self._batch = Batch(self.model, num_envs)
+        joints = [self.model.joint(name) for name in robot.independent]
+        self._positions = [*range(7), *(int(joint.qposadr[0]) for joint in joints)]
+        self._velocities = [int(joint.dofadr[0]) for joint in joints]
+        self.diverged = np.zeros(num_envs, bool)
+
+    def start(self, q: Array, v: Array) -> None:
+        """Put every robot into a state; rotors turn with their joints.
+
+        Args:
+            q: Our positions, shape (num_envs, nq).
+            v: Our velocities, shape (num_envs, nv).
+        """
+        self._batch.reset()
+        self.diverged[:] = False
+        nq, nv = self.model.nq, self.model.nv
+        for state, q_i, v_i in zip(self._batch.states, q, v, strict=True):
+            state[1 : 1 + nq] = self._coordinates.positions(q_i)
+            state[1 + nq : 1 + nq + nv] = self._coordinates.velocity_map(q_i) @ v_i
+
+    def step(self, target: Array, duration: float) -> None:
+        """Hold joint targets [rad], shape (num_envs, n_joints), for a time [s]."""
+        n = round(duration / self.model.opt.timestep)
+        control = np.repeat(target[:, None, :], n, axis=1)
+        before = self._batch.states[:, 0]
+        after = self._batch.trajectory(control)[:, -1]
+        # MuJoCo puts a robot whose state is bad back to the start, where its clock is zero.
+        self.diverged |= (after[:, 0] < before + 0.5 * duration) | ~np.isfinite(after).all(axis=1)
+        self._batch.states[:] = after
+
+    def state(self) -> tuple[Array, Array]:
+        """Return our positions (num_envs, nq) and velocities (num_envs, nv)."""
+        qpos, qvel = self._batch.split(self._batch.states)
+        q = qpos[:, self._positions]
+        w, x, y, z = q[:, 3:7].T
+        R = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        linear = np.einsum("jin,nj->ni", R, qvel[:, 0:3])  # MuJoCo's is in world axes
+        return q, np.hstack([qvel[:, 3:6], linear, qvel[:, self._velocities]])

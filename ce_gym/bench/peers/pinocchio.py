@@ -1,0 +1,198 @@
+# pyright: reportAttributeAccessIssue=false
+"""Pinocchio as a peer: the tree of a robot with armature, and its loops as constraints.
+
+Knows Pinocchio's Python API (https://github.com/stack-of-tasks/pinocchio), which has traps: joints not numbered depth
+first make `crba` wrong without a word; `lcaba` ends the process unless `computeJointMinimalOrdering` was called before;
+constraints go in vectors of Pinocchio's own; `aba` knows no tied joints. Pinocchio's base velocity is [linear,
+angular], its quaternion (x, y, z, w); ours are the other way round. (Compiled modules carry no types, hence the line
+above.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin  # type: ignore[import-not-found]
+from numpy.typing import NDArray
+
+from ce_gym.bench.measure.timing import Competitor
+from ce_gym.export.joint_ties import joint_ties
+from ce_gym.export.mjcf import mass_properties
+from ce_gym.export.mjcf_equalities import joint_armature
+from ce_gym.export.reference_pose import reference_pose
+from ce_gym.model.description import LinearConstraint, LoopConstraint, Robot
+from ce_gym.model.errors import RobotError
+from ce_gym.model.mechanism import Mechanism, build_mechanism
+
+Array = NDArray[np.float64]
+Call = Callable[[], object]
+
+PROXIMAL = (1e-10, 1e-4, 20)
+"""Accuracy, compliance mu and most iterations of constrained dynamics: as accurate as mu allows, in few iterations."""
+
+AXES = ("X", "Y", "Z")
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A robot in Pinocchio.
+
+    Attributes:
+        robot: What it was made from.
+        model: The tree, armature included.
+        names: Our body of each of its joints, in Pinocchio's order.
+        loops: Constraint models, one for each closed loop.
+    """
+
+    robot: Robot
+    model: pin.Model
+    names: tuple[str, ...]
+    loops: pin.StdVec_RigidConstraintModel
+
+    def positions(self, q: Array) -> Array:
+        """Return Pinocchio's positions for ours, shape (nq,) to (model.nq,); loops are as in the standing pose."""
+        joints = reference_pose(self.robot, joint_ties(self.robot))
+        base = 7 if self.robot.floating else 0
+        joints = joints | dict(zip(self.robot.independent, q[base:], strict=True))
+        head = [*q[:3], *q[4:7], q[3]] if base else []
+        return np.array([*head, *(joints[name] for name in self.names if name in joints)])
+
+    def velocities(self, v: Array) -> Array:
+        """Return Pinocchio's velocities, or forces, for ours, shape (nv,) to (model.nv,); dependent joints have 0."""
+        base = 6 if self.robot.floating else 0
+        joints = dict(zip(self.robot.independent, v[base:], strict=True))
+        names = self.names[1:] if base else self.names
+        return np.array([*v[3:base], *v[: min(3, base)], *(joints.get(name, 0.0) for name in names)])
+
+    def accelerations(self, a: Array) -> Array:
+        """Return our accelerations for Pinocchio's, shape (model.nv,) to (nv,)."""
+        base = 6 if self.robot.floating else 0
+        names = self.names[1:] if base else self.names
+        joints = dict(zip(names, a[base:], strict=True))
+        return np.array([*a[3:base], *a[: min(3, base)], *(joints[name] for name in self.robot.independent)])
+
+    def methods(self) -> dict[str, Callable[[Array, Array, Array], Array]]:
+        """Return Pinocchio's ways to forward dynamics of this robot: from its positions, velocities and forces."""
+        model, data = self.model, self.model.createData()
+        if not len(self.loops):
+            return {
+                "aba": lambda q, v, tau: pin.aba(model, data, q, v, tau),
+                "crba + rnea": lambda q, v, tau: _by_mass_matrix(model, data, q, v, tau),
+            }
+        constraints = pin.StdVec_RigidConstraintData()
+        constraints.extend([loop.createData() for loop in self.loops])
+        settings, other = pin.ProximalSettings(*PROXIMAL), model.createData()
+        pin.initConstraintDynamics(model, data, self.loops, constraints)
+        pin.computeJointMinimalOrdering(model, other, self.loops)
+        return {
+            "constraintDynamics": lambda q, v, tau: pin.constraintDynamics(
+                model, data, q, v, tau, self.loops, constraints, settings
+            ),
+            "lcaba": lambda q, v, tau: pin.lcaba(model, other, q, v, tau, self.loops, constraints, settings),
+        }
+
+
+def load(robot: Robot) -> Peer:
+    """Build a robot at transmission level `armature`.
+
+    Raises:
+        RobotError: If the robot has something that Pinocchio's forward dynamics does not.
+    """
+    mechanism, ties = build_mechanism(robot, "armature", eliminate=False), joint_ties(robot)
+    for constraint in robot.constraints:
+        moving = [body for body in constraint.bodies if body in mechanism.bodies]
+        if isinstance(constraint, LinearConstraint):
+            if len(moving) == len(constraint.bodies):
+                raise RobotError(f"{robot.name}: constraint {constraint.name!r} ties joints, which aba does not know")
+        elif not isinstance(constraint, LoopConstraint):
+            raise RobotError(f"{robot.name}: constraint {constraint.name!r} is none of Pinocchio's rigid constraints")
+    if any(set(ties[spin.rotor].ratios) - set(robot.independent) for spins in mechanism.spins for spin in spins):
+        raise RobotError(f"{robot.name}: armature inside a loop varies with the pose, which Pinocchio's cannot")
+    model, names = _tree(mechanism, joint_armature(mechanism, ties))
+    return Peer(robot, model, names, _loops(robot, model))
+
+
+def competitors(peer: Peer, n_states: int = 64) -> dict[str, Competitor]:
+    """Return each of its methods called from a Python loop on standing states with random velocities and forces."""
+    rng = np.random.default_rng(0)
+    q = np.array([0.0] * 3 + [1.0] + [0.0] * 3 if peer.robot.floating else [])
+    pose = dict(peer.robot.pose.joints)
+    q = peer.positions(np.array([*q, *(pose.get(name, 0.0) for name in peer.robot.independent)]))
+    moving = 0.0 if len(peer.loops) else 1.0  # random velocities would tear loops apart
+    states = [
+        (q, moving * rng.uniform(-2, 2, peer.model.nv), rng.uniform(-10, 10, peer.model.nv)) for _ in range(n_states)
+    ]
+    return {name: Competitor(_loop(method, states), n_states) for name, method in peer.methods().items()}
+
+
+def overhead(n_calls: int = 64) -> Competitor:
+    """Return `aba` of a single joint called from a Python loop: mostly the way from Python and back."""
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "x")
+    model.appendBodyToJoint(joint, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    data = model.createData()
+    states = [(np.zeros(1), np.zeros(1), np.zeros(1))] * n_calls
+    return Competitor(_loop(lambda q, v, tau: pin.aba(model, data, q, v, tau), states), n_calls)
+
+
+def _loop(method: Callable[[Array, Array, Array], Array], states: list[tuple[Array, Array, Array]]) -> Call:
+    def run() -> None:
+        for state in states:
+            method(*state)
+
+    return run
+
+
+def _by_mass_matrix(model: pin.Model, data: pin.Data, q: Array, v: Array, tau: Array) -> Array:
+    bias = pin.rnea(model, data, q, v, np.zeros(model.nv))
+    pin.crba(model, data, q)
+    pin.cholesky.decompose(model, data)
+    return pin.cholesky.solve(model, data, tau - bias)
+
+
+def _tree(mechanism: Mechanism, armature: dict[str, float]) -> tuple[pin.Model, tuple[str, ...]]:
+    """Add joints depth first."""
+    model, names = pin.Model(), []
+    ids: dict[str | None, int] = {None: 0}
+    model.gravity.linear = np.array(mechanism.robot.gravity)
+    children: dict[str | None, list[str]] = {}
+    for body in mechanism.bodies.values():
+        children.setdefault(body.parent, []).append(body.name)
+    waiting = children[None][::-1]
+    while waiting:
+        body = mechanism.bodies[waiting.pop()]
+        waiting += children.get(body.name, [])[::-1]
+        placement = pin.SE3(np.array(body.rotation), np.array(body.position))
+        ids[body.name] = model.addJoint(ids[body.parent], _joint(body.joint_type, body.axis), placement, body.name)
+        mass, com, inertia = mass_properties(body.inertia)
+        model.appendBodyToJoint(ids[body.name], pin.Inertia(mass, com, inertia), pin.SE3.Identity())
+        if body.name in armature:
+            all_armature = np.array(model.armature)
+            all_armature[model.joints[ids[body.name]].idx_v] = armature[body.name]
+            model.armature = all_armature
+        names.append(body.name)
+    return model, tuple(names)
+
+
+def _joint(kind: str, axis: Array) -> pin.JointModel:
+    if kind == "free":
+        return pin.JointModelFreeFlyer()
+    family = {"revolute": "R", "prismatic": "P"}[kind]
+    for i, letter in enumerate(AXES):  # along a coordinate axis there is a cheaper joint
+        if np.allclose(axis, np.eye(3)[i]):
+            return getattr(pin, f"JointModel{family}{letter}")()
+    return getattr(pin, {"R": "JointModelRevoluteUnaligned", "P": "JointModelPrismaticUnaligned"}[family])(axis)
+
+
+def _loops(robot: Robot, model: pin.Model) -> pin.StdVec_RigidConstraintModel:
+    loops = pin.StdVec_RigidConstraintModel()
+    for loop in robot.constraints:
+        if isinstance(loop, LoopConstraint):
+            sides = []
+            for body, place in ((loop.first, loop.first_placement), (loop.second, loop.second_placement)):
+                joint = model.getJointId(body) if body else 0
+                sides += [joint, pin.SE3(np.array(place.rotation).reshape(3, 3), np.array(place.position))]
+            loops.append(pin.RigidConstraintModel(pin.ContactType.CONTACT_3D, model, *sides))
+    return loops

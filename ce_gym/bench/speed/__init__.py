@@ -1,0 +1,1 @@
+"""Time of forward dynamics and of sub-steps beside other simulators."""

@@ -1,0 +1,1 @@
+"""Stability over steps, grounds and robots."""

@@ -1,0 +1,1 @@
+"""From a traced function to vector code: graph, order, functions of vectors, one tile."""

@@ -1,0 +1,209 @@
+"""One CasADi SX function as straight-line vector code.
+
+Knows CasADi's instruction list and the vector builder. Every operation of the function's `graph` becomes one value, in
+the order that `ordering` chooses. Loads are emitted at first use and stores at the very end, so outputs may share their
+memory with inputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import casadi
+
+from ce_gym.compile.lowering import math as vector_math
+from ce_gym.compile.lowering.graph import CHOICE, MINUS_PRODUCT, PRODUCT_MINUS, PRODUCT_PLUS, graph_of
+from ce_gym.compile.lowering.ordering import ordered
+from ce_gym.compile.lowering.vector import Value, VectorBuilder
+
+
+def lower_function(
+    v: VectorBuilder, function: casadi.Function, inputs: Sequence[Value], outputs: Sequence[Value]
+) -> None:
+    """Emit `function` at the builder's position.
+
+    Args:
+        v: builder of the block to append to.
+        function: an SX function; sparse inputs and outputs are laid out densely, column by column.
+        inputs: pointer to the first vector of each function input.
+        outputs: pointer to the first vector of each function output; structural zeros are written as 0.
+
+    Raises:
+        NotImplementedError: for an operation that has no vector form.
+    """
+    graph = graph_of(function)
+    lowering = _Lowering(v, function.name())
+    loads = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
+    places = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
+    results = [[v.const(0.0)] * function.numel_out(i) for i in range(function.n_out())]
+    loaded: dict[tuple[int, int], Value] = {}
+    values: dict[int, Value] = {}
+
+    def value(k: int) -> Value:
+        """Result of instruction k: done already, or an input or a constant met for the first time."""
+        if k not in values:
+            if k in graph.constants:
+                values[k] = lowering.constant(graph.constants[k])
+            else:
+                which, nonzero = function.instruction_input(k)
+                place = which, loads[which][nonzero]
+                if place not in loaded:
+                    loaded[place] = v.load(inputs[which], place[1])
+                values[k] = loaded[place]
+        return values[k]
+
+    for k in ordered(graph):
+        values[k] = lowering.operation(graph.ops[k], [value(a) for a in graph.operands[k]])
+    for k, op in enumerate(graph.ops):
+        if op == casadi.OP_OUTPUT:
+            which, nonzero = function.instruction_output(k)
+            results[which][places[which][nonzero]] = value(graph.operands[k][0])
+    for pointer, stored in zip(outputs, results, strict=True):
+        for position, result in enumerate(stored):
+            v.store(result, pointer, position)
+
+
+def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:
+    """Column-major position of each structural nonzero."""
+    rows, columns = sparsity.get_triplet()
+    return [row + column * sparsity.size1() for row, column in zip(rows, columns, strict=True)]
+
+
+class _Lowering:
+    """Emits operations and remembers what else is known about their results."""
+
+    def __init__(self, v: VectorBuilder, name: str):
+        self.v = v
+        self.name = name
+        self.masks: dict[Value, Value] = {}
+        self.numbers: dict[Value, float] = {}
+        self.sines: dict[Value, tuple[Value, Value]] = {}
+
+    def constant(self, number: float) -> Value:
+        """A constant; the number is remembered for those who need it."""
+        value = self.v.const(number)
+        self.numbers[value] = number
+        return value
+
+    def operation(self, op: int, operands: Sequence[Value]) -> Value:
+        """Emit one operation."""
+        if op not in OPERATIONS:
+            raise NotImplementedError(
+                f"function {self.name!r}: {_name_of(op)} has no vector form; "
+                f"expected one of {', '.join(sorted(_name_of(known) for known in OPERATIONS if known >= 0))}"
+            )
+        return OPERATIONS[op](self, *operands)
+
+    def sin_cos(self, x: Value) -> tuple[Value, Value]:
+        """Both at once: the argument is reduced once however many sines and cosines are taken of it."""
+        if x not in self.sines:
+            self.sines[x] = vector_math.sin_cos(self.v, x)
+        return self.sines[x]
+
+    def truth(self, mask: Value) -> Value:
+        """A mask as CasADi has it, 1.0 or 0.0; the mask itself is remembered for those who need just that."""
+        value = self.v.select(mask, self.v.const(1.0), self.v.const(0.0))
+        self.masks[value] = mask
+        return value
+
+    def mask(self, value: Value) -> Value:
+        """Where a value is not zero."""
+        if value not in self.masks:
+            self.masks[value] = self.v.compare("!=", value, self.v.const(0.0))
+        return self.masks[value]
+
+    def differ(self, a: Value, b: Value) -> Value:
+        """Whether two values differ; of two that are masks already, by a bit each."""
+        if a in self.masks and b in self.masks:
+            return self.truth(self.v.builder.xor(self.masks[a], self.masks[b]))
+        return self.truth(self.v.compare("!=", a, b))
+
+    def sign(self, x: Value) -> Value:
+        """-1, 1, or x itself where it is neither negative nor positive."""
+        v, zero = self.v, self.v.const(0.0)
+        positive = v.select(v.compare(">", x, zero), v.const(1.0), x)
+        return v.select(v.compare("<", x, zero), v.const(-1.0), positive)
+
+    def power(self, x: Value, y: Value) -> Value:
+        """Integer powers by multiplication, halves by the square root, the rest by exp and log."""
+        exponent = self.numbers.get(y)
+        if exponent is not None and exponent == int(exponent) and abs(exponent) <= 64:
+            return vector_math.integer_power(self.v, x, int(exponent))
+        if exponent == 0.5:
+            return self.v.intrinsic("sqrt", x)
+        return vector_math.power(self.v, x, y)
+
+
+Operation = Callable[..., Value]
+
+
+def _builder(method: str) -> Operation:
+    """An operation that the vector builder has."""
+    return lambda s, *operands: getattr(s.v, method)(*operands)
+
+
+def _intrinsic(name: str) -> Operation:
+    """An operation that is one LLVM intrinsic."""
+    return lambda s, *operands: s.v.intrinsic(name, *operands)
+
+
+def _elementary(name: str) -> Operation:
+    """An operation from our own mathematics."""
+    return lambda s, *operands: getattr(vector_math, name)(s.v, *operands)
+
+
+def _comparison(sign: str) -> Operation:
+    return lambda s, a, b: s.truth(s.v.compare(sign, a, b))
+
+
+OPERATIONS: dict[int, Operation] = {
+    CHOICE: lambda s, c, a, b: s.v.select(s.mask(c), a, b),
+    PRODUCT_PLUS: _builder("fma"),
+    PRODUCT_MINUS: lambda s, a, b, c: s.v.fma(a, b, s.v.neg(c)),
+    MINUS_PRODUCT: lambda s, a, b, c: s.v.fma(s.v.neg(a), b, c),
+    casadi.OP_ASSIGN: lambda s, x: x,
+    casadi.OP_ADD: _builder("add"),
+    casadi.OP_SUB: _builder("sub"),
+    casadi.OP_MUL: _builder("mul"),
+    casadi.OP_DIV: _builder("div"),
+    casadi.OP_NEG: _builder("neg"),
+    casadi.OP_SQ: lambda s, x: s.v.mul(x, x),
+    casadi.OP_TWICE: lambda s, x: s.v.add(x, x),
+    casadi.OP_INV: lambda s, x: s.v.div(s.v.const(1.0), x),
+    casadi.OP_SQRT: _intrinsic("sqrt"),
+    casadi.OP_FABS: _intrinsic("fabs"),
+    casadi.OP_FLOOR: _intrinsic("floor"),
+    casadi.OP_CEIL: _intrinsic("ceil"),
+    casadi.OP_FMIN: _intrinsic("minnum"),
+    casadi.OP_FMAX: _intrinsic("maxnum"),
+    casadi.OP_COPYSIGN: _intrinsic("copysign"),
+    casadi.OP_SIGN: _Lowering.sign,
+    casadi.OP_SIN: lambda s, x: s.sin_cos(x)[0],
+    casadi.OP_COS: lambda s, x: s.sin_cos(x)[1],
+    casadi.OP_TAN: _elementary("tan"),
+    casadi.OP_ASIN: _elementary("asin"),
+    casadi.OP_ACOS: _elementary("acos"),
+    casadi.OP_ATAN: _elementary("atan"),
+    casadi.OP_ATAN2: _elementary("atan2"),
+    casadi.OP_EXP: _elementary("exp"),
+    casadi.OP_LOG: _elementary("log"),
+    casadi.OP_TANH: _elementary("tanh"),
+    casadi.OP_POW: _Lowering.power,
+    casadi.OP_CONSTPOW: _Lowering.power,
+    casadi.OP_HYPOT: lambda s, x, y: s.v.intrinsic("sqrt", s.v.add(s.v.mul(x, x), s.v.mul(y, y))),
+    casadi.OP_FMOD: lambda s, x, y: vector_math.remainder(s.v, x, y, "trunc"),
+    casadi.OP_REMAINDER: lambda s, x, y: vector_math.remainder(s.v, x, y, "rint"),
+    casadi.OP_LT: _comparison("<"),
+    casadi.OP_LE: _comparison("<="),
+    casadi.OP_EQ: _comparison("=="),
+    casadi.OP_NE: _Lowering.differ,
+    casadi.OP_NOT: lambda s, a: s.truth(s.v.builder.not_(s.mask(a))),
+    casadi.OP_AND: lambda s, a, b: s.truth(s.v.builder.and_(s.mask(a), s.mask(b))),
+    casadi.OP_OR: lambda s, a, b: s.truth(s.v.builder.or_(s.mask(a), s.mask(b))),
+    casadi.OP_IF_ELSE_ZERO: lambda s, c, x: s.v.select(s.mask(c), x, s.v.const(0.0)),
+}
+
+
+def _name_of(op: int) -> str:
+    names = [name for name in dir(casadi) if name.startswith("OP_") and getattr(casadi, name) == op]
+    return names[0] if names else f"operation {op}"

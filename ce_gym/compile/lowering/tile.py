@@ -1,0 +1,197 @@
+"""Everything that is done to one tile, as LLVM code: skip test, rows to lanes, random numbers, steps, lanes to rows.
+
+Knows a `Program` and llvmlite's builder; knows neither numba nor files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import casadi
+from llvmlite import ir
+
+from ce_gym.compile.arrays import ALIGNMENT
+from ce_gym.compile.layout import Layout
+from ce_gym.compile.lowering.function import lower_function
+from ce_gym.compile.lowering.lookup import Table, emit_lookup
+from ce_gym.compile.lowering.random import emit_uniform
+from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
+from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step
+
+INT = ir.IntType(64)
+FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
+
+
+def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...]) -> None:
+    """Emit the work on one tile at the builder's position.
+
+    Args:
+        builder: of the function that loops over tiles.
+        program: what to do.
+        layout: its calling convention.
+        arguments: 64-bit integers: address of the address table, address of the repeat counts, address of this
+            thread's scratch memory, number of the tile, number of environments.
+    """
+    work = _TileWork(builder, program, layout, arguments)
+    if not program.skip_unless:
+        work.emit()
+        return
+    with builder.if_then(work.any_lane(program.skip_unless)):
+        work.emit()
+
+
+class _TileWork:
+    """Addresses of one tile's buffers and the code that uses them."""
+
+    def __init__(self, builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...]) -> None:
+        table, repeats, scratch, tile, num_envs = arguments
+        self.builder, self.program, self.layout = builder, program, layout
+        self.vectors = VectorBuilder(builder, layout.dtype)
+        self.table = builder.inttoptr(table, INT.as_pointer())
+        self.repeats = builder.inttoptr(repeats, INT.as_pointer())
+        self.last_env = builder.sub(num_envs, INT(1))
+        self.first_env = builder.mul(tile, INT(self.vectors.lanes))
+        remaining = builder.sub(num_envs, self.first_env)
+        self.valid_lanes = self._smaller(remaining, INT(self.vectors.lanes))
+        self.lanes = {b.name: self._lanes_of(b, scratch, tile) for b in program.buffers if b.kind != "table"}
+        self.bodies: dict[casadi.Function, ir.Function] = {}
+
+    def any_lane(self, name: str) -> Value:
+        """Whether a buffer of size 1 is not zero in some lane."""
+        v, bits = self.vectors, ir.IntType(self.vectors.lanes)
+        set_lanes = v.compare("!=", v.load(self.lanes[name], 0), v.const(0.0))
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(set_lanes, bits), bits(0))
+
+    def emit(self) -> None:
+        """All work on the tile, in order."""
+        kinds = {
+            kind: [b for b in self.program.buffers if b.kind == kind] for kind in ("rows_in", "random", "rows_out")
+        }
+        for buffer in kinds["rows_in"]:
+            self._rows_to_lanes(buffer)
+        if kinds["random"]:
+            self._fill_random(kinds["random"])
+        for step in self.program.steps:
+            if isinstance(step, Repeat):
+                with self._repeated(step.times):
+                    for call in step.calls:
+                        self._step(call)
+            else:
+                self._step(step)
+        for buffer in kinds["rows_out"]:
+            self._lanes_to_rows(buffer)
+
+    def _address(self, position: int) -> Value:
+        """Entry of the address table, as an integer."""
+        return self.builder.load(self.builder.gep(self.table, [INT(position)]))
+
+    def _array(self, buffer: Buffer) -> Value:
+        return self._address(self.layout.arguments.index(buffer))
+
+    def _lanes_of(self, buffer: Buffer, scratch: Value, tile: Value) -> Value:
+        """Pointer to the first vector of a buffer in this tile."""
+        if buffer.kind == "tiles":
+            offset = self.builder.mul(tile, INT(ALIGNMENT * buffer.size))
+            address = self.builder.add(self._array(buffer), offset)
+        else:
+            address = self.builder.add(scratch, INT(self.layout.scratch_offsets[buffer.name]))
+        return self.builder.inttoptr(address, self.vectors.float_type.as_pointer())
+
+    def _rows_to_lanes(self, buffer: Buffer) -> None:
+        """Copy this tile's rows to lanes; lanes past the last environment repeat its row."""
+        b = self.builder
+        with loop(b, INT(self.vectors.lanes), "lane") as lane:
+            row = self._smaller(b.add(self.first_env, lane), self.last_env)
+            with self._elements(buffer, row, lane) as (row_element, lane_element):
+                b.store(_convert(b, b.load(row_element), FLOATS[self.layout.dtype]), lane_element)
+
+    def _lanes_to_rows(self, buffer: Buffer) -> None:
+        """Copy the lanes of real environments to their rows."""
+        b = self.builder
+        with loop(b, self.valid_lanes, "lane") as lane:
+            row = b.add(self.first_env, lane)
+            with self._elements(buffer, row, lane) as (row_element, lane_element):
+                b.store(_convert(b, b.load(lane_element), FLOATS[buffer.dtype or self.layout.dtype]), row_element)
+
+    @contextmanager
+    def _elements(self, buffer: Buffer, row: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
+        """Loop over the values of one environment: where each is in its row and where in its lane."""
+        b = self.builder
+        row_type = FLOATS[buffer.dtype or self.layout.dtype]
+        rows = b.inttoptr(self._array(buffer), row_type.as_pointer())
+        lanes = b.bitcast(self.lanes[buffer.name], FLOATS[self.layout.dtype].as_pointer())
+        row_start = b.mul(row, INT(buffer.size))
+        with loop(b, INT(buffer.size), "value") as value:
+            in_lanes = b.add(b.mul(value, INT(self.vectors.lanes)), lane)
+            yield b.gep(rows, [b.add(row_start, value)]), b.gep(lanes, [in_lanes])
+
+    def _fill_random(self, buffers: list[Buffer]) -> None:
+        """Draw the numbers of all random buffers from each lane's key and counter."""
+        keys, counters = (self._words(self._address(self.layout.keys + i)) for i in range(2))
+        emit_uniform(self.vectors, keys, counters, [(self.lanes[b.name], b.size) for b in buffers])
+
+    def _words(self, address: Value) -> Value:
+        """One 64-bit integer per lane from an array with one per environment."""
+        b = self.builder
+        words = b.inttoptr(address, INT.as_pointer())
+        result: Value = ir.Constant(ir.VectorType(INT, self.vectors.lanes), ir.Undefined)
+        for lane in range(self.vectors.lanes):
+            env = self._smaller(b.add(self.first_env, INT(lane)), self.last_env)
+            result = b.insert_element(result, b.load(b.gep(words, [env])), ir.IntType(32)(lane))
+        return result
+
+    @contextmanager
+    def _repeated(self, times: str) -> Iterator[None]:
+        """What is built inside `with` is done as often as a run-time integer says."""
+        count = self.builder.load(self.builder.gep(self.repeats, [INT(self.layout.repeats.index(times))]))
+        with loop(self.builder, count, "repeat"):
+            yield
+
+    def _step(self, step: Step) -> None:
+        if isinstance(step, Lookup):
+            self._look_up(step)
+        else:
+            self._call(step)
+
+    def _look_up(self, lookup: Lookup) -> None:
+        """Look up the surface over a table at every point."""
+        buffers = {b.name: b for b in self.layout.buffers}
+        rows = self.layout.shapes[lookup.table]
+        table = Table(self._array(buffers[lookup.table]), self._address(rows), self._address(rows + 1))
+        frame, points, output = self.lanes[lookup.frame], self.lanes[lookup.points], self.lanes[lookup.output]
+        emit_lookup(self.vectors, table, frame, points, output, buffers[lookup.points].size // 2)
+
+    def _call(self, call: Call) -> None:
+        """Call one lowered function, if it is needed."""
+        body = self.bodies.get(call.function) or self._body(call.function)
+        self.bodies[call.function] = body
+        pointers = [self.lanes[name] for name in call.inputs + call.outputs]
+        if not call.only_if:
+            self.builder.call(body, pointers)
+            return
+        with self.builder.if_then(self.any_lane(call.only_if)):
+            self.builder.call(body, pointers)
+
+    def _body(self, function: casadi.Function) -> ir.Function:
+        """A function's own LLVM function: one long block that the optimiser sees alone."""
+        pointer = self.vectors.float_type.as_pointer()
+        signature = ir.FunctionType(ir.VoidType(), [pointer] * (function.n_in() + function.n_out()))
+        body = ir.Function(self.builder.module, signature, f"call_{len(self.bodies)}")
+        body.linkage = "internal"
+        body.attributes.add("noinline")
+        body.attributes.alignstack = ALIGNMENT  # else spilled vectors straddle two cache lines each
+        vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype)
+        lower_function(vectors, function, body.args[: function.n_in()], body.args[function.n_in() :])
+        vectors.builder.ret_void()
+        return body
+
+    def _smaller(self, a: Value, b: Value) -> Value:
+        return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
+
+
+def _convert(builder: Builder, value: Value, to: ir.Type) -> Value:
+    """A float in the other precision, or as it is."""
+    if value.type == to:
+        return value
+    return builder.fpext(value, to) if to == FLOATS["float64"] else builder.fptrunc(value, to)

@@ -1,0 +1,1 @@
+"""Spatial vectors, the update of positions, and traced functions on numpy arrays: knows no robot."""

@@ -1,0 +1,128 @@
+"""What a cluster's constraints say about its coordinates: `q = gamma(y)` and its derivatives `G` and `g`.
+
+Each cluster has spanning coordinates `q` (one per body, eliminated rotors included) and independent coordinates `y`,
+a subset of them. All that the recursions need is
+
+    q = gamma(y),   qd = G yd,   qdd = G ydd + g        (constraint-embedding paper, eq. explicit_constraints)
+
+`G` and `g` are derived by automatic differentiation, never by hand. Here for clusters whose constraints are all
+linear; closure.py does the others. May know descriptions and CasADi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.constraints.closure import Closure
+from ce_gym.model.clusters import Cluster
+from ce_gym.model.description import LinearConstraint
+from ce_gym.model.errors import RobotError
+
+SX = ca.SX
+
+
+@dataclass(frozen=True)
+class LoopState:
+    """How a cluster's loops are closed at one state.
+
+    Attributes:
+        guessed: Rows of the dependent coordinates that were found from a guess.
+        gap: Largest residual of the rows that were solved by iteration; 0 if all were solved by formulas.
+        nearness: 1 at the reference pose, 0 at a singularity, negative beyond: the smallest determinant of the blocks
+            of the constraint Jacobian, relative to the reference pose.
+    """
+
+    guessed: tuple[int, ...]
+    gap: SX
+    nearness: SX
+
+
+@dataclass(frozen=True)
+class ClusterCoordinates:
+    """The coordinates of one cluster at one state.
+
+    Attributes:
+        index: Row of each body in the spanning quantities, by name.
+        q: Spanning positions, shape (n,).
+        qd: Spanning velocities, shape (n,).
+        G: Constraint Jacobian, shape (n, d).
+        g: Velocity-product acceleration of the constraint, shape (n,).
+        loop: What closed loops add; None if all constraints are linear.
+    """
+
+    index: dict[str, int]
+    q: SX
+    qd: SX
+    G: SX
+    g: SX
+    loop: LoopState | None = None
+
+
+def cluster_coordinates(cluster: Cluster, y: SX, yd: SX) -> ClusterCoordinates:
+    """Evaluate a cluster's constraint at independent positions `y` (d,) and velocities `yd` (d,)."""
+    symbol, rate = SX.sym("y", y.shape[0]), SX.sym("yd", y.shape[0])
+    gamma = explicit_constraint(cluster, symbol)
+    G = ca.jacobian(gamma, symbol)
+    g = ca.jtimes(G @ rate, symbol, rate)
+    evaluate = ca.Function("constraint", [symbol, rate], [gamma, ca.densify(G), ca.densify(g)])
+    q, G_at, g_at = evaluate(y, yd)
+    G_at, g_at = ca.sparsify(G_at), ca.sparsify(g_at)
+    return ClusterCoordinates({name: i for i, name in enumerate(cluster.bodies)}, q, G_at @ yd, G_at, g_at)
+
+
+def loop_coordinates(cluster: Cluster, closure: Closure, y: SX, yd: SX, guess: SX) -> ClusterCoordinates:
+    """Evaluate a cluster with closed loops at `y` (d,), `yd` (d,) and a guess of what needs one, (n_guess,)."""
+    z, gap = closure.locate(y, guess)
+    G, g, nearness = closure.rates(y, z, yd)
+    G, g = ca.sparsify(G), ca.sparsify(g)
+    q, qd = closure.spanning(y, z), G @ yd
+    guessed = tuple(closure.assembly.unknown[j] for j in closure.guessed)
+    loop = LoopState(guessed, gap, nearness)
+    return ClusterCoordinates({name: i for i, name in enumerate(cluster.bodies)}, q, qd, G, g, loop)
+
+
+def geared(coordinates: ClusterCoordinates, rotors: list[str], ratio: SX | float) -> ClusterCoordinates:
+    """Return coordinates whose rotors turn `ratio` times as far; nothing else follows from them."""
+    scale = SX.ones(coordinates.q.numel())
+    scale[[coordinates.index[name] for name in rotors]] = ratio
+    q, qd, g = scale * coordinates.q, scale * coordinates.qd, scale * coordinates.g
+    return replace(coordinates, q=q, qd=qd, G=ca.sparsify(ca.diag(scale) @ coordinates.G), g=g)
+
+
+def explicit_constraint(cluster: Cluster, y: SX) -> SX:
+    """Return `gamma(y)`, the spanning coordinates of a cluster, shape (n,)."""
+    G, offset = linear_solution(cluster)
+    return ca.sparsify(SX(G)) @ y + offset
+
+
+def linear_solution(cluster: Cluster) -> tuple[np.ndarray, np.ndarray]:
+    """Solve the linear constraints of a cluster, `K q = b`, for `q = G y + q0`.
+
+    Returns:
+        G, shape (n, d), and q0, shape (n,).
+
+    Raises:
+        RobotError: If the independent coordinates do not determine the others.
+    """
+    rows = {name: i for i, name in enumerate(cluster.bodies)}
+    constraints = [c for c in cluster.constraints if isinstance(c, LinearConstraint)]
+    K, b = np.zeros((len(constraints), len(rows))), np.zeros(len(constraints))
+    for row, constraint in enumerate(constraints):
+        b[row] = constraint.offset
+        for body, coefficient in constraint.coefficients:
+            K[row, rows[body]] += coefficient
+    independent = [rows[name] for name in cluster.independent]
+    dependent = [i for i in range(len(rows)) if i not in independent]
+    G, q0 = np.zeros((len(rows), len(independent))), np.zeros(len(rows))
+    G[independent, range(len(independent))] = 1.0
+    if dependent:
+        K_d = K[:, dependent]
+        if K_d.shape[0] != K_d.shape[1] or np.linalg.matrix_rank(K_d) < len(dependent):
+            tied = ", ".join(cluster.bodies[i] for i in dependent)
+            raise RobotError(f"cluster of {cluster.bodies[0]!r}: its constraints do not determine {tied}")
+        G[dependent] = np.linalg.solve(K_d, -K[:, independent])
+        q0[dependent] = np.linalg.solve(K_d, b)
+    return np.where(np.abs(G) < 1e-14, 0.0, G), q0

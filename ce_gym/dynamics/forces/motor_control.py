@@ -1,0 +1,133 @@
+"""Control of a robot at its joints or at its motors, up to what the motors deliver to the joints.
+
+At the motors, a target is an angle or a torque of a rotor, whatever lies between it and the joints: with theta the
+rotors' angles and `W` their speeds for unit joint velocities,
+
+    tau_m = kp_m (target - theta) - kd_m thetad        tau = W^T tau_m
+
+each within the motor's own limits. Every motor has a loop of its own, so that where belts, differentials or rods tie
+motors and joints together the gains at the joints are `W^T diag(kp_m) W`, and couple. The gains of a motor are those of
+its joints as it feels them alone, the other motors of the cluster at rest, in the standing pose:
+
+    kp_m,i = e_i^T W^-T diag(kp) W^-1 e_i        kp / N^2 behind a gear of ratio N, where both controls are the same
+
+As in actuation.py forces are taken one step ahead. May know actuation, kinematics and scenes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.actuation import (
+    Actuated,
+    JointForce,
+    MotorForce,
+    actuated_clusters,
+    controller,
+    deliver,
+    motor_forces,
+    within_joint_limits,
+)
+from ce_gym.dynamics.forces.scene import Scene, target_names
+from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
+from ce_gym.model.description import Motor
+from ce_gym.model.mechanism import Mechanism
+
+
+def commanded_forces(
+    scene: Scene, kinematics: Kinematics, y: SX, yd: SX, target: SX, dt: float, hints: SX
+) -> MotorForce:
+    """Return what the motors deliver to the joints.
+
+    Args:
+        scene: The robot and what surrounds it.
+        kinematics: Of the robot.
+        y: Independent joint positions [rad or m], shape (nj,).
+        yd: Their velocities, shape (nj,).
+        target: See `target_names`, shape (n_targets,).
+        dt: Length of the step [s].
+        hints: What the attempt before has found of limited torques, shape (limit_count,).
+    """
+    if scene.options.control in ("position", "torque"):
+        return motor_forces(scene, kinematics, controller(scene, y, yd, target, dt), yd, dt, hints)
+    position, strength = scene.options.control == "motor_position", scene.figures.strength
+    names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.independent
+    undriven = [row for row, name in enumerate(joints) if name in names]
+    force = _joint_forces(scene, y, yd, target, dt, names, undriven)
+    for cluster in actuated_clusters(scene.mechanism, kinematics):
+        own = target[[names.index(motor.rotor) for motor in cluster.motors]]
+        if position:
+            kp, kd = _gains(scene, cluster)
+            damping = kd + dt * kp
+            asked = JointForce(kp * (own - cluster.angles) - damping * (cluster.W @ yd[cluster.rows]), dt * damping)
+        else:
+            asked = JointForce(own, SX(own.numel(), 1))
+        if scene.options.motors == "ideal":
+            cluster = replace(cluster, motors=[Motor(motor.rotor, motor.torque) for motor in cluster.motors])
+        asked = JointForce(strength * asked.tau, ca.diag(strength * asked.slope))
+        deliver(force, asked, cluster, yd, strength, dt, hints)
+    return within_joint_limits(scene, force, undriven, hints)
+
+
+def motor_springs(scene: Scene, kinematics: Kinematics, y: SX, target: SX) -> tuple[SX, SX]:
+    """Return stiffness [N m/rad] and stretch [rad] of each spring of position control at the motors, (n_targets,)."""
+    names, joints = target_names(scene.mechanism, "motor_position"), scene.mechanism.robot.independent
+    stiffness, at = SX.zeros(len(names)), SX.zeros(len(names))
+    for row, name in enumerate(joints):
+        if name in names:
+            stiffness[names.index(name)], at[names.index(name)] = scene.figures.kp[row], y[row]
+    for cluster in actuated_clusters(scene.mechanism, kinematics):
+        entries = [names.index(motor.rotor) for motor in cluster.motors]
+        stiffness[entries], at[entries] = _gains(scene, cluster)[0], cluster.angles
+    return stiffness, target - at
+
+
+@lru_cache(maxsize=64)
+def standing_motors(mechanism: Mechanism) -> dict[str, tuple[float, NDArray[np.float64], NDArray[np.float64]]]:
+    """Return what motors do in the standing pose of a robot that is as it should be.
+
+    Returns:
+        For each rotor with a motor its angle [rad], its speed for unit velocities of the joints of its cluster, shape
+        (d,), and the speeds of those joints for unit speed of it alone, shape (d,).
+    """
+    robot, first = mechanism.robot, 7 if mechanism.robot.floating else 0
+    pose = dict(robot.pose.joints)
+    q = np.array([*[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0][:first], *(pose.get(name, 0.0) for name in robot.independent)])
+    mechanism = replace(mechanism, ratio=None)
+    kinematics = outward_velocity_pass(mechanism, SX(q), SX(len(q) - (1 if robot.floating else 0), 1))
+    found = {}
+    for cluster in actuated_clusters(mechanism, kinematics):
+        W, angles = np.array(ca.evalf(cluster.W)), np.array(ca.evalf(cluster.angles))[:, 0]
+        for i, (motor, back) in enumerate(zip(cluster.motors, np.linalg.pinv(W).T, strict=True)):
+            found[motor.rotor] = float(angles[i]), W[i], back
+    return found
+
+
+def _gains(scene: Scene, cluster: Actuated) -> tuple[SX, SX]:
+    """Return position [N m/rad] and velocity gains [N m s/rad] of a cluster's motors, shape (n_motors,) each."""
+    known = standing_motors(scene.mechanism)
+    squares = SX(ca.sparsify(ca.DM(np.array([known[motor.rotor][2] for motor in cluster.motors]) ** 2)))
+    return squares @ scene.figures.kp[cluster.rows], squares @ scene.figures.kd[cluster.rows]
+
+
+def _joint_forces(
+    scene: Scene, y: SX, yd: SX, target: SX, dt: float, names: tuple[str, ...], rows: list[int]
+) -> MotorForce:
+    """Return what is asked of the joints that no motor drives, and nothing of the others."""
+    n, strength = y.numel(), scene.figures.strength
+    force = MotorForce(SX(n, 1), SX(n, n), {})
+    joints = scene.mechanism.robot.independent
+    control = "position" if scene.options.control == "motor_position" else "torque"
+    full = SX.zeros(n)
+    for row in rows:
+        full[row] = target[names.index(joints[row])]
+    asked = controller(replace(scene, options=replace(scene.options, control=control)), y, yd, full, dt)
+    for row in rows:
+        force.tau[row], force.slope[row, row] = strength * asked.tau[row], strength * asked.slope[row, row]
+    return force

@@ -1,0 +1,127 @@
+"""What a scene consists of, and the state of one robot in it. May know descriptions, mechanisms and parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Literal
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.constraints.closure import reference_guess
+from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
+from ce_gym.model.description import ContactMaterial
+from ce_gym.model.mechanism import Mechanism
+
+Control = Literal["position", "torque", "motor_position", "motor_torque"]
+Friction = Literal["tangent", "secant"]
+Motors = Literal["ideal", "limited"]
+Ground = Literal["flat", "field"]
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """What a scene consists of and how it is stepped.
+
+    Attributes:
+        dt: Length of the step [s]; None makes it an input of the traced step.
+        control: "position" for joint targets [rad or m] through the robot's gains, "torque" for joint torques;
+            "motor_position" and "motor_torque" for angles and torques of the motors' rotors instead.
+        contacts: Names of the contact spheres that can touch the ground.
+        material: Compliance and friction of the contacts.
+        friction: "tangent" solves a step in which a contact sticks or slips against expectation a second time; "secant"
+            never does, and is slow to break away.
+        method: Name of a time-stepping method, see `METHODS`.
+        motors: "ideal" for the joints' torque limits; "limited" for the motors' own limits and friction.
+        ground: "flat" for the plane z = 0, "field" for a height and slope under each contact that the caller supplies.
+        parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
+    """
+
+    dt: float | None
+    control: Control = "position"
+    contacts: tuple[str, ...] = ()
+    material: ContactMaterial = field(default_factory=ContactMaterial)
+    friction: Friction = "tangent"
+    method: str = "euler"
+    motors: Motors = "ideal"
+    ground: Ground = "flat"
+    parameters: tuple[str, ...] = ()
+
+
+@dataclass
+class Scene:
+    """A robot in a scene, with numbers or symbols for its figures.
+
+    Attributes:
+        mechanism: The robot at a transmission level.
+        options: What the scene consists of.
+        figures: Contact, gains and motor strength.
+        ground: Height [m] and slopes dz/dx, dz/dy of the ground under each contact, shape (3, n_contacts); not used on
+            flat ground.
+        looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_contacts);
+            empty if that is where they are.
+    """
+
+    mechanism: Mechanism
+    options: StepOptions
+    figures: Figures
+    ground: SX
+    looked_up: SX = field(default_factory=SX)
+
+
+def make_scene(mechanism: Mechanism, options: StepOptions, parameters: SX, ground: SX) -> Scene:
+    """Return a scene whose declared parameters, stacked in the order of the options, are `parameters`."""
+    named = with_parameters(mechanism, options.parameters, parameters)
+    return Scene(named, options, figures(mechanism.robot, options.material, options.parameters, parameters), ground)
+
+
+@dataclass
+class State:
+    """What one robot carries from step to step.
+
+    Attributes:
+        q: Positions, shape (nq,).
+        v: Velocities, shape (nv,).
+        load: Normal force of each contact over the last step [N], shape (n_contacts,).
+        anchor: Horizontal deflections of the contacts' bristles, world axes [m], shape (2 n_contacts,); empty without.
+        dependent: Where the dependent coordinates that no formula gives will be, roughly, shape (n_guess,).
+    """
+
+    q: SX
+    v: SX
+    load: SX
+    anchor: SX
+    dependent: SX
+
+    def items(self) -> list[tuple[str, SX]]:
+        """Return the parts that are there, by name."""
+        return [(f.name, getattr(self, f.name)) for f in fields(self) if getattr(self, f.name).numel()]
+
+
+def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:
+    """Return what each entry of a step's target is for, by the name of the body that it moves.
+
+    The independent joints; or, for control at the motors, the motors' rotors and then the joints that no motor drives,
+    which are controlled as joints.
+    """
+    robot = mechanism.robot
+    if control in ("position", "torque"):
+        return robot.independent
+    rotors = tuple(motor.rotor for motor in robot.motors)
+    driven = {
+        name for cluster in mechanism.tree.clusters if set(rotors) & set(cluster.bodies) for name in cluster.bodies
+    }
+    return rotors + tuple(name for name in robot.independent if name not in driven)
+
+
+def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
+    """Return the sizes of the parts of a state that are there."""
+    joints, floating = len(mechanism.robot.independent), mechanism.robot.floating
+    n = len(options.contacts)
+    sizes = {"q": joints + (7 if floating else 0), "v": joints + (6 if floating else 0), "load": n}
+    sizes |= {"anchor": 2 * n if options.material.bristle > 0 else 0, "dependent": len(reference_guess(mechanism))}
+    return {name: size for name, size in sizes.items() if size}
+
+
+def symbolic_state(mechanism: Mechanism, options: StepOptions) -> State:
+    """Return a state of fresh symbols."""
+    sizes = state_sizes(mechanism, options)
+    return State(**{f.name: SX.sym(f.name, sizes.get(f.name, 0)) for f in fields(State)})

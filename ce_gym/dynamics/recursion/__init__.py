@@ -1,0 +1,1 @@
+"""Passes over the tree of bodies: kinematics, CE-ABA and CE-RNEA."""

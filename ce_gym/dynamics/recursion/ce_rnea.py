@@ -1,0 +1,108 @@
+"""Inverse dynamics by the constraint-embedding recursive Newton-Euler algorithm (CE-RNEA), paper section V.
+
+Bodies are visited one by one: accelerations base to tip, forces tip to base, and the cluster's constraint Jacobian
+projects the spanning torques, `tau_y = G^T tau_span`. A rotor's spin adds the couple `h thdd + v_c x* h thd` to its
+carrier and `G_r^T (J thdd + h^T a_c)` to the torques, see ce_aba.py for the symbols; for that of rotors that are not
+symmetric see rotors.py. May know kinematics and spatial algebra.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX, cross, turning_force
+from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
+from ce_gym.dynamics.recursion.ce_aba import gravity_acceleration
+from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
+from ce_gym.dynamics.recursion.rotors import lateral_inertia
+from ce_gym.model.mechanism import Mechanism
+
+
+def inverse_dynamics(mechanism: Mechanism, kinematics: Kinematics, vdot: SX) -> SX:
+    """Return the generalised force that produces an acceleration.
+
+    Args:
+        mechanism: The mechanism.
+        kinematics: From the outward velocity pass.
+        vdot: Acceleration in the coordinates of `v`, shape (nv,).
+
+    Returns:
+        tau, base wrench [moment; force] first, shape (nv,).
+    """
+    a, qdd = outward_acceleration(mechanism, kinematics, vdot)
+    f = {}
+    for name, body in mechanism.bodies.items():
+        inertia, w = constant(body.inertia), kinematics.bodies[name].v[:3]
+        f[name] = inertia @ a[name] + turning_force(inertia, w)
+    return inward_force_pass(mechanism, kinematics, a, f, qdd)
+
+
+def outward_acceleration(mechanism: Mechanism, kinematics: Kinematics, vdot: SX) -> tuple[dict[str, SX], list[SX]]:
+    """Return each body's acceleration minus gravity, shape (6,), and each cluster's spanning accelerations."""
+    gravity = gravity_acceleration(mechanism)
+    world = ca.vertcat(SX(3, 1), -gravity)
+    a: dict[str, SX] = {}
+    qdd: list[SX] = []
+    for k in mechanism.tree.base_to_tip():
+        cluster, rows = mechanism.tree.clusters[k], kinematics.rows[k]
+        if is_free(mechanism, cluster):
+            base = cluster.bodies[0]
+            state = kinematics.bodies[base]
+            a[base] = vdot[rows] + ca.vertcat(SX(3, 1), cross(state.v[:3], state.v[3:]) - state.R.T @ gravity)
+            qdd.append(vdot[rows])
+            continue
+        coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
+        qdd.append(coordinates.G @ vdot[rows] + coordinates.g)
+        for body in mechanism.moving(cluster):
+            state = kinematics.bodies[body.name]
+            from_parent = state.X.motion(a[body.parent] if body.parent is not None else world)
+            a[body.name] = from_parent + state.S * qdd[k][coordinates.index[body.name]] + state.c
+    return a, qdd
+
+
+def inward_force_pass(
+    mechanism: Mechanism, kinematics: Kinematics, a: dict[str, SX], f: dict[str, SX], qdd: list[SX]
+) -> SX:
+    """Collect net forces `f` of the bodies, tip to base, into the generalised force, shape (nv,)."""
+    tau = SX(sum(len(rows) for rows in kinematics.rows), 1)
+    for k in mechanism.tree.tip_to_base():
+        cluster, rows = mechanism.tree.clusters[k], kinematics.rows[k]
+        if is_free(mechanism, cluster):
+            tau[rows] = f[cluster.bodies[0]]
+            continue
+        coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
+        spanning = SX(len(coordinates.index), 1)
+        if mechanism.level == "exact":
+            for spin in mechanism.spins[k]:
+                row, J = coordinates.index[spin.rotor], spin.inertia
+                spanning[row] = J * qdd[k][row]
+                if spin.carrier is not None:
+                    h, w, wd = J * constant(spin.axis), kinematics.bodies[spin.carrier].v[:3], a[spin.carrier][:3]
+                    lateral = lateral_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
+                    spanning[row] += ca.dot(h, wd) + lateral.torque
+                    couple = h * qdd[k][row] + cross(w, h * coordinates.qd[row]) + lateral.inertia @ wd + lateral.couple
+                    f[spin.carrier] += ca.vertcat(couple, SX(3, 1))
+        for body in reversed(mechanism.moving(cluster)):
+            state = kinematics.bodies[body.name]
+            spanning[coordinates.index[body.name]] = state.S.T @ f[body.name]
+            if body.parent is not None:
+                f[body.parent] += state.X.force_to_parent(f[body.name])
+        tau[rows] = coordinates.G.T @ spanning
+        if mechanism.level in ("coupled", "armature"):
+            tau[rows] += _reflected(mechanism, coordinates, k, qdd[k])
+    return tau
+
+
+def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qdd: SX) -> SX:
+    """Torque of the reflected inertia: the whole block, or its diagonal at the armature level, shape (d,).
+
+    With closed loops `G_r` varies; the whole block then has a velocity term `G_r^T J g_r`, the diagonal does without.
+    """
+    G, index, cluster = coordinates.G, coordinates.index, mechanism.tree.clusters[k]
+    ydd = qdd[[index[name] for name in cluster.independent]]
+    torque = SX(G.shape[1], 1)
+    for spin in mechanism.spins[k]:
+        row = index[spin.rotor]
+        G_r = G[row, :]
+        torque += spin.inertia * (ca.vec(G_r) ** 2 * ydd if mechanism.level == "armature" else G_r.T * qdd[row])
+    return torque

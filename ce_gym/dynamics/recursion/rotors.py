@@ -1,0 +1,61 @@
+"""The inertia of an eliminated rotor that is not symmetric about its spin axis, as its carrier feels it.
+
+A rotor that spins by theta about a principal axis u of its inertia, centre of mass on that axis, has the kinetic energy
+
+    T = m |v_com|^2 / 2 + w^T I(theta) w / 2 + J thd u^T w + J thd^2 / 2        (w of the carrier, all in its frame)
+
+because I(theta) u = J u at every angle. Its two lateral principal moments, mean +- lateral, turn with it:
+
+    I(theta) = I_mean + dI,   dI = lateral (cos(2 theta) (e e^T - n n^T) + sin(2 theta) (e n^T + n e^T)),   n = u x e
+
+with the axis e of the larger one at theta = 0. I_mean is constant and merged into the carrier; the terms with J are
+those of a symmetric rotor, see ce_aba.py. Since (d dI/dtheta) w = 2 u x (dI w), Lagrange's equations leave
+
+    couple on the carrier   dI wd + (w + 2 thd u) x (dI w)
+    torque about the axis   -w^T (d dI/dtheta) w / 2 = u^T (w x (dI w))
+
+and no force. May know spatial algebra and mechanisms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.algebra.spatial import SX, cross, mirrored
+from ce_gym.dynamics.recursion.kinematics import constant
+from ce_gym.model.mechanism import Spin
+
+
+@dataclass
+class LateralInertia:
+    """What the lateral difference of a rotor's moments adds at one state; nothing for a symmetric rotor.
+
+    Attributes:
+        inertia: dI, added to the angular inertia of the carrier [kg m^2], carrier's frame, shape (3, 3).
+        couple: Velocity-product couple that moves the carrier [N m], carrier's frame, shape (3,).
+        torque: Velocity-product torque that turns the rotor about its axis [N m].
+    """
+
+    inertia: SX
+    couple: SX
+    torque: SX
+
+
+def lateral_inertia(spin: Spin, angle: SX, rate: SX, w: SX) -> LateralInertia:
+    """Evaluate a rotor that has a carrier.
+
+    Args:
+        spin: The rotor.
+        angle: Its joint coordinate [rad].
+        rate: Its speed [rad/s].
+        w: Angular velocity of the carrier [rad/s], carrier's frame, shape (3,).
+    """
+    e, n = spin.heavy_axis, np.cross(spin.axis, spin.heavy_axis)
+    at_zero, at_quarter = np.outer(e, e) - np.outer(n, n), np.outer(e, n) + np.outer(n, e)
+    c, s = spin.lateral * ca.cos(2 * angle), spin.lateral * ca.sin(2 * angle)
+    inertia = ca.sparsify(mirrored(c * constant(at_zero) + s * constant(at_quarter)))
+    momentum, axis = ca.sparsify(inertia @ w), constant(spin.axis)
+    return LateralInertia(inertia, cross(w + 2 * rate * axis, momentum), ca.dot(axis, cross(w, momentum)))

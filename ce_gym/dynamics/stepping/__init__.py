@@ -1,0 +1,1 @@
+"""A time step made of the recursions and the forces, and its methods."""

@@ -1,0 +1,61 @@
+"""Mechanical energy of a robot in a scene: what moves, what can fall, and what is bent.
+
+Without motors nothing that the scene contains can give energy to the robot, so this sum must not grow. May know
+everything in this room but the methods and the trace.
+"""
+
+from __future__ import annotations
+
+import math
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.actuation import limit_stiffness
+from ce_gym.dynamics.forces.motor_control import motor_springs
+from ce_gym.dynamics.forces.scene import Scene, State
+from ce_gym.dynamics.functions import kinetic_and_potential
+from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
+from ce_gym.dynamics.stepping.step import no_hints, touching
+
+
+def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
+    """Return kinetic, potential and elastic energy [J].
+
+    Elastic are the springs and bristles of contacts, stops of joints, and position control, the last as if motors had
+    no limits.
+
+    Args:
+        scene: The robot and what surrounds it.
+        state: Of the robot.
+        target: Targets, or torques, which have no energy, shape (n_targets,), see `target_names`.
+    """
+    kinetic, potential = kinetic_and_potential(scene.mechanism, state.q, state.v, state.dependent)
+    return kinetic + potential + contact_energy(scene, state) + joint_energy(scene, state, target)
+
+
+def contact_energy(scene: Scene, state: State) -> SX:
+    """Return the energy of contact springs and bristles [J]."""
+    kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
+    k, k_t = scene.figures.compliance.stiffness, scene.figures.compliance.bristle
+    touches = [contact.touch for contact in touching(scene, kinematics, state, 0.0, no_hints(scene))]
+    return sum((k * ca.fmax(t.depth, 0) ** 2 + k_t * ca.sumsqr(t.anchor) for t in touches), SX(0)) / 2
+
+
+def joint_energy(scene: Scene, state: State, target: SX) -> SX:
+    """Return the energy of the stops of the joints, and of position control [J]."""
+    robot, total = scene.mechanism.robot, SX(0)
+    y = state.q[state.q.numel() - len(robot.independent) :]
+    for i, name in enumerate(robot.independent):
+        low, high = robot.body(name).joint.position
+        beyond = (ca.fmax(low - y[i], 0) if math.isfinite(low) else 0) + (
+            ca.fmax(y[i] - high, 0) if math.isfinite(high) else 0
+        )
+        total += limit_stiffness(robot, name)[0] * beyond**2 / 2
+    if scene.options.control == "position":
+        total += ca.sum1(scene.figures.strength * scene.figures.kp * (target - y) ** 2) / 2
+    if scene.options.control == "motor_position":
+        kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
+        stiffness, stretch = motor_springs(scene, kinematics, y, target)
+        total += ca.sum1(scene.figures.strength * stiffness * stretch**2) / 2
+    return total

@@ -1,0 +1,74 @@
+"""How a step on a height field finds the ground under each contact, as traced functions around the look-ups.
+
+A sphere touches sloping ground beside the place under its centre. So the field is looked up twice: under the centre,
+and where a sphere on the plane found there would touch it. The plane at the second place is the one that the sphere
+meets, but for errors of second order in how much the ground turns over a radius. With the first alone forces would not
+be normal to the path on which a sphere can roll, and energy would grow. Spheres without radius need no second look.
+
+May know scenes, steps and kinematics.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.scene import StepOptions, symbolic_state
+from ce_gym.dynamics.functions import traced
+from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
+from ce_gym.dynamics.stepping.step import contact_places, contact_spheres
+from ce_gym.model.mechanism import Mechanism
+
+
+def places_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+    """Trace where the centres of the contact spheres are.
+
+    Returns:
+        Function (q) or, for a robot whose loops need guesses, (q, dependent) -> x and y of each centre [m], shape
+        (2 n_contacts,).
+    """
+    state = symbolic_state(mechanism, options)
+    kinematics = outward_velocity_pass(mechanism, state.q, SX(*state.v.shape), state.dependent)
+    given = {name: value for name, value in state.items() if name in ("q", "dependent")}
+    return traced("places", given, {"places": ca.vec(contact_places(mechanism, options, kinematics))})
+
+
+def touching_function(mechanism: Mechanism, options: StepOptions) -> ca.Function | None:
+    """Trace where the spheres with a radius would touch a plane.
+
+    Returns:
+        Function (places, ground) -> x and y of the touching points [m], shape (2 m,), from the centres and the height
+        and slopes under them, shape (3 n_contacts,); None if no sphere has a radius.
+    """
+    radius, round_ones, places, ground = _spheres(mechanism, options)
+    if not round_ones:
+        return None
+    slope = ground[1:, round_ones]
+    lean = slope * ca.repmat(radius / ca.sqrt(1 + ca.sum1(slope**2)), 2, 1)
+    touching = ca.vec(places[:, round_ones] + lean)
+    return traced("touching", {"places": ca.vec(places), "ground": ca.vec(ground)}, {"touching": touching})
+
+
+def planes_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+    """Trace the planes that the spheres meet.
+
+    Returns:
+        Function (places, ground, touching, found) -> ground: height under each centre [m] and slopes of the plane that
+        was found, shape (3 m,), where the sphere touches, shape (3 n_contacts,).
+    """
+    _, round_ones, places, ground = _spheres(mechanism, options)
+    touching, found = SX.sym("touching", 2, len(round_ones)), SX.sym("found", 3, len(round_ones))
+    planes = SX(ground)
+    planes[:, round_ones] = found
+    planes[0, round_ones] += ca.sum1(found[1:, :] * (places[:, round_ones] - touching))
+    given = {"places": places, "ground": ground, "touching": touching, "found": found}
+    return traced("planes", {name: ca.vec(value) for name, value in given.items()}, {"ground_next": ca.vec(planes)})
+
+
+def _spheres(mechanism: Mechanism, options: StepOptions) -> tuple[SX, list[int], SX, SX]:
+    """Return radii of the spheres that have one, which those are, and symbols for the places and ground of all."""
+    radius = np.array([sphere.radius for sphere in contact_spheres(mechanism, options)])
+    round_ones = np.flatnonzero(radius).tolist()
+    places, ground = SX.sym("places", 2, len(radius)), SX.sym("ground", 3, len(radius))
+    return SX(ca.DM(radius[round_ones])).T, round_ones, places, ground

@@ -1,0 +1,125 @@
+"""The contract of a policy: all that somebody must know to run it on another simulator or on a robot.
+
+Plain data, so that it can be written beside a policy or into its file. Nothing is said here that is written elsewhere:
+where the numbers of an observation come from is read off the traced terms. May know programs; no Gymnasium.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.envs.runtime.program import OBSERVATION_BOUND, TaskProgram
+
+FORMAT = "ce_gym policy contract, version 1"
+
+MEANINGS = {
+    "joint_pd": "joint target [rad] = default_pose + scale * clip(action, -1, 1); torque = kp * (target - position) "
+    "- kd * velocity, within torque_limits; joints without an action hold the default pose",
+    "joint_torque": "joint torque [N m] = scale * clip(action, -1, 1); joints without an action have none",
+    "motor_pd": "rotor target [rad] = rest + scale * clip(action, -1, 1); the gains of a motor are those of its "
+    "joints as it feels them in the default pose while the other motors of its cluster are at rest",
+    "motor_torque": "rotor torque [N m] = scale * clip(action, -1, 1); motors without an action have none",
+}
+"""What an action means, by its kind."""
+
+COORDINATES = {
+    "q": "base position in the world (3) [m], base quaternion w x y z, body to world (4), joints in the order of "
+    "`joints` [rad]",
+    "v": "angular (3) [rad/s] and linear velocity (3) [m/s] of the base in the base frame, joints [rad/s]",
+    "command": "forward and sideways velocity in the base frame [m/s], yaw rate [rad/s]",
+    "action": "the action before this observation, after clipping",
+}
+"""What an observation is made of, by the name that its blocks use."""
+
+
+def contract(program: TaskProgram, task: str) -> dict[str, Any]:
+    """Return the contract of policies for a task on a robot.
+
+    Args:
+        program: The task on the robot.
+        task: Its name.
+
+    Returns:
+        JSON-able data. `joints`, `default_pose` [rad], `kp` [N m/rad], `kd` [N m s/rad] and `torque_limits` [N m] are
+        in one order. `observation["blocks"]` lie one after another; where a block has `of`, its entry i is
+        `offset[i] + scale[i] * of[rows[i]]`, with `of` one of `coordinates`; else `meaning` says what it is.
+    """
+    robot, chosen = program.model.robot, program.task
+    joints = robot.independent
+    kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
+    torques = [robot.body(name).joint.torque for name in joints]
+    pose = dict(robot.pose.joints)
+    return {
+        "format": FORMAT,
+        "robot": robot.name,
+        "transmission": program.model.transmission,
+        "task": task,
+        "joints": list(joints),
+        "default_pose": [float(pose.get(name, 0.0)) for name in joints],
+        "kp": [float(kp.get(name, 0.0)) for name in joints],
+        "kd": [float(kd.get(name, 0.0)) for name in joints],
+        "torque_limits": [float(torque) if math.isfinite(torque) else None for torque in torques],
+        "standing_height": float(robot.pose.height),
+        "control_dt": program.control_dt,
+        "physics_dt": chosen.dt,
+        "action": _action(program),
+        "observation": {
+            "size": program.observation_size,
+            "history": chosen.history,
+            "order": "blocks of one observation in this order; then, with a history, older observations, newest first",
+            "blocks": _blocks(program),
+        },
+        "normalisation": {"inside_network": True, "clip": OBSERVATION_BOUND},
+        "coordinates": COORDINATES,
+        "command": {"range": [list(pair) for pair in chosen.command_range], "period": chosen.command_period},
+    }
+
+
+def _action(program: TaskProgram) -> dict[str, Any]:
+    actions, kind = program.actions, program.task.actions
+    return {
+        "kind": kind,
+        "meaning": MEANINGS[kind],
+        "motors" if kind.startswith("motor") else "joints": [actions.targets[i] for i in actions.moved],
+        "scale": [float(scale) for scale in actions.scale],
+        **({"rest": [float(actions.rest[i]) for i in actions.moved]} if kind == "motor_pd" else {}),
+        "low": -1.0,
+        "high": 1.0,
+    }
+
+
+def _blocks(program: TaskProgram) -> list[dict[str, Any]]:
+    look = program.look()
+    state = {name: SX.sym(name, look.size1_in(name)) for name in look.name_in()}
+    seen = dict(zip(look.name_out(), look.call(list(state.values())), strict=True))
+    blocks = []
+    for name, size in program.observation_sizes.items():
+        document = inspect.getdoc(program.observation_terms[name]) or ""
+        noise = {"noise": program.task.noise[name]} if program.task.noise.get(name) else {}
+        meaning = " ".join(document.split())
+        blocks.append({"name": name, "size": size, "meaning": meaning, **_source(seen[name], state), **noise})
+    return blocks
+
+
+def _source(block: SX, state: dict[str, SX]) -> dict[str, Any]:
+    """Where a block takes its numbers from, if each is one number of the state, scaled and shifted; else nothing."""
+    used = [name for name, symbol in state.items() if ca.depends_on(block, symbol)]
+    if len(used) != 1:
+        return {}
+    symbol = state[used[0]]
+    slope = ca.jacobian(block, symbol)
+    if ca.symvar(slope):
+        return {}
+    scales = np.array(ca.evalf(slope))
+    if not ((scales != 0).sum(axis=1) == 1).all():
+        return {}
+    rows = np.argmax(scales != 0, axis=1)
+    offset = np.array(ca.evalf(ca.substitute(block, symbol, SX.zeros(*symbol.shape))))[:, 0]
+    scale = scales[np.arange(len(rows)), rows]
+    return {"of": used[0], "rows": rows.tolist(), "scale": scale.tolist(), "offset": (offset + 0.0).tolist()}

@@ -1,0 +1,98 @@
+"""What an action asks of joints or motors, as traced functions. May know tasks, compile and dynamics."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatch
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.compile import Call, Repeat, Step
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.motor_control import standing_motors
+from ce_gym.dynamics.forces.scene import Control, target_names
+from ce_gym.dynamics.functions import traced
+from ce_gym.envs.task.tasks import Task
+from ce_gym.model.mechanism import Mechanism
+
+CONTROL: dict[str, Control] = {
+    "joint_pd": "position",
+    "joint_torque": "torque",
+    "motor_pd": "motor_position",
+    "motor_torque": "motor_torque",
+}
+"""How the dynamics calls what an action means."""
+
+
+class ActionMap:
+    """The way from the actions of a task to the targets of the dynamics.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        task: The task.
+
+    Attributes:
+        control: How the dynamics calls what an action means.
+        targets: What each entry of a target is for.
+        moved: Which of them the actions move, in order.
+        rest: Target without action, shape (n_targets,): the standing pose [rad], or 0 [N m].
+        scale: What an action of 1 adds [rad or N m], shape (n_actions,).
+
+    Raises:
+        ValueError: If no joint matches, or a torque is asked for where there is no limit.
+    """
+
+    def __init__(self, mechanism: Mechanism, task: Task) -> None:
+        robot = mechanism.robot
+        self.control: Control = CONTROL[task.actions]
+        self.targets = target_names(mechanism, self.control)
+        acting = {n for n in robot.independent if any(fnmatch(n, p) for p in task.action_joints)}
+        if self.control.startswith("motor"):
+            rotors = {motor.rotor for motor in robot.motors}
+            clusters = [cluster for cluster in mechanism.tree.clusters if acting & set(cluster.independent)]
+            acting = {name for cluster in clusters for name in cluster.bodies if name in rotors}
+        self.moved = [i for i, name in enumerate(self.targets) if name in acting]
+        if not self.moved:
+            expected = f"patterns of joints among {robot.independent}"
+            if self.control.startswith("motor"):
+                expected = f"{expected} that motors drive, for actions={task.actions!r}"
+            raise ValueError(f"action_joints={task.action_joints!r}; expected {expected}")
+        if self.control in ("position", "motor_position"):
+            self.rest, self.scale = self._positions(mechanism, task.action_scale)
+        else:
+            self.rest = np.zeros(len(self.targets))
+            motors = {motor.rotor: motor.torque for motor in robot.motors}
+            names = [self.targets[i] for i in self.moved]
+            self.scale = np.array([motors.get(name, robot.body(name).joint.torque) for name in names])
+            if not np.isfinite(self.scale).all():
+                what = "motor" if self.control.startswith("motor") else "joint"
+                raise ValueError(
+                    f"{robot.name}: actions={task.actions!r} needs a torque limit (effort) of every {what}"
+                )
+
+    def _positions(self, mechanism: Mechanism, scale: float) -> tuple[np.ndarray, np.ndarray]:
+        """A motor is turned as far as moves the joint that it drives most by `scale`, in the standing pose."""
+        pose = dict(mechanism.robot.pose.joints)
+        motors = standing_motors(mechanism) if self.control == "motor_position" else {}
+        rest = np.array([motors[name][0] if name in motors else pose.get(name, 0.0) for name in self.targets])
+        turns = [motors[self.targets[i]][1] if motors else np.ones(1) for i in self.moved]
+        return rest, scale * np.array([ratios[np.argmax(np.abs(ratios))] for ratios in turns])
+
+    def act(self, late: bool) -> ca.Function:
+        """(action_in) -> clipped action, target, and 0 sub-steps waited if actions come late."""
+        action = SX.sym("action_in", len(self.moved))
+        clipped, target = ca.fmax(-1, ca.fmin(1, action)), SX(self.rest)
+        target[self.moved] += self.scale * clipped
+        waited = {"waited": SX(0)} if late else {}
+        return traced("act", {"action_in": action}, {"clipped": clipped, "target": target} | waited)
+
+    def delayed(self, physics: tuple[Step | Repeat, ...]) -> tuple[Step | Repeat, ...]:
+        """Put before each sub-step the choice between the target of the last action and that of the new one."""
+        n, waited, delay = len(self.targets), SX.sym("waited"), SX.sym("delay")
+        old, new = SX.sym("target", n), SX.sym("new_target", n)
+        outputs = {"target_next": ca.if_else(waited < delay, old, new), "waited_next": waited + 1}
+        arrive = traced("arrive", {"waited": waited, "delay": delay, "target": old, "new_target": new}, outputs)
+        call = Call(arrive, tuple(arrive.name_in()), ("target", "waited"))
+        arrived = Call(ca.Function("arrived", [new], [new]), ("new_target",), ("target",))
+        steps = [Repeat(step.times, (call, *step.calls)) if isinstance(step, Repeat) else step for step in physics]
+        return (*steps, arrived)

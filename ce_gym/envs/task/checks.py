@@ -1,0 +1,105 @@
+"""Checks of the figures of a task that users give as arguments. May know tasks and fields."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+from ce_gym.envs.task.tasks import Actions
+from ce_gym.envs.task.terrain_tiles import checked_terrain
+
+CHOICES = {"actions": get_args(Actions), "friction": ("tangent", "secant"), "motors": ("ideal", "limited")}
+POSITIVE = ("action_scale", "command_period", "gait_period", "dt")
+COUNTS = ("history", "n_substeps", "episode_length", "max_episode_steps")
+LARGEST = {"dt": 0.1, "standing_fraction": 1.0}
+
+
+def checked_value(name: str, value: Any, old: Any) -> Any:
+    """Return a figure of a task in the form that tasks have it.
+
+    Args:
+        name: Attribute of `Task`.
+        value: What a user gave.
+        old: What the task has, whose kind decides.
+
+    Raises:
+        ValueError: If it is not of that kind or out of range.
+    """
+    if name in CHOICES:
+        _check(name, value, value in CHOICES[name], " or ".join(repr(choice) for choice in CHOICES[name]))
+        return value
+    if name == "terrain":
+        return checked_terrain(value)
+    if name == "contacts":
+        return value if isinstance(value, str) else _names(name, value)
+    if name == "command_range":
+        pairs = tuple(_pair(name, pair) for pair in _sequence(name, value))
+        _check(name, value, len(pairs) == 3, "three pairs (low, high) with low <= high")
+        return pairs
+    if name == "latency":
+        low, high = _pair(name, value)
+        _check(name, value, low >= 0 and low == int(low) and high == int(high), "two whole numbers, 0 or more")
+        return int(low), int(high)
+    if name == "randomise":
+        _check(name, value, isinstance(value, Mapping), "pairs (low, high) by the name of a figure")
+        return {str(key): _pair(f"randomise[{key!r}]", pair) for key, pair in value.items()}
+    if name in COUNTS:
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        _check(name, value, whole and value >= 1, "a whole number, at least 1")
+        return value
+    if isinstance(old, bool):
+        _check(name, value, isinstance(value, bool), "true or false")
+        return value
+    if isinstance(old, Mapping):
+        _check(name, value, isinstance(value, Mapping), "numbers by name")
+        for key, figure in value.items():
+            _check(f"{name}[{key!r}]", figure, number(f"{name}[{key!r}]", figure) >= 0, "0 or more")
+            _check(name, key, name != "reset_noise" or key in old, f"one of {', '.join(old)}")
+        return {**old, **{str(key): float(figure) for key, figure in value.items()}}
+    if isinstance(old, tuple):
+        names = _names(name, value)
+        _check(name, value, len(names) > 0 or name != "observations", "at least one name")
+        return names
+    if name == "command_curriculum":
+        _check(name, value, 0 < number(name, value) <= 1, "a share above 0 and up to 1")
+    figure, expected = number(name, value), "a positive number" if name in POSITIVE else "0 or more"
+    _check(name, value, figure > 0 or (figure == 0 and name not in POSITIVE), expected)
+    most = LARGEST.get(name, math.inf)
+    _check(name, value, figure <= most, f"at most {most:g}")
+    return figure
+
+
+def number(name: str, value: Any) -> float:
+    """Return a finite number.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    numeric = isinstance(value, int | float) and not isinstance(value, bool)
+    _check(name, value, numeric and math.isfinite(value), "a finite number")
+    return float(value)
+
+
+def _pair(name: str, value: Any) -> tuple[float, float]:
+    items = _sequence(name, value)
+    _check(name, value, len(items) == 2, "a pair (low, high) with low <= high")
+    low, high = (number(name, item) for item in items)
+    _check(name, value, low <= high, "a pair (low, high) with low <= high")
+    return low, high
+
+
+def _names(name: str, value: Any) -> tuple[str, ...]:
+    items = tuple(_sequence(name, value))
+    _check(name, value, all(isinstance(item, str) for item in items), "a list of names")
+    return items
+
+
+def _sequence(name: str, value: Any) -> Sequence[Any]:
+    _check(name, value, isinstance(value, Sequence) and not isinstance(value, str), "a list")
+    return value
+
+
+def _check(name: str, value: Any, valid: bool, expected: str) -> None:
+    if not valid:
+        raise ValueError(f"{name}={value!r}; expected {expected}")

@@ -1,0 +1,46 @@
+"""What a task commands: velocities, and headings to turn to. May know tasks, draws and progress."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.envs.task.curriculum import Progress
+from ce_gym.envs.task.sampling import Draws
+from ce_gym.envs.task.tasks import Task
+
+HEADING_GAIN = 0.5
+"""Commanded yaw rate for each radian between a robot and the heading it shall have [1/s]."""
+
+
+class Commands:
+    """The commands of a task.
+
+    Args:
+        task: The task.
+        progress: Its curricula.
+    """
+
+    def __init__(self, task: Task, progress: Progress) -> None:
+        self.task, self.progress = task, progress
+
+    def new(self, draws: Draws, grown: SX | None) -> dict[str, SX]:
+        """Return a command within the range that the robot has come to, or to stand still; and a heading."""
+        standing = draws.unit() < self.task.standing_fraction
+        moving = draws.within(self.task.command_range)
+        moving = moving if grown is None else self.progress.share(grown) * moving
+        command = {"command": ca.if_else(standing, 0, moving)}
+        return command | ({"heading": draws.uniform(-np.pi, np.pi)} if self.task.heading else {})
+
+    def steered(self, values: dict[str, SX], command: dict[str, SX]) -> dict[str, SX]:
+        """Replace the commanded yaw rate by one that turns the robot to its heading."""
+        if "heading" not in command:
+            return command
+        w, x, y, z = (values["q"][3 + i] for i in range(4))
+        behind = command["heading"] - ca.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        error = ca.atan2(ca.sin(behind), ca.cos(behind))
+        low, high = self.task.command_range[2]
+        rate = ca.fmax(low, ca.fmin(high, HEADING_GAIN * error))
+        moving = ca.sumsqr(command["command"]) > 0
+        return command | {"command": ca.vertcat(command["command"][:2], ca.if_else(moving, rate, 0))}

@@ -1,0 +1,83 @@
+"""How a task sees the ground of a field, and puts robots on it: traced functions around a look-up.
+
+Of a field the task knows what is under the base and under every contact sphere of the robot, looked up once in a
+control step, after the physics. May know kinematics, progress, compile and the sub-steps.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.compile import Buffer, Call, Lookup, Step
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.functions import traced
+from ce_gym.dynamics.recursion.kinematics import constant, outward_velocity_pass
+from ce_gym.envs.task.curriculum import Progress
+from ce_gym.envs.task.sampling import Draws
+from ce_gym.envs.task.terrain_tiles import PLATFORM
+from ce_gym.model.mechanism import Mechanism
+from ce_gym.sim.substeps import FRAME, HEIGHTS
+
+SEEN = "seen_ground"
+"""Buffer with height [m] and slopes of the ground under the base and under each contact sphere, one after the other."""
+
+
+class Ground:
+    """The ground of a field under one robot.
+
+    Args:
+        mechanism: The robot.
+        contacts: Names of the spheres that take part in the physics.
+    """
+
+    def __init__(self, mechanism: Mechanism, contacts: tuple[str, ...]) -> None:
+        self.mechanism, self.contacts = mechanism, contacts
+        self.size = 3 * (1 + len(mechanism.robot.contacts))
+
+    def look(self, dependent: int) -> tuple[list[Buffer], tuple[Step, ...]]:
+        """Return how to look at the ground, and the buffers for it but table and frame.
+
+        Args:
+            dependent: Length of the state `dependent`; 0 if there is none.
+        """
+        q = SX.sym("q", len(self.mechanism.robot.independent) + 7)
+        given = {"q": q} | ({"dependent": SX.sym("dependent", dependent)} if dependent else {})
+        at = ca.horzcat(q[:2], self._centres(given)[:2, :])
+        places = traced("seen_places", given, {"seen_places": ca.vec(at)})
+        buffers = [Buffer("seen_places", 2 * self.size // 3, "scratch"), Buffer(SEEN, self.size, "scratch")]
+        call = Call(places, tuple(given), ("seen_places",))
+        return buffers, (call, Lookup(HEIGHTS, FRAME, "seen_places", SEEN))
+
+    def lift(self, q: SX, dependent: SX | None, seen: SX) -> SX:
+        """Return how far to raise a robot for no contact to be deeper in the ground than it would be in flat [m].
+
+        Args:
+            q: Positions with the height that the robot would have on flat ground, shape (nq,).
+            dependent: State of that name, if there is one.
+            seen: The buffer `SEEN`.
+        """
+        spheres = self.mechanism.robot.contacts
+        centres = self._centres({"q": q} | ({} if dependent is None else {"dependent": dependent}))
+        chosen = [i for i, sphere in enumerate(spheres) if sphere.name in self.contacts]
+        needed = []
+        for i in chosen:
+            height, slope = seen[3 * i + 3], seen[3 * i + 4 : 3 * i + 6]
+            z, radius = centres[2, i], spheres[i].radius
+            needed.append(ca.fmin(z, radius) * ca.sqrt(1 + ca.sumsqr(slope)) - (z - height))
+        return ca.mmax(ca.vertcat(*needed)) if needed else seen[0]
+
+    def _centres(self, given: dict[str, SX]) -> SX:
+        q, n = given["q"], len(self.mechanism.robot.independent)
+        bodies = outward_velocity_pass(self.mechanism, q, SX(n + 6, 1), given.get("dependent")).bodies
+        spheres = self.mechanism.robot.contacts
+        points = [bodies[s.body].point_position(constant(np.array(s.position))) for s in spheres]
+        return ca.horzcat(SX(3, 0), *points)
+
+
+def starting_place(progress: Progress, level: SX, draws: Draws) -> SX:
+    """Return where an episode begins, x and y [m]: about the middle of a tile of a level, in any column."""
+    terrain = progress.task.terrain
+    column = ca.floor(draws.uniform(0, terrain["columns"]))
+    middle = terrain["size"] * (ca.vertcat(level, column) + 0.5)
+    return middle + draws.symmetric(2, PLATFORM / 2)

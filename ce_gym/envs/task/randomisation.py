@@ -1,0 +1,57 @@
+"""Physical figures that are drawn anew for each episode. May know parameters of the dynamics and descriptions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.parameters import parameter_defaults
+from ce_gym.envs.task.tasks import RANDOMISED, Range
+from ce_gym.model.description import Robot
+
+FACTORS = ("stiffness", "kp", "kd", "motor_strength", "rotor_inertia", "ratio")
+"""Figures whose ranges are factors on what the robot has."""
+
+
+class Randomised:
+    """The figures of one robot that a task draws, in the order of the task.
+
+    Args:
+        robot: The robot.
+        ranges: Lower and upper bound by name, see `RANDOMISED`.
+
+    Attributes:
+        parameters: Names of the parameters of the dynamics.
+        size: Length of their values, stacked.
+        n_draws: Numbers in [0, 1) that they are made of, one for each value.
+
+    Raises:
+        ValueError: If a name does not exist or a range is none.
+    """
+
+    def __init__(self, robot: Robot, ranges: Mapping[str, Range]) -> None:
+        base = robot.bodies[0].name
+        names = []
+        for name, (low, high) in ranges.items():
+            if name.split(":")[0] not in RANDOMISED:
+                raise ValueError(f"randomise={name!r}; expected one of {', '.join(RANDOMISED)}")
+            if not low <= high:
+                raise ValueError(f"randomise[{name!r}]=({low}, {high}); expected low <= high")
+            if low < 0 and name.split(":")[0] not in ("added_mass", "com_shift"):
+                raise ValueError(f"randomise[{name!r}]=({low}, {high}); expected 0 or more")
+            names.append(f"{name}:{base}" if name in ("added_mass", "com_shift") else name)
+        self.parameters = tuple(names)
+        self._ranges = tuple(ranges.values())
+        self._defaults = list(parameter_defaults(robot, robot.material, self.parameters).values())
+        self.size = self.n_draws = sum(len(default) for default in self._defaults)
+
+    def values(self, draw: SX) -> SX:
+        """Return the parameters' values, stacked, for numbers in [0, 1), shape (size,)."""
+        values, first = [SX(0, 1)], 0
+        for name, (low, high), default in zip(self.parameters, self._ranges, self._defaults, strict=True):
+            value = low + (high - low) * draw[first : first + len(default)]
+            values.append(value * default if name in FACTORS else value)
+            first += len(default)
+        return ca.vertcat(*values)

@@ -1,0 +1,42 @@
+"""Named use of a vector of uniform random numbers while a function is traced.
+
+The kernel fills a buffer with uniform numbers from a counter-based stream; a traced function consumes them one after
+the other and afterwards knows how many it needed. May know CasADi.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+
+
+class Draws:
+    """Uniform numbers in [0, 1), consumed in order."""
+
+    def __init__(self) -> None:
+        self._symbols: list[SX] = []
+
+    @property
+    def symbols(self) -> SX:
+        """What has been consumed so far, the function's input, shape (n,)."""
+        return ca.vertcat(*self._symbols)
+
+    def unit(self) -> SX:
+        """Return one number in [0, 1)."""
+        self._symbols.append(SX.sym(f"u{len(self._symbols)}"))
+        return self._symbols[-1]
+
+    def uniform(self, low: float, high: float) -> SX:
+        """Return one number in [low, high)."""
+        return low + (high - low) * self.unit()
+
+    def symmetric(self, count: int, bound: float) -> SX:
+        """Return independent numbers in [-bound, bound), shape (count,)."""
+        return ca.vertcat(SX(0, 1), *[self.uniform(-bound, bound) for _ in range(count)])
+
+    def within(self, ranges: Sequence[tuple[float, float]]) -> SX:
+        """Return one number in each range, shape (len(ranges),)."""
+        return ca.vertcat(*[self.uniform(low, high) for low, high in ranges])

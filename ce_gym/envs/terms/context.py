@@ -1,0 +1,203 @@
+"""What a reward, observation or termination may ask about one robot at the end of a control step, as SX.
+
+A term is a free function of a `Snapshot`. Everything here is traced when it is asked for and costs nothing otherwise.
+May know kinematics and mechanisms; no tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.functions import spanning_coordinates
+from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
+from ce_gym.model.mechanism import Mechanism
+
+
+class Snapshot:
+    """One robot at the end of a control step.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        values: Expressions of the state buffers, by name: q, v, command, action, previous_action, torque,
+            air_time, clock, load, scaled_parameters; and seen_ground, height and slopes of the ground under the base
+            and each contact sphere, shape (3 (1 + n_spheres),), if it is not flat.
+        control_dt: Length of a control step [s].
+        gait_period: Time of one cycle of the gait's clock [s].
+    """
+
+    def __init__(
+        self, mechanism: Mechanism, values: Mapping[str, SX], control_dt: float, gait_period: float = 1.0
+    ) -> None:
+        self.mechanism, self.control_dt, self._values = mechanism, control_dt, values
+        self._gait_period = gait_period
+        robot = mechanism.robot
+        self._n_joints = len(robot.independent)
+        pose = dict(robot.pose.joints)
+        self.standing_joints = np.array([pose.get(name, 0.0) for name in robot.independent])
+
+    @property
+    def q(self) -> SX:
+        """Positions, shape (nq,)."""
+        return self._values["q"]
+
+    @property
+    def v(self) -> SX:
+        """Velocities, shape (nv,)."""
+        return self._values["v"]
+
+    @property
+    def command(self) -> SX:
+        """The command, forward and sideways velocity [m/s] and yaw rate [rad/s], shape (3,)."""
+        return self._values["command"]
+
+    @property
+    def action(self) -> SX:
+        """The action just carried out, clipped, shape (n_joints,)."""
+        return self._values["action"]
+
+    @property
+    def previous_action(self) -> SX:
+        """The action before it, shape (n_joints,)."""
+        return self._values["previous_action"]
+
+    @property
+    def torque(self) -> SX:
+        """Motor torque at each joint in the last sub-step [N m], shape (n_joints,)."""
+        return self._values["torque"]
+
+    @property
+    def air_time(self) -> SX:
+        """How long each foot had been in the air up to the previous control step [s], shape (n_feet,)."""
+        return self._values["air_time"]
+
+    @property
+    def load(self) -> SX:
+        """Normal force on each contact in the last sub-step [N], shape (n_contacts,)."""
+        return self._values["load"]
+
+    @property
+    def scaled_parameters(self) -> SX:
+        """The randomised figures of the episode, each in [-1, 1], shape (n,)."""
+        return self._values.get("scaled_parameters", SX(0, 1))
+
+    @property
+    def phase(self) -> SX:
+        """Where the gait's clock is [rad]; it starts at 0 with the episode."""
+        return (2 * np.pi * self.control_dt / self._gait_period) * self._values["clock"]
+
+    @property
+    def joint_positions(self) -> SX:
+        """Independent joint positions [rad], shape (n_joints,)."""
+        return self.q[self.q.shape[0] - self._n_joints :]
+
+    @property
+    def joint_velocities(self) -> SX:
+        """Independent joint velocities [rad/s], shape (n_joints,)."""
+        return self.v[self.v.shape[0] - self._n_joints :]
+
+    @property
+    def base_angular_velocity(self) -> SX:
+        """In the base frame [rad/s], shape (3,)."""
+        return self.v[:3]
+
+    @property
+    def base_linear_velocity(self) -> SX:
+        """In the base frame [m/s], shape (3,)."""
+        return self.v[3:6]
+
+    @property
+    def base_height(self) -> SX:
+        """Height of the base origin above the ground [m]."""
+        return self.q[2] - self._ground[0] if self._ground.numel() else self.q[2]
+
+    @property
+    def terrain_level(self) -> SX:
+        """Level of the terrain on which the episode began; 0 on flat ground."""
+        return self._values.get("level", SX(0))
+
+    @property
+    def times_grown(self) -> SX:
+        """How often the range of commands has grown, see `ce_gym.envs.task.curriculum`."""
+        return self._values.get("grown", SX(0))
+
+    @property
+    def _ground(self) -> SX:
+        return self._values.get("seen_ground", SX(0, 1))
+
+    @cached_property
+    def up(self) -> SX:
+        """The world's upward direction in the base frame, shape (3,); (0, 0, 1) if upright."""
+        return self.kinematics.bodies[self.mechanism.robot.bodies[0].name].R[2, :].T
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """Poses and velocities of all bodies."""
+        return outward_velocity_pass(self.mechanism, self.q, self.v, self._values.get("dependent"))
+
+    @property
+    def rotor_velocities(self) -> list[SX]:
+        """Speed of each rotor [rad/s]."""
+        speeds = spanning_coordinates(self.mechanism, self.kinematics)[1]
+        return [speeds[rotor.name] for rotor in self.mechanism.robot.rotors()]
+
+    def lowest_points(self, group: str) -> list[tuple[str, SX, SX]]:
+        """Return body, height above the ground [m] and velocity (3,) [m/s] of each contact sphere of a group."""
+        points = []
+        for i, sphere in enumerate(self.mechanism.robot.contacts):
+            if sphere.group == group:
+                body = self.kinematics.bodies[sphere.body]
+                centre = constant(np.array(sphere.position))
+                velocity, above = body.R @ body.point_velocity(centre), body.point_position(centre)[2]
+                if self._ground.numel():
+                    height, slope = self._ground[3 * i + 3], self._ground[3 * i + 4 : 3 * i + 6]
+                    above = (above - height) / ca.sqrt(1 + ca.sumsqr(slope))
+                points.append((sphere.body, above - sphere.radius, velocity))
+        return points
+
+    def touching(self, group: str) -> SX:
+        """Whether each contact sphere of a group is on the ground, 0 or 1, shape (n,)."""
+        return ca.vertcat(SX(0, 1), *[height for _, height, _ in self.lowest_points(group)]) < 0
+
+    @cached_property
+    def _feet(self) -> dict[str, list[tuple[SX, SX]]]:
+        """Height and velocity of the spheres of each foot; a foot is a body with spheres of the group "foot"."""
+        feet: dict[str, list[tuple[SX, SX]]] = {}
+        for body, height, velocity in self.lowest_points("foot"):
+            feet.setdefault(body, []).append((height, velocity))
+        return feet
+
+    @cached_property
+    def foot_heights(self) -> SX:
+        """Height of the lowest point of each foot above the ground [m], shape (n_feet,)."""
+        lowest = []
+        for spheres in self._feet.values():
+            height = spheres[0][0]
+            for other, _ in spheres[1:]:
+                height = ca.fmin(height, other)
+            lowest.append(height)
+        return ca.vertcat(SX(0, 1), *lowest)
+
+    @cached_property
+    def foot_velocities(self) -> SX:
+        """Mean velocity of the spheres of each foot, world axes [m/s], shape (3, n_feet)."""
+        return ca.horzcat(SX(3, 0), *[sum(v for _, v in spheres) / len(spheres) for spheres in self._feet.values()])
+
+    @cached_property
+    def foot_contact(self) -> SX:
+        """Whether each foot is on the ground, 0 or 1, shape (n_feet,)."""
+        return self.foot_heights < 0
+
+    @cached_property
+    def landed(self) -> SX:
+        """Whether each foot has touched down in this control step, 0 or 1, shape (n_feet,)."""
+        return ca.logic_and(self.foot_contact, self.air_time > 0)
+
+    @cached_property
+    def commanded_to_move(self) -> SX:
+        """1 if the command asks for motion, else 0."""
+        return ca.sumsqr(self.command) > 0.01

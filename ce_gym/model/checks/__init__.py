@@ -1,0 +1,1 @@
+"""Is this robot possible? Checks of bodies, of constraints and of whole robots."""

@@ -1,0 +1,77 @@
+"""Is this constraint possible? Checks of one constraint of each kind against the bodies it names.
+
+Knows only the robot description. Each check raises a `RobotError` of one line. Whether the constraints of a robot can
+be met together is a matter of solving them, which the dynamics does.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ce_gym.model.checks.body import RELATIVE_TOLERANCE, check_finite
+from ce_gym.model.constraint_functions import constraint_function
+from ce_gym.model.description import (
+    Constraint,
+    FunctionConstraint,
+    LinearConstraint,
+    LoopConstraint,
+    Robot,
+    RodConstraint,
+)
+from ce_gym.model.errors import RobotError, bad, unknown
+
+
+def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
+    """Check the figures of one constraint and the names in it."""
+    key = f"constraint {constraint.name!r}"
+    names = {body.name: body for body in robot.bodies}
+    for body in constraint.bodies:
+        if body not in names:
+            raise unknown(file, key, body, names, "the name of a body")
+    if isinstance(constraint, LoopConstraint | RodConstraint):
+        if constraint.first == constraint.second:
+            raise bad(file, key, (constraint.first, constraint.second), "two different bodies")
+        _check_loop(constraint, key, file) if isinstance(constraint, LoopConstraint) else _check_rod(
+            constraint, key, file
+        )
+        return
+    for body in constraint.bodies:
+        if names[body].joint.type == "free":
+            raise bad(file, key, body, "a body whose joint has one degree of freedom")
+    if len(set(constraint.bodies)) < 2 or len(set(constraint.bodies)) < len(constraint.bodies):
+        raise bad(file, key, constraint.bodies, "at least two different bodies, each once")
+    if isinstance(constraint, LinearConstraint):
+        _check_linear(constraint, key, file)
+    else:
+        _check_function(constraint, key, file)
+
+
+def _check_linear(constraint: LinearConstraint, key: str, file: str) -> None:
+    for body, coefficient in constraint.coefficients:
+        if not math.isfinite(coefficient) or coefficient == 0.0:
+            raise bad(file, f"{key} coefficient of {body!r}", coefficient, "a finite number other than 0")
+    check_finite(file, f"{key} offset", (constraint.offset,))
+
+
+def _check_loop(constraint: LoopConstraint, key: str, file: str) -> None:
+    if constraint.joint not in ("revolute", "ball"):
+        raise bad(file, f"{key} joint", constraint.joint, "revolute or ball")
+    if not math.isclose(math.hypot(*constraint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
+        raise bad(file, f"{key} axis", constraint.axis, "a unit axis")
+    for placement in (constraint.first_placement, constraint.second_placement):
+        check_finite(file, f"{key} placement", (*placement.position, *[x for row in placement.rotation for x in row]))
+
+
+def _check_rod(constraint: RodConstraint, key: str, file: str) -> None:
+    check_finite(file, f"{key} points", (*constraint.first_point, *constraint.second_point))
+    if not 0.0 < constraint.length < math.inf:
+        raise bad(file, f"{key} length", constraint.length, "a length above 0 [m]")
+
+
+def _check_function(constraint: FunctionConstraint, key: str, file: str) -> None:
+    if not constraint.arguments:
+        raise bad(file, f"{key} arguments", constraint.arguments, "at least one body")
+    try:
+        constraint_function(constraint.function)
+    except RobotError as error:
+        raise RobotError(f"{file}: {key}: {error}") from None

@@ -1,0 +1,207 @@
+"""Is this robot possible? Checks of finished descriptions, whoever made them.
+
+Knows only the robot description. Each check raises a `RobotError` of one line for the first thing that is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterable
+from fnmatch import fnmatch
+from functools import cache
+
+import numpy as np
+
+from ce_gym.model.checks.body import check_body, check_finite, moves_inertia, violates_triangle_inequality
+from ce_gym.model.checks.constraint import check_constraint
+from ce_gym.model.clusters import Cluster, cluster_tree
+from ce_gym.model.description import LinearConstraint, Robot
+from ce_gym.model.errors import InertiaWarning, bad, unknown
+
+
+def check_robot(robot: Robot) -> None:
+    """Check a whole robot.
+
+    Raises:
+        RobotError: Something cannot be.
+
+    Warns:
+        InertiaWarning: An inertia violates the triangle inequality, and the robot does not say that it is kept
+            knowingly; said once per process and robot.
+    """
+    file = robot.source or robot.name
+    _check_tree(robot, file)
+    supported = {body.parent for body in robot.bodies} | _dependent(robot)
+    for body in robot.bodies:
+        check_body(body, file, may_be_massless=body.name in supported and body.joint.type != "free")
+    _check_constraints(robot, file)
+    _check_independent(robot, file)
+    _check_something_moves(robot, file)
+    _check_contacts(robot, file)
+    _check_motors(robot, file)
+    _check_pose_and_gains(robot, file)
+    _check_inertia(robot, file)
+
+
+def _check_inertia(robot: Robot, file: str) -> None:
+    """Warn of figures that no rigid body can have, unless they are kept knowingly."""
+    impossible = [body.name for body in robot.bodies if violates_triangle_inequality(body)]
+    for pattern in robot.kept_inertia:
+        if not any(fnmatch(name, pattern) for name in impossible):
+            expected = f"one of {', '.join(impossible)}" if impossible else "nothing: no inertia is impossible"
+            raise bad(file, "kept_inertia", pattern, expected)
+    unknowing = [name for name in impossible if not any(fnmatch(name, pattern) for pattern in robot.kept_inertia)]
+    if unknowing:
+        _warn_of_inertia(robot.name, tuple(unknowing))
+
+
+def _dependent(robot: Robot) -> set[str]:
+    """Bodies that others move: such a body, or one that carries another, can be so light that its mass is left out."""
+    tied = {name for constraint in robot.constraints for name in constraint.bodies}
+    return tied - set(robot.independent)
+
+
+def _check_tree(robot: Robot, file: str) -> None:
+    """Names are unique, parents come first, and only the first body may be free."""
+    if not robot.bodies:
+        raise bad(file, "bodies", (), "at least one body that moves")
+    seen: list[str] = []
+    for body in robot.bodies:
+        if body.name in seen:
+            raise bad(file, "body name", body.name, "a name that no other body has")
+        if body.parent is not None and body.parent not in seen:
+            raise unknown(file, f"{body.kind} {body.name!r} parent", body.parent, seen, "a body listed before it")
+        if body.joint.type == "free" and (seen or body.parent is not None):
+            raise bad(
+                file, f"{body.kind} {body.name!r} joint type", "free", "free only for the first body, on the world"
+            )
+        seen.append(body.name)
+
+
+def _check_constraints(robot: Robot, file: str) -> None:
+    _check_unique(file, "constraint name", [constraint.name for constraint in robot.constraints])
+    for constraint in robot.constraints:
+        check_constraint(constraint, robot, file)
+
+
+def _check_independent(robot: Robot, file: str) -> None:
+    names = [body.name for body in robot.bodies if body.joint.type != "free"]
+    for joint in robot.independent:
+        if joint not in names:
+            raise unknown(file, "independent", joint, names, "the name of a body whose joint has one degree of freedom")
+    _check_unique(file, "independent", robot.independent)
+    for cluster in cluster_tree(robot).clusters:
+        linear = all(isinstance(constraint, LinearConstraint) for constraint in cluster.constraints)
+        if (
+            linear and robot.body(cluster.bodies[0]).joint.type != "free"
+        ):  # others are solved to be checked: a Model does
+            _check_determined(cluster, file)
+
+
+def _check_determined(cluster: Cluster, file: str) -> None:
+    """The constraints of a cluster must determine its dependent coordinates from the independent ones."""
+    rows = [dict(tie.coefficients) for tie in cluster.constraints if isinstance(tie, LinearConstraint)]
+    count = len(cluster.bodies) - len(rows)
+    key = f"independent joints among {', '.join(cluster.bodies)}"
+    if count < 1:
+        ties = tuple(constraint.name for constraint in cluster.constraints)
+        raise bad(file, f"constraints among {', '.join(cluster.bodies)}", ties, "fewer constraints than bodies")
+    if len(cluster.independent) != count:
+        raise bad(file, key, cluster.independent, f"{count} of them, because {len(rows)} constraints tie the rest")
+    dependent = [body for body in cluster.bodies if body not in cluster.independent]
+    K = np.array([[row.get(body, 0.0) for body in dependent] for row in rows]).reshape(len(rows), len(rows))
+    scale = np.abs(K).max(axis=1, initial=0.0, keepdims=True)
+    if (scale == 0.0).any() or np.linalg.matrix_rank(K / scale) < len(rows):
+        raise bad(file, key, cluster.independent, f"joints that determine {', '.join(dependent)}; these do not")
+
+
+def _check_something_moves(robot: Robot, file: str) -> None:
+    """The joint of a body that carries nothing and is tied to nothing must move some inertia."""
+    tied = {name for constraint in robot.constraints for name in constraint.bodies}
+    for body in robot.bodies:
+        if body.name not in tied | {other.parent for other in robot.bodies} and not moves_inertia(body):
+            expected = "a mass or an inertia that its joint moves"
+            raise bad(file, f"{body.kind} {body.name!r} inertia", body.inertial.inertia, expected)
+
+
+def _check_contacts(robot: Robot, file: str) -> None:
+    _check_unique(file, "contact name", [contact.name for contact in robot.contacts])
+    names = [body.name for body in robot.bodies]
+    for contact in robot.contacts:
+        key = f"contacts.{contact.name}"
+        if contact.body not in names:
+            raise unknown(file, f"{key}.body", contact.body, names, "the name of a body")
+        if robot.body(contact.body).kind == "rotor":
+            raise bad(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
+        check_finite(file, f"{key}.position", contact.position)
+        if not 0.0 <= contact.radius < math.inf:
+            raise bad(file, f"{key}.radius", contact.radius, "0 or more [m]")
+    for name in ("stiffness", "damping", "friction", "bristle", "dissipation"):
+        value = getattr(robot.material, name)
+        if value is not None and not 0.0 <= value < math.inf:
+            raise bad(file, f"material.{name}", value, "0 or more")
+    if not 0.0 < robot.material.slip_speed < math.inf:
+        raise bad(file, "material.slip_speed", robot.material.slip_speed, "more than 0 [m/s]")
+
+
+def _check_motors(robot: Robot, file: str) -> None:
+    rotors = [body.name for body in robot.rotors()]
+    _check_unique(file, "motors", [motor.rotor for motor in robot.motors])
+    for motor in robot.motors:
+        if motor.rotor not in rotors:
+            raise unknown(file, "motors", motor.rotor, rotors, "the name of a rotor")
+        for name in ("torque", "velocity", "stall", "damping", "friction"):
+            value = getattr(motor, name)
+            if value is not None and not value >= 0.0:
+                raise bad(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
+        if motor.velocity == 0.0:
+            raise bad(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
+
+
+def _check_pose_and_gains(robot: Robot, file: str) -> None:
+    check_finite(file, "pose.height", (robot.pose.height,))
+    check_finite(file, "gravity", robot.gravity)
+    _check_joint_values(robot, file, "pose.joints", robot.pose.joints)
+    _check_assembly(robot, file)
+    for key, pairs in (("gains.kp", robot.gains.kp), ("gains.kd", robot.gains.kd)):
+        _check_joint_values(robot, file, key, pairs)
+        for joint, gain in pairs:
+            if gain < 0.0:
+                raise bad(file, f"{key}.{joint}", gain, "0 or more")
+        for joint in robot.independent:
+            if pairs and joint not in dict(pairs):
+                raise bad(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")
+
+
+def _check_assembly(robot: Robot, file: str) -> None:
+    dependent = [b.name for b in robot.bodies if b.joint.type != "free" and b.name not in robot.independent]
+    _check_unique(file, "assembly", [joint for joint, _ in robot.assembly])
+    for joint, value in robot.assembly:
+        if joint not in dependent:
+            raise unknown(file, "assembly", joint, dependent, "the name of a dependent joint")
+        check_finite(file, f"assembly.{joint}", (value,))
+
+
+def _check_joint_values(robot: Robot, file: str, key: str, pairs: tuple[tuple[str, float], ...]) -> None:
+    _check_unique(file, key, [joint for joint, _ in pairs])
+    for joint, value in pairs:
+        if joint not in robot.independent:
+            raise unknown(file, key, joint, robot.independent, "the name of an independent joint")
+        check_finite(file, f"{key}.{joint}", (value,))
+
+
+def _check_unique(file: str, key: str, names: Iterable[str]) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise bad(file, key, name, "a name that is used once")
+        seen.add(name)
+
+
+@cache
+def _warn_of_inertia(robot: str, bodies: tuple[str, ...]) -> None:
+    """Warn once: the cache keeps the second call with the same arguments from running."""
+    names = ", ".join(bodies)
+    message = f"{robot}: the inertia of {names} violates the triangle inequality; it is kept as it is"
+    warnings.warn(message, InertiaWarning, stacklevel=2)

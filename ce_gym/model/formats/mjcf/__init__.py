@@ -1,0 +1,1 @@
+"""MJCF, through the package `mujoco` (extra `mjcf`)."""

@@ -1,0 +1,195 @@
+"""The bodies of a compiled MJCF file -> a tree of bodies with one joint each.
+
+MuJoCo's body may have no joint (then it is welded to its parent) or several (then all but the last move massless links
+in between), a joint may turn about a point other than the body's origin, and `ref` gives a name to the angle at which
+the file was drawn. Here, a body turns about its own origin and its coordinate is MuJoCo's `qpos`. Knows the compiled
+model and the robot description.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ce_gym.model.description import ZERO, Body, Inertial, Joint, Placement, Shape, Vec3
+from ce_gym.model.errors import bad
+from ce_gym.model.formats.mjcf.source import MjcfSource, placement, rotation
+from ce_gym.model.formats.placement import compose, mat3, merge_inertials, transform_inertial, vec3
+
+_UNLIMITED = (-float("inf"), float("inf"))
+
+
+@dataclass
+class MjcfTree:
+    """Bodies, and where everything of the file is.
+
+    Attributes:
+        bodies: Parents before children, a free base first.
+        frames: For each of MuJoCo's bodies, the body (None: the world) that carries its frame, and the pose in it.
+        moved_by: The body that each of MuJoCo's joints moves, by joint index; joints that are locked have none.
+    """
+
+    bodies: list[Body] = field(default_factory=list)
+    frames: list[tuple[str | None, Placement]] = field(default_factory=lambda: [(None, Placement())])
+    moved_by: dict[int, str] = field(default_factory=dict)
+
+    def fresh(self, name: str) -> str:
+        """Return `name`, or `name_2` and so on if a body has it already."""
+        taken, count, new = {body.name for body in self.bodies}, 1, name
+        while new in taken:
+            count += 1
+            new = f"{name}_{count}"
+        return new
+
+    def parent(self, body: str) -> str | None:
+        """Return the parent of a body."""
+        return next(b.parent for b in self.bodies if b.name == body)
+
+
+def read_bodies(source: MjcfSource, locked: Mapping[int, float]) -> MjcfTree:
+    """Read the tree of bodies.
+
+    Args:
+        source: The compiled file.
+        locked: Coordinates [rad or m] of joints that an equality holds still, by joint index: they become welds.
+
+    Raises:
+        RobotError: Nothing moves, or a joint has several degrees of freedom and is not that of the base.
+    """
+    tree, model = MjcfTree(), source.model
+    for index in range(1, model.nbody):
+        _add_body(source, tree, index, locked)
+    if not tree.bodies:
+        raise bad(source.file, "bodies", (), "at least one body that moves")
+    _report_forces(source)
+    tree.bodies.sort(key=lambda body: body.joint.type != "free")
+    free = [body.name for body in tree.bodies if body.joint.type == "free"]
+    if len(free) > 1:
+        raise bad(source.file, "bodies that move freely", tuple(free), "one robot, so at most one free joint")
+    return tree
+
+
+def _add_body(source: MjcfSource, tree: MjcfTree, index: int, locked: Mapping[int, float]) -> None:
+    model = source.model
+    name = source.name("body", index)
+    carrier, pose = tree.frames[model.body_parentid[index]]
+    frame = compose(pose, placement(model.body_pos[index], model.body_quat[index]))
+    first = model.body_jntadr[index]
+    joints = list(range(first, first + model.body_jntnum[index]))
+    moving = [j for j in joints if j not in locked]
+    for j in joints:
+        if j in locked:
+            frame = compose(frame, _motion(source, j, locked[j]))
+            continue
+        link = tree.fresh(name if j == moving[-1] else source.name("joint", j))
+        tree.bodies.append(_moved_body(source, j, link, carrier, frame))
+        tree.moved_by[j] = link
+        carrier, frame = link, _after(source, j)
+    tree.frames.append((carrier, frame))
+    if carrier is not None and model.body_mass[index] > 0.0:
+        _join(source, tree, carrier, index, bool(moving))
+
+
+def _join(source: MjcfSource, tree: MjcfTree, carrier: str, index: int, own: bool) -> None:
+    """Give a body's mass and shapes to the link that carries it."""
+    model = source.model
+    axes = rotation(model.body_iquat[index])
+    inertia = axes @ np.diag(model.body_inertia[index]) @ axes.T
+    part = Inertial(float(model.body_mass[index]), vec3(model.body_ipos[index]), mat3((inertia + inertia.T) / 2))
+    part = transform_inertial(tree.frames[index][1], part)
+    at = next(i for i, body in enumerate(tree.bodies) if body.name == carrier)
+    body = tree.bodies[at]
+    tree.bodies[at] = replace(body, inertial=part if own else merge_inertials([body.inertial, part]))
+
+
+def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, frame: Placement) -> Body:
+    """Return the body that joint `j` moves, without mass; `frame` is where MuJoCo's body is at `qpos = ref`."""
+    model, kinds = source.model, source.mujoco.mjtJoint
+    kind = model.jnt_type[j]
+    nothing = Inertial(0.0, ZERO, (ZERO, ZERO, ZERO))
+    if kind == kinds.mjJNT_FREE:
+        return Body(name, "link", None, Placement(), Joint("free"), nothing)
+    if kind == kinds.mjJNT_BALL:
+        raise bad(source.file, f"joint {source.name('joint', j)!r} type", "ball", "hinge, slide or free")
+    dof = model.jnt_dofadr[j]
+    limits = model.jnt_range[j] if model.jnt_limited[j] else _UNLIMITED
+    joint = Joint(
+        type="revolute" if kind == kinds.mjJNT_HINGE else "prismatic",
+        axis=_axis(source, j),
+        position=(float(limits[0]), float(limits[1])),
+        damping=float(model.dof_damping[dof]),
+    )
+    at_zero = compose(frame, _motion(source, j, 0.0))
+    pivot = compose(at_zero, Placement(_pivot(source, j)))
+    return Body(name, "link", carrier, pivot, joint, nothing)
+
+
+def _after(source: MjcfSource, j: int) -> Placement:
+    """Pose of MuJoCo's body in the frame of the body that its joint `j` moves."""
+    return Placement(vec3([-x + 0.0 for x in _pivot(source, j)]))
+
+
+def _pivot(source: MjcfSource, j: int) -> Vec3:
+    """The point of MuJoCo's body that is the origin of ours [m]: where a hinge's axis passes."""
+    hinge = source.model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_HINGE
+    return vec3(source.model.jnt_pos[j]) if hinge else ZERO
+
+
+def _axis(source: MjcfSource, j: int) -> Vec3:
+    axis = source.model.jnt_axis[j]
+    return vec3(axis / np.linalg.norm(axis) + 0.0)
+
+
+def _motion(source: MjcfSource, j: int, coordinate: float) -> Placement:
+    """Pose, in the frame that MuJoCo's body has at `qpos = ref`, of the same frame at `qpos = coordinate`."""
+    model = source.model
+    axis = np.array(_axis(source, j))
+    travel = coordinate - float(model.qpos0[model.jnt_qposadr[j]])
+    if model.jnt_type[j] != source.mujoco.mjtJoint.mjJNT_HINGE:
+        return Placement(vec3(travel * axis))
+    turn = placement(np.zeros(3), np.array([np.cos(travel / 2), *(np.sin(travel / 2) * axis)]))
+    pivot = _pivot(source, j)
+    there = compose(Placement(pivot), turn)
+    return compose(there, _after(source, j))
+
+
+def _report_forces(source: MjcfSource) -> None:
+    """Note passive forces of joints and bodies that a robot cannot have."""
+    model = source.model
+    for attribute, what in (("dof_frictionloss", "dry friction"), ("dof_dampingpoly", "nonlinear damping")):
+        values = np.atleast_1d(getattr(model, attribute, np.zeros(model.nv)))
+        joints = {int(model.dof_jntid[dof]) for dof in range(model.nv) if np.any(values[dof])}
+        source.left_out += [f"{what} of joint {source.name('joint', j)}" for j in sorted(joints)]
+    for j in range(model.njnt):
+        if model.jnt_stiffness[j] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[j]):
+            source.left_out.append(f"spring of joint {source.name('joint', j)}")
+    for i in range(1, model.nbody):
+        if model.body_gravcomp[i]:
+            source.left_out.append(f"gravity compensation of body {source.name('body', i)}")
+        if model.body_mocapid[i] >= 0:
+            source.left_out.append(f"motion capture of body {source.name('body', i)}")
+
+
+def shapes(source: MjcfSource, tree: MjcfTree) -> Iterator[tuple[str, Shape]]:
+    """Iterate over primitives to draw, each with the body that carries it."""
+    model, kinds = source.model, source.mujoco.mjtGeom
+    types = {kinds.mjGEOM_BOX: "box", kinds.mjGEOM_SPHERE: "sphere"}
+    types |= {kinds.mjGEOM_CAPSULE: "capsule", kinds.mjGEOM_CYLINDER: "cylinder"}
+    undrawn = 0
+    for geom in range(model.ngeom):
+        carrier, frame = tree.frames[model.geom_bodyid[geom]]
+        kind = types.get(kinds(int(model.geom_type[geom])))
+        if carrier is None:
+            continue
+        if kind is None:
+            undrawn += 1
+            continue
+        a, b, c = (float(x) for x in model.geom_size[geom])
+        size = {"box": (2 * a, 2 * b, 2 * c), "sphere": (a,)}.get(kind, (a, 2 * b))
+        pose = compose(frame, placement(model.geom_pos[geom], model.geom_quat[geom]))
+        red, green, blue, alpha = (float(x) for x in model.geom_rgba[geom])
+        yield carrier, Shape(kind, size, pose, (red, green, blue, alpha))  # type: ignore[arg-type]
+    if undrawn:
+        source.left_out.append(f"the drawing of {undrawn} geoms (meshes and ellipsoids)")

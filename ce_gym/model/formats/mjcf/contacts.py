@@ -1,0 +1,143 @@
+"""The geoms of a compiled MJCF file that can touch the ground -> contact spheres.
+
+A sphere is one sphere, a capsule the two at its ends, a box its eight corners. A geom can touch the ground if MuJoCo
+would let it touch one of the geoms that do not move, or, in a file without any, anything at all. The ground is the
+plane z = 0. Groups follow from the reference pose: "torso" is what the base carries, "foot" what is lowest of the
+rest, "knee" what is not. Knows the compiled model and the robot description.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.model.description import ContactMaterial, ContactSphere
+from ce_gym.model.formats.mjcf.bodies import MjcfTree
+from ce_gym.model.formats.mjcf.source import MjcfSource, rotation
+from ce_gym.model.formats.placement import transform_point, vec3
+
+FOOT_BAND = 0.02
+"""Spheres whose undersides are this close [m] to the lowest one are feet."""
+
+_DEFAULT_SOLVER = ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0))  # MuJoCo's solref and solimp
+
+
+def read_contacts(source: MjcfSource, tree: MjcfTree) -> tuple[tuple[ContactSphere, ...], ContactMaterial]:
+    """Return the contact spheres and their material; what cannot be one is added to `source.left_out`."""
+    geoms = [g for g in range(source.model.ngeom) if _carrier(source, tree, g) is not None]
+    ground = [g for g in range(source.model.ngeom) if _carrier(source, tree, g) is None]
+    touching = [g for g in geoms if _touches(source, g, ground)]
+    _report_ground(source, ground)
+    _report_between(source, tree, geoms)
+    spheres, heights = [], []
+    for geom in touching:
+        for name, centre, radius in _spheres(source, geom):
+            body, frame = tree.frames[source.model.geom_bodyid[geom]]
+            point = np.array(source.model.geom_pos[geom]) + rotation(source.model.geom_quat[geom]) @ centre
+            spheres.append(ContactSphere(name, str(body), transform_point(frame, vec3(point)), radius))
+            world = source.data.geom_xpos[geom] + source.data.geom_xmat[geom].reshape(3, 3) @ centre
+            heights.append(float(world[2]) - radius)
+    return _grouped(spheres, heights, tree), _material(source, touching, ground)
+
+
+def _carrier(source: MjcfSource, tree: MjcfTree, geom: int) -> str | None:
+    return tree.frames[source.model.geom_bodyid[geom]][0]
+
+
+def _match(source: MjcfSource, a: int, b: int) -> bool:
+    """Whether the masks of two geoms let them touch."""
+    own, other = source.model.geom_contype, source.model.geom_conaffinity
+    return bool(own[a] & other[b] or own[b] & other[a])
+
+
+def _touches(source: MjcfSource, geom: int, ground: list[int]) -> bool:
+    model = source.model
+    solid = [g for g in ground if _solid(source, g)]
+    pairs = {frozenset((int(a), int(b))) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)}
+    if any(frozenset((geom, g)) in pairs for g in ground):
+        return True
+    excluded = {int(x) for x in model.exclude_signature}
+    body = int(model.geom_bodyid[geom])
+    free = [g for g in solid if not {(int(model.geom_bodyid[g]) << 16) + body, body << 16} & excluded]
+    if solid:
+        return any(_match(source, geom, g) for g in free)
+    return _solid(source, geom)
+
+
+def _solid(source: MjcfSource, geom: int) -> bool:
+    """Whether a geom touches anything at all."""
+    return bool(source.model.geom_contype[geom] or source.model.geom_conaffinity[geom])
+
+
+def _spheres(source: MjcfSource, geom: int) -> Iterator[tuple[str, NDArray[np.float64], float]]:
+    """Iterate over name, centre [m] in the geom's frame and radius [m] of the spheres that stand for a geom."""
+    kinds = source.mujoco.mjtGeom
+    name, kind = source.name("geom", geom), source.model.geom_type[geom]
+    a, b, c = (float(x) for x in source.model.geom_size[geom])
+    if kind == kinds.mjGEOM_SPHERE:
+        yield name, np.zeros(3), a
+    elif kind == kinds.mjGEOM_CAPSULE:
+        for end, side in (("top", 1.0), ("bottom", -1.0)):
+            yield f"{name}_{end}", np.array([0.0, 0.0, side * b]), a
+    elif kind == kinds.mjGEOM_BOX:
+        for i, signs in enumerate(product((1.0, -1.0), repeat=3)):
+            yield f"{name}_corner{i + 1}", np.array(signs) * (a, b, c), 0.0
+    else:
+        source.left_out.append(f"contact of geom {name}, which is no sphere, capsule or box")
+
+
+def _grouped(spheres: list[ContactSphere], heights: list[float], tree: MjcfTree) -> tuple[ContactSphere, ...]:
+    """Name the groups from the heights [m] of the undersides at the reference pose."""
+    base = next((body.name for body in tree.bodies if body.joint.type == "free"), None)
+    lowest = min((h for sphere, h in zip(spheres, heights, strict=True) if sphere.body != base), default=0.0)
+
+    def group(sphere: ContactSphere, height: float) -> str:
+        if sphere.body == base:
+            return "torso"
+        return "foot" if height <= lowest + FOOT_BAND else "knee"
+
+    return tuple(
+        ContactSphere(sphere.name, sphere.body, sphere.position, sphere.radius, group(sphere, height))
+        for sphere, height in zip(spheres, heights, strict=True)
+    )
+
+
+def _material(source: MjcfSource, touching: list[int], ground: list[int]) -> ContactMaterial:
+    """Return MuJoCo's friction, the larger of the two that touch; its compliance has no counterpart in N/m."""
+    model = source.model
+    under = [g for g in ground if _solid(source, g)]
+    rough = max((float(model.geom_friction[g][0]) for g in under), default=0.0)
+    values = sorted({max(float(model.geom_friction[g][0]), rough) for g in touching})
+    if len(values) > 1:
+        every = ", ".join(f"{value:g}" for value in values)
+        source.left_out.append(f"friction other than {values[-1]:g} (the file has {every})")
+    if any(model.geom_condim[g] > 3 for g in touching):
+        source.left_out.append("torsional and rolling friction")
+    solvers = [(tuple(map(float, model.geom_solref[g])), tuple(map(float, model.geom_solimp[g]))) for g in touching]
+    if any(not np.allclose(np.hstack(solver), np.hstack(_DEFAULT_SOLVER)) for solver in solvers):
+        source.left_out.append("the compliance of contacts (solref, solimp)")
+    return ContactMaterial(friction=values[-1]) if values else ContactMaterial()
+
+
+def _report_ground(source: MjcfSource, ground: list[int]) -> None:
+    model, plane = source.model, source.mujoco.mjtGeom.mjGEOM_PLANE
+    for g in ground:
+        normal, height = source.data.geom_xmat[g].reshape(3, 3)[:, 2], source.data.geom_xpos[g][2]
+        flat = model.geom_type[g] == plane and np.allclose(normal, (0, 0, 1)) and abs(height) < 1e-9
+        if _solid(source, g) and not flat:
+            source.left_out.append(f"obstacle {source.name('geom', g)} (the ground is the plane z = 0)")
+
+
+def _report_between(source: MjcfSource, tree: MjcfTree, geoms: list[int]) -> None:
+    """Note that bodies of the robot pass through each other, if in MuJoCo they would not."""
+    parents = {body.name: body.parent for body in tree.bodies}
+    for i, a in enumerate(geoms):
+        for b in geoms[:i]:
+            first, second = str(_carrier(source, tree, a)), str(_carrier(source, tree, b))
+            apart = first != second and first != parents[second] and second != parents[first]
+            if apart and _match(source, a, b):
+                source.left_out.append("contact between bodies of the robot")
+                return

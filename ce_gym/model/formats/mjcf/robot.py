@@ -1,0 +1,131 @@
+"""MJCF -> `Robot`, through the package `mujoco` (extra `mjcf`).
+
+| in the file                      | in the robot                                                                   |
+|----------------------------------|--------------------------------------------------------------------------------|
+| bodies, hinge, slide, free joint | bodies (`mjcf_bodies.py`)                                                      |
+| equalities                       | exact constraints (`mjcf_ties.py`)                                             |
+| armature                         | rotors behind gears (`mjcf_rotors.py`)                                         |
+| geoms                            | contact spheres, and shapes to draw (`mjcf_contacts.py`)                       |
+| actuators                        | torque limits and gains (`mjcf_actuators.py`)                                  |
+| the first keyframe               | the standing pose, and the branch in which loops are assembled                 |
+
+What else acts on the robot in MuJoCo is listed in one `LossyImportWarning`. Cameras, lights, sensors and textures act
+on nothing and are passed over. Knows the compiled model and the robot description.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ce_gym.model.checks.robot import check_robot
+from ce_gym.model.description import Pose, Robot
+from ce_gym.model.errors import LossyImportWarning
+from ce_gym.model.formats.mjcf.actuators import read_actuators
+from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, shapes
+from ce_gym.model.formats.mjcf.contacts import read_contacts
+from ce_gym.model.formats.mjcf.equalities import choose_independent, locked_joints, read_constraints
+from ce_gym.model.formats.mjcf.rotors import add_rotors
+from ce_gym.model.formats.mjcf.source import MjcfSource, read_mjcf
+from ce_gym.model.formats.placement import vec3
+from ce_gym.model.formats.rotor_rule import with_rotors
+
+Angles = tuple[tuple[str, float], ...]  # pairs (body, joint coordinate [rad or m])
+
+
+def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) -> Robot:
+    """Read an MJCF file.
+
+    Args:
+        path: The file.
+        gear_ratios: For joints with armature whose gear ratio is not the `gear` of their actuator: the ratio, by the
+            name of the joint. Only the exact level depends on it, see `mjcf_rotors.py`.
+
+    Raises:
+        RobotError: `mujoco` is missing or refuses the file, or the file describes something that cannot be.
+
+    Warns:
+        LossyImportWarning: Something in the file has no counterpart; all of it in one message.
+    """
+    source = read_mjcf(path)
+    locked = locked_joints(source)
+    tree = read_bodies(source, locked)
+    constraints = read_constraints(source, tree, locked)
+    spinning = [
+        body.name for body in with_rotors(tree.bodies, constraints, tree.moved_by.values()) if body.kind == "rotor"
+    ]
+    independent = choose_independent(source, tree, spinning)
+    gains = read_actuators(source, tree, independent)
+    contacts, material = read_contacts(source, tree)
+    _add_shapes(source, tree)
+    links = {*independent, *(contact.body for contact in contacts)}  # what touches the ground spins outside
+    tree.bodies[:] = with_rotors(tree.bodies, constraints, [b for b in tree.moved_by.values() if b not in links])
+    gears = add_rotors(source, tree, gear_ratios or {})
+    pose, assembly = _pose(source, tree, independent)
+    robot = Robot(
+        name=_name(source, path),
+        bodies=tuple(tree.bodies),
+        constraints=(*constraints, *gears),
+        independent=independent,
+        contacts=contacts if source.enabled("CONTACT") else (),
+        material=material,
+        pose=pose,
+        assembly=assembly,
+        gains=gains,
+        gravity=vec3(source.model.opt.gravity) if source.enabled("GRAVITY") else (0.0, 0.0, 0.0),
+        source=str(path),
+    )
+    check_robot(robot)
+    _report_world(source)
+    if source.left_out:
+        warnings.warn(f"{path}: left out: {'; '.join(source.left_out)}", LossyImportWarning, stacklevel=3)
+    return replace(robot, notes=tuple(f"left out: {what}" for what in source.left_out))
+
+
+def _name(source: MjcfSource, path: Path) -> str:
+    name = source.model.names[: source.model.names.index(b"\0")].decode()
+    return path.stem if name in ("", "MuJoCo Model") else name
+
+
+def _add_shapes(source: MjcfSource, tree: MjcfTree) -> None:
+    drawn: dict[str, list] = {}
+    for carrier, shape in shapes(source, tree):
+        drawn.setdefault(carrier, []).append(shape)
+    tree.bodies[:] = [replace(body, shapes=tuple(drawn.get(body.name, ()))) for body in tree.bodies]
+
+
+def _pose(
+    source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...]
+) -> tuple[Pose, tuple[tuple[str, float], ...]]:
+    """Return the standing pose, and the dependent coordinates at it."""
+    model, qpos = source.model, source.data.qpos
+    height, angles = 0.0, {}
+    for j, body in tree.moved_by.items():
+        address = model.jnt_qposadr[j]
+        if model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE:
+            height = float(qpos[address + 2])
+            if not np.allclose(qpos[address + 3 : address + 7], (1, 0, 0, 0), atol=1e-9):
+                source.left_out.append("the inclination of the base in the reference pose")
+        else:
+            angles[body] = float(qpos[address])
+    dependent = tuple((body, angle) for body, angle in angles.items() if body not in independent)
+    return Pose(height, tuple((body, angles[body]) for body in independent)), dependent
+
+
+def _report_world(source: MjcfSource) -> None:
+    """Note what acts on the whole robot."""
+    model = source.model
+    for what, value in (("wind", model.opt.wind), ("density", model.opt.density), ("viscosity", model.opt.viscosity)):
+        if np.any(value):
+            source.left_out.append(f"{what} of the medium")
+    for count, what in ((model.nflex, "deformable bodies"), (model.nplugin, "plugins")):
+        if count:
+            source.left_out.append(what)
+    for t in range(model.ntendon):
+        acts = [getattr(model, f"tendon_{key}")[t] for key in ("stiffness", "damping", "frictionloss", "limited")]
+        if any(map(np.any, acts)):
+            source.left_out.append(f"spring, damper, friction or limit of tendon {source.name('tendon', t)}")

@@ -1,0 +1,192 @@
+"""The armature of a compiled MJCF file -> rotors behind gears.
+
+Armature is the reflected inertia `ratio^2 J` of a rotor. MuJoCo adds it to the diagonal of the mass matrix and knows
+nothing of the rest that a spinning rotor does: it couples to the body that carries it (terms `ratio J`) and acts as a
+gyroscope. Here every armature becomes a rotor, a thin disc about the joint axis at the joint, tied by a gear:
+
+- `coupled` reproduces MuJoCo's mass matrix, and `armature` too unless tendon armature or an equality ties several
+  joints together; `none` lacks the armature;
+- `exact` adds what MuJoCo leaves out, as far as the file knows the ratio: the `gear` of the joint's actuator, if it is
+  not 1, or what the caller says. Where the ratio is not known it is taken as 1e6, the limit in which armature is all
+  there is, and `exact` equals MuJoCo too.
+
+The rotor has no mass, and its inertia at rest is taken out of the body that carries it, where a published inertia has
+it already: total mass and inertia stay those of the file. Knows the compiled model and the robot description.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ce_gym.model.description import ZERO, Body, Inertial, Joint, LinearConstraint, Placement
+from ce_gym.model.errors import bad, unknown
+from ce_gym.model.formats.mjcf.bodies import MjcfTree
+from ce_gym.model.formats.mjcf.equalities import drives_joint, tendon_coefficients
+from ce_gym.model.formats.mjcf.source import MjcfSource
+from ce_gym.model.formats.placement import mat3
+
+UNKNOWN_RATIO = 1e6
+"""Gear ratio in place of one that is not known: the rotor's own inertia is then 1e-12 of the reflected one."""
+
+
+@dataclass(frozen=True)
+class _Armature:
+    """Reflected inertia of what turns with `sum(coefficient * joint coordinate)`.
+
+    Attributes:
+        name: Name of the joint's body, of the tendon or of the actuator.
+        joints: Coefficients of joint coordinates, by joint index.
+        reflected: `ratio^2 J` [kg m^2 or kg].
+        ratio: Speed of the rotor over that of the sum; None if it is not known.
+    """
+
+    name: str
+    joints: dict[int, float]
+    reflected: float
+    ratio: float | None
+
+
+def add_rotors(source: MjcfSource, tree: MjcfTree, gear_ratios: Mapping[str, float]) -> tuple[LinearConstraint, ...]:
+    """Add a rotor to the tree for each armature, and return the gears.
+
+    Args:
+        source: The compiled file.
+        tree: Its bodies; gains the rotors.
+        gear_ratios: Ratios that the file does not know, by the name of the joint.
+
+    Raises:
+        RobotError: A ratio is given for a joint that does not exist, or is 0.
+    """
+    ratios = _known_ratios(source, tree, gear_ratios)
+    found = [*_joint_armatures(source, tree, ratios), *_tendon_armatures(source), *_motor_armatures(source)]
+    moving = [replace(a, joints={j: x for j, x in a.joints.items() if j in tree.moved_by}) for a in found]
+    by_carrier: dict[str | None, list[_Armature]] = {}
+    for armature in moving:
+        if armature.joints:
+            by_carrier.setdefault(_carrier(tree, armature), []).append(armature)
+    return tuple(gear for carrier, armatures in by_carrier.items() for gear in _mount(source, tree, carrier, armatures))
+
+
+def _mount(
+    source: MjcfSource, tree: MjcfTree, carrier: str | None, armatures: list[_Armature]
+) -> Iterator[LinearConstraint]:
+    """Mount rotors on one body, take their inertia at rest out of it, and iterate over their gears."""
+    known = [armature for armature in armatures if armature.ratio is not None]
+    if known and not _take_out(tree, carrier, [_rotor(tree, carrier, armature) for armature in known]):
+        names = ", ".join(armature.name for armature in known)
+        source.left_out.append(f"the gear ratio at {names} (such rotors have more inertia than {carrier})")
+        armatures = [replace(armature, ratio=None) for armature in armatures]
+    for armature in armatures:
+        rotor = _rotor(tree, carrier, armature)
+        tree.bodies.append(rotor)
+        ratio = _ratio(armature)
+        pairs = tuple((tree.moved_by[j], -ratio * x) for j, x in armature.joints.items())
+        yield LinearConstraint(rotor.name, ((rotor.name, 1.0), *pairs))
+
+
+def _take_out(tree: MjcfTree, carrier: str | None, rotors: list[Body]) -> bool:
+    """Take the rotors' inertia at rest out of their carrier and return True; False if it has not that much."""
+    if carrier is None:
+        return True
+    at = next(i for i, body in enumerate(tree.bodies) if body.name == carrier)
+    inertial = tree.bodies[at].inertial
+    rest = np.array(inertial.inertia)
+    for rotor in rotors:
+        axes = np.array(rotor.placement.rotation)
+        rest = rest - axes @ np.array(rotor.inertial.inertia) @ axes.T
+    if np.linalg.eigvalsh(rest)[0] <= 0.0:
+        return False
+    tree.bodies[at] = replace(tree.bodies[at], inertial=replace(inertial, inertia=mat3((rest + rest.T) / 2)))
+    return True
+
+
+def _carrier(tree: MjcfTree, armature: _Armature) -> str | None:
+    """Return the body that all joints of an armature lie beyond: their nearest common ancestor."""
+    parents = {body.name: body.parent for body in tree.bodies}
+    chains: list[list[str | None]] = []
+    for j in armature.joints:
+        chain: list[str | None] = [parents[tree.moved_by[j]]]
+        while chain[-1] is not None:
+            chain.append(parents[chain[-1]])
+        chains.append(chain)
+    return next(body for body in chains[0] if all(body in chain for chain in chains))
+
+
+def _rotor(tree: MjcfTree, carrier: str | None, armature: _Armature) -> Body:
+    """Return a rotor on `carrier`: a thin disc without mass, about the joint's axis if one joint drives it."""
+    driven = next(body for body in tree.bodies if body.name == tree.moved_by[min(armature.joints)])
+    moment = armature.reflected / _ratio(armature) ** 2
+    u = np.array(driven.joint.axis)
+    disc = Inertial(0.0, ZERO, mat3(0.5 * moment * (np.eye(3) + np.outer(u, u))))
+    place = driven.placement if driven.parent == carrier else Placement()
+    name = tree.fresh(f"{armature.name}_rotor")
+    return Body(name, "rotor", carrier, place, Joint("revolute", driven.joint.axis), disc)
+
+
+def _ratio(armature: _Armature) -> float:
+    return UNKNOWN_RATIO if armature.ratio is None else armature.ratio
+
+
+def _known_ratios(source: MjcfSource, tree: MjcfTree, given: Mapping[str, float]) -> dict[int, float]:
+    """Return gear ratios by joint index: those of single actuators with a gear that is not 1, and those given."""
+    model = source.model
+    names = {source.name("joint", j): j for j in tree.moved_by}
+    gears: dict[int, list[float]] = {}
+    for a in range(model.nu):
+        if drives_joint(source, a):
+            gears.setdefault(int(model.actuator_trnid[a][0]), []).append(float(model.actuator_gear[a][0]))
+    ratios = {j: gear[0] for j, gear in gears.items() if len(gear) == 1 and abs(gear[0]) not in (0.0, 1.0)}
+    for name, ratio in given.items():
+        if name not in names:
+            raise unknown(source.file, "gear_ratios", name, names, "the name of a joint")
+        if not np.isfinite(ratio) or ratio == 0.0:
+            raise bad(source.file, f"gear_ratios.{name}", ratio, "a finite number other than 0")
+        ratios[names[name]] = float(ratio)
+    return ratios
+
+
+def _joint_armatures(source: MjcfSource, tree: MjcfTree, ratios: Mapping[int, float]) -> list[_Armature]:
+    model = source.model
+    found = []
+    for j, body in tree.moved_by.items():
+        reflected = float(model.dof_armature[model.jnt_dofadr[j]])
+        if model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE:
+            if reflected:
+                source.left_out.append(f"armature of the free joint {source.name('joint', j)}")
+        elif reflected:
+            found.append(_Armature(body, {j: 1.0}, reflected, ratios.get(j)))
+    return found
+
+
+def _tendon_armatures(source: MjcfSource) -> list[_Armature]:
+    model = source.model
+    found = []
+    for t in range(model.ntendon):
+        name, reflected = source.name("tendon", t), float(getattr(model, "tendon_armature", np.zeros(model.ntendon))[t])
+        coefficients = tendon_coefficients(source, t)
+        if reflected and coefficients is None:
+            source.left_out.append(f"armature of the spatial tendon {name}")
+        elif reflected:
+            found.append(_Armature(name, coefficients or {}, reflected, None))
+    return found
+
+
+def _motor_armatures(source: MjcfSource) -> list[_Armature]:
+    """Armature that stands at an actuator, before its gear; MuJoCo has it since 4.0."""
+    model = source.model
+    found = []
+    for a in range(model.nu):
+        inertia = float(getattr(model, "actuator_armature", np.zeros(model.nu))[a])
+        gear, target = float(model.actuator_gear[a][0]), int(model.actuator_trnid[a][0])
+        name = source.name("actuator", a)
+        joints = {target: 1.0} if drives_joint(source, a) else None
+        if model.actuator_trntype[a] == source.mujoco.mjtTrn.mjTRN_TENDON:
+            joints = tendon_coefficients(source, target)
+        if inertia and joints is None:
+            source.left_out.append(f"armature of actuator {name}")
+        elif inertia and joints:
+            found.append(_Armature(name, joints, inertia * gear**2, None if abs(gear) in (0.0, 1.0) else gear))
+    return found

@@ -1,0 +1,148 @@
+"""A URDF file -> its links and joints, known to form one tree.
+
+Knows XML and the graph that a URDF describes, not what its links and joints are like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.formats.urdf import elements as read
+
+MOVING = ("revolute", "continuous", "prismatic", "floating")
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """A <joint>: what it is called and what it joins."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    element: Element
+
+    @property
+    def where(self) -> str:
+        """The joint's name, for messages."""
+        return f"joint {self.name!r}"
+
+
+class UrdfGraph:
+    """The links and joints of a file.
+
+    Attributes:
+        file: Name of the file, for messages.
+        robot: The root element.
+        links: Link elements by name, in the order of the file.
+        joints: The joint that moves a link, by the name of that link.
+        order: Names of the links, parents before children, otherwise in the order of the file.
+        root: The only link that is no joint's child.
+    """
+
+    def __init__(self, path: Path):
+        self.file = str(path)
+        self.robot = _parse(path)
+        self.links = self._links()
+        self.joints = {joint.child: joint for joint in self._joints()}
+        self.order = self._parents_first()
+        self.root = self.order[0]
+
+    @property
+    def is_plus(self) -> bool:
+        """Whether the file uses what URDF+ adds: <loop>, <coupling>, or `independent` on a joint."""
+        added = [self.robot.find(tag) for tag in ("loop", "coupling")]
+        return any(element is not None for element in added) or any(
+            joint.element.get("independent") is not None for joint in self.joints.values()
+        )
+
+    def welded_to(self, link: str) -> Iterator[str]:
+        """Iterate over `link` and the links beyond it that fixed joints tie to it, parents before children."""
+        welded = {link}
+        for other in self.order:
+            joint = self.joints.get(other)
+            if joint is not None and joint.type == "fixed" and joint.parent in welded:
+                welded.add(other)
+        return (other for other in self.order if other in welded)
+
+    def _links(self) -> dict[str, Element]:
+        links: dict[str, Element] = {}
+        for element in self.robot.findall("link"):
+            name = read.name_of(self.file, element)
+            if name in links:
+                raise bad(self.file, "link name", name, "a name that no other link has")
+            links[name] = element
+        if not links:
+            raise bad(self.file, "<robot>", None, "at least one <link>")
+        return links
+
+    def _joints(self) -> list[UrdfJoint]:
+        joints: dict[str, UrdfJoint] = {}
+        moved_by: dict[str, str] = {}
+        for element in self.robot.findall("joint"):
+            joint = self._joint(element)
+            if joint.name in joints:
+                raise bad(self.file, "joint name", joint.name, "a name that no other joint has")
+            if joint.child in moved_by:
+                both = f"{moved_by[joint.child]!r} and {joint.name!r}"
+                raise bad(
+                    self.file, f"link {joint.child!r} parents", both, "one joint; close a loop by a constraint instead"
+                )
+            joints[joint.name] = joint
+            moved_by[joint.child] = joint.name
+        return list(joints.values())
+
+    def _joint(self, element: Element) -> UrdfJoint:
+        name = read.name_of(self.file, element)
+        where = f"joint {name!r}"
+        kind = element.get("type")
+        if kind not in (*MOVING, "fixed"):
+            raise bad(self.file, f"{where} type", kind, f"one of {', '.join((*MOVING, 'fixed'))}")
+        ends = {}
+        for end in ("parent", "child"):
+            link = read.name_of(self.file, read.required(self.file, where, element, end), "link", where)
+            if link not in self.links:
+                raise unknown(self.file, f"{where} <{end} link>", link, self.links, "the name of a link")
+            ends[end] = link
+        return UrdfJoint(name, kind, ends["parent"], ends["child"], element)
+
+    def _parents_first(self) -> list[str]:
+        """Order the links so that parents come before children; the first is the only root."""
+        roots = [link for link in self.links if link not in self.joints]
+        if len(roots) > 1:
+            raise bad(self.file, "root links", roots, "one link that is no joint's child")
+        order: dict[str, None] = {}
+        for link in self.links:
+            chain = [link]
+            while (joint := self.joints.get(chain[-1])) is not None and chain[-1] not in order:
+                if joint.parent in chain:
+                    cycle = " -> ".join([*reversed(chain[chain.index(joint.parent) :]), joint.parent])
+                    raise bad(self.file, "joints", cycle, "a tree; a cycle needs a constraint in place of one joint")
+                chain.append(joint.parent)
+            order.update(dict.fromkeys(reversed(chain)))
+        return list(order)
+
+
+def _parse(path: Path) -> Element:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise RobotError(f"{path}: cannot be read: expected a URDF file ({_reason(error)})") from None
+    if "<!DOCTYPE" in text:  # it can define entities, which read other files or grow without bound
+        raise RobotError(f"{path}: there is a <!DOCTYPE>: expected a URDF without document type and entities")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise RobotError(f"{path}: malformed XML: expected a URDF file ({_reason(error)})") from None
+    if root.tag != "robot":
+        raise bad(str(path), "root element", root.tag, "<robot>")
+    return root
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())

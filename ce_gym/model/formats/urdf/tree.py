@@ -1,0 +1,159 @@
+"""A plain URDF file -> bodies in a tree.
+
+Links joined by fixed joints become one body that has the name of the link nearest to the root; the names of the
+others stay known as frames. A body has the name of its link, and its joint has the name of its body. Knows the URDF
+format and the robot description; what URDF cannot say (rotors, transmissions, contacts) is in `yaml_file.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from ce_gym.model.checks.body import check_body
+from ce_gym.model.description import Body, Joint, LinearConstraint, Placement, Shape
+from ce_gym.model.errors import bad, unknown
+from ce_gym.model.formats.placement import compose, merge_inertials, transform_inertial
+from ce_gym.model.formats.urdf import elements as read
+from ce_gym.model.formats.urdf.graph import UrdfGraph, UrdfJoint
+
+Base = Literal["floating", "fixed"]
+Frame = tuple[str | None, Placement]  # the body (None: the world) that carries a frame, and the frame's pose in it
+
+WORLD = "world"
+
+
+@dataclass(frozen=True)
+class UrdfTree:
+    """What a URDF file says.
+
+    Attributes:
+        name: Name of the robot.
+        bodies: Parents before children, otherwise in the order of the links in the file.
+        frames: Where every link of the file is, also those that were merged into another.
+        constraints: The file's <mimic> joints.
+        notes: What was left out.
+    """
+
+    name: str
+    bodies: tuple[Body, ...]
+    frames: dict[str, Frame]
+    constraints: tuple[LinearConstraint, ...]
+    notes: tuple[str, ...]
+
+
+def read_urdf(path: Path, base: Base | None = None) -> UrdfTree:
+    """Read a URDF file.
+
+    Args:
+        path: The file.
+        base: Whether the root link is a body that moves freely or is fixed to the world. By default the root is fixed
+            if it is called "world" or has no mass.
+
+    Raises:
+        RobotError: The file is missing, malformed, or describes something that is not a tree of rigid bodies; or it is
+            URDF+, whose loops and couplings must not be lost.
+    """
+    graph = UrdfGraph(path)
+    if graph.is_plus:
+        raise bad(graph.file, "<loop>, <coupling> or independent", "URDF+", "a plain URDF; load the URDF+ file itself")
+    tree = read_tree(graph, base)
+    for body in tree.bodies:
+        check_body(body, graph.file)
+    return tree
+
+
+def read_tree(graph: UrdfGraph, base: Base | None = None) -> UrdfTree:
+    """Read the tree of a file that has been parsed; as `read_urdf`, but the figures of bodies are not checked."""
+    return _Reader(graph, base).tree()
+
+
+class _Reader:
+    """One pass over one file; holds the look-up tables the pass needs."""
+
+    def __init__(self, graph: UrdfGraph, base: Base | None):
+        self.graph, self.file, self.joints = graph, graph.file, graph.joints
+        self.colors = read.colors_of(self.file, graph.robot)
+        self.inertials = {name: read.inertial(self.file, f"link {name!r}", link) for name, link in graph.links.items()}
+        self.root_is_world = self._root_is_world(base)
+        self.frames = self._frames()
+        self.notes: list[str] = []
+
+    def tree(self) -> UrdfTree:
+        bodies = tuple(self._body(link) for link in self.graph.order if self._moves(link))
+        mimics = tuple(self._mimics())
+        name = self.graph.robot.get("name") or Path(self.file).stem
+        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes))
+
+    def _root_is_world(self, base: Base | None) -> bool:
+        floating = [joint for joint in self.joints.values() if joint.type == "floating"]
+        for joint in floating:
+            if joint.parent != self.graph.root or base == "fixed":
+                raise bad(self.file, f"{joint.where} type", "floating", "a joint with one degree of freedom")
+        mass = sum(part.mass for link in self.graph.welded_to(self.graph.root) if (part := self.inertials[link]))
+        if floating and mass:
+            raise bad(self.file, f"link {self.graph.root!r} mass", mass, "none, because a floating joint hangs on it")
+        if base is not None:
+            return bool(floating) or base == "fixed"
+        return self.graph.root == WORLD or mass == 0.0
+
+    def _moves(self, link: str) -> bool:
+        return not self.root_is_world if link == self.graph.root else self.joints[link].type != "fixed"
+
+    def _frames(self) -> dict[str, Frame]:
+        frames: dict[str, Frame] = {}
+        for link in self.graph.order:
+            if self._moves(link):
+                frames[link] = (link, Placement())
+            elif link == self.graph.root:
+                frames[link] = (None, Placement())
+            else:
+                frames[link] = self._attachment(self.joints[link], frames)
+        return frames
+
+    def _attachment(self, joint: UrdfJoint, frames: dict[str, Frame]) -> Frame:
+        carrier, pose = frames[joint.parent]
+        return carrier, compose(pose, read.placement(self.file, joint.where, joint.element))
+
+    def _body(self, link: str) -> Body:
+        parts = list(self.graph.welded_to(link))
+        inertials = [
+            transform_inertial(self.frames[part][1], inertial) for part in parts if (inertial := self.inertials[part])
+        ]
+        if not inertials:
+            raise bad(self.file, f"link {link!r} <inertial>", None, "mass and inertia, because the link moves")
+        joint = self.joints.get(link)
+        parent, pose, motion = None, Placement(), Joint("free")
+        if joint is not None and joint.type != "floating":
+            parent, pose = self._attachment(joint, self.frames)
+            motion = read.joint(self.file, joint.where, joint.element, joint.type)
+        shapes = tuple(shape for part in parts for shape in self._shapes(part))
+        return Body(link, "link", parent, pose, motion, merge_inertials(inertials), shapes)
+
+    def _shapes(self, link: str) -> Iterator[Shape]:
+        for visual in self.graph.links[link].findall("visual"):
+            shape = read.shape(self.file, f"link {link!r}", visual, self.colors)
+            if shape is None:
+                self.notes.append(f"link {link}: a mesh is not drawn")
+            else:
+                yield replace(shape, placement=compose(self.frames[link][1], shape.placement))
+
+    def _mimics(self) -> Iterator[LinearConstraint]:
+        """Iterate over `child = multiplier * other + offset`, the URDF way to write a gear."""
+        by_name = {joint.name: joint for joint in self.joints.values()}
+        for joint in self.joints.values():
+            mimic = joint.element.find("mimic")
+            if mimic is None:
+                continue
+            other = by_name.get(mimic.get("joint", ""))
+            if other is None:
+                raise unknown(
+                    self.file, f"{joint.where} <mimic joint>", mimic.get("joint"), by_name, "the name of a joint"
+                )
+            ratio = read.number(self.file, joint.where, mimic, "multiplier", 1.0)
+            if ratio == 0.0:
+                raise bad(self.file, f"{joint.where} <mimic multiplier>", ratio, "a ratio other than 0")
+            offset = read.number(self.file, joint.where, mimic, "offset", 0.0)
+            yield LinearConstraint(f"{joint.name} mimic", ((joint.child, 1.0), (other.child, -ratio)), offset)

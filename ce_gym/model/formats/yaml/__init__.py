@@ -1,0 +1,1 @@
+"""The project's own robot files: YAML beside a plain URDF."""

@@ -1,0 +1,107 @@
+"""The `constraints` of the project's robot files: gears and differentials, closed loops, rods, users' functions.
+
+Knows the description and YAML sections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from ce_gym.model.description import (
+    Body,
+    Constraint,
+    FunctionConstraint,
+    LinearConstraint,
+    LoopConstraint,
+    Placement,
+    RodConstraint,
+)
+from ce_gym.model.errors import bad, unknown
+from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform_point, vec3
+from ce_gym.model.formats.reading import Section
+from ce_gym.model.formats.urdf.elements import unit_axis
+from ce_gym.model.formats.urdf.tree import WORLD, Frame
+
+
+def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Frame]) -> Iterator[Constraint]:
+    """Iterate over the entries of the list `constraints`.
+
+    Args:
+        file: The whole file.
+        bodies: All bodies.
+        frames: Body and pose of every frame that can be named, merged links included.
+    """
+    names = [body.name for body in bodies]
+    for i, data in enumerate(file.list("constraints")):
+        entry = Section(file.file, f"constraints[{i}]", data)
+        kind = entry.text("type", choices=("linear", "loop", "rod", "function"))
+        if kind == "linear":
+            yield _linear(entry, names)
+        elif kind == "loop":
+            yield _loop(entry, frames)
+        elif kind == "rod":
+            yield _rod(entry, frames)
+        else:
+            yield _function(entry)
+
+
+def frame_named(section: Section, key: str, frames: dict[str, Frame]) -> Frame:
+    """Return the body that carries the frame named under `key`, and the frame's pose in that body."""
+    name = section.text(key)
+    if name not in frames and name != WORLD:
+        raise unknown(section.file, section.key(key), name, frames, "the name of a body")
+    return frames.get(name, (None, Placement()))
+
+
+def coefficients(section: Section, names: list[str]) -> tuple[tuple[str, float], ...]:
+    """Return pairs of a body and a number other than 0."""
+    for body in section:
+        if body not in names:
+            raise unknown(section.file, section.path, body, names, "the name of a body")
+        if section.number(body) == 0.0:
+            raise bad(section.file, section.key(body), 0.0, "a number other than 0")
+    return section.numbers()
+
+
+def _linear(entry: Section, names: list[str]) -> LinearConstraint:
+    entry.allow("name", "type", "coefficients", "offset")
+    pairs = coefficients(entry.section("coefficients"), names)
+    return LinearConstraint(entry.text("name"), pairs, entry.number("offset", 0.0))
+
+
+def _loop(entry: Section, frames: dict[str, Frame]) -> LoopConstraint:
+    entry.allow("name", "type", "joint", "axis", "first", "second")
+    joint = entry.text("joint", choices=("revolute", "ball"))
+    if joint == "ball" and "axis" in entry:
+        raise bad(entry.file, entry.key("axis"), entry.get("axis"), "no axis, because a ball joint has none")
+    axis = unit_axis(entry.file, entry.key("axis"), entry.vector("axis", 3, (0.0, 0.0, 1.0)))
+    (first, first_placement), (second, second_placement) = (
+        _loop_end(entry, end, frames) for end in ("first", "second")
+    )
+    name = entry.text("name")
+    return LoopConstraint(name, joint, first, second, first_placement, second_placement, axis)  # type: ignore[arg-type]
+
+
+def _loop_end(entry: Section, end: str, frames: dict[str, Frame]) -> Frame:
+    section = entry.section(end).allow("body", "xyz", "rpy")
+    body, pose = frame_named(section, "body", frames)
+    rotation = rotation_from_rpy(*section.vector("rpy", 3, (0.0, 0.0, 0.0)))
+    return body, compose(pose, Placement(vec3(section.vector("xyz", 3, (0.0, 0.0, 0.0))), rotation))
+
+
+def _rod(entry: Section, frames: dict[str, Frame]) -> RodConstraint:
+    entry.allow("name", "type", "length", "first", "second")
+    ends = []
+    for end in ("first", "second"):
+        section = entry.section(end).allow("body", "point")
+        body, pose = frame_named(section, "body", frames)
+        ends.append((body, transform_point(pose, vec3(section.vector("point", 3)))))
+    (first, first_point), (second, second_point) = ends
+    return RodConstraint(entry.text("name"), first, second, first_point, second_point, entry.number("length"))
+
+
+def _function(entry: Section) -> FunctionConstraint:
+    entry.allow("name", "type", "function", "arguments", "dependent")
+    return FunctionConstraint(
+        entry.text("name"), entry.text("function"), entry.texts("arguments"), entry.texts("dependent")
+    )

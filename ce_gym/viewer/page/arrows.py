@@ -1,0 +1,117 @@
+"""Arrows: contact forces at the contacts, commanded and real speed above the base.
+
+An arrow is one unit long along z and is stretched by its scale track. Knows actors (posed rollouts) and three.js
+commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.viewer.page import animation, three
+from ce_gym.viewer.page.fallback_shapes import frame_along
+from ce_gym.viewer.page.poses import Actor, smooth
+from ce_gym.viewer.page.three import Color, Command
+
+Array = NDArray[np.float64]
+
+FORCE_COLOR = (0.90, 0.20, 0.24)
+COMMAND_COLOR = (0.13, 0.65, 0.35)
+VELOCITY_COLOR = (0.15, 0.42, 0.85)
+HIDDEN = 1e-4  # scale of an arrow that should not be seen; zero would make its matrix singular
+HEAD = 0.2  # length of the head over that of the arrow
+LONGEST = 2.0  # as a multiple of the robot's radius, so that an impact does not leave the picture
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """An arrow that moves.
+
+    Attributes:
+        path: Scene path.
+        color: Red, green, blue.
+        thickness: Radius of the head [m].
+        start: [m], shape (F, 3).
+        vector: From start to tip [m], shape (F, 3).
+    """
+
+    path: str
+    color: Color
+    thickness: float
+    start: Array
+    vector: Array
+
+    def commands(self) -> Iterator[Command]:
+        """Draw a shaft and a head that together reach from 0 to 1 along z."""
+        shaft = three.cylinder(0.45 * self.thickness, 1.0 - HEAD)
+        head = three.cylinder(self.thickness, HEAD, top=0.0)
+        middle = three.transform([0, 0, (1.0 - HEAD) / 2]), three.transform([0, 0, 1.0 - HEAD / 2])
+        yield three.mesh(f"{self.path}/shaft", shaft, self.color, middle[0] @ three.Y_TO_Z)
+        yield three.mesh(f"{self.path}/head", head, self.color, middle[1] @ three.Y_TO_Z)
+        for part in ("shaft", "head"):
+            yield three.set_property(f"{self.path}/{part}/<object>", "castShadow", False)
+
+    def values(self) -> dict[str, Array]:
+        """Return the values of the animation tracks by name."""
+        length = np.linalg.norm(self.vector, axis=-1)
+        # Short arrows are also thin, so that they vanish smoothly.
+        width = np.clip(length / (6.0 * self.thickness), HIDDEN, 1.0)
+        return {
+            "position": self.start,
+            "quaternion": animation.quaternions(frame_along(self.vector)),
+            "scale": np.column_stack([width, width, np.maximum(length, HIDDEN)]),
+        }
+
+
+def all_arrows(actor: Actor) -> Iterator[Arrow]:
+    """Yield the arrows that the rollout has figures for."""
+    yield from force_arrows(actor)
+    if actor.rollout.commands.shape[1] >= 2:
+        yield from speed_arrows(actor)
+
+
+def force_arrows(actor: Actor) -> Iterator[Arrow]:
+    """Yield one arrow for each contact; the robot's weight would be 1.5 times as long as its radius."""
+    robot, forces = actor.robot, actor.rollout.contact_forces[actor.frames]
+    weight = robot.total_mass * float(np.linalg.norm(robot.gravity)) or 1.0
+    spheres = {sphere.name: sphere for sphere in robot.contacts}
+    bodies = [body.name for body in robot.bodies]
+    for name, force in zip(actor.contact_names, np.moveaxis(forces, 1, 0), strict=True):
+        sphere = spheres[name]
+        index = bodies.index(sphere.body)
+        centre = actor.positions[:, index] + actor.rotations[:, index] @ np.array(sphere.position)
+        vector = limited(1.5 * force * actor.radius / weight, LONGEST * actor.radius)
+        path = f"{actor.path}/contact forces/{name.replace('/', '_')}"
+        yield Arrow(path, FORCE_COLOR, 0.035 * actor.radius, centre - [0.0, 0.0, sphere.radius], vector)
+
+
+def speed_arrows(actor: Actor) -> Iterator[Arrow]:
+    """Yield arrows of the commanded and of the real horizontal speed, 1 m/s as long as 0.7 of the robot's radius."""
+    base, forward = actor.positions[:, 0], actor.rotations[:, 0, :, 0]
+    yaw = np.arctan2(forward[:, 1], forward[:, 0])
+    x, y = actor.rollout.commands[actor.frames, :2].T
+    command = np.column_stack([np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y, 0 * x])
+    top = base + [0.0, 0.0, float(actor.high[2] - base[0, 2]) + 0.25 * actor.radius]
+    arrows = {"command": (COMMAND_COLOR, 0.0, command), "velocity": (VELOCITY_COLOR, 0.12, velocity(actor))}
+    for name, (color, drop, speed) in arrows.items():
+        vector = limited(0.7 * speed * actor.radius, LONGEST * actor.radius)
+        start = top - [0.0, 0.0, drop * actor.radius]
+        yield Arrow(f"{actor.path}/{name}", color, 0.03 * actor.radius, start, vector)
+
+
+def velocity(actor: Actor, seconds: float = 0.2) -> Array:
+    """Return the base's horizontal velocity [m/s], shape (F, 3), averaged over a step or so of walking."""
+    if len(actor.times) < 2:
+        return np.zeros((len(actor.times), 3))
+    speed = np.gradient(actor.positions[:, 0], actor.times, axis=0) * [1.0, 1.0, 0.0]
+    return smooth(speed, actor.times, seconds)
+
+
+def limited(vectors: Array, longest: float) -> Array:
+    """Return vectors, shape (F, 3), none longer than `longest`."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors * np.minimum(1.0, longest / np.maximum(length, 1e-12))

@@ -1,0 +1,123 @@
+"""Belts, for whoever looks through the links: where a rotor drives a joint that it does not sit on.
+
+A robot file says how fast a rotor turns with which joints, not by what. Where axes are parallel and farther apart than
+a pulley is wide, something flexible must run between them, and it is drawn: two strands, tangents to pulleys of one
+size, and a pulley that turns on each joint's axis. A belt that goes on to a further joint runs over a pulley that is
+free on the axis between, so that its rotor turns equally far with every joint on the way; a rotor that turns otherwise,
+or with a joint that no belt could reach, is part of a differential, and nothing is drawn. Knows the robot description.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.model.description import Body, LinearConstraint, Placement, Robot, Shape
+from ce_gym.viewer.page.fallback_shapes import DARK, LIGHT, frame_along, rotor_discs
+
+Array = NDArray[np.float64]
+
+PULLEY = 0.6  # radius over that of the rotor's disc
+
+
+@dataclass(frozen=True)
+class Part:
+    """A strand or a pulley.
+
+    Attributes:
+        shape: What is drawn, in the frame of the body that carries it; a strand is a box along its x.
+        links: Whose joint angles, added, turn the pulley against that body, or move the strand; each with 1 or -1.
+        axis: Of a pulley, through the body's origin, shape (3,); None for a strand.
+        reach: How far a strand moves along its x for each radian [m]; 0 for a pulley.
+    """
+
+    shape: Shape
+    links: tuple[tuple[str, int], ...]
+    axis: Array | None = None
+    reach: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """A belt from one axis to the next, in the frame of the body that carries both."""
+
+    carrier: str
+    link: Body
+    at: Array  # a point of the first axis [m], shape (3,)
+    across: Array  # from there to the second [m]
+    axis: Array  # direction of both
+    sign: int  # 1, or -1 if the link's joint turns against it
+
+
+def belt_parts(robot: Robot) -> dict[str, list[Part]]:
+    """Return strands and pulleys by the name of the body that carries them.
+
+    A rotor that turns with several joints in a row, such as knee and ankle, has one belt to the first and from there
+    one to the next.
+    """
+    discs = rotor_discs(robot)
+    parts: dict[str, list[Part]] = {}
+    for constraint in robot.constraints:
+        rotors = [name for name in constraint.bodies if name in discs]
+        if not isinstance(constraint, LinearConstraint) or len(rotors) != 1:
+            continue
+        radius = PULLEY * discs[rotors[0]].size[0]
+        stages = _stages(robot, constraint, robot.body(rotors[0]), radius)
+        for index, stage in enumerate(stages):
+            links = tuple((later.link.name, later.sign) for later in stages[index:])
+            parts.setdefault(stage.carrier, []).extend(_strands(stage, radius, links))
+            rotation = np.array(stage.link.placement.rotation).T
+            centre = rotation @ (stage.at + stage.across - np.array(stage.link.placement.position))
+            pulley = _pulley(centre, rotation @ stage.axis, radius, links[1:])
+            parts.setdefault(stage.link.name, []).append(pulley)
+    return parts
+
+
+def _stages(robot: Robot, constraint: LinearConstraint, rotor: Body, radius: float) -> list[_Stage]:
+    """Return the belts that could do what a constraint says, one after the other; none if belts could not."""
+    stages: list[_Stage] = []
+    turns: list[float] = []
+    waiting = {name: coefficient for name, coefficient in constraint.coefficients if name != rotor.name}
+    carrier, at, axis = rotor.parent, *_axis(rotor)
+    while waiting:
+        link = next((robot.body(name) for name in waiting if robot.body(name).parent == carrier), None)
+        if link is None or carrier is None:
+            return []
+        place, other = _axis(link)
+        across = place - at - axis * (axis @ (place - at))
+        if abs(axis @ other) < 0.99 or np.linalg.norm(across) < 2 * radius:
+            return []  # gears
+        stages.append(_Stage(carrier, link, at, across, axis, 1 if axis @ other > 0 else -1))
+        turns.append(waiting.pop(link.name) * stages[-1].sign)
+        rotation = np.array(link.placement.rotation)
+        carrier, at, axis = link.name, rotation.T @ (at + across - place), rotation.T @ axis
+    return stages if np.allclose(turns, turns[0], rtol=1e-6) else []
+
+
+def _axis(body: Body) -> tuple[Array, Array]:
+    """Return a point of a joint's axis [m] and its direction in the parent's frame, each shape (3,)."""
+    return np.array(body.placement.position), np.array(body.placement.rotation) @ np.array(body.joint.axis)
+
+
+def _strands(stage: _Stage, radius: float, links: tuple[tuple[str, int], ...]) -> list[Part]:
+    length = float(np.linalg.norm(stage.across))
+    side = np.cross(stage.axis, stage.across / length)
+    frame = np.column_stack([stage.across / length, side, stage.axis])
+    size, middle = (length, 0.12 * radius, 0.5 * radius), stage.at + stage.across / 2
+    # A pulley that turns about z moves what is above it, on the side of y, against x.
+    return [
+        Part(Shape("box", size, _placed(middle + s * radius * side, frame), (*DARK, 1.0)), links, reach=-s * radius)
+        for s in (1, -1)
+    ]
+
+
+def _pulley(at: Array, axis: Array, radius: float, links: tuple[tuple[str, int], ...]) -> Part:
+    shape = Shape("cylinder", (radius, 0.6 * radius), _placed(at, frame_along(axis)), (*LIGHT, 1.0))
+    return Part(shape, links, axis)
+
+
+def _placed(position: Array, frame: Array) -> Placement:
+    x, y, z = (tuple(row) for row in frame.tolist())
+    return Placement(tuple(position.tolist()), (x, y, z))

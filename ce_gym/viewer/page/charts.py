@@ -1,0 +1,120 @@
+"""What the page plots beside the scene, and how close each joint is to its torque limit.
+
+Knows actors (posed rollouts); knows no page.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.page.poses import Actor
+from ce_gym.viewer.page.robot import body_paths
+
+Array = NDArray[np.float64]
+
+SPEEDS = {"forward speed [m/s]": 3, "sideways speed [m/s]": 4, "turning [rad/s]": 2}
+"""Velocities of a floating base that can be commanded, in the order of commands: the column of `v`."""
+
+
+@dataclass(frozen=True)
+class Charts:
+    """Signals of one rollout over its frames.
+
+    Attributes:
+        signals: By name with unit, each shape (F,).
+        commanded: What was commanded, by the name of the signal, each shape (F,).
+        limits: Largest size that the robot allows, by the name of the signal.
+        effort: Size of each joint's torque over its limit, 0 where it has none, shape (F, n_joints) or (F, 0).
+        paths: Scene path of the body that each of these joints moves.
+    """
+
+    signals: Mapping[str, Array]
+    commanded: Mapping[str, Array]
+    limits: Mapping[str, float]
+    effort: Array
+    paths: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return this for the page: signals as base64 of float32, effort as that of bytes, 255 at the limit."""
+        effort = np.clip(np.rint(255 * self.effort), 0, 255).astype(np.uint8)
+        return {
+            "signals": {name: packed(values) for name, values in self.signals.items()},
+            "commanded": {name: packed(values) for name, values in self.commanded.items()},
+            "limits": dict(self.limits),
+            "effort": base64.b64encode(effort.tobytes()).decode(),
+            "paths": list(self.paths) if effort.shape[1] else [],
+        }
+
+
+def packed(values: Array) -> str:
+    """Return numbers as base64 of float32."""
+    return base64.b64encode(values.astype("<f4").tobytes()).decode()
+
+
+def charts(actor: Actor) -> Charts:
+    """Return what can be plotted of an actor.
+
+    Raises:
+        ViewerError: Torques do not fit the robot's joints.
+    """
+    rollout, rows, robot = actor.rollout, actor.frames, actor.robot
+    joints, torques, v = robot.independent, rollout.torques[rows], rollout.v[rows]
+    if torques.shape[1] not in (0, len(joints)):
+        raise ViewerError(
+            f"rollout of {rollout.robot!r} has torques of {torques.shape[1]} joints; the robot has {len(joints)}"
+        )
+    signals: dict[str, Array] = {}
+    commanded: dict[str, Array] = {}
+    limits: dict[str, float] = {}
+    if robot.floating and v.shape[1] >= 6:
+        signals |= {name: v[:, column] for name, column in SPEEDS.items()}
+        commanded |= dict(zip(SPEEDS, rollout.commands[rows].T, strict=False))
+        signals["height of the base [m]"] = actor.positions[:, 0, 2]
+    if rollout.contact_forces.shape[1]:
+        signals["force from the ground [N]"] = rollout.contact_forces[rows, :, 2].sum(1)
+    signals |= dict(zip(rollout.signal_names, rollout.signals[rows].T, strict=True))
+    bodies = [robot.body(name) for name in joints]
+    for kind, unit, values in (("torque", "N m", torques), ("speed", "rad/s", v[:, v.shape[1] - len(joints) :])):
+        for body, column in zip(bodies, values.T, strict=values.shape[1] > 0):
+            name = f"{kind} of {body.name.removesuffix('_link')} [{unit}]"
+            limit = body.joint.torque if kind == "torque" else body.joint.velocity
+            signals[name] = column
+            limits |= {name: limit} if np.isfinite(limit) else {}
+    paths = body_paths(robot, actor.path)
+    largest = np.array([body.joint.torque for body in bodies])
+    effort = np.abs(torques) / largest if torques.shape[1] else np.empty((len(rows), 0))
+    return Charts(signals, commanded, limits, effort, tuple(paths[name] for name in joints))
+
+
+def chosen(found: Sequence[Charts], wanted: Sequence[str], count: int = 3) -> list[str]:
+    """Return the names of the signals to plot at first.
+
+    Args:
+        found: What there is.
+        wanted: Names or beginnings of names; if none, the speed, the joint closest to its torque limit and the reward.
+        count: How many, if none are wanted.
+
+    Raises:
+        ViewerError: There is no such signal; names those there are.
+    """
+    known = list(dict.fromkeys(name for one in found for name in one.signals))
+    names = []
+    for word in wanted:
+        matches = [name for name in known if name.startswith(word)] or [name for name in known if word in name]
+        if not matches:
+            raise ViewerError(f"no signal {word!r} to plot; expected one of {', '.join(known)}")
+        names.append(matches[0])
+    if names or not found:
+        return names
+    first = found[0]
+    torques = [name for name in first.signals if name.startswith("torque of")]
+    hardest = [torques[int(first.effort.max(0).argmax())]] if torques else []
+    order = ["forward speed [m/s]", *hardest, "reward", "force from the ground [N]", *known]
+    return [name for name in dict.fromkeys(order) if name in known][:count]

@@ -1,0 +1,86 @@
+"""Shapes for bodies that have none: stick figures of whole robots, discs of rotors. Knows the robot description."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.model.description import Body, Placement, Robot, Shape, Vec3
+from ce_gym.viewer.page.three import Color
+
+Array = NDArray[np.float64]
+
+AT_ORIGIN = Placement()
+LIGHT, DARK = (0.93, 0.94, 0.95), (0.16, 0.18, 0.21)
+STICK_COLORS = {"link": (0.30, 0.45, 0.62), "rotor": (0.90, 0.55, 0.20)}
+
+
+def shapes_of(robot: Robot) -> dict[str, tuple[Shape, ...]]:
+    """Return what is drawn for each body: its shapes, or a stick figure if no body has any."""
+    if any(body.shapes for body in robot.bodies):
+        return {body.name: body.shapes for body in robot.bodies}
+    return stick_figure(robot)
+
+
+def stick_figure(robot: Robot) -> dict[str, tuple[Shape, ...]]:
+    """Return shapes for a robot that has none: a ball at each body's origin, sticks to its children and contacts."""
+    ends = [(body.parent, body.placement.position) for body in robot.bodies if body.parent is not None]
+    ends += [(sphere.body, sphere.position) for sphere in robot.contacts]
+    radius = 0.07 * max((float(np.linalg.norm(end)) for _, end in ends), default=0.0) or 0.05
+    shapes = {body.name: [_ball(STICK_COLORS[body.kind], radius)] for body in robot.bodies}
+    for name, end in ends:
+        if np.linalg.norm(end) > 1e-6:
+            shapes[name].append(_stick(np.array(end), 0.5 * radius))
+    for sphere in robot.contacts:
+        shapes[sphere.body].append(_ball(DARK, max(sphere.radius, 0.5 * radius), Placement(sphere.position)))
+    return {name: tuple(items) for name, items in shapes.items()}
+
+
+def _ball(color: Color, radius: float, placement: Placement = AT_ORIGIN) -> Shape:
+    red, green, blue = color
+    return Shape("sphere", (radius,), placement, (red, green, blue, 1.0))
+
+
+def _stick(end: Array, radius: float) -> Shape:
+    pose = _along(end, tuple((end / 2).tolist()))
+    return Shape("cylinder", (radius, float(np.linalg.norm(end))), pose, (*LIGHT, 1.0))
+
+
+def rotor_discs(robot: Robot) -> dict[str, Shape]:
+    """Return a disc for each rotor without shapes: the solid cylinder that has the rotor's mass and inertia.
+
+    Rotors without mass get none, nor do robots that are stick figures anyway.
+    """
+    if not any(body.shapes for body in robot.bodies):
+        return {}
+    return {body.name: _disc(body) for body in robot.rotors() if not body.shapes and body.inertial.mass > 0}
+
+
+def _disc(rotor: Body) -> Shape:
+    # A solid cylinder has m r^2 / 2 about its axis and m (3 r^2 + h^2) / 12 across it.
+    mass, inertia, axis = rotor.inertial.mass, np.array(rotor.inertial.inertia), np.array(rotor.joint.axis)
+    along = float(axis @ inertia @ axis)
+    across = (float(np.trace(inertia)) - along) / 2
+    radius = np.sqrt(2 * along / mass)
+    height = np.sqrt(max(12 * across / mass - 3 * radius**2, (0.1 * radius) ** 2))
+    red, green, blue = STICK_COLORS["rotor"]
+    return Shape("cylinder", (float(radius), float(height)), _along(axis, rotor.inertial.com), (red, green, blue, 1.0))
+
+
+def _along(direction: Array, position: Vec3) -> Placement:
+    x, y, z = (tuple(row) for row in frame_along(direction).tolist())
+    return Placement(position, (x, y, z))
+
+
+def frame_along(direction: Array) -> Array:
+    """Return rotations, shape (..., 3, 3), whose third axis is along `direction`, shape (..., 3).
+
+    A zero direction gives the upright frame.
+    """
+    length = np.linalg.norm(direction, axis=-1, keepdims=True)
+    z = np.where(length > 1e-12, direction / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    # Any vector that is not nearly along z completes the frame.
+    helper = np.where(np.abs(z[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    y = np.cross(z, helper)
+    y /= np.linalg.norm(y, axis=-1, keepdims=True)
+    return np.stack([np.cross(y, z), y, z], -1)

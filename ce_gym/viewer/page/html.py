@@ -1,0 +1,149 @@
+"""Rollouts -> one HTML file that plays them: no server, no network, nothing beside it.
+
+Knows the scene's commands and where meshcat keeps its page's code; meshcat itself is not even imported.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import importlib.util
+import json
+import string
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.page import arrows, three
+from ce_gym.viewer.page.charts import charts, chosen, packed
+from ce_gym.viewer.page.lights_and_camera import HORIZON
+from ce_gym.viewer.page.poses import Actor, PosedModel
+from ce_gym.viewer.page.scene import GHOST_TINTS, ROW, build_scene, make_actors
+from ce_gym.viewer.rollouts.rollout import Rollout
+
+FIRST_COLOR = (0.15, 0.20, 0.27)
+OTHERS_COLOR = (0.62, 0.66, 0.70)
+
+
+def page(
+    rollouts: Rollout | Sequence[Rollout],
+    *,
+    title: str | None = None,
+    models: Sequence[PosedModel] | None = None,
+    spacing: float | None = None,
+    plot: Sequence[str] = (),
+    max_fps: float | None = None,
+) -> str:
+    """Return a self-contained HTML page with play, pause, scrub and speed, and plots beside the robots.
+
+    Args:
+        rollouts: What to show; several stand side by side, many in a square.
+        title: Heading of the page; by default the robots' names.
+        models: A posed model for each rollout; built from the rollouts' robots if not given.
+        spacing: Distance between neighbours [m]; zero overlays the others as ghosts. By default neighbours keep clear
+            of each other.
+        plot: Names or beginnings of the names of signals to plot at first; any other can be chosen in the page.
+        max_fps: Frames beyond this rate are left out [1/s]; 50 by default, 25 for more robots than stand in a row.
+
+    Raises:
+        ViewerError: meshcat is not installed, a rollout does not fit its robot, or there is no such signal.
+    """
+    rollouts = [rollouts] if isinstance(rollouts, Rollout) else list(rollouts)
+    code = meshcat_code()
+    max_fps = max_fps or (50.0 if len(rollouts) <= ROW else 25.0)
+    actors = make_actors(rollouts, models, max_fps)
+    commands = [base64.b64encode(three.pack(command)).decode() for command in build_scene(actors, spacing=spacing)]
+    title = title or " / ".join(dict.fromkeys(Path(rollout.robot).stem for rollout in rollouts))
+    return _template("player.html").substitute(
+        title=html.escape(title),
+        legend=_legend(actors),
+        meshcat=code,
+        ground=source("ground.js"),
+        belts=source("belts.js"),
+        plots=source("plots.js"),
+        player=source("player.js"),
+        commands=json.dumps(commands),
+        data=_data(actors, plot, ghosts=spacing == 0),
+        frame=repr(max(rollouts[0].dt, 1.0 / max_fps)),
+        horizon=three.hex_color(HORIZON),
+    )
+
+
+def write_html(rollouts: Rollout | Sequence[Rollout], path: str | Path, **options: Any) -> Path:
+    """Write the page of rollouts to a file and return its path; see `page` for the options."""
+    path = Path(path)
+    path.write_text(page(rollouts, **options), encoding="utf-8")
+    return path
+
+
+def meshcat_code() -> str:
+    """Return the code of meshcat's page.
+
+    Raises:
+        ViewerError: meshcat is not installed.
+    """
+    spec = importlib.util.find_spec("meshcat")
+    if spec is None or spec.origin is None:
+        raise ViewerError.missing_meshcat()
+    return Path(spec.origin).with_name("viewer").joinpath("dist", "main.min.js").read_text(encoding="utf-8")
+
+
+def source(name: str) -> str:
+    """Return the text of a file of the page."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
+def _template(name: str) -> string.Template:
+    return string.Template(source(name))
+
+
+def _data(actors: Sequence[Actor], plot: Sequence[str], *, ghosts: bool) -> str:
+    """Return what is plotted, as JSON that may stand in a script: of few robots, or nobody could tell lines apart."""
+    shown = list(actors[:ROW])
+    found = [charts(actor) for actor in shown]
+    robots = [
+        {
+            "name": name_of(actor),
+            "color": _css(color_of(index)),
+            "ghost": ghosts and index > 0,
+            "times": packed(actor.times),
+            **one.as_json(),
+        }
+        for index, (actor, one) in enumerate(zip(shown, found, strict=True))
+    ]
+    text = json.dumps({"robots": robots, "chosen": chosen(found, plot)})
+    return text.replace("<", "\\u003c")  # a label must not end the script
+
+
+def name_of(actor: Actor) -> str:
+    """Return what the legend calls an actor."""
+    rollout = actor.rollout
+    return rollout.label or f"{Path(rollout.robot).stem}, {rollout.transmission} transmission"
+
+
+def color_of(index: int) -> three.Color:
+    """Return the colour of an actor's lines, and of itself if it is a ghost."""
+    return GHOST_TINTS[(index - 1) % len(GHOST_TINTS)] if index else FIRST_COLOR
+
+
+def _legend(actors: Sequence[Actor]) -> str:
+    """Return list items that show and hide what they name: robots, left to right, and kinds of arrows."""
+    items = [(color_of(i), name_of(actor), [actor.path]) for i, actor in enumerate(actors[:ROW])]
+    if rest := actors[ROW:]:
+        items.append((OTHERS_COLOR, f"and {len(rest)} more", [actor.path for actor in rest]))
+    arrows_of = (
+        (arrows.FORCE_COLOR, "contact forces", "contact forces", [a for a in actors if a.contact_names]),
+        (arrows.COMMAND_COLOR, "commanded speed", "command", [a for a in actors if a.rollout.commands.shape[1] >= 2]),
+        (arrows.VELOCITY_COLOR, "actual speed", "velocity", [a for a in actors if a.rollout.commands.shape[1] >= 2]),
+    )
+    items += [(color, text, [f"{a.path}/{leaf}" for a in who]) for color, text, leaf, who in arrows_of if who]
+    return "".join(
+        f'<li><label><input type="checkbox" checked data-paths="{html.escape(json.dumps(paths))}">'
+        f'<i style="background:{_css(color)}"></i>{html.escape(text)}</label></li>'
+        for color, text, paths in items
+    )
+
+
+def _css(color: three.Color) -> str:
+    return f"#{three.hex_color(color):06x}"

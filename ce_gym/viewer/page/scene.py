@@ -1,0 +1,171 @@
+"""Rollouts -> the commands of one meshcat scene: robots, arrows, stage and the animation that moves them.
+
+Robots stand side by side, many of them in a square, or on top of each other as ghosts. The world moves under the camera
+so that the first thing to leave the picture is the ground, not the robot. Knows rollouts and posed models; knows no
+files, no servers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.sim.terrain import Terrain
+from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.page import animation, arrows, three
+from ce_gym.viewer.page.lights_and_camera import camera_commands, eye, field_command, stage_commands
+from ce_gym.viewer.page.poses import Actor, PosedModel, smooth
+from ce_gym.viewer.page.robot import body_paths, robot_commands
+from ce_gym.viewer.page.three import Color, Command
+from ce_gym.viewer.rollouts.ground_patch import around, clear_view, reach
+from ce_gym.viewer.rollouts.rollout import Rollout
+
+Array = NDArray[np.float64]
+
+ROOT = "/world"
+GHOST_TINTS: tuple[Color, ...] = ((0.90, 0.45, 0.25), (0.25, 0.55, 0.85), (0.35, 0.65, 0.35))
+GHOST_OPACITY = 0.4
+ROW = 4  # so many stand in one row; more stand in a square
+APART = 3.0  # distance of robots that stand apart, each on ground of its own, in radii
+FOLLOW_SECONDS = 0.8  # the camera averages the robots' path over this time [s]
+
+
+def make_actors(
+    rollouts: Sequence[Rollout], models: Sequence[PosedModel] | None = None, max_fps: float = 50.0
+) -> list[Actor]:
+    """Pose the robots of rollouts.
+
+    Args:
+        rollouts: At least one.
+        models: A posed model for each; built from the rollouts' robots if not given.
+        max_fps: Frames beyond this rate are left out [1/s].
+
+    Raises:
+        ViewerError: There is nothing to show, or a rollout does not fit its robot.
+    """
+    if not rollouts:
+        raise ViewerError("nothing to show: expected at least one rollout")
+    if models is None:
+        known = {(rollout.robot, rollout.transmission): rollout for rollout in rollouts}
+        built = {key: load_model(rollout) for key, rollout in known.items()}
+        models = [built[rollout.robot, rollout.transmission] for rollout in rollouts]
+    pairs = zip(rollouts, models, strict=True)
+    return [Actor(rollout, model, f"{ROOT}/{index}", max_fps) for index, (rollout, model) in enumerate(pairs)]
+
+
+def build_scene(actors: Sequence[Actor], *, spacing: float | None = None) -> list[Command]:
+    """Return the commands that show actors, the animation last.
+
+    Args:
+        actors: At least one.
+        spacing: Distance between neighbours [m]; zero draws all but the first as ghosts in the same place. By default
+            neighbours keep clear of each other. Robots that stand apart all start towards the same side, x.
+    """
+    if spacing is None:
+        spacing = (1.6 if _all_flat(actors) else APART) * max(actor.radius for actor in actors)
+    poses = places(actors, spacing)
+    end = max(max(actor.times[-1], actor.rollout.dt) for actor in actors)
+    commands = [*_stage(actors, poses), *_fields(actors, poses, spacing)]
+    clips = [_follow(actors, poses, end)]
+    for index, actor in enumerate(actors):
+        ghost = index > 0 and spacing == 0
+        tint = GHOST_TINTS[(index - 1) % len(GHOST_TINTS)] if ghost else None
+        commands += robot_commands(actor.robot, actor.path, tint=tint, opacity=GHOST_OPACITY if ghost else 1.0)
+        commands.append(three.set_transform(actor.path, poses[index]))
+        clips += actor.clips(end)
+        for arrow in () if ghost else arrows.all_arrows(actor):
+            commands += arrow.commands()
+            clips.append(animation.moving(arrow.path, actor.times, end, arrow.values()))
+    return [*commands, animation.set_animation(clips)]
+
+
+def load_model(rollout: Rollout) -> PosedModel:
+    """Return the model that a rollout was made with."""
+    from ce_gym.dynamics import Model
+
+    return Model(rollout.robot, transmission=rollout.transmission)
+
+
+def places(actors: Sequence[Actor], spacing: float) -> list[Array]:
+    """Return where the world of each actor is put, shape (4, 4); ghosts share that of the first."""
+    count = len(actors)
+    if spacing == 0:
+        return [np.linalg.inv(actors[0].start).astype(np.float64)] * count
+    columns = count if count <= ROW else int(np.ceil(np.sqrt(count)))
+    rows = -(-count // columns)
+    result = []
+    for index, actor in enumerate(actors):
+        row, column = divmod(index, columns)
+        place = [spacing * ((rows - 1) / 2 - row), spacing * ((columns - 1) / 2 - column), 0.0]
+        result.append(three.transform(place) @ np.linalg.inv(actor.start))
+    return result
+
+
+def _stage(actors: Sequence[Actor], poses: Sequence[Array]) -> Iterator[Command]:
+    paths = [_moved(actor.positions[..., :2].reshape(-1, 2), pose) for actor, pose in zip(actors, poses, strict=True)]
+    starts = np.array([_moved(actor.middle[:1], pose)[0] for actor, pose in zip(actors, poses, strict=True)])
+    radius = max(actor.radius for actor in actors) + float(np.linalg.norm(np.ptp(starts, 0))) / 2
+    corners = np.concatenate(paths)
+    flat, height = _all_flat(actors), _height(actors)
+    yield from stage_commands(corners.min(0), corners.max(0), root=ROOT, radius=radius, flat=flat)
+    yield three.set_transform(ROOT, three.transform([0.0, 0.0, -height]))
+    place = eye(radius)
+    if len(actors) == 1 or np.ptp(starts, 0).max() == 0:
+        place[2] = _sight(actors[0], height, radius, place)
+    yield from camera_commands(place)
+
+
+def _sight(actor: Actor, height: float, radius: float, place: Array) -> float:
+    """Return how high the camera must be for the ground never to come between it and the robot [m]."""
+    ground, frames, turn = actor.rollout.ground, slice(None, None, 10), actor.start[:3, :3]
+    targets = np.column_stack([actor.middle, actor.levels + height])[frames]
+    return max(float(clear_view(ground, at, at + turn @ place, radius / 4)[2] - at[2]) for at in targets)
+
+
+def _all_flat(actors: Sequence[Actor]) -> bool:
+    return all(actor.rollout.ground is None for actor in actors)
+
+
+def _fields(actors: Sequence[Actor], poses: Sequence[Array], spacing: float) -> Iterator[Command]:
+    """Draw the ground where it is not flat: one piece for ghosts, else a disc that goes along with each robot."""
+    if _all_flat(actors):
+        return
+    bases = [body_paths(actor.robot, actor.path)[actor.robot.bodies[0].name] for actor in actors]
+    grounds = [actor.rollout.ground or around(Terrain.flat(), actor.middle) for actor in actors]
+    if len(actors) > 1 and spacing > 0:
+        for index, actor in enumerate(actors):
+            far = min(spacing / 2, reach(grounds[index], actor.middle))
+            piece = around(grounds[index], actor.middle, far)
+            yield field_command(f"{ROOT}/ground_{index}", piece, [bases[index]], far, fading=0.8)
+            yield three.set_transform(f"{ROOT}/ground_{index}", poses[index])
+        return
+    everywhere = np.concatenate([actor.middle for actor in actors])
+    widest = max(grounds, key=lambda ground: reach(ground, everywhere))
+    yield field_command(f"{ROOT}/ground", widest, bases, reach(widest, actors[0].middle))
+    yield three.set_transform(f"{ROOT}/ground", poses[0])
+
+
+def _height(actors: Sequence[Actor]) -> float:
+    """Return the height of the middle of the robots above the ground where they start [m]; the camera looks there."""
+    low = min(actor.low[2] - actor.levels[0] for actor in actors)
+    return float(low + max(actor.high[2] - actor.levels[0] for actor in actors)) / 2
+
+
+def _moved(points: Array, pose: Array) -> Array:
+    """Return points of the ground, shape (n, 2), moved by a pose, shape (4, 4)."""
+    return points @ pose[:2, :2].T + pose[:2, 3]
+
+
+def _follow(actors: Sequence[Actor], poses: Sequence[Array], end: float) -> Command:
+    """Move the world against the mean path of the robots' middles, so that they stay before the camera."""
+    times = max((actor.times for actor in actors), key=len)
+    middles = [_moved(actor.middle, pose) for actor, pose in zip(actors, poses, strict=True)]
+    levels = [actor.levels + pose[2, 3] for actor, pose in zip(actors, poses, strict=True)]
+    paths = [
+        [np.interp(times, actor.times, values) for values in (*middle.T, height)]
+        for actor, middle, height in zip(actors, middles, levels, strict=True)
+    ]
+    centre = smooth(np.mean(paths, 0).T, times, FOLLOW_SECONDS)
+    return animation.moving(ROOT, times, end, {"position": -centre - [0.0, 0.0, _height(actors)]})

@@ -1,0 +1,1 @@
+"""Rollouts: what a robot did, recorded and kept in a file."""
