@@ -1,14 +1,14 @@
 """CasADi SX functions, and look-ups in tables between them, as batched SIMD kernels.
 
-Knows casadi, llvmlite, numba and numpy; knows no physics and no other part of ce_gym. Importing this package imports
+Knows casadi, llvmlite and numpy; knows no physics and no other part of ce_gym. Importing this package imports
 none of the heavy ones: `load_kernel` does, when it is called.
 """
 
 from ce_gym.compile.arrays import aligned_zeros, lane_count
-from ce_gym.compile.cache import source_fingerprint
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.loading import load_kernel
 from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step
+from ce_gym.compile.sources import source_fingerprint
 
 __all__ = [
     "Buffer",

@@ -1,85 +1,117 @@
-"""The folder of compiled kernels, what their names depend on, and writing that survives two processes at once.
+"""The folder of compiled kernels: one file to a kernel, all that is believed and executed under one digest.
 
-Knows files and versions; knows nothing of kernels' contents.
+The digest guards against damage; against other users, `ce_gym.compile.ours` does. What cannot be read is compiled
+again, what cannot be written is done without. Knows files; knows nothing of kernels' contents.
 """
 
 import hashlib
-import importlib.util
+import json
 import os
-import platform
 import sys
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 
+from ce_gym.compile.ours import prepare_folder, read_file
+
 FOLDER_VARIABLE = "CE_GYM_CACHE_DIR"
-COMPILERS = ("casadi", "numba", "llvmlite", "numpy")
+DIGEST_BYTES = 32
+
+
+def cache_folder() -> Path | None:
+    """Where kernels are kept: $CE_GYM_CACHE_DIR, else the user's cache folder; else a temporary one; else nowhere.
+
+    A folder is passed over, in one line to the user, if it cannot be written or if other users could write it.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
+    wanted = os.environ.get(FOLDER_VARIABLE) or os.path.join(home, "ce_gym")
+    for place in (wanted, os.path.join(tempfile.gettempdir(), f"ce_gym-{user}")):
+        folder = Path(os.path.realpath(place))  # links are followed once, here; what they lead to is judged
+        try:
+            prepare_folder(folder)
+        except OSError as problem:
+            _tell_once(f"ce_gym: no kernels are kept in {folder}: {problem.strerror or problem}")
+        else:
+            return folder
+    return None
+
+
+def read_entry(folder: Path | None, name: str) -> tuple[dict, bytes] | None:
+    """What `write_entry` kept, or None if it is missing, damaged, or could be someone else's."""
+    if folder is None:
+        return None
+    try:
+        content = read_file(_path(folder, name))
+    except OSError:
+        return None
+    digest, payload = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
+    if digest != _digest(name, payload):
+        return None
+    record, _, code = payload.partition(b"\n")
+    return json.loads(record), code
+
+
+def write_entry(folder: Path | None, name: str, record: dict, code: bytes) -> None:
+    """Keep a kernel, or tell the user once that there is no room.
+
+    Args:
+        folder: of `cache_folder`.
+        name: of the kernel.
+        record: plain data, as JSON has it.
+        code: machine code.
+    """
+    if folder is None:
+        return
+    payload = json.dumps(record).encode() + b"\n" + code
+    try:
+        _replace(_path(folder, name), _digest(name, payload) + payload)
+    except OSError as problem:
+        _tell_once(f"ce_gym: kernels compiled now are not kept in {folder}: {problem.strerror or problem}")
+
+
+def _path(folder: Path, name: str) -> Path:
+    return folder / f"{name}.kernel"
+
+
+def _digest(name: str, payload: bytes) -> bytes:
+    """Covers the name, so that one kernel's file is not taken for another's."""
+    return hashlib.sha256(name.encode() + b"\n" + payload).digest()
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file as a whole: a reader sees the old content or the new, never half of one; nothing else stays."""
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)
+        raise
 
 
 @cache
-def source_fingerprint(*packages: str) -> str:
-    """Hash of what the machine code follows from, beside the program itself.
+def _tell_once(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def announced(what: str, folder: Path | None, started: float) -> Iterator[None]:
+    """Say on one line why the user waits and, in the end, for how long.
 
     Args:
-        packages: importable packages whose .py files count.
-
-    Returns:
-        16 hexadecimal digits, over the sources, the versions of CasADi, numba, llvmlite, numpy and Python, and the
-        processor's name and features.
+        what: is compiled.
+        folder: of `cache_folder`.
+        started: time from which to count [s], of `time.perf_counter`.
     """
-    from llvmlite import binding
-
-    digest = hashlib.sha256()
-    for package in packages:
-        for path in _sources(package):
-            digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    facts = [f"{name} {version(name)}" for name in COMPILERS] + [platform.python_version(), platform.machine()]
-    facts += [binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()]
-    digest.update("\n".join(facts).encode())
-    return digest.hexdigest()[:16]
-
-
-def _sources(package: str) -> list[Path]:
-    spec = importlib.util.find_spec(package)
-    if spec is None or spec.submodule_search_locations is None:
-        raise ValueError(f"package {package!r}: not found, expected an importable package with Python sources")
-    return sorted(path for root in spec.submodule_search_locations for path in Path(root).rglob("*.py"))
-
-
-def cache_folder() -> Path:
-    """Where kernels are kept: $CE_GYM_CACHE_DIR, else the user's cache folder, else a temporary one."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
-    wanted = Path(os.environ.get(FOLDER_VARIABLE) or os.path.join(home, "ce_gym"))
-    for folder in (wanted, Path(tempfile.gettempdir()) / f"ce_gym-{user}"):
-        if _is_ours(folder):
-            return folder
-    return Path(tempfile.mkdtemp(prefix="ce_gym-"))
-
-
-def _is_ours(folder: Path) -> bool:
-    """Whether this user can write there and, since code is run from it, nobody else made it."""
+    kept = "not kept" if folder is None else f"once; cached in {folder}"
+    print(f"ce_gym: compiling {what}, {kept} ...", end="", file=sys.stderr, flush=True)
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return not hasattr(os, "getuid") or folder.stat().st_uid == os.getuid()
-    except OSError:
-        return False
-
-
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """Replace a file as a whole: a reader sees the old content or the new, never half of one."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.name, delete=False) as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-    os.replace(file.name, path)
-
-
-def checksum(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def announce(text: str) -> None:
-    """Begin or finish the one line that says why the user waits."""
-    print(text, end="", file=sys.stderr, flush=True)
+        yield
+    finally:
+        print(f" {time.perf_counter() - started:.1f} s", file=sys.stderr, flush=True)

@@ -1,6 +1,6 @@
 """A compiled kernel and how it is called: checks of its arguments, addresses, threads.
 
-Knows numpy arrays and the calling convention; LLVM, numba and files stay behind `loading`.
+Knows numpy arrays and the calling convention; LLVM and files stay behind `loading`.
 """
 
 import weakref

@@ -5,8 +5,7 @@ Plain data that is stored beside the machine code, so that a cached kernel needs
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 
 from ce_gym.compile.arrays import ALIGNMENT
@@ -80,17 +79,7 @@ def layout_of(program: Program, dtype: str) -> Layout:
     return Layout(program.name, dtype, program.buffers, tuple(repeats), tuple(written))
 
 
-def layout_to_json(layout: Layout) -> str:
-    """Text from which `layout_from_json` makes an equal layout."""
-    return json.dumps(asdict(layout))
-
-
-def layout_from_json(text: str) -> Layout:
-    """Inverse of `layout_to_json`.
-
-    Raises:
-        ValueError, KeyError, TypeError: when the text is not one.
-    """
-    data = json.loads(text)
-    buffers = tuple(Buffer(**buffer) for buffer in data["buffers"])
-    return Layout(data["name"], data["dtype"], buffers, tuple(data["repeats"]), tuple(data["written"]))
+def layout_from(record: dict) -> Layout:
+    """The layout of which `record` is `dataclasses.asdict`, directly or by way of JSON."""
+    buffers = tuple(Buffer(**buffer) for buffer in record["buffers"])
+    return Layout(record["name"], record["dtype"], buffers, tuple(record["repeats"]), tuple(record["written"]))

@@ -1,6 +1,6 @@
 """`load_kernel`: from the cache folder, or built, compiled and put there.
 
-Knows the order of these steps and nothing of how each is done. numba and CasADi are imported when a step needs them.
+Knows the order of these steps and nothing of how each is done. LLVM and CasADi are imported when a step needs them.
 """
 
 from __future__ import annotations
@@ -9,18 +9,19 @@ import hashlib
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ce_gym.compile.arrays import lane_count
-from ce_gym.compile.cache import announce, cache_folder, source_fingerprint
+from ce_gym.compile.cache import announced, cache_folder, read_entry, write_entry
 from ce_gym.compile.kernel import Kernel
-from ce_gym.compile.layout import Layout, layout_from_json, layout_of, layout_to_json
+from ce_gym.compile.layout import layout_from, layout_of
 from ce_gym.compile.program import Program, check_program
+from ce_gym.compile.sources import source_fingerprint
 
-_loaded: dict[tuple[Path, str], Kernel] = {}
+_loaded: dict[tuple[Path | None, str], Kernel] = {}
 _lock = threading.RLock()
 
 
@@ -46,53 +47,30 @@ def load_kernel(key: str, build: Callable[[], Program], dtype: str = "float64") 
     folder = cache_folder()
     with _lock:
         if (folder, name) not in _loaded:
-            _loaded[folder, name] = _load(folder, name, _Source(build, dtype, folder))
+            _loaded[folder, name] = _load(folder, name, build, dtype)
         return _loaded[folder, name]
 
 
-def _load(folder: Path, name: str, source: _Source) -> Kernel:
-    from ce_gym.compile.module import CachedModule
+def _load(folder: Path | None, name: str, build: Callable[[], Program], dtype: str) -> Kernel:
+    from ce_gym.compile.machine_code import load_object
 
-    with source:
-        module = CachedModule(folder, name)
-        content = module.read()
-        layout = source.layout() if content is None else layout_from_json(content)
-        run = module.load(source.emit)
-        if source.program is not None:
-            module.write(layout_to_json(layout))
-    return Kernel(layout, run)
+    entry = read_entry(folder, name)
+    if entry is None:
+        entry = _compile(build, dtype, folder)
+        write_entry(folder, name, *entry)
+    record, code = entry
+    return Kernel(layout_from(record), load_object(code))
 
 
-class _Source:
-    """The program, built at the moment something asks for it; tells the user how long the compilation took."""
+def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> tuple[dict, bytes]:
+    """The calling convention as plain data, and object code."""
+    from ce_gym.compile.lowering.tile import emit_tile
+    from ce_gym.compile.machine_code import compile_object
 
-    def __init__(self, build: Callable[[], Program], dtype: str, folder: Path):
-        self.program: Program | None = None
-        self._build, self._dtype, self._folder = build, dtype, folder
-        self._started = 0.0
-
-    def __enter__(self) -> None:
-        self._started = time.perf_counter()
-
-    def __exit__(self, *error: object) -> None:
-        if self.program is not None:
-            announce(f" {time.perf_counter() - self._started:.1f} s\n")
-
-    def get(self) -> Program:
-        """The program; the first call builds it."""
-        if self.program is None:
-            program = self._build()
-            check_program(program)
-            announce(f"ce_gym: compiling {program.name} ({self._dtype}), once; cached in {self._folder} ...")
-            self.program = program
-        return self.program
-
-    def layout(self) -> Layout:
-        """Its calling convention."""
-        return layout_of(self.get(), self._dtype)
-
-    def emit(self, builder: Any, arguments: tuple) -> None:
-        """Emit the work on one tile."""
-        from ce_gym.compile.lowering.tile import emit_tile
-
-        emit_tile(builder, self.get(), self.layout(), arguments)
+    started = time.perf_counter()
+    program = build()
+    check_program(program)
+    layout = layout_of(program, dtype)
+    with announced(f"{program.name} ({dtype})", folder, started):
+        code = compile_object(lambda builder, arguments: emit_tile(builder, program, layout, arguments))
+    return asdict(layout), code

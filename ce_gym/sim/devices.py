@@ -8,7 +8,6 @@ imported when a GPU is asked for. May know `compile`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -133,20 +132,16 @@ class Cuda:
 
 
 class Emulated(Cuda):
-    """The GPU's tensors and sources on the processor: for tests and comparisons where there is no GPU, and very slow.
+    """The GPU's tensors and sources on the CPU: for tests and comparisons where there is no GPU, and very slow."""
 
-    Args:
-        folder: Where compiled sources are kept; that of the kernels if None.
-    """
-
-    def __init__(self, folder: Path | None = None) -> None:
-        self.name, self._place, self._folder = "emulated cuda", "cpu", folder
+    def __init__(self) -> None:
+        self.name, self._place = "emulated cuda", "cpu"
 
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
         """Return the kernel of some stages, run by the processor."""
         from ce_gym.compile.cuda import host_kernel
 
-        return host_kernel(build, dtype, self._folder)
+        return host_kernel(build, dtype)
 
 
 def device_named(device: str | Device) -> Device:

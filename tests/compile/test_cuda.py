@@ -261,7 +261,7 @@ def test_machine_code_is_kept_and_a_damaged_file_made_again(tmp_path, needs_comp
     assert cached_cubin(tmp_path, "k", build, "float32", "sm_90") == first
     assert len(built) == 1
     assert capsys.readouterr().err.count("compiling") == 1
-    (tmp_path / "k.cubin").write_bytes(b"damaged")
+    (tmp_path / "k.kernel").write_bytes(b"damaged")
     assert cached_cubin(tmp_path, "k", build, "float32", "sm_90")[0] == first[0]
     assert len(built) == 2
 

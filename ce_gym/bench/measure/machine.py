@@ -8,7 +8,7 @@ import os
 import platform
 from pathlib import Path
 
-PACKAGES = ("ce_gym", "numpy", "numba", "llvmlite", "casadi", "gymnasium", "mujoco")
+PACKAGES = ("ce_gym", "numpy", "llvmlite", "casadi", "gymnasium", "mujoco")
 
 
 def describe() -> dict[str, str]:

@@ -10,15 +10,15 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import importlib.util
-import os
 import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from ce_gym.compile.cache import cache_folder, write_atomically
+from ce_gym.compile.cache import cache_folder, read_entry, write_entry
 from ce_gym.compile.cuda.source import BLOCK, ENTRY, Source
 
 SHIM = """#include <cmath>
@@ -55,30 +55,24 @@ class HostLauncher:
     """Runs an emitted kernel robot by robot on arrays in the processor's memory.
 
     Args:
-        source: The kernel.
-        folder: Where the shared library is kept, compiled only if it is not there yet; that of the kernels if None.
+        source: The kernel; compiled only if the cache has no library of it yet.
 
     Raises:
         RuntimeError: One line, if there is no C++ compiler or it refuses the source.
     """
 
-    def __init__(self, source: Source, folder: Path | None = None) -> None:
+    def __init__(self, source: Source) -> None:
         compiler = host_compiler()
         if compiler is None:
             raise RuntimeError("no C++ compiler (c++, g++, clang++ or the package ziglang) to run CUDA C on the host")
         text = SHIM + source.text + _loop(source.text)
-        folder = folder or cache_folder()
-        name = hashlib.sha256(" ".join((*compiler, *OPTIONS, text)).encode()).hexdigest()[:24]
-        library = folder / f"host_{name}.so"
-        if not library.exists():
-            file, new = folder / f"host_{name}.cpp", folder / f"host_{name}.{os.getpid()}"
-            write_atomically(file, text)
-            result = subprocess.run([*compiler, *OPTIONS, str(file), "-o", str(new)], capture_output=True, text=True)
-            if result.returncode:
-                errors = [line for line in result.stderr.splitlines() if "error" in line]
-                raise RuntimeError(f"{source.layout.name}: {(errors or [result.stderr])[0]}")
-            os.replace(new, library)
-        self._run = ctypes.CDLL(str(library)).run_all
+        name = "host_" + hashlib.sha256(" ".join((*compiler, *OPTIONS, text)).encode()).hexdigest()[:24]
+        folder = cache_folder()
+        entry = read_entry(folder, name)
+        if entry is None:
+            entry = {}, _compile(compiler, text, source.layout.name)
+            write_entry(folder, name, *entry)
+        self._run = _load(entry[1]).run_all
 
     def __call__(self, addresses: Sequence[int], numbers: Sequence[int], count: int) -> None:
         """Run the kernel on all robots.
@@ -89,6 +83,26 @@ class HostLauncher:
             count: Number of robots.
         """
         self._run(*map(ctypes.c_void_p, addresses), *map(ctypes.c_int, numbers), ctypes.c_int(count))
+
+
+def _compile(compiler: list[str], text: str, name: str) -> bytes:
+    """The shared library."""
+    with tempfile.TemporaryDirectory(prefix="ce_gym-") as folder:
+        file, library = Path(folder) / "kernel.cpp", Path(folder) / "kernel.so"
+        file.write_text(text, encoding="utf-8")
+        result = subprocess.run([*compiler, *OPTIONS, str(file), "-o", str(library)], capture_output=True, text=True)
+        if result.returncode:
+            errors = [line for line in result.stderr.splitlines() if "error" in line]
+            raise RuntimeError(f"{name}: {(errors or [result.stderr])[0]}")
+        return library.read_bytes()
+
+
+def _load(code: bytes) -> ctypes.CDLL:
+    """Load a shared library, which must be a file for as long as that takes."""
+    with tempfile.TemporaryDirectory(prefix="ce_gym-", ignore_cleanup_errors=True) as folder:
+        file = Path(folder) / "kernel.so"
+        file.write_bytes(code)
+        return ctypes.CDLL(str(file))
 
 
 def _loop(text: str) -> str:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from ce_gym.compile.cache import announce, cache_folder, checksum, source_fingerprint, write_atomically
+from ce_gym.compile.cache import announced, cache_folder, read_entry, write_entry
 from ce_gym.compile.cuda.kernel import CudaKernel, Launcher
 from ce_gym.compile.cuda.nvrtc import Usage, compile_cubin, compiler_version
 from ce_gym.compile.cuda.source import Source, emit_source
-from ce_gym.compile.layout import layout_from_json, layout_to_json
+from ce_gym.compile.layout import layout_from
 from ce_gym.compile.program import Program
+from ce_gym.compile.sources import source_fingerprint
 
 Stages = Callable[[], Sequence[Program]]
-_loaded: dict[tuple[Path, str, int], CudaKernel] = {}
+_loaded: dict[tuple[Path | None, str, int], CudaKernel] = {}
 _lock = threading.RLock()
 
 
@@ -52,40 +52,33 @@ def kernel_name(key: str, dtype: str, arch: str) -> str:
     return "cuda_" + hashlib.sha256(facts.encode()).hexdigest()[:24]
 
 
-def cached_cubin(folder: Path, name: str, build: Stages, dtype: str, arch: str) -> tuple[bytes, Source, Usage]:
-    """Read `<name>.cubin`, `<name>.cu` and `<name>.json`, written last; make them if one is missing or damaged.
+def cached_cubin(folder: Path | None, name: str, build: Stages, dtype: str, arch: str) -> tuple[bytes, Source, Usage]:
+    """Read a kernel from the cache; make it if it is missing or damaged.
 
     Returns:
         Machine code, the source, and what the kernel takes.
     """
-    cubin, text, record = (folder / f"{name}.{suffix}" for suffix in ("cubin", "cu", "json"))
-    try:
-        known = json.loads(record.read_text(encoding="utf-8"))
-        if known["files"] == [checksum(cubin), checksum(text)]:
-            source = Source(text.read_text(encoding="utf-8"), layout_from_json(known["layout"]))
-            return cubin.read_bytes(), source, Usage(**known["usage"])
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
+    entry = read_entry(folder, name)
+    if entry is None:
+        entry = _compile(build, dtype, arch, folder)
+        write_entry(folder, name, *entry)
+    record, code = entry
+    return code, Source(record["text"], layout_from(record["layout"])), Usage(**record["usage"])
+
+
+def _compile(build: Stages, dtype: str, arch: str, folder: Path | None) -> tuple[dict, bytes]:
+    """The source and what the kernel takes as plain data, and machine code."""
     started = time.perf_counter()
     source = emit_source(build(), dtype)
-    announce(f"ce_gym: compiling {source.layout.name} ({dtype}, {arch}), once; cached in {folder} ...")
-    code, usage = compile_cubin(source.text, arch)
-    announce(f" {time.perf_counter() - started:.1f} s\n")
-    write_atomically(text, source.text)
-    write_atomically(cubin, code)
-    content = {
-        "layout": layout_to_json(source.layout),
-        "usage": asdict(usage),
-        "files": [checksum(cubin), checksum(text)],
-    }
-    write_atomically(record, json.dumps(content))
-    return code, source, usage
+    with announced(f"{source.layout.name} ({dtype}, {arch})", folder, started):
+        code, usage = compile_cubin(source.text, arch)
+    return {"text": source.text, "layout": asdict(source.layout), "usage": asdict(usage)}, code
 
 
-def host_kernel(build: Stages, dtype: str, folder: Path | None = None) -> CudaKernel:
+def host_kernel(build: Stages, dtype: str) -> CudaKernel:
     """The same kernel run by the processor, for tests and comparisons without a GPU; see `ce_gym.compile.cuda.host`."""
     from ce_gym.compile.cuda.host import HostLauncher
 
     source = emit_source(build(), dtype)
-    launch: Launcher = HostLauncher(source, folder)
+    launch: Launcher = HostLauncher(source)
     return CudaKernel(source, launch, "cpu")

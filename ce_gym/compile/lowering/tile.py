@@ -1,6 +1,6 @@
 """Everything that is done to one tile, as LLVM code: skip test, rows to lanes, random numbers, steps, lanes to rows.
 
-Knows a `Program` and llvmlite's builder; knows neither numba nor files.
+Knows a `Program` and llvmlite's builder; knows neither LLVM's compiler nor files.
 """
 
 from __future__ import annotations

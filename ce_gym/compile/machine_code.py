@@ -1,0 +1,89 @@
+"""LLVM code to object code for this CPU, and object code to a function.
+
+Knows LLVM's compiler and linker; no files and no programs.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable
+from functools import cache
+
+from llvmlite import binding, ir
+
+from ce_gym.compile.kernel import MachineCode
+from ce_gym.compile.lowering.vector import Builder, Value, loop
+
+Emit = Callable[[Builder, tuple[Value, ...]], None]
+"""Emits the work on one tile: takes the builder and, for `MachineCode`'s arguments, those three addresses, the number
+of the tile and that of environments."""
+
+ENTRY = "run"
+OPTIMISATION = 3
+
+
+@cache
+def host_cpu() -> tuple[str, str]:
+    """Name and features of this machine's CPU, as LLVM has them; kernels are compiled for it."""
+    return binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
+
+
+def compile_object(emit: Emit) -> bytes:
+    """Compile the loop over tiles.
+
+    Args:
+        emit: emits its body.
+
+    Returns:
+        An object file that defines the one function `run`.
+    """
+    machine = _target_machine()
+    module = binding.parse_assembly(str(_loop_over_tiles(emit)))
+    module.verify()
+    tuning = binding.create_pipeline_tuning_options(speed_level=OPTIMISATION)
+    tuning.loop_vectorization = tuning.slp_vectorization = False  # the code is made of vectors already
+    passes = binding.create_pass_builder(machine, tuning)
+    passes.getModulePassManager().run(module, passes)
+    return machine.emit_object(module)
+
+
+def load_object(code: bytes) -> MachineCode:
+    """Make what `compile_object` returned callable; calls release the GIL.
+
+    It stays in memory until the process ends: a thread may be running it when everything else is taken down.
+    """
+    jit = binding.create_lljit_compiler(_target_machine(), use_jit_link=True)
+    builder = binding.JITLibraryBuilder().add_object_img(code).add_current_process().export_symbol(ENTRY)
+    library = builder.link(jit, "kernel")
+    run = ctypes.CFUNCTYPE(None, *[ctypes.c_int64] * 6)(library[ENTRY])
+    library.detach()
+    jit.detach()
+    return run
+
+
+def _loop_over_tiles(emit: Emit) -> ir.Module:
+    module, word = ir.Module("kernel"), ir.IntType(64)
+    module.triple = _triple()
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [word] * 6), ENTRY)
+    table, repeats, scratch, first_tile, end_tile, num_envs = function.args
+    builder: Builder = ir.IRBuilder(function.append_basic_block("entry"))
+    with loop(builder, builder.sub(end_tile, first_tile), "tile") as index:
+        emit(builder, (table, repeats, scratch, builder.add(first_tile, index), num_envs))
+    builder.ret_void()
+    return module
+
+
+def _triple() -> str:
+    """The machine's triple; with ELF objects on Windows too, which LLVM links in memory like those of Linux."""
+    return binding.get_process_triple() + ("-elf" if os.name == "nt" else "")
+
+
+def _target_machine() -> binding.TargetMachine:
+    """What compiles for this CPU. Code and constants lie close together: the linker puts them into one block."""
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    cpu, features = host_cpu()
+    return binding.Target.from_triple(_triple()).create_target_machine(
+        cpu, features, OPTIMISATION, reloc="pic", codemodel="small", jit=True
+    )
