@@ -1,4 +1,4 @@
-"""Tiles in memory: how many lanes a tile has, and zeros that start on a cache line. Knows numpy only."""
+"""Tiles in memory: how many lanes a tile has, and zeros that start on a cache line."""
 
 import numpy as np
 from numpy.typing import DTypeLike

@@ -1,4 +1,4 @@
-"""Who passes what to the machine code: the order of addresses and repeats, and where scratch values lie.
+"""The calling convention of a kernel: the order of addresses and repeat counts, and offsets of scratch values.
 
 Plain data that is stored beside the machine code, so that a cached kernel needs neither CasADi nor the program.
 """

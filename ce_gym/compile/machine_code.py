@@ -1,7 +1,4 @@
-"""LLVM code to object code for this CPU, and object code to a function.
-
-Knows LLVM's compiler and linker; no files and no programs.
-"""
+"""LLVM code to object code for this CPU, and object code to a function."""
 
 from __future__ import annotations
 

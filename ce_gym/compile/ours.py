@@ -1,4 +1,4 @@
-"""Folders and files that nobody but this user, or the administrator, can have written. Knows the file system only.
+"""Folders and files that nobody but this user, or the administrator, can have written.
 
 Code is run from them. On Windows, where permissions are not mode bits, nothing is checked: the user's profile, in which
 the default folder lies, is the user's own.

@@ -1,7 +1,6 @@
 """What a kernel is made of: buffers, and steps that read and write them: calls of SX functions and table look-ups.
 
 Data and its checks only.
-Knows casadi's Function by its interface and nothing of LLVM, files or physics.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class Call:
         function: the SX function. Each input and output fills one whole buffer, column by column.
         inputs: buffer of each function input.
         outputs: buffer of each function output; it may be an input's too, since all loads come before any store.
-        only_if: a buffer of size 1; the call is left out where it is zero in all lanes of a tile. To keep lanes
+        only_if: a buffer of size 1; the call is skipped where it is zero in all lanes of a tile. To keep lanes
             independent of their neighbours it must change nothing in a lane where the buffer is zero.
     """
 
@@ -92,7 +91,7 @@ Step: TypeAlias = Call | Lookup
 
 @dataclass(frozen=True)
 class Repeat:
-    """Steps made in order, several times over.
+    """Steps run in order, repeatedly.
 
     Attributes:
         times: name of a run-time integer.
@@ -105,13 +104,13 @@ class Repeat:
 
 @dataclass(frozen=True)
 class Program:
-    """Steps made in order on every tile.
+    """Steps run in order on every tile.
 
     Attributes:
         name: for people, `mini_cheetah exact environment`.
         buffers: all buffers the steps mention.
         steps: calls, look-ups and repeated ones, in the order of execution.
-        skip_unless: a `tiles` buffer of size 1; a tile whose lanes are all zero there is left alone entirely.
+        skip_unless: a `tiles` buffer of size 1; a tile whose lanes are all zero there is skipped.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """How far a block slides, as a share of what rigid bodies with Coulomb's friction do: a reference in closed form.
 
 Under a constant push of `s` times the cone a block at rest covers (s - 1) mu g t^2 / 2. Compliance and regularised
-friction leave a little of their own, which the shortest step shows; the rest is the method's. Knows scenes and codes.
+friction leave a little of their own, which the shortest step shows; the rest is the method's.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Our side of the accuracy benchmark: the simulator's own kernel, with the length of the step as an input.
 
 One kernel then serves every point of a curve; the code is the one that `Simulator` runs, but for constants that depend
-on the step and can no longer be folded. Knows models and the public parts of sim.
+on the step and can no longer be folded.
 """
 
 from __future__ import annotations

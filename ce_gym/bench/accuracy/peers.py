@@ -1,8 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """MuJoCo's side of the accuracy benchmark: the same scene through the project's MJCF export and `mujoco.rollout`.
 
-Knows MuJoCo's Python API and how positions correspond. (MuJoCo's compiled modules carry no types, hence the line
-above.)
+(MuJoCo's compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The picture of the accuracy benchmark: one panel for each scene, error against time. Needs matplotlib.
 
-Lines are ours in blue and green, MuJoCo's in orange, red and grey; the palette is that of Okabe and Ito. Knows curves,
-not how they are measured.
+Lines are ours in blue and green, MuJoCo's in orange, red and grey; the palette is that of Okabe and Ito.
 """
 
 from __future__ import annotations

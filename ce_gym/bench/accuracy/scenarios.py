@@ -1,7 +1,7 @@
 """The scenes of the accuracy benchmark: which robot, from where, driven how and for how long.
 
 Everything is held for `HOLD` at a time, joint targets, torques and pushes alike, so that every code integrates the same
-motion whatever its step, and every step length divides `HOLD`. Knows robot descriptions; nothing that steps them.
+motion whatever its step, and every step length divides `HOLD`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""How far a device is from the processor's kernels after one step from random states: every robot, level and type.
-
-Knows simulators and devices; nothing of GPUs.
-"""
+"""How far a device is from the CPU's kernels after one step from random states: every robot, level and type."""
 
 from __future__ import annotations
 
@@ -54,7 +51,7 @@ def measure(
         names: Of robots.
         levels: Transmission levels.
         num_envs: Robots in a batch.
-        device: What is compared with the processor.
+        device: What is compared with the CPU.
         where: Its name, for the title.
         report: Gets the table and the requirements.
 
@@ -71,8 +68,8 @@ def measure(
                 rows.append((name, level, dtype, float(apart.max()), 100 * float((apart == 0).mean())))
                 worst[dtype] = max(worst[dtype], float(apart.max()))
     columns = ("robot", "level", "dtype", "largest difference", "robots with the same numbers [%]")
-    title = f"One step from {num_envs} random states: difference from the processor's kernel, {where}"
+    title = f"One step from {num_envs} random states: difference from the CPU's kernel, {where}"
     report.tables.append(Table(title, columns, tuple(rows)))
     for dtype, bound in BOUND.items():
-        claim = f"{dtype}: every robot within {bound:g} of the processor's kernel"
+        claim = f"{dtype}: every robot within {bound:g} of the CPU's kernel"
         report.requirements.append(Requirement(claim, f"largest {worst[dtype]:.1e}", worst[dtype] <= bound))

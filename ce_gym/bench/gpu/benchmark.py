@@ -1,6 +1,6 @@
-"""GPU: agreement with the processor, registers, sub-steps and environment steps per second, MuJoCo Warp, learning.
+"""GPU: agreement with the CPU, registers, sub-steps and environment steps per second, MuJoCo Warp, learning.
 
-Without a GPU it prints what can be known without one: agreement, of the emitted source run by the processor, and what
+Without a GPU it prints what can be known without one: agreement, of the emitted source run by the CPU, and what
 the kernels take, by the run-time compiler; the rest it names as not measured, with the reason.
 """
 
@@ -48,11 +48,11 @@ def run(arguments: argparse.Namespace) -> Report:
     report, missing = Report("gpu"), list[tuple[str, str, str]]()
     device, reason = _device()
     report.machine["GPU"] = gpu_speed.name_of(device) if not reason else f"none: {reason}"
-    where = "on the GPU" if not reason else "emitted source run by the processor"
+    where = "on the GPU" if not reason else "emitted source run by the CPU"
     try:
         gpu_agreement.measure(arguments.robots, arguments.levels, arguments.num_envs, device, where, report)
     except RuntimeError as problem:  # neither a GPU nor a C++ compiler
-        missing.append(("agreement with the processor", "1e-11 and 1e-5", str(problem)))
+        missing.append(("agreement with the CPU", "1e-11 and 1e-5", str(problem)))
     try:
         report.tables.append(_resources(arguments.robot))
     except CudaUnavailable as problem:

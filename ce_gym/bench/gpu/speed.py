@@ -1,7 +1,4 @@
-"""Rates on a GPU: sub-steps, environment steps, learning. Every function here needs a GPU.
-
-Knows torch, simulators, vector environments and, as a command, the training script.
-"""
+"""Rates on a GPU: sub-steps, environment steps, learning. Every function here needs a GPU."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device
 
 SUBSTEPS = 20
-"""Sub-steps of a launch; as in the processor's benchmark, targets jump between launches."""
+"""Sub-steps of a launch; as in the CPU's benchmark, targets jump between launches."""
 CALLS = 10
 DT = 0.005
 Rates = dict[str, dict[int, float]]

@@ -1,7 +1,7 @@
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 """MuJoCo Warp as a peer on the GPU: the same robot, feet and step. Needs the package `mujoco-warp`, and a GPU.
 
-Knows MuJoCo's models and Warp's graphs. (MuJoCo's compiled modules carry no types, hence the line above.)
+(MuJoCo's compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations

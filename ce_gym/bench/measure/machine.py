@@ -1,4 +1,4 @@
-"""The machine a figure was measured on. Knows the operating system and installed packages only."""
+"""The machine a figure was measured on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def describe() -> dict[str, str]:
 
 
 def processor() -> str:
-    """Return the model name of the processor, or its architecture where the system does not tell."""
+    """Return the model name of the CPU, or its architecture where the system does not tell."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():

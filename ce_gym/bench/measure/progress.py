@@ -1,4 +1,4 @@
-"""How far a benchmark is, on a terminal; nothing where nobody looks. Knows no benchmark."""
+"""How far a benchmark is, on a terminal; nothing where nobody looks."""
 
 from __future__ import annotations
 

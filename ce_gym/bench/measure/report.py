@@ -1,4 +1,4 @@
-"""What a benchmark returns: aligned plain-text tables, the machine and what was required. Knows nothing of robots."""
+"""What a benchmark returns: aligned plain-text tables, the machine and what was required."""
 
 from __future__ import annotations
 

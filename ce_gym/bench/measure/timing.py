@@ -1,7 +1,4 @@
-"""Honest timing: competitors take turns in one run, so that a change of the machine's pace meets them all.
-
-Knows callables only.
-"""
+"""Honest timing: competitors take turns in one run, so that a change of the machine's pace meets them all."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Our instruction counts on the paper's systems, beside those on file, and what follows: slopes, crossovers.
-
-Knows models, the generators of chains and the reference counts; no pictures.
-"""
+"""Our instruction counts on the paper's systems, beside those on file, and what follows: slopes, crossovers."""
 
 from __future__ import annotations
 

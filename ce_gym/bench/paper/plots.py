@@ -1,7 +1,7 @@
 """Pictures of the paper's figures: depth, locality, cost of approximation, tracking torque. Needs matplotlib.
 
 One colour means one algorithm throughout; the palette is that of Okabe and Ito, which colour-blind readers can tell
-apart. Knows counts, not how they are taken.
+apart.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Instruction counts of other people's algorithms on the paper's systems, read from `data/`; sources are cited there.
-
-Knows those files only.
-"""
+"""Instruction counts of other people's algorithms on the paper's systems, read from `data/`, which cites sources."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 # pyright: reportAttributeAccessIssue=false
 """MuJoCo as a peer: the same robot, in the same coordinates, and its batched rollout.
 
-Knows MuJoCo's Python API and the MJCF export. MuJoCo's velocities are [base linear in the world, base angular in the
-base, joints depth first]; ours are [base angular, base linear, independent joints], base velocities in the base frame.
-(MuJoCo's compiled modules carry no types, hence the line above.)
+MuJoCo's velocities are [base linear in the world, base angular in the base, joints depth first]; ours are [base
+angular, base linear, independent joints], base velocities in the base frame. (MuJoCo's compiled modules carry no types,
+hence the line above.)
 """
 
 from __future__ import annotations

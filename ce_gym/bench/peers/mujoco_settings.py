@@ -1,7 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """MuJoCo at its best: the fastest settings with which a robot still stands as it does at 1 ms with a converged solver.
 
-Knows MuJoCo's options and the standing scene. (MuJoCo's compiled modules carry no types, hence the line above.)
+(MuJoCo's compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations

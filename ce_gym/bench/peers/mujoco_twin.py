@@ -1,7 +1,7 @@
 """Robots stepped by MuJoCo in our coordinates, so that a policy trained here can act there as it is.
 
 The robots' MJCF has the same gains, torque limits, masses and friction. MuJoCo carries out the position control
-implicitly in the joint velocities (`implicitfast`); contacts are its own. Knows the MuJoCo peer of this room.
+implicitly in the joint velocities (`implicitfast`); contacts are its own.
 """
 
 from __future__ import annotations

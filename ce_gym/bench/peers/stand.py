@@ -1,7 +1,4 @@
-"""The scene of the speed benchmark: robots hold their standing pose while their targets jitter, contacts active.
-
-Knows the Simulator and MuJoCo's batch, and judges both by the same figures.
-"""
+"""The scene of the speed benchmark: robots hold their standing pose while their targets jitter, contacts active."""
 
 from __future__ import annotations
 

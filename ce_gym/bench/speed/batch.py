@@ -1,7 +1,4 @@
-"""Time of a sub-step against the number of robots in a batch, as a table and as a picture.
-
-Knows competitors, tables and, only when it draws, matplotlib.
-"""
+"""Time of a sub-step against the number of robots in a batch, as a table and as a picture."""
 
 from __future__ import annotations
 

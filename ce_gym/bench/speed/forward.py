@@ -1,7 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """Forward dynamics alone as something to time: our kernel on random states, and MuJoCo's `mj_forward`.
 
-Knows the compiler's public names, models and MuJoCo (whose compiled modules carry no types, hence the line above).
+(MuJoCo's compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations

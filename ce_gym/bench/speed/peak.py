@@ -1,7 +1,6 @@
 """The most floating-point operations per second that a core does: independent chains of fused multiply-adds.
 
-Compiled on the same way as everything else, so that vectors, flags and threads are those of the step. Knows the
-compiler's public names.
+Compiled on the same way as everything else, so that vectors, flags and threads are those of the step.
 """
 
 from __future__ import annotations

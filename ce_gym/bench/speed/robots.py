@@ -1,6 +1,6 @@
 """Forward dynamics and sub-step of every robot and level, one core and all, beside MuJoCo and Pinocchio.
 
-Whoever is compared is timed in turn, robot by robot. Knows competitors and tables.
+Whoever is compared is timed in turn, robot by robot.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """Sub-steps as something to time: our Simulator's and MuJoCo's rollout of the same robot from the same pose.
 
-Targets jitter around the standing pose on both sides. Knows the Simulator and the peer's settings. (MuJoCo's compiled
-modules carry no types, hence the line above.)
+Targets jitter around the standing pose on both sides. (MuJoCo's compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 MuJoCo: engine tests of free bodies, of a spinning body in contact, and of resting penetration. SimBenchmark: rolling,
 momentum and energy of a free robot, a humanoid on stiff position control. Drake: a block on an incline, a mass on a
-spring. Where they give a step, ours is five times as long. Knows the Simulator.
+spring. Where they give a step, ours is five times as long.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The stability map: every time step with every ground stiffness and slip speed, standing and collapsing.
 
 Robots of one kernel differ in stiffness, damping and slip speed, which are declared parameters, so that one kernel
-serves a whole time step. Knows the Simulator.
+serves a whole time step.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The stability map as a picture. Knows matplotlib and maps, no robots."""
+"""The stability map as a picture."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Endurance of whole robots: ten minutes of standing, a base that spins, random torques, single precision.
-
-Knows the Simulator.
-"""
+"""Endurance of whole robots: ten minutes of standing, a base that spins, random torques, single precision."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 """The GPU itself: whether there is one, what it is, and launching machine code on it.
 
 Memory and streams are torch's, so that what torch does before and after a launch stays in order; launching is
-`cuda.core`'s. Knows addresses and machine code only. (Compiled modules carry no types, hence the line above.)
+`cuda.core`'s. (Compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations

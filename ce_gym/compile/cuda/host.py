@@ -1,8 +1,7 @@
-"""Emitted CUDA C run by the processor: the same text, through a C++ compiler and a few lines that stand in for CUDA's.
+"""Emitted CUDA C run by the CPU: the same text, through a C++ compiler and a few lines that stand in for CUDA's.
 
 For tests and for comparisons where there is no GPU; a user never needs it. It shows that the arithmetic, the copying
 and the order of stages are right, not that a GPU rounds as IEEE 754 says, nor how fast it is.
-Knows the text of sources and how to call a shared library.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def host_compiler() -> list[str] | None:
 
 
 class HostLauncher:
-    """Runs an emitted kernel robot by robot on arrays in the processor's memory.
+    """Runs an emitted kernel robot by robot on arrays in the CPU's memory.
 
     Args:
         source: The kernel; compiled only if the cache has no library of it yet.

@@ -1,7 +1,4 @@
-"""A kernel of the GPU and how it is called: checks of the tensors, their addresses, one launch.
-
-Knows tensors by their interface (shape, dtype, `data_ptr`); what launches, a GPU or the host, is handed to it.
-"""
+"""A kernel of the GPU and how it is called: checks of the tensors, their addresses, one launch."""
 
 from __future__ import annotations
 

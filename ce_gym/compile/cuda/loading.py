@@ -1,4 +1,4 @@
-"""`load_cuda_kernel`: from the cache folder, or emitted, compiled and put there. Knows the order of these steps."""
+"""`load_cuda_kernel`: from the cache folder, or emitted, compiled and put there."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _compile(build: Stages, dtype: str, arch: str, folder: Path | None) -> tuple
 
 
 def host_kernel(build: Stages, dtype: str) -> CudaKernel:
-    """The same kernel run by the processor, for tests and comparisons without a GPU; see `ce_gym.compile.cuda.host`."""
+    """The same kernel run by the CPU, for tests and comparisons without a GPU; see `ce_gym.compile.cuda.host`."""
     from ce_gym.compile.cuda.host import HostLauncher
 
     source = emit_source(build(), dtype)

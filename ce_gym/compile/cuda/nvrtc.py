@@ -2,7 +2,7 @@
 """From CUDA C to machine code by NVIDIA's run-time compiler, and what the compiler tells of it.
 
 Uses the packages `cuda-core` and `nvidia-cuda-nvrtc` (extra `gpu`); needs neither a GPU, a driver nor a C compiler.
-Knows sources as text only. (Compiled modules carry no types, hence the line above.)
+(Compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What every emitted source begins with: types, the copying of a robot's values, random numbers, the look-up.
 
-C text only. `random` and `lookup` hold the same two formulas for the processor; tests hold them equal.
+C text only. `random` and `lookup` hold the same two formulas for the CPU; tests hold them equal.
 """
 
 from ce_gym.compile.lowering.random import FIRST_FACTOR, GOLDEN, RANDOM_BITS, SECOND_FACTOR

@@ -1,10 +1,9 @@
 """A kernel as CUDA C: one thread is one robot, whose values are local arrays from its first load to its last store.
 
 A kernel is a list of programs, its stages, made in order on every robot, so that a whole environment step, reset
-included, is one launch. `Program` says what a stage does; the same programs are compiled for the processor by `tile`.
-Knows programs, and C as text; nothing of compilers and GPUs.
+included, is one launch. `Program` says what a stage does; the same programs are compiled for the CPU by `tile`.
 
-Where this differs from the processor's tiles, results do not: a call that a tile leaves out only if none of its lanes
+Where this differs from the CPU's tiles, results do not: a call that a tile leaves out only if none of its lanes
 needs it (`only_if`), a thread leaves out by itself, and such a call changes nothing in a lane that does not need it.
 """
 

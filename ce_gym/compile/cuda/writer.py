@@ -2,9 +2,7 @@
 
 `lowering` and `math` emit through either builder, so the order of operations, the polynomials and their coefficients
 stand once. Every operation is rounded by itself: the text must be compiled without contraction of sums and products
-(`nvrtc` does), and then gives the processor's numbers, bit for bit.
-
-Knows CUDA C's names; nothing of CasADi, kernels or GPUs.
+(`nvrtc` does), and then gives the CPU's numbers, bit for bit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Floating-point operations of a function, as they are emitted. Knows lowering and llvmlite's instructions."""
+"""Floating-point operations of a function, as they are emitted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ce_gym.compile.lowering.function import lower_function
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 OPERATIONS = {"fadd": 1, "fsub": 1, "fmul": 1, "fdiv": 1, "llvm.fma": 2, "llvm.sqrt": 1}
-"""What counts, and how often; comparisons, minima and changes of sign do not."""
+"""What counts, and how often; comparisons, minima and sign changes do not."""
 
 
 def floating_point_operations(function: casadi.Function, dtype: str = "float64") -> int:

@@ -1,8 +1,7 @@
 """One CasADi SX function as straight-line vector code.
 
-Knows CasADi's instruction list and the vector builder. Every operation of the function's `graph` becomes one value, in
-the order that `ordering` chooses. Loads are emitted at first use and stores at the very end, so outputs may share their
-memory with inputs.
+Every operation of the function's `graph` becomes one value, in the order that `ordering` chooses. Loads are emitted at
+first use and stores at the very end, so outputs may share their memory with inputs.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from collections.abc import Callable, Sequence
 import casadi
 
 from ce_gym.compile.lowering import math as vector_math
-from ce_gym.compile.lowering.graph import CHOICE, MINUS_PRODUCT, PRODUCT_MINUS, PRODUCT_PLUS, graph_of
+from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, SELECT, graph_of
 from ce_gym.compile.lowering.ordering import ordered
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
@@ -70,7 +69,7 @@ def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:
 
 
 class _Lowering:
-    """Emits operations and remembers what else is known about their results."""
+    """Emits operations; caches masks, constants and sine-cosine pairs of values already emitted."""
 
     def __init__(self, v: VectorBuilder, name: str):
         self.v = v
@@ -80,7 +79,7 @@ class _Lowering:
         self.sines: dict[Value, tuple[Value, Value]] = {}
 
     def constant(self, number: float) -> Value:
-        """A constant; the number is remembered for those who need it."""
+        """A constant; its number is kept for `power`."""
         value = self.v.const(number)
         self.numbers[value] = number
         return value
@@ -95,13 +94,13 @@ class _Lowering:
         return OPERATIONS[op](self, *operands)
 
     def sin_cos(self, x: Value) -> tuple[Value, Value]:
-        """Both at once: the argument is reduced once however many sines and cosines are taken of it."""
+        """Both at once: the argument is reduced once for all its sines and cosines."""
         if x not in self.sines:
             self.sines[x] = vector_math.sin_cos(self.v, x)
         return self.sines[x]
 
     def truth(self, mask: Value) -> Value:
-        """A mask as CasADi has it, 1.0 or 0.0; the mask itself is remembered for those who need just that."""
+        """A mask as CasADi has it, 1.0 or 0.0; the mask itself is kept for `mask`."""
         value = self.v.select(mask, self.v.const(1.0), self.v.const(0.0))
         self.masks[value] = mask
         return value
@@ -148,7 +147,7 @@ def _intrinsic(name: str) -> Operation:
 
 
 def _elementary(name: str) -> Operation:
-    """An operation from our own mathematics."""
+    """An operation from `lowering.math`."""
     return lambda s, *operands: getattr(vector_math, name)(s.v, *operands)
 
 
@@ -157,10 +156,10 @@ def _comparison(sign: str) -> Operation:
 
 
 OPERATIONS: dict[int, Operation] = {
-    CHOICE: lambda s, c, a, b: s.v.select(s.mask(c), a, b),
-    PRODUCT_PLUS: _builder("fma"),
-    PRODUCT_MINUS: lambda s, a, b, c: s.v.fma(a, b, s.v.neg(c)),
-    MINUS_PRODUCT: lambda s, a, b, c: s.v.fma(s.v.neg(a), b, c),
+    SELECT: lambda s, c, a, b: s.v.select(s.mask(c), a, b),
+    FMA: _builder("fma"),
+    FMS: lambda s, a, b, c: s.v.fma(a, b, s.v.neg(c)),
+    FNMA: lambda s, a, b, c: s.v.fma(s.v.neg(a), b, c),
     casadi.OP_ASSIGN: lambda s, x: x,
     casadi.OP_ADD: _builder("add"),
     casadi.OP_SUB: _builder("sub"),

@@ -1,9 +1,8 @@
-"""A traced function as a graph of operations, each of which is rounded once: no compiler is left a choice.
+"""A traced function as a graph of IEEE 754 operations: what is fused is decided here, not by a compiler.
 
-Compilers fuse products with sums and turn quotients into products where they are allowed to. Which ones is their own
-affair, and so are the last digits of the result. Here it is done once for all targets, and none is allowed to do more:
-what is left are operations of IEEE 754: processors and GPUs that keep to it give the same numbers, bit for bit.
-The rewritings leave seven tenths of the operations of a step. Knows CasADi's instruction list.
+Compilers that may fuse multiply-adds and replace divisions by reciprocals choose differently for each target, and the
+last bits differ with them. Both rewritings are done here once for all targets and forbidden to every compiler, so CPUs
+and GPUs that follow IEEE 754 give the same bits. About 70 % of a step's CasADi instructions are left.
 """
 
 from __future__ import annotations
@@ -13,12 +12,12 @@ from dataclasses import dataclass
 
 import casadi
 
-ABSORBED, CHOICE, PRODUCT_PLUS, PRODUCT_MINUS, MINUS_PRODUCT = -1, -2, -3, -4, -5
-"""What CasADi does not have: nothing to do any more; of operands (a, b, c) `b if a else c`, `a b + c`, `a b - c` and
+REMOVED, SELECT, FMA, FMS, FNMA = -1, -2, -3, -4, -5
+"""Operations that CasADi lacks: removed by a rewriting; of (a, b, c): `b if a else c`, `a b + c`, `a b - c`,
 `c - a b`."""
 
-NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, ABSORBED)
-"""What only reads or writes, or nothing at all."""
+NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, REMOVED)
+"""Nothing is computed for these."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +25,9 @@ class Graph:
     """Operations of a function.
 
     Attributes:
-        ops: What is done, by number: first the function's instructions, then what the rewritings have added.
-        operands: Of each, the numbers of those whose results it takes.
-        constants: The numbers that are known, by number of the operation.
+        ops: Operation of each node: the function's instructions first, then nodes added by rewritings.
+        operands: Operand nodes of each node.
+        constants: Values of constant nodes.
     """
 
     ops: list[int]
@@ -36,7 +35,7 @@ class Graph:
     constants: dict[int, float]
 
     def users(self) -> dict[int, list[int]]:
-        """Return, by number, all that take a result; one that takes it twice comes twice."""
+        """Return the users of each node; a user of it twice is listed twice."""
         users = defaultdict(list)
         for k, of in enumerate(self.operands):
             for a in of:
@@ -44,28 +43,28 @@ class Graph:
         return users
 
     def add(self, op: int, *operands: int) -> int:
-        """Add an operation and return its number."""
+        """Add a node and return its number."""
         self.ops.append(op)
         self.operands.append(operands)
         return len(self.ops) - 1
 
     def replace(self, k: int, op: int, *operands: int) -> None:
-        """Get the result of an operation in another way."""
+        """Replace the operation and the operands of a node."""
         self.ops[k], self.operands[k] = op, operands
 
 
 def graph_of(function: casadi.Function) -> Graph:
     """Return the graph of an SX function, rewritten."""
     graph = _instructions(function)
-    _join_choices(graph)
-    _choose_sums(graph)
-    _avoid_quotients(graph)
-    _fuse_products(graph)
+    _form_selects(graph)
+    _select_between_sums(graph)
+    _use_reciprocals(graph)
+    _fuse_multiply_adds(graph)
     return graph
 
 
 def _instructions(function: casadi.Function) -> Graph:
-    """The instructions as they are; CasADi names registers, which are used again and again."""
+    """The instructions as they are, in SSA form: CasADi's registers are reused."""
     registers = [-1] * function.sz_w()
     graph = Graph([], [], {})
     for k in range(function.n_instructions()):
@@ -80,8 +79,8 @@ def _instructions(function: casadi.Function) -> Graph:
     return graph
 
 
-def _join_choices(graph: Graph) -> None:
-    """Make sums of what is zero unless a condition holds, and what is zero if it does, choices: CasADi's `if_else`."""
+def _form_selects(graph: Graph) -> None:
+    """Rewrite `if_else_zero(c, x) + if_else_zero(not c, y)`, which is CasADi's `if_else`, as `select(c, x, y)`."""
     ops, operands, users = graph.ops, graph.operands, graph.users()
     for k, op in enumerate(ops):
         if op != casadi.OP_ADD or any(ops[a] != casadi.OP_IF_ELSE_ZERO for a in operands[k]):
@@ -89,32 +88,29 @@ def _join_choices(graph: Graph) -> None:
         for yes, no in (operands[k], operands[k][::-1]):
             (condition, left), (otherwise, right) = operands[yes], operands[no]
             if ops[otherwise] == casadi.OP_NOT and operands[otherwise] == (condition,):
-                graph.replace(k, CHOICE, condition, left, right)
+                graph.replace(k, SELECT, condition, left, right)
                 for part in (yes, no):
                     if users[part] == [k]:
-                        graph.replace(part, ABSORBED)
+                        graph.replace(part, REMOVED)
                 break
 
 
-def _choose_sums(graph: Graph) -> None:
-    """Make the sum with what is zero unless a condition holds the choice of the sum or its other part.
-
-    A processor with masks does that in one instruction; elsewhere there are as many as before.
-    """
+def _select_between_sums(graph: Graph) -> None:
+    """Rewrite `b + if_else_zero(c, x)` as `select(c, b + x, b)`: one instruction on CPUs with masked operations."""
     ops, operands, users = graph.ops, graph.operands, graph.users()
     for k, op in enumerate(ops[:]):
-        if op != casadi.OP_IF_ELSE_ZERO or not _is_for_a_sum(graph, users[k]):
+        if op != casadi.OP_IF_ELSE_ZERO or not _has_one_user_a_sum(graph, users[k]):
             continue
         user, (condition, part) = users[k][0], operands[k]
         left, right = operands[user]
         if ops[user] == casadi.OP_ADD or right == k:
             other = left if right == k else right
-            graph.replace(user, CHOICE, condition, graph.add(ops[user], other, part), other)
-            graph.replace(k, ABSORBED)
+            graph.replace(user, SELECT, condition, graph.add(ops[user], other, part), other)
+            graph.replace(k, REMOVED)
 
 
-def _avoid_quotients(graph: Graph) -> None:
-    """Make quotients by constants, and several of one divisor, products with its reciprocal."""
+def _use_reciprocals(graph: Graph) -> None:
+    """Replace divisions by a constant, and several divisions by one value, by products with the reciprocal."""
     ops, operands, constants = graph.ops, graph.operands, graph.constants
     quotients: dict[int, list[int]] = defaultdict(list)
     for k, op in enumerate(ops):
@@ -134,23 +130,23 @@ def _avoid_quotients(graph: Graph) -> None:
                 graph.replace(k, casadi.OP_MUL, operands[k][0], reciprocal)
 
 
-def _fuse_products(graph: Graph) -> None:
-    """Let sums take up the products that nobody else takes, one each: of two, the one that comes last."""
+def _fuse_multiply_adds(graph: Graph) -> None:
+    """Fuse sums with products that have no other user; of two such products, the later one."""
     ops, operands, users = graph.ops, graph.operands, graph.users()
     for k in reversed(range(len(ops))):
-        if ops[k] not in (casadi.OP_MUL, casadi.OP_SQ) or not _is_for_a_sum(graph, users[k]):
+        if ops[k] not in (casadi.OP_MUL, casadi.OP_SQ) or not _has_one_user_a_sum(graph, users[k]):
             continue
         user, a, b = users[k][0], operands[k][0], operands[k][-1]
         left, right = operands[user]
         if ops[user] == casadi.OP_ADD:
-            graph.replace(user, PRODUCT_PLUS, a, b, right if left == k else left)
+            graph.replace(user, FMA, a, b, right if left == k else left)
         elif left == k:
-            graph.replace(user, PRODUCT_MINUS, a, b, right)
+            graph.replace(user, FMS, a, b, right)
         else:
-            graph.replace(user, MINUS_PRODUCT, a, b, left)
-        graph.replace(k, ABSORBED)
+            graph.replace(user, FNMA, a, b, left)
+        graph.replace(k, REMOVED)
 
 
-def _is_for_a_sum(graph: Graph, users: list[int]) -> bool:
-    """Whether a result has one user, which is a sum or a difference."""
+def _has_one_user_a_sum(graph: Graph, users: list[int]) -> bool:
+    """Whether the only user of a node is a sum or a difference."""
     return len(users) == 1 and graph.ops[users[0]] in (casadi.OP_ADD, casadi.OP_SUB)

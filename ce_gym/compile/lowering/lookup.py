@@ -1,14 +1,12 @@
 """A smooth surface over a table of numbers, looked up at a point in each lane, with its slopes.
 
 The surface is the biquadratic B-spline whose control values are the entries: a point within half a cell of entry (i, j)
-takes part of the nine entries around, along either axis with the weights
+is a weighted mean of the nine entries around it, along either axis with the weights
 
     (1/2 - t)^2 / 2,    3/4 - t^2,    (1/2 + t)^2 / 2,        -1/2 <= t <= 1/2 cells from the entry.
 
 Its slopes are continuous (a bilinear surface has creases), it never leaves the range of the entries around, and it is
-the plane itself where they lie on one. Beyond the outermost entries it goes on straight.
-
-Knows vectors and LLVM; nothing of what the numbers mean.
+the plane itself where they lie on one. Beyond the outermost entries it is extrapolated linearly.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ class Table:
 def emit_lookup(v: VectorBuilder, table: Table, frame: Value, points: Value, output: Value, n_points: int) -> None:
     """Emit the look-up at every point of the lanes, as a loop.
 
-    Whatever the coordinates are, not a number included, only entries of the table are read.
+    Whatever the coordinates are, NaN included, only entries of the table are read.
 
     Args:
         v: builder of the block to append to.
@@ -98,7 +96,7 @@ def _along(v: VectorBuilder, u: Value, count: Value) -> _Along:
 def _entries(v: VectorBuilder, table: Table, row: Value, column: Value) -> list[list[Value]]:
     """Load three by three entries of each lane, from (row, column) on.
 
-    Lane by lane, which on many processors is faster than their instructions for the purpose.
+    Lane by lane, which on many CPUs is faster than their gather instructions.
     """
     b, n_bytes = v.builder, v.bits // 8
     index = b.add(b.mul(row, v.splat(b.trunc(table.columns, INDEX))), column)

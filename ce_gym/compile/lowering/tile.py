@@ -1,7 +1,4 @@
-"""Everything that is done to one tile, as LLVM code: skip test, rows to lanes, random numbers, steps, lanes to rows.
-
-Knows a `Program` and llvmlite's builder; knows neither LLVM's compiler nor files.
-"""
+"""Everything that is done to one tile, as LLVM code: skip test, rows to lanes, random numbers, steps, lanes to rows."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """A thin layer over llvmlite's builder: one value is one vector, one lane of it per environment.
 
-Knows llvmlite's IR classes. llvmlite cannot declare vector intrinsics, so they are declared here by
-their mangled names.
+llvmlite cannot declare vector intrinsics, so they are declared here by their mangled names.
 """
 
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ Builder: TypeAlias = Any
 class VectorBuilder:
     """Emits instructions on vectors of `lanes` floats of one dtype at the end of one LLVM block.
 
-    No instruction has fast-math flags: LLVM may not fuse, reorder or replace any; what is emitted is what is rounded.
+    No instruction has fast-math flags: LLVM may not fuse, reorder or replace any; each operation is rounded by itself.
 
     Attributes:
         builder: the llvmlite builder.
