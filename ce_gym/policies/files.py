@@ -6,24 +6,22 @@
 | `policy.npz`  | weights of the actor and the record, nothing else; a tenth of the zip: policies are shipped so     |
 | `policy.onnx` | as train/export.py writes it, the record in its metadata; needs onnxruntime                        |
 
-So a stranger's policy can be judged and shown. To train one on is another matter: see `load_learner` in
-train/evaluate.py. Knows formats; where files lie is the business of places.py.
+All but ONNX are read within a limit on memory. Knows formats; where files lie is the business of places.py.
 """
 
 from __future__ import annotations
 
 import json
-import pickle
 import warnings
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
+from ce_gym.policies.archive import read_json, read_npz
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.places import locate_policy
 from ce_gym.policies.weights import read_weights
@@ -31,14 +29,13 @@ from ce_gym.policies.weights import read_weights
 RECORD_KEY = "ce_gym_policy"
 """Key under which an ONNX file holds the record of its policy."""
 
-REQUIRED = ("env", "env_kwargs", "transmission", "observation_size", "action_size", "activation", "contract")
+REQUIRED: dict[str, type] = {
+    "env": str, "env_kwargs": dict, "transmission": str, "observation_size": int, "action_size": int,
+    "activation": str, "contract": dict,
+}  # fmt: skip
 """What a record must say."""
 
-DAMAGE = (
-    OSError, LookupError, TypeError, ValueError, AttributeError, NotImplementedError, EOFError,
-    zipfile.BadZipFile, zlib.error, pickle.UnpicklingError,
-)  # fmt: skip
-"""What reading a damaged file may raise."""
+KINDS = {str: "text", dict: "a JSON object", int: "a whole number"}
 
 
 def load_policy(path: str | Path, transmission: str | None = None) -> Policy:
@@ -98,11 +95,10 @@ def write_npz(actor: Actor, record: Mapping[str, Any], out: Path) -> None:
 
 def _read_npz(file: Path) -> tuple[Any, dict[str, Any]]:
     try:
-        with np.load(file, allow_pickle=False) as opened:
-            arrays = {name: opened[name] for name in opened.files}
+        arrays = read_npz(file)
         record = json.loads(str(arrays.pop("record")))
-        layers = tuple((arrays[f"weight_{i}"], arrays[f"bias_{i}"]) for i in range(len(arrays) // 2))
-    except DAMAGE as error:
+        layers = tuple(_layer(arrays[f"weight_{i}"], arrays[f"bias_{i}"]) for i in range(len(arrays) // 2))
+    except Exception as error:  # damage shows in every kind of them
         raise PolicyError(f"{file}: no weights of an actor can be read from it: {_one_line(error)}") from None
     return layers, _checked(record, file)
 
@@ -110,19 +106,30 @@ def _read_npz(file: Path) -> tuple[Any, dict[str, Any]]:
 def _read_zip(file: Path) -> tuple[Any, dict[str, Any]]:
     beside = file.with_suffix(".json")
     try:
-        record = _checked(json.loads(beside.read_text(encoding="utf-8")), beside)
+        record = read_json(beside)
     except FileNotFoundError:
         raise PolicyError(f"{beside}: no such file; expected the policy.json that training writes") from None
-    except (OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise PolicyError(f"{beside}: cannot be read as JSON: {_one_line(error)}") from None
+    record = _checked(record, beside)
     try:
         weights = read_weights(file)
         hidden = [name.removesuffix(".weight") for name in weights if name.startswith("mlp_extractor.policy_net")]
         names = [*(name for name in hidden if f"{name}.bias" in weights), "action_net"]
-        layers = tuple((weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names)
-    except DAMAGE as error:
+        layers = tuple(_layer(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names)
+    except Exception as error:  # damage shows in every kind of them
         raise PolicyError(f"{file}: no weights of an actor can be read from it: {_one_line(error)}") from None
     return layers, record
+
+
+def _layer(weight: NDArray, bias: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the arrays of a linear layer, if they are."""
+    for array, axes in ((weight, 2), (bias, 1)):
+        if array.dtype.kind != "f" or array.ndim != axes:
+            raise ValueError(f"{array.dtype} of shape {array.shape}; expected a layer's numbers along {axes} axes")
+        if not np.isfinite(array).all():
+            raise ValueError("a weight is NaN or infinite; expected finite numbers")
+    return weight, bias
 
 
 def _read_onnx(file: Path) -> Policy:
@@ -133,25 +140,36 @@ def _read_onnx(file: Path) -> Policy:
     try:
         session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
         record = json.loads(session.get_modelmeta().custom_metadata_map.get(RECORD_KEY, "null"))
+        name = session.get_inputs()[0].name
     except Exception as error:  # onnxruntime has a class of its own for each kind of damage
         raise PolicyError(f"{file}: not an ONNX file that can be run: {_one_line(error)}") from None
-    name, record = session.get_inputs()[0].name, _checked(record, file)
+    record = _checked(record, file)
 
     def act(observations: Any) -> np.ndarray:
         rows = np.asarray(observations, np.float32)
         actions = np.asarray(session.run(None, {name: np.atleast_2d(rows)})[0])
         return actions.reshape(*rows.shape[:-1], -1)
 
+    try:
+        found = act(np.zeros((2, record["observation_size"]), np.float32))
+    except Exception as error:
+        raise PolicyError(f"{file}: not an ONNX file that can be run: {_one_line(error)}") from None
+    if found.shape != (2, record["action_size"]) or not np.isfinite(found).all():
+        raise PolicyError(f"{file}: gives {found.shape[-1]} numbers; expected {record['action_size']}, finite ones")
     return Policy(act, record)
 
 
 def _checked(record: Any, file: Path) -> dict[str, Any]:
     """Return a record if it has what is needed to run its policy."""
-    for key in REQUIRED:
+    for key, kind in REQUIRED.items():
         if not isinstance(record, dict) or key not in record:
             raise PolicyError(f"{file}: {key}: missing; expected a record written by this version of train/ppo.py")
+        if type(record[key]) is not kind:  # a bool is an int
+            raise PolicyError(f"{file}: {key}: {_shortened(record[key])}; expected {KINDS[kind]}")
     if record["activation"] not in ACTIVATIONS:
-        raise PolicyError(f"{file}: activation: {record['activation']!r}; expected one of {', '.join(ACTIVATIONS)}")
+        raise PolicyError(
+            f"{file}: activation: {_shortened(record['activation'])}; expected one of {', '.join(ACTIVATIONS)}"
+        )
     return record
 
 
@@ -166,4 +184,12 @@ def _check_sizes(actor: Actor, record: dict[str, Any], file: Path) -> None:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    return _shortened(" ".join(str(error).split()), str) or type(error).__name__
+
+
+def _shortened(value: Any, text: Callable[[Any], str] = repr) -> str:
+    """Return a value as text of at most 200 characters that a terminal shows as they are."""
+    try:
+        return "".join(c if c.isprintable() else "?" for c in text(value)[:200])
+    except RecursionError:
+        return "a deeply nested value"

@@ -29,10 +29,11 @@ def find_policy(path: str | Path) -> Path | None:
     """Return the file of a policy, None if `path` means none; see `locate_policy`."""
     path = Path(path)
     if path.suffix in FORMATS:
-        return path if path.is_file() and not _is_other_npz(path) else None
+        return path if _is_file(path) and not _is_other_npz(path) else None
     folders = [path, *([shelf() / path, shelf() / f"{path}_exact"] if len(path.parts) == 1 else [])]
     files = [folder / f"policy{suffix}" for folder in folders for suffix in FORMATS]
-    return next((file for file in (*files, path.with_name(f"{path.name}.zip")) if file.is_file()), None)
+    files += [path.with_name(f"{path.name}.zip")] if path.name else []
+    return next((file for file in files if _is_file(file)), None)
 
 
 def locate_policy(path: str | Path) -> Path:
@@ -50,6 +51,14 @@ def locate_policy(path: str | Path) -> Path:
         known = ", ".join(shipped_policies()) or "none yet"
         raise PolicyError(f"{path}: no such policy; expected {WHERE} (there are: {known})")
     return file
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is a regular file; a path that no system would take means none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def _is_other_npz(path: Path) -> bool:

@@ -1,8 +1,8 @@
 """The weights in a `policy.zip` of Stable-Baselines3, read without torch and without running code.
 
-The zip holds `policy.pth`, a file of torch's: a zip of its own, in which `data.pkl` is a pickle that names the arrays
-and `data/` has their bytes. A pickle can name any function to call; this reader knows the few that rebuild an array
-and refuses all others.
+The zip holds files of torch's, such as `policy.pth`: zips of their own, in which `data.pkl` is a pickle that names the
+arrays and `data/` has their bytes. A pickle can name any function to call; this reader knows the few that rebuild an
+array and refuses all others.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.policies.archive import read_member
 
-def read_weights(file: Path) -> dict[str, NDArray]:
-    """Return the arrays of a policy by name.
+
+def read_weights(file: Path, member: str = "policy.pth") -> dict[str, Any]:
+    """Return the arrays of a policy by name; or those of another member, in the dictionaries in which they lie.
 
     Raises:
-        OSError, LookupError, TypeError, ValueError, AttributeError, NotImplementedError, EOFError, zipfile.BadZipFile,
-        zlib.error, pickle.UnpicklingError: If the file is damaged, or names anything but arrays.
+        Exception: Of many kinds, if the file is damaged, too large, or names anything but arrays.
     """
-    with zipfile.ZipFile(file) as outer, zipfile.ZipFile(io.BytesIO(outer.read("policy.pth"))) as inner:
+    with zipfile.ZipFile(file) as outer, zipfile.ZipFile(io.BytesIO(read_member(outer, member))) as inner:
         return dict(_Arrays(inner).load())
 
 
@@ -35,14 +36,14 @@ class _Arrays(pickle.Unpickler):
     def __init__(self, archive: zipfile.ZipFile) -> None:
         (index,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
         self._archive, self._root = archive, index.removesuffix("data.pkl")
-        super().__init__(io.BytesIO(archive.read(index)))
+        super().__init__(io.BytesIO(read_member(archive, index)))
 
     def find_class(self, module: str, name: str) -> Any:
         known = {
             "collections.OrderedDict": OrderedDict,
             "torch._utils._rebuild_tensor_v2": _rebuild,
-            "torch.FloatStorage": np.dtype("<f4"),
-            "torch.DoubleStorage": np.dtype("<f8"),
+            "torch.FloatStorage": "<f4",  # text, since a pickle may change the state of objects that it names
+            "torch.DoubleStorage": "<f8",
         }
         if f"{module}.{name}" not in known:
             raise pickle.UnpicklingError(f"{module}.{name} is no part of a policy's weights")
@@ -50,7 +51,7 @@ class _Arrays(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> NDArray:
         _, dtype, name, *_ = pid  # "storage", its type, its file, device, size
-        return np.frombuffer(self._archive.read(f"{self._root}data/{name}"), dtype)
+        return np.frombuffer(read_member(self._archive, f"{self._root}data/{name}"), dtype)
 
 
 def _rebuild(storage: NDArray, offset: int, shape: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> NDArray:

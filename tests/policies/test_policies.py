@@ -184,7 +184,7 @@ def test_a_damaged_record_is_one_line(tmp_path: Path, text: str | None, words: s
     [
         ({"activation": "Nope"}, "activation: 'Nope'; expected one of Tanh"),
         ({"observation_size": 47}, "a layer takes 48 numbers; expected 47"),
-        ({"observation_size": "many"}, "a layer takes 48 numbers; expected many"),
+        ({"observation_size": "many"}, "observation_size: 'many'; expected a whole number"),
         ({"action_size": 11}, "gives 12 numbers; expected the 11"),
     ],
 )

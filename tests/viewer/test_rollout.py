@@ -167,7 +167,7 @@ def single_array(path: Path) -> Path:
         (lambda path: garbage(path, b"hello"), "cannot be read"),
         (truncated, "cannot be read"),
         (flipped, "cannot be read"),
-        (single_array, "not a ce_gym rollout"),
+        (single_array, "cannot be read"),
         (lambda path: rewritten(path, drop=("q",)), "has no q; expected times, q, v"),
         (lambda path: rewritten(path, q=np.array([{}], object)), "cannot be read"),
         (

@@ -7,8 +7,6 @@ files and terrain; knows no dynamics and no way of drawing.
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.policies.archive import read_npz
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.rollouts.ground_patch import Heights
 
 FORMAT = "ce_gym rollout"
 VERSION = 3
 READABLE = (2, 3)  # version 2 knew no ground but the flat
+
+MOST_BYTES = 2**30  # of a rollout in memory: an hour of a humanoid at 50 frames a second takes a tenth
 
 ARRAYS = {"times": 1, "q": 2, "v": 2, "contact_forces": 3, "commands": 2, "torques": 2, "signals": 2}
 """What a rollout consists of: the number of axes of each array, the first of which is time."""
@@ -186,26 +187,21 @@ def _check_clock(dt: float, times: Array) -> None:
 
 def _read_entries(path: Path) -> dict[str, Any]:
     try:
-        archive = np.load(path, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise RolloutError(f"{path}: not a ce_gym rollout; expected an npz, not a single array")
-        with archive:
-            if "header" not in archive.files:
-                raise RolloutError(f"{path}: not a ce_gym rollout; expected an npz with an entry 'header'")
-            return {name: archive[name] for name in archive.files}
+        entries = read_npz(path, MOST_BYTES)
     except FileNotFoundError:
         raise RolloutError(f"{path}: no such file; expected a rollout (.npz)") from None
-    except RolloutError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+    except Exception as error:  # damage shows in every kind of them
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RolloutError(f"{path}: cannot be read as a rollout ({reason})") from None
+    if "header" not in entries:
+        raise RolloutError(f"{path}: not a ce_gym rollout; expected an npz with an entry 'header'")
+    return entries
 
 
 def _read_header(entry: NDArray[Any]) -> dict[str, Any]:
     try:
         header = json.loads(str(entry))
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         header = None
     if not isinstance(header, dict) or header.pop("format", None) != FORMAT:
         raise RolloutError(f"not a ce_gym rollout; expected a header with format {FORMAT!r}")
