@@ -5,6 +5,7 @@ none of the heavy ones: `load_kernel` does, when it is called.
 """
 
 from ce_gym.compile.arrays import aligned_zeros, lane_count
+from ce_gym.compile.critical import CriticalSection
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.loading import load_kernel
 from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step
@@ -13,6 +14,7 @@ from ce_gym.compile.sources import source_fingerprint
 __all__ = [
     "Buffer",
     "Call",
+    "CriticalSection",
     "Kernel",
     "Lookup",
     "Program",

@@ -90,7 +90,8 @@ class Kernel:
         table[: len(words)] = words
         counts = address + WORD * self._n_words
 
-        def work(first_tile: int, end_tile: int) -> None:
+        # The default keeps what is read and written alive for as long as a thread works, whatever becomes of this call.
+        def work(first_tile: int, end_tile: int, _kept: object = (block, arrays, keys, counters)) -> None:
             scratch = self._scratch.take()
             self._run(address, counts, scratch[1], first_tile, end_tile, num_envs)
             self._scratch.give(scratch)

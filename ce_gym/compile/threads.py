@@ -3,11 +3,13 @@
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 
 from ce_gym.compile.arrays import aligned_zeros
+from ce_gym.compile.critical import CriticalSection
 
 _pool: ThreadPoolExecutor | None = None
 _lock = threading.Lock()
@@ -16,7 +18,8 @@ _lock = threading.Lock()
 class MemoryPool:
     """Aligned blocks of equal length, made when first needed and kept for the next user.
 
-    `take` and `give` may be called from any thread: a list's pop and append are atomic.
+    One that an exception keeps from coming back is freed with its last user. `take` and `give` may be called from any
+    thread: a list's pop and append are atomic.
     """
 
     def __init__(self, n_words: int):
@@ -37,18 +40,30 @@ class MemoryPool:
 
 
 def run_chunks(work: Callable[[int, int], None], count: int, num_threads: int) -> None:
-    """Call `work(first, end)` on contiguous parts of range(count), one part per thread, the first in this one."""
+    """Call `work(first, end)` on contiguous parts of range(count), one part per thread, the first in this one.
+
+    When this returns or raises nobody works any more: Ctrl-C waits for that, and parts that no thread has begun by the
+    time this one is free, since all are busy with other calls, are done by this one.
+    """
     num_threads = min(num_threads, count)
     if num_threads <= 1:
         work(0, count)
         return
-    edges = [count * i // num_threads for i in range(num_threads + 1)]
-    others = [_threads().submit(work, *edges[i : i + 2]) for i in range(1, num_threads)]
-    try:
-        work(0, edges[1])
-    finally:  # nobody may still write to the caller's arrays when this returns or raises
-        for other in others:
-            other.result()
+    parts = list(pairwise(count * i // num_threads for i in range(num_threads + 1)))
+    begun: list[tuple[Future[None], tuple[int, int]]] = []
+    with CriticalSection("run_chunks"):
+        try:
+            for part in parts[1:]:
+                begun.append((_threads().submit(work, *part), part))
+            work(*parts[0])
+            for other, part in begun:
+                if other.cancel():
+                    work(*part)
+        finally:
+            errors = [other.exception() for other, _ in begun if not other.cancel()]
+    for error in errors:
+        if error is not None:
+            raise error
 
 
 def _threads() -> ThreadPoolExecutor:

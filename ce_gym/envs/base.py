@@ -1,4 +1,4 @@
-"""What single and vector environments tell about the batch behind them. May know batches; no Gymnasium."""
+"""What single and vector environments have in common. May know batches, and Gymnasium's errors."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from gymnasium.error import ClosedEnvironmentError
 from numpy.typing import NDArray
 
+from ce_gym.compile import CriticalSection
 from ce_gym.envs.policy_spec import contract
 from ce_gym.envs.runtime.batch import Batch
 from ce_gym.envs.runtime.program import OBSERVATION_BOUND
@@ -21,10 +23,27 @@ class BatchShell:
     Attributes:
         batch: The batch.
         task: Name of the task.
+        closed: Whether it has been closed.
     """
 
     batch: Batch
     task: str
+    closed: bool
+    _section: CriticalSection
+
+    @property
+    def _title(self) -> str:
+        return f"{type(self).__name__} {self.task!r} of {self.batch.num_envs} {self.batch.program.model.robot.name}"
+
+    def _changing(self) -> CriticalSection:
+        """Return the section of a call that changes the state: all of it or nothing, one call at a time.
+
+        Raises:
+            gymnasium.error.ClosedEnvironmentError: If it is closed.
+        """
+        if self.closed:
+            raise ClosedEnvironmentError(f"{self._title}: called after close(), expected a new environment")
+        return self._section
 
     @property
     def dt(self) -> float:

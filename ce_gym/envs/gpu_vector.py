@@ -10,6 +10,7 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from ce_gym.compile import CriticalSection
 from ce_gym.envs.base import BatchShell
 from ce_gym.envs.runtime.gpu_batch import GpuBatch
 from ce_gym.envs.runtime.setup import checked_dtype, make_program
@@ -74,6 +75,7 @@ class GpuVectorEnv(BatchShell, VectorEnv[Any, Any, Any]):
         self.render_mode = None
         self._observation = torch.zeros((num_envs, self.batch.observation_size), device=self.device)
         self._seeded = False
+        self._section = CriticalSection(self._title)
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -91,10 +93,11 @@ class GpuVectorEnv(BatchShell, VectorEnv[Any, Any, Any]):
         mask = torch.as_tensor((options or {}).get("reset_mask", np.ones(self.num_envs, bool)), device=self.device)
         if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
             raise ValueError(f"reset_mask has shape {tuple(mask.shape)}; expected bool, ({self.num_envs},)")
-        if seed is not None or not self._seeded:
-            self.batch.seed(self._keys(seed))
-            self._seeded = True
-        self._observation = self.batch.reset(mask, self._observation)
+        with self._changing():
+            if seed is not None or not self._seeded:
+                self.batch.seed(self._keys(seed))
+                self._seeded = True
+            self._observation = self.batch.reset(mask, self._observation)
         return self._shown(self._observation), {"diverged": torch.zeros_like(mask), **self.batch.progress()}
 
     def step(self, actions: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -107,8 +110,9 @@ class GpuVectorEnv(BatchShell, VectorEnv[Any, Any, Any]):
         expected = (self.num_envs, self.batch.program.n_actions)
         if tuple(rows.shape) != expected:
             raise ValueError(f"action has shape {tuple(rows.shape)}; expected {expected}")
-        r = self.batch.step(rows)
-        self._observation = r.observation
+        with self._changing():
+            r = self.batch.step(rows)
+            self._observation = r.observation
         length, *sums = r.ended.T
         terms = {"length": length, **dict(zip(self.batch.program.sum_names, sums, strict=True))}
         means = {name: total / length.clamp(min=1) for name, total in terms.items() if name.startswith("metrics/")}

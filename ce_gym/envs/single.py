@@ -11,6 +11,7 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from ce_gym.compile import CriticalSection
 from ce_gym.envs.base import BatchShell
 from ce_gym.envs.rendering import RENDER_MODES, Screen
 from ce_gym.envs.runtime.program import OBSERVATION_BOUND, TaskProgram
@@ -62,18 +63,20 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
         self.render_mode = render_mode
         self._screen = Screen(render_mode, self.batch, width=width, height=height)
         self.n_diverged = 0
-        self._seeded = False
+        self.closed = self._seeded = False
+        self._section = CriticalSection(self._title)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start a new episode; see `gymnasium.Env.reset`. The same seed gives the same episodes, step by step."""
-        super().reset(seed=seed)
-        if seed is not None or not self._seeded:
-            key = checked_seed(seed) if seed is not None else self.np_random.integers(2**63)
-            self.batch.seed(np.array([key], np.uint64))
-            self._seeded = True
-        observation = self._shown(self.batch.reset(np.ones(1, bool)))[0]
+        with self._changing():
+            super().reset(seed=seed)
+            if seed is not None or not self._seeded:
+                key = checked_seed(seed) if seed is not None else self.np_random.integers(2**63)
+                self.batch.seed(np.array([key], np.uint64))
+                self._seeded = True
+            observation = self._shown(self.batch.reset(np.ones(1, bool)))[0]
         self._screen.refresh()
         return observation, {"diverged": False, **self._whereabouts()}
 
@@ -82,10 +85,14 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
 
         Raises:
             ValueError: If the action has the wrong shape or is not finite.
+            RuntimeError: If another thread steps or resets this environment.
+            gymnasium.error.ClosedEnvironmentError: After `close`.
         """
-        outcome = self.batch.step(checked_action(action, (1, self.batch.program.n_actions)))
-        diverged = bool(outcome.diverged[0])
-        self.n_diverged += diverged
+        rows = checked_action(action, (1, self.batch.program.n_actions))
+        with self._changing():
+            outcome = self.batch.step(rows)
+            diverged = bool(outcome.diverged[0])
+            self.n_diverged += diverged
         info = {"diverged": diverged, **dict(zip(self._names, outcome.terms[0].tolist(), strict=True))}
         info |= self._whereabouts()
         observation = self._shown(outcome.observation[0])
@@ -99,6 +106,7 @@ class LeggedEnv(BatchShell, gymnasium.Env[NDArray[np.float32], NDArray[np.float3
 
     def close(self) -> None:
         """Give back whatever rendering holds; harmless if done before."""
+        self.closed = True
         self._screen.close()
 
     def _shown(self, rows: NDArray[np.float32]) -> Any:

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ce_gym.compile import CriticalSection
 from ce_gym.envs.base import BatchShell
 from ce_gym.envs.rendering import RENDER_MODES, Screen
 from ce_gym.envs.runtime.setup import make_batch
@@ -92,6 +93,7 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         self._finished = np.zeros(num_envs, bool)
         self._observation = np.zeros((num_envs, self.batch.observation_size), np.float32)
         self._seeded = False
+        self._section = CriticalSection(self._title)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -108,12 +110,13 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         mask = self._reset_mask(options)
         if seed is not None and (isinstance(seed, str) or not hasattr(seed, "__len__")):
             seed = checked_seed(seed)
-        super().reset(seed=seed if isinstance(seed, int) else None)
-        self._seed(seed)
-        fresh = self.batch.reset(mask)
-        self._observation = np.where(mask[:, None], fresh, self._observation)
-        self._elapsed[mask] = 0
-        self._finished[mask] = False
+        with self._changing():
+            super().reset(seed=seed if isinstance(seed, int) else None)
+            self._seed(seed)
+            fresh = self.batch.reset(mask)
+            self._observation = np.where(mask[:, None], fresh, self._observation)
+            self._elapsed[mask] = 0
+            self._finished[mask] = False
         self._screen.refresh()
         return self._shown(self._observation), {"diverged": np.zeros(self.num_envs, bool), **self.batch.progress()}
 
@@ -125,8 +128,19 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         Raises:
             ValueError: If the actions have the wrong shape or are not finite.
             gymnasium.error.ResetNeeded: In "Disabled" mode, if a finished environment has not been reset.
+            RuntimeError: If another thread steps or resets these environments.
+            gymnasium.error.ClosedEnvironmentError: After `close`.
         """
         rows = checked_action(actions, (self.num_envs, self.batch.program.n_actions))
+        with self._changing():
+            results = self._advance(rows)
+        self._screen.refresh()
+        return results
+
+    def _advance(
+        self, rows: NDArray[np.float32]
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Step with actions, shape (num_envs, n_actions), and reset whom it is time for; return what `step` does."""
         resetting = self._finished
         some_reset = bool(resetting.any())
         if some_reset and self.autoreset_mode == AutoresetMode.DISABLED:
@@ -161,7 +175,6 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
         self._finished = done
         self._observation = observation
         infos |= self.batch.progress()
-        self._screen.refresh()
         return self._shown(observation), reward, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

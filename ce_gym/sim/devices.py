@@ -34,6 +34,10 @@ class Device(Protocol):
         """Return zeros for `size` values of each robot, as kernels take them."""
         ...
 
+    def copy(self, array: Array) -> Array:
+        """Return a copy of such an array."""
+        ...
+
     def read(self, array: Array, num_envs: int) -> Array:
         """Return a copy of such an array as rows, shape (num_envs, size)."""
         ...
@@ -58,6 +62,10 @@ class Processor:
     tiles = staticmethod(host_tiles.tiles)
     read = staticmethod(host_tiles.read_rows)
     write = staticmethod(host_tiles.write_rows)
+
+    def copy(self, array: Array) -> NDArray:
+        """Return a copy."""
+        return array.copy()
 
     def rows(self, values: Any, dtype: str, shape: tuple[int, ...] = ()) -> NDArray:
         """Return values as an array; broadcast to `shape` and contiguous, if one is given."""
@@ -96,6 +104,10 @@ class Cuda:
         import torch
 
         return torch.zeros((1, size, num_envs), dtype=getattr(torch, dtype), device=self._place)
+
+    def copy(self, array: Array) -> Array:
+        """Return a copy."""
+        return array.clone()
 
     def read(self, array: Array, num_envs: int) -> Array:
         """Return a copy as rows, shape (num_envs, size)."""

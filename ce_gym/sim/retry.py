@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.compile import Kernel
-from ce_gym.sim.substeps import TIMES
+from ce_gym.compile import CriticalSection, Kernel
+from ce_gym.sim.pieces import run_substeps
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
 Arrays = Mapping[str, NDArray]
@@ -31,7 +31,14 @@ class Retry:
     kernel: Callable[[int], Kernel]
 
     def __call__(
-        self, before: Arrays, after: Arrays, num_envs: int, inputs: Arrays, shared: Arrays, n_substeps: int
+        self,
+        before: Arrays,
+        after: Arrays,
+        num_envs: int,
+        inputs: Arrays,
+        shared: Arrays,
+        n_substeps: int,
+        section: CriticalSection,
     ) -> int:
         """Step again the robots that diverged between `before` and `after`, and write what became of them to `after`.
 
@@ -45,6 +52,7 @@ class Retry:
             inputs: Rows that the call was given, shape (num_envs, size) each.
             shared: Arrays that all robots have in common.
             n_substeps: Sub-steps that the call made.
+            section: The one that this is called in.
 
         Returns:
             How many robots were stepped again.
@@ -58,7 +66,7 @@ class Retry:
             alone = {name: _rows_as_tiles(array, num_envs, failed) for name, array in before.items()}
             given = {name: np.ascontiguousarray(rows[failed]) for name, rows in inputs.items()}
             n = int(failed.sum())
-            self.kernel(parts)(alone | given | dict(shared), n, repeats={TIMES: parts * n_substeps})
+            run_substeps(self.kernel(parts), alone | given | dict(shared), n, parts * n_substeps, section)
             saved = read_rows(alone["diverged"], n)[:, 0] < 0.5
             chosen = failed.copy()
             chosen[failed] = saved

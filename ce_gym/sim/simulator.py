@@ -13,7 +13,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.compile import Buffer, Program
+from ce_gym.compile import Buffer, CriticalSection, Program
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import Control, Friction, Motors, StepOptions, target_names
 from ce_gym.dynamics.model import Model
@@ -21,8 +21,10 @@ from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import OUTPUTS
 from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
 from ce_gym.sim.devices import Array, Device, Processor, device_named, to_numpy
+from ce_gym.sim.pieces import piece_length, run_substeps
+from ce_gym.sim.placement import Placement
 from ce_gym.sim.retry import Retry
-from ce_gym.sim.substeps import FRAME, HEIGHTS, TIMES, substeps
+from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 from ce_gym.sim.terrain import Terrain
 
 
@@ -111,6 +113,7 @@ class Simulator:
         self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
         self.dtype, self.num_threads = dtype, num_threads
         self.contact_names = select_contacts(model.robot, contacts)
+        self._placement = Placement(model, self.contact_names, terrain)
         self.options = StepOptions(
             dt=dt,
             control=control,  # type: ignore[arg-type]
@@ -130,6 +133,7 @@ class Simulator:
             retry, lambda parts: load_step_kernel(model, replace(self.options, dt=dt / parts), asked, dtype)
         )
         self.n_retried = self._n_cleared = 0
+        self._section = CriticalSection(f"Simulator of {num_envs} {model.robot.name}")
         self._arrays = {
             name: self._device.tiles(num_envs, buffer.size, dtype)
             for name, buffer in self._kernel.buffers.items()
@@ -152,8 +156,8 @@ class Simulator:
             mask: Which robots, bool, shape (num_envs,); all of them if None.
         """
         q = self.model.standing_q.copy()
-        if self.model.robot.floating and self.contact_names:
-            q[2] += self._lift(q)
+        if self.model.robot.floating:
+            q[2] += self._placement.lift(q)
         self.set_state(q, np.zeros(self.model.nv), mask)
 
     def set_state(self, q: ArrayLike, v: ArrayLike, mask: ArrayLike | None = None) -> None:
@@ -167,27 +171,28 @@ class Simulator:
         Raises:
             ValueError: If a shape is wrong, a number is not finite, or a loop does not close.
         """
-        chosen, q, v = self._chosen(mask), to_numpy(q), to_numpy(v)
-        for name, value, size in (("q", q, self.model.nq), ("v", v, self.model.nv)):
+        chosen, rows = self._chosen(mask), {"q": to_numpy(q), "v": to_numpy(v)}
+        for name, value in rows.items():
+            size = self._arrays[name].shape[1]
             if value.shape not in ((size,), (self.num_envs, size)):
                 raise ValueError(f"{name} has shape {value.shape}; expected ({size},) or ({self.num_envs}, {size})")
-            if not np.isfinite(value).all():
-                raise ValueError(f"{name} holds a number that is not finite")
-            self._device.write(self._arrays[name], np.broadcast_to(value, (self.num_envs, size)), chosen)
-        self._n_cleared += int(self.diverged[slice(None) if chosen is None else chosen].sum())
-        zeros = {name: np.zeros(self._arrays[name].shape[1]) for name in ("anchor", "diverged") if name in self._arrays}
+            if not (np.abs(value) <= np.finfo(self.dtype).max).all():
+                raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
+        rows |= {name: np.zeros(self._arrays[name].shape[1]) for name in ("anchor", "diverged") if name in self._arrays}
         if self.contact_names:
-            zeros["load"] = self._resting_load(q)
-        for name, rows in zeros.items():
-            self._device.write(self._arrays[name], np.broadcast_to(rows, (self.num_envs, rows.shape[-1])), chosen)
+            rows["load"] = self._resting_load(rows["q"])
         if "dependent" in self._arrays:
-            guess = self.model.dependent_guess(q)
-            self._device.write(
-                self._arrays["dependent"], np.broadcast_to(guess, (self.num_envs, guess.shape[-1])), chosen
-            )
+            rows["dependent"] = self.model.dependent_guess(rows["q"])
+        with self._section:  # all that can be refused has been
+            self._n_cleared += int(self.diverged[slice(None) if chosen is None else chosen].sum())
+            for name, value in rows.items():
+                whole = np.broadcast_to(value, (self.num_envs, value.shape[-1]))
+                self._device.write(self._arrays[name], whole, chosen)
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
-        """Advance all robots by `n_substeps` sub-steps.
+        """Advance all robots by `n_substeps` sub-steps, or none of them by any.
+
+        Ctrl-C waits for the end of a short call; a long one is taken back, within a second.
 
         Args:
             target: Positions [rad] or torques [N m], shape (num_envs, n) or (n,), in the order of `target_names`:
@@ -196,17 +201,30 @@ class Simulator:
 
         Raises:
             ValueError: If the shape is wrong.
+            RuntimeError: If another thread steps or sets the same robots.
         """
         n = len(self.target_names)
         rows = self._device.rows(target, self.dtype)
         if tuple(rows.shape) not in ((n,), (self.num_envs, n)):
             raise ValueError(f"target has shape {tuple(rows.shape)}; expected ({n},) or ({self.num_envs}, {n})")
         rows = self._device.rows(rows, self.dtype, (self.num_envs, n))
-        given, repeats = {"target": rows}, {TIMES: n_substeps}
-        before = {name: array.copy() for name, array in self._arrays.items()} if self._retry.halvings else {}
-        self._kernel(self._arrays | self._tables | given, self.num_envs, repeats=repeats, num_threads=self.num_threads)
-        if before:
-            self.n_retried += self._retry(before, self._arrays, self.num_envs, given, self._tables, n_substeps)
+        with self._section:
+            self._advance({"target": rows}, n_substeps)
+
+    def _advance(self, given: dict[str, Array], n_substeps: int) -> None:
+        """Step all robots; the state is as before if that raises, by Ctrl-C in a long call."""
+        keep = self._retry.halvings > 0 or n_substeps > piece_length(self.num_envs)
+        before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
+        arrays = self._arrays | self._tables | given
+        try:
+            run_substeps(self._kernel, arrays, self.num_envs, n_substeps, self._section, self.num_threads)
+            if self._retry.halvings:
+                again = (self.num_envs, given, self._tables, n_substeps, self._section)
+                self.n_retried += self._retry(before, self._arrays, *again)
+        except BaseException:
+            for name, array in before.items():
+                self._arrays[name][...] = array
+            raise
 
     def set_parameter(self, name: str, value: ArrayLike, mask: ArrayLike | None = None) -> None:
         """Set a figure that was declared in `parameters`.
@@ -305,31 +323,11 @@ class Simulator:
 
     def _resting_load(self, q: ArrayLike) -> NDArray:
         """Return the springs' forces on the contacts [N], shape (..., n_contacts): what friction has to go by."""
-        radius, _, above, cosine = self._above_ground(q)
         stiffness: float | NDArray = self.options.material.stiffness
         if "stiffness" in self._columns:
             rows = to_numpy(self._device.read(self._arrays["parameters"], self.num_envs))
             stiffness = rows[:, self._columns["stiffness"]]
-        return stiffness * np.maximum(radius - cosine * above, 0)
-
-    def _lift(self, q: ArrayLike) -> float:
-        """Return how far to raise a robot for no contact to be deeper in the terrain than it is in flat ground [m]."""
-        radius, z, above, cosine = self._above_ground(q)
-        return float((np.minimum(z, radius) / cosine - above).max()) if self.terrain is not None else 0.0
-
-    def _above_ground(self, q: ArrayLike) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return how the contact spheres are placed above the ground under their centres.
-
-        Returns:
-            Radius, height of the centre in the world and above the ground [m], and cosine of the ground's slope, all of
-            shape (..., n_contacts).
-        """
-        chosen = [self.model.contact_names.index(name) for name in self.contact_names]
-        radius = np.array([self.model.robot.contacts[i].radius for i in chosen])
-        centres = self.model.contact_points(q, np.zeros(self.model.nv))[0][..., chosen, :]
-        x, y, z = np.moveaxis(centres, -1, 0)
-        ground = self.terrain.at(x, y) if self.terrain is not None else np.zeros((*x.shape, 3))
-        return radius, z, z - ground[..., 0], 1 / np.sqrt(1 + np.square(ground[..., 1:]).sum(-1))
+        return stiffness * self._placement.depth(q)
 
     def _read(self, name: str) -> Array:
         if name not in self._arrays:

@@ -4,14 +4,14 @@ import argparse
 
 import pytest
 
-from ce_gym.bench import soak
+from ce_gym.bench.soak import benchmark as soak
 from ce_gym.envs.runtime.batch import Batch
 
 IDS = ["ce_gym/MiniCheetahVelocity-v0", "ce_gym/MiniCheetahRun-v0"]
 
 
 def arguments(**changes) -> argparse.Namespace:
-    return argparse.Namespace(**{"minutes": 0.05, "env": IDS, "steps": 80, "seed": 0, **changes})
+    return argparse.Namespace(**{"minutes": 0.05, "env": IDS, "steps": 80, "seed": 0, "interrupts": None, **changes})
 
 
 def test_a_few_seconds_of_it():

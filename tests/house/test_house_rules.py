@@ -32,9 +32,9 @@ MAY_IMPORT = {
 LAYERS = {
     "model": "errors table description constraint_functions clusters mechanism checks generators formats load listing",
     "model/formats": "reading placement rotor_rule urdf yaml mjcf",
-    "compile": "arrays program layout lowering ours cache threads kernel machine_code sources loading cuda",
+    "compile": "arrays program layout lowering ours cache critical threads kernel machine_code sources loading cuda",
     "dynamics": "algebra constraints recursion forces functions stepping model",
-    "sim": "tiles devices terrain substeps retry simulator",
+    "sim": "tiles devices terrain placement substeps pieces retry simulator",
     "envs": "terms task runtime policy_spec base rendering single gpu_vector vector registration custom",
     "viewer": "errors console rollouts page raytrace live window renderers cli",
     "bench": "measure peers friction instructions tracking soak digests speed throughput paper accuracy stability gpu"

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.bench.soak import interrupts
 
 NUM_ENVS = 64
 """Robots in a batch."""
@@ -58,10 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env", action="append", help="environment id, may be repeated; all by default")
     parser.add_argument("--steps", type=int, default=150, help="control steps in one environment before the next")
     parser.add_argument("--seed", type=int, default=0, help="of actions and failures")
+    parser.add_argument("--interrupts", type=int, metavar="N", help="instead, interrupt N calls by Ctrl-C")
 
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the soak; at least one round through the environments, and `WARM_UP` more to judge memory by."""
+    if arguments.interrupts:
+        return interrupts.run(arguments.interrupts, arguments.seed)
     import ce_gym
 
     ids = arguments.env or sorted(ce_gym.environment_ids())

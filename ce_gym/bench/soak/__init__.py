@@ -1,0 +1,1 @@
+"""Minutes of steps that must not fail, leak or be torn."""
