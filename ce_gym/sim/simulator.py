@@ -244,14 +244,14 @@ class Simulator:
             raise ValueError(
                 f"parameter {name!r}; expected one of those declared with Simulator(..., parameters=): {declared}"
             )
-        rows = to_numpy(self._device.read(self._arrays["parameters"], self.num_envs))
-        columns = self._columns[name]
+        columns, chosen, new = self._columns[name], self._chosen(mask), to_numpy(value)
         size = columns.stop - columns.start
-        new = to_numpy(value)
         if new.shape not in ((), (size,), (self.num_envs, size)) or not np.isfinite(new).all():
             raise ValueError(f"{name} has shape {new.shape}; expected ({size},) or ({self.num_envs}, {size}), finite")
-        rows[:, columns] = new
-        self._device.write(self._arrays["parameters"], rows, self._chosen(mask))
+        with self._section:
+            rows = to_numpy(self._device.read(self._arrays["parameters"], self.num_envs))
+            rows[:, columns] = new
+            self._device.write(self._arrays["parameters"], rows, chosen)
 
     @property
     def q(self) -> Array:

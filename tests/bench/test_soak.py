@@ -1,6 +1,9 @@
 """The soak finds what it looks for, and nothing where nothing is wrong."""
 
 import argparse
+import json
+import subprocess
+import sys
 
 import pytest
 
@@ -41,3 +44,17 @@ def test_it_notices_a_process_that_grows(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(soak, "resident", lambda: next(memory, 200.0))
     report = soak.run(arguments(minutes=0.02, env=IDS[:1], steps=20))
     assert not report.requirements[2].met
+
+
+def test_interrupted_calls(tmp_path):
+    """In a process of its own, for Ctrl-C is sent to it. How soon a long call answers depends on the machine."""
+    file = tmp_path / "report.json"
+    command = [sys.executable, "-m", "ce_gym.bench", "soak", "--interrupts", "32", "--json", str(file)]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+    report = json.loads(file.read_text())
+    whole, long = report["requirements"]
+    assert whole["met"], report["remarks"]
+    assert long["measured"].endswith("as it was")
+    rows = report["tables"][0]["rows"]
+    assert sum(row[1] + row[2] for row in rows) == 32

@@ -1,0 +1,202 @@
+"""A step is all or nothing, whatever Ctrl-C and other threads do meanwhile."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from ce_gym import Model, Simulator
+from ce_gym.sim import pieces
+
+N = 12
+SEEN = ("q", "v", "torque", "contact_forces", "diverged")
+
+FREED_TOO_EARLY = """
+import gc, os, signal, threading, time
+import ce_gym
+
+model = ce_gym.Model("mini_cheetah")
+target = model.standing_q[7:]
+busy, freed = ce_gym.Simulator(model, 64, num_threads=os.cpu_count()), ce_gym.Simulator(model, 20_000, num_threads=2)
+freed.step(target)
+other = threading.Thread(target=busy.step, args=(target, 50_000))
+other.start()
+time.sleep(0.1)
+threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    freed.step(target)
+    time.sleep(60)
+except KeyboardInterrupt:
+    pass
+del freed
+gc.collect()
+other.join()
+busy.step(target)
+print("alive")
+"""
+"""The threads are busy with one simulator while a second one's call waits for them, is interrupted and deleted."""
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return Model("mini_cheetah")
+
+
+def moving(model: Model, **options) -> Simulator:
+    """Robots that fall, slide and land."""
+    sim = Simulator(model, N, **options)
+    rng = np.random.default_rng(0)
+    q, v = np.tile(model.standing_q, (N, 1)), rng.normal(0, 0.5, (N, model.nv))
+    q[:, 2] += np.linspace(0.0, 0.1, N)
+    sim.set_state(q, v)
+    return sim
+
+
+def seen(sim: Simulator) -> bytes:
+    return b"".join(getattr(sim, name).tobytes() for name in SEEN)
+
+
+def watch(sim: Simulator, monkeypatch: pytest.MonkeyPatch, interrupted: int = 0, meanwhile=lambda: None) -> list[int]:
+    """Have calls made in pieces of three sub-steps, and Ctrl-C come in one of them.
+
+    Args:
+        sim: What makes the calls.
+        monkeypatch: Undoes it.
+        interrupted: Number of the piece, from 1.
+        meanwhile: What else to do in each piece.
+
+    Returns:
+        The lengths of the pieces, to be looked at later.
+    """
+    kernel, lengths = sim._kernel, []
+
+    def watched(arrays, num_envs, repeats, **options):
+        lengths.append(repeats["n_substeps"])
+        meanwhile()
+        if len(lengths) == interrupted:
+            signal.raise_signal(signal.SIGINT)
+        kernel(arrays, num_envs, repeats=repeats, **options)
+
+    monkeypatch.setattr(sim, "_kernel", watched)
+    monkeypatch.setattr(pieces, "LONGEST", 3 * pieces.FEWEST)
+    return lengths
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are sent otherwise here")
+def test_no_memory_is_freed_that_a_thread_still_writes_to():
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}  # what is freed is gone at once
+    command = [sys.executable, "-c", FREED_TOO_EARLY]
+    finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (finished.returncode, finished.stdout) == (0, "alive\n"), finished.stderr
+
+
+def test_pieces_are_short():
+    for num_envs in (1, 16, 1000, 50_000):
+        assert 1 <= pieces.piece_length(num_envs) <= max(1, 100_000 // num_envs)
+
+
+@pytest.mark.parametrize("options", [{}, {"method": "extrapolated"}, {"dtype": "float32"}], ids=str)
+def test_a_call_in_pieces_has_the_same_bits(model: Model, options: dict, monkeypatch: pytest.MonkeyPatch):
+    whole, split = (moving(model, **options) for _ in range(2))
+    whole.step(model.standing_q[7:], 10)
+    lengths = watch(split, monkeypatch)
+    split.step(model.standing_q[7:], 10)
+    assert lengths == [3, 3, 3, 1]
+    assert seen(split) == seen(whole)
+    split.step(model.standing_q[7:], 2)
+    whole.step(model.standing_q[7:], 2)
+    assert lengths[4:] == [2]
+    assert seen(split) == seen(whole)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_long_call_is_taken_back(model: Model, threads: int, monkeypatch: pytest.MonkeyPatch):
+    sim, twin = moving(model, num_threads=threads), moving(model)
+    lengths = watch(sim, monkeypatch, interrupted=2)
+    before = seen(sim)
+    with pytest.raises(KeyboardInterrupt):
+        sim.step(model.standing_q[7:], 10)
+    assert lengths == [3, 3]
+    assert seen(sim) == before
+    for one in (sim, twin):
+        one.step(model.standing_q[7:], 10)
+    assert seen(sim) == seen(twin), "something hidden was left changed"
+
+
+@pytest.mark.parametrize("n_substeps", [2, 10])
+def test_a_call_that_is_nearly_over_is_finished(model: Model, n_substeps: int, monkeypatch: pytest.MonkeyPatch):
+    sim, twin = moving(model), moving(model)
+    watch(sim, monkeypatch, interrupted=-(-n_substeps // 3))
+    with pytest.raises(KeyboardInterrupt):
+        sim.step(model.standing_q[7:], n_substeps)
+    twin.step(model.standing_q[7:], n_substeps)
+    assert seen(sim) == seen(twin)
+
+
+def test_a_handler_that_goes_on_lets_the_call_go_on(model: Model, monkeypatch: pytest.MonkeyPatch):
+    sim, twin, heard = moving(model), moving(model), []
+    before = signal.signal(signal.SIGINT, lambda *_: heard.append(1))
+    try:
+        watch(sim, monkeypatch, interrupted=2)
+        sim.step(model.standing_q[7:], 10)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    twin.step(model.standing_q[7:], 10)
+    assert heard == [1]
+    assert seen(sim) == seen(twin)
+
+
+def test_robots_that_are_stepped_again_are_taken_back_too(model: Model, monkeypatch: pytest.MonkeyPatch):
+    """Ctrl-C comes after all robots have been stepped, while the one that diverged is stepped with half the step."""
+    sim = moving(model, contacts="foot", dt=0.01, retry=6)
+    v = sim.v
+    v[5, 6:] = 4500.0 * np.resize([1.0, -1.0], 12)
+    sim.set_state(sim.q, v)
+    before, load = seen(sim), sim._retry.kernel
+    monkeypatch.setattr(pieces, "LONGEST", 5 * pieces.FEWEST)
+
+    def kernel(parts):
+        signal.raise_signal(signal.SIGINT)
+        return load(parts)
+
+    object.__setattr__(sim._retry, "kernel", kernel)
+    with pytest.raises(KeyboardInterrupt):
+        sim.step(model.standing_q[7:], 5)
+    assert seen(sim) == before
+    assert (sim.n_retried, sim.n_diverged) == (0, 0)
+
+
+@pytest.mark.parametrize("call", ["step", "set_state", "reset", "set_parameter"])
+def test_a_second_thread_is_refused(model: Model, call: str, monkeypatch: pytest.MonkeyPatch):
+    sim, twin = (moving(model, parameters=("friction",)) for _ in range(2))
+    sim.step(model.standing_q[7:])
+    given = {
+        "step": (model.standing_q[7:],),
+        "set_state": (model.standing_q, np.zeros(model.nv)),
+        "reset": (),
+        "set_parameter": ("friction", 0.1),
+    }
+    errors = []
+
+    def other():
+        with pytest.raises(RuntimeError) as caught:
+            getattr(sim, call)(*given[call])
+        errors.append(str(caught.value))
+
+    def meanwhile():
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+
+    watch(sim, monkeypatch, meanwhile=meanwhile)
+    sim.step(model.standing_q[7:])
+    assert errors == ["Simulator of 12 mini_cheetah: called during another call, expected one call at a time"]
+    for _ in range(2):
+        twin.step(model.standing_q[7:])
+    assert seen(sim) == seen(twin)
