@@ -2,7 +2,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := viewer,video,train,export,rsl-rl,gpu,bench,docs,dev
+EXTRAS := viewer,video,fast,train,export,rsl-rl,gpu,bench,docs,dev
 
 .PHONY: help venv demo test lint types docs links wheel clean
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import gymnasium
 
-EXTRAS = {"mujoco": "mjcf", "meshcat": "viewer", "onnx": "export"}
+EXTRAS = {"mujoco": "mjcf", "meshcat": "viewer", "onnx": "export", "numba": "fast"}
 """What brings packages that a program needs for a part of its work."""
 
 Table = list[list[str]]
@@ -29,18 +29,27 @@ def run(program: str, work: Callable[[], int]) -> int:
             warnings.showwarning = lambda message, *_, **__: print(f"{program}: warning: {message}", file=sys.stderr)
             return work()
     except ModuleNotFoundError as error:
-        package = str(error.name).split(".")[0]
-        if package == "ce_gym":
-            raise
-        how = f"ce_gym[{EXTRAS[package]}]" if package in EXTRAS else package
-        print(f'{program}: needs {package}, which is not installed: pip install "{how}"', file=sys.stderr)
-        return 2
+        return say_missing(program, error)
     except OSError as error:
         print(f"{program}: {error.filename}: {error.strerror or error}", file=sys.stderr)
         return 2
     except (ValueError, gymnasium.error.Error) as error:
         print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+
+
+def say_missing(program: str, error: ModuleNotFoundError) -> int:
+    """Say in one line which package a program needs and what brings it; return the exit code.
+
+    Raises:
+        ModuleNotFoundError: If it is a part of ce_gym itself.
+    """
+    package = str(error.name).split(".")[0]
+    if package == "ce_gym":
+        raise error
+    how = f"ce_gym[{EXTRAS[package]}]" if package in EXTRAS else package
+    print(f'{program}: needs {package}, which is not installed: pip install "{how}"', file=sys.stderr)
+    return 2
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:

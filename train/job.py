@@ -114,8 +114,8 @@ def available_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def jobs(args: argparse.Namespace) -> list[Job]:
-    """The training runs a command line asks for.
+def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
+    """The training runs a command line asks for; `folder` ends the names of folders that it does not give.
 
     Raises:
         ValueError: If the command line, a settings file or a policy cannot be used.
@@ -132,7 +132,9 @@ def jobs(args: argparse.Namespace) -> list[Job]:
     kwargs = dict(record.get("env_kwargs", {}))
     kwargs |= {"transmission": args.transmission} if args.transmission else {}
     kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
-    out = args.out or Path("runs") / "-".join([path.stem, *([args.transmission] if args.transmission else [])])
+    out = args.out or Path("runs") / (
+        "-".join([path.stem, *([args.transmission] if args.transmission else [])]) + folder
+    )
     seeds = args.seeds or [args.seed]
     return [
         Job(
@@ -183,19 +185,20 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
-def main(program: str, train: Callable[[Job], Trained], argv: list[str] | None = None) -> int:
+def main(program: str, train: Callable[[Job], Trained], argv: list[str] | None = None, folder: str = "") -> int:
     """Train every seed asked for, evaluate each policy, and say where it lies.
 
     Args:
         program: Name of the learner's file, for messages.
         train: What learns.
         argv: Arguments of the command line.
+        folder: Ends the names of folders, so that policies of different learners do not mix.
     """
     from evaluate import evaluate, report  # what judges is not needed before
 
     args = parser().parse_args(argv)
     try:
-        for job in jobs(args):
+        for job in jobs(args, folder):
             print(f"training {job.env_id}, seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", flush=True)
             trained = train(job)
             print(f"saved {trained.policy} after {trained.record['steps']:,} steps", flush=True)

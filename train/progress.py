@@ -12,8 +12,10 @@ import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 CURVE: tuple[str, ...] = ("steps", "seconds", "reward", "length")
@@ -26,6 +28,40 @@ def episode_means(episodes: Iterable[Mapping[str, float]] | None) -> dict[str, f
     if not recent:
         return {}
     return {key: float(np.mean([episode[key] for episode in recent])) for key in recent[-1] if key != "t"}
+
+
+class RecentEpisodes:
+    """What the last episodes came to.
+
+    Args:
+        count: How many are kept.
+
+    Attributes:
+        names: Of the entries: return `r`, length `l`, reward terms, metrics.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count, self.names, self._rows = count, [], np.zeros((0, 0))
+
+    def add(self, done: NDArray[np.bool_], infos: dict[str, Any]) -> None:
+        """Add the episodes that have just ended, if the environments report them."""
+        if "episode_terms" in infos:
+            terms = dict(infos["episode_terms"])
+            entries = {"r": terms.pop("return"), "l": terms.pop("length"), **terms}
+            self.names, new = list(entries), np.stack([values[done] for values in entries.values()], axis=1)
+            self._rows = np.concatenate([self._rows.reshape(-1, len(entries)), new])[-self.count :]
+
+    def means(self) -> dict[str, float]:
+        """Mean of every entry; empty before the first episode ends."""
+        return dict(zip(self.names, self._rows.mean(axis=0).tolist(), strict=True)) if len(self._rows) else {}
+
+    def rows(self) -> NDArray:
+        """The entries, one episode per row."""
+        return self._rows
+
+    def restore(self, names: list[str], rows: NDArray) -> None:
+        """Take over what another one held."""
+        self.names, self._rows = names, rows
 
 
 class Curve:
@@ -72,6 +108,32 @@ def read_curve(file: Path) -> list[dict[str, float]]:
             return [{key: float(row[key]) for key in CURVE} for row in csv.DictReader(lines)]
     except (KeyError, TypeError, ValueError, csv.Error):
         raise ValueError(f"{file}: expected the columns {', '.join(CURVE)}, numbers in each row") from None
+
+
+class Log:
+    """Writes what happens in each iteration into a CSV file.
+
+    Args:
+        file: To write; begun anew.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file, self.columns = file, []
+        file.write_text("", encoding="utf-8")
+
+    def add(self, steps: int, seconds: float, means: dict[str, float], figures: dict[str, float]) -> None:
+        """Write one row, from the first episode that ends on."""
+        if not means:
+            return
+        rollout = {"rollout/ep_rew_mean": means["r"], "rollout/ep_len_mean": means["l"]}
+        times = {"time/total_timesteps": steps, "time/time_elapsed": round(seconds, 3)}
+        row = times | rollout | {key: mean for key, mean in means.items() if key not in ("r", "l")} | figures
+        with self.file.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            if not self.columns:
+                self.columns = list(row)
+                writer.writerow(self.columns)
+            writer.writerow([row[key] for key in self.columns])
 
 
 def adapted_rate(rate: float, kl: float, target: float, limits: tuple[float, float] = (1e-5, 1e-2)) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ce_gym.compile import CriticalSection
 from ce_gym.envs.base import BatchShell
 from ce_gym.envs.rendering import RENDER_MODES, Screen
+from ce_gym.envs.runtime.batch import check_snapshot
 from ce_gym.envs.runtime.setup import make_batch
 from ce_gym.envs.single import checked_action, checked_seed, recorded_state, shown, spaces
 from ce_gym.envs.task.checks import checked_value
@@ -192,6 +193,28 @@ class LeggedVectorEnv(BatchShell, VectorEnv[Observations, NDArray[np.float32], N
     def state(self) -> dict[str, NDArray]:
         """Return what a recorder needs, one robot per row; see `recorded_state`."""
         return recorded_state(self.batch)
+
+    def snapshot(self) -> dict[str, NDArray]:
+        """Return copies of the states of all environments, random streams included, by name; see `restore`."""
+        return self.batch.snapshot() | {name: array.copy() for name, array in self._own_state().items()}
+
+    def restore(self, snapshot: Mapping[str, NDArray]) -> None:
+        """Go on from a snapshot, bit for bit, in this or another process.
+
+        Raises:
+            ValueError: If it is of another task or robot, of another dtype or of more or fewer environments; nothing
+                has changed then.
+        """
+        own = self._own_state()
+        check_snapshot(snapshot, own)
+        self.batch.restore(snapshot)
+        self._elapsed, self._finished, self._observation = (snapshot[name].copy() for name in own)
+        self._seeded = True
+        self._screen.refresh()
+
+    def _own_state(self) -> dict[str, NDArray]:
+        """What changes here, beside the batch."""
+        return {"elapsed": self._elapsed, "finished": self._finished, "observation": self._observation}
 
     @property
     def elapsed_steps(self) -> NDArray[np.int64]:

@@ -385,3 +385,32 @@ def test_commands_can_be_set():
 
 def test_spec_kwargs_are_json():
     json.dumps(gymnasium.spec(VELOCITY).kwargs)
+
+
+def played(envs, actions: np.ndarray) -> list[np.ndarray]:
+    return [part for action in actions for part in envs.step(action)[:4]]
+
+
+def test_a_snapshot_goes_on_bit_for_bit():
+    """In another batch, made with another seed, while episodes end and begin."""
+    first, second = (gymnasium.make_vec(VELOCITY, num_envs=5, max_episode_steps=9) for _ in range(2))
+    first.reset(seed=3)
+    second.reset(seed=4)
+    actions = random_actions(30, 5)
+    played(first, actions[:11])
+    second.unwrapped.restore(first.unwrapped.snapshot())
+    for a, b in zip(played(first, actions[11:]), played(second, actions[11:]), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_snapshot_that_does_not_fit_changes_nothing():
+    envs, fewer = (gymnasium.make_vec(VELOCITY, num_envs=n).unwrapped for n in (5, 3))
+    envs.reset(seed=0)
+    fewer.reset(seed=0)
+    before = envs.snapshot()
+    with pytest.raises(ValueError, match=r"elapsed: int64 \(3,\); expected int64 \(5,\)"):
+        envs.restore(fewer.snapshot())
+    with pytest.raises(ValueError, match="q: nothing"):
+        envs.restore({name: array for name, array in before.items() if name != "q"})
+    for name, array in envs.snapshot().items():
+        np.testing.assert_array_equal(array, before[name])

@@ -6,6 +6,7 @@ environment of its own are the same numbers, bit for bit. May know programs, com
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,6 +130,25 @@ class Batch:
         """Overwrite a state buffer, for tests, evaluation and curricula; shape (num_envs, size)."""
         write_rows(self._arrays[name], rows, mask)
 
+    def snapshot(self) -> dict[str, NDArray]:
+        """Return copies of all that changes, by name, one environment per row; see `restore`."""
+        return {name: self.rows(name) for name in self.program.state_sizes} | {
+            "keys": self.keys.copy(),
+            "counters": self._counters.copy(),
+        }
+
+    def restore(self, snapshot: Mapping[str, NDArray]) -> None:
+        """Go on from a snapshot, bit for bit.
+
+        Raises:
+            ValueError: If it is of another task or robot, of another dtype or of more or fewer environments; nothing
+                has changed then.
+        """
+        check_snapshot(snapshot, self.snapshot())
+        for name in self.program.state_sizes:
+            self.write(name, snapshot[name])
+        self.keys[:], self._counters[:] = snapshot["keys"], snapshot["counters"]
+
     def episode_sums(self, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
         """Return sums over the current episodes, zero outside the mask, each shape (num_envs,)."""
         lanes = self._arrays["sums"].shape[2]
@@ -136,6 +156,15 @@ class Batch:
         sums = np.zeros((self.num_envs, len(self.program.sum_names)))
         sums[index] = self._arrays["sums"][index // lanes, :, index % lanes]
         return dict(zip(self.program.sum_names, _finite(sums).T, strict=True))
+
+
+def check_snapshot(snapshot: Mapping[str, NDArray], own: Mapping[str, NDArray]) -> None:
+    """Raise ValueError unless a snapshot has all that an own one has, of the same shapes and types."""
+    for name, array in own.items():
+        given = snapshot.get(name)
+        if given is None or (given.shape, given.dtype) != (array.shape, array.dtype):
+            found = "nothing" if given is None else f"{given.dtype} {given.shape}"
+            raise ValueError(f"snapshot: {name}: {found}; expected {array.dtype} {array.shape}")
 
 
 def _finite(values: NDArray) -> NDArray:

@@ -1,0 +1,367 @@
+"""Train a policy with PPO in seconds: collection and learning as compiled loops over plain arrays.
+
+The same algorithm, arguments and settings files as train/ppo.py, which is the reference; a sixth of the processor time
+for learning. Writes `policy.npz` (weights and record), `policy.json` (the record), `policy.learner.npz` (what going on
+needs; arrays and JSON, nothing that could run), `progress.csv`, `curve.csv` and `checkpoints/`. On one machine a seed
+gives the same bits on any number of threads, and so does training that was interrupted and resumed. Uses public names
+of ce_gym only, and no name of a robot or task.
+
+    python train/fast_ppo.py --env ce_gym/MiniCheetahVelocity-v0
+    python train/fast_ppo.py --resume runs/mini_cheetah_velocity-fast --steps 20e6
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import zipfile
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from console import say_missing
+from gymnasium.vector import AutoresetMode, VectorEnv
+from job import CHECKPOINTS, Job, Trained, make_record
+from job import main as run_jobs
+from numpy.typing import NDArray
+from progress import Curve, Log, ProgressBar, RecentEpisodes, StopInOrder, adapted_rate, geometric, linear, read_curve
+
+try:
+    from loops import adam, advantages_of, drawn
+    from networks import (
+        FIGURES,
+        KINDS,
+        actor_gradient,
+        critic_gradient,
+        layers_of,
+        make_work,
+        outputs,
+        parameter_count,
+    )
+except ModuleNotFoundError as error:
+    raise SystemExit(say_missing("fast_ppo.py", error)) from None
+
+import ce_gym  # noqa: F401  (registers the environments)
+from ce_gym.policies import Actor, Policy, PolicyError, locate_policy, write_npz
+
+SHARES = 8
+"""Parts of a minibatch that threads work on. Fixed, so that results do not depend on the number of threads."""
+
+F = np.float32
+
+
+class FastPPO:
+    """Proximal policy optimisation (Schulman et al. 2017, arXiv:1707.06347) with generalised advantage estimation.
+
+    Args:
+        envs: A vector environment in SAME_STEP autoreset mode.
+        job: The training run.
+
+    Attributes:
+        theta: All parameters: the actor's, the logarithms of the standard deviations, the critic's.
+        steps: Environment steps done.
+        rate: Learning rate.
+        step_seconds, collect_seconds: Time spent inside the environment, and in collection as a whole [s].
+    """
+
+    def __init__(self, envs: VectorEnv, job: Job) -> None:
+        self.envs, self.settings, self.threads = envs, job.settings, job.threads
+        s, n = job.settings, job.settings.num_envs
+        seen: Any = envs.single_observation_space
+        self.two_views = isinstance(seen, gymnasium.spaces.Dict)
+        sizes = [view.shape[0] for view in ((seen["policy"], seen["critic"]) if self.two_views else (seen, seen))]
+        self.n_actions = (envs.single_action_space.shape or (0,))[0]
+        self.actor_sizes = np.array([sizes[0], *s.hidden, self.n_actions])
+        self.critic_sizes = np.array([sizes[1], *s.hidden, 1])
+        self.kind = KINDS.index(s.activation)
+        self.rng = np.random.default_rng(job.seed)
+        count = parameter_count(self.actor_sizes) + self.n_actions + parameter_count(self.critic_sizes)
+        self.theta = np.zeros(count, F)
+        self.moments = np.zeros((2, self.theta.size), F)
+        self.gradients = np.zeros((SHARES, self.theta.size), F)
+        self._start_parameters()
+        self.steps, self.updates, self.rate = 0, 0, s.learning_rate
+        self.episodes = RecentEpisodes(n)
+        self.step_seconds = self.collect_seconds = 0.0
+        self.pool = ThreadPoolExecutor(max(job.threads, 1))
+        self.work = [make_work(np.maximum(self.actor_sizes, self.critic_sizes)) for _ in range(SHARES)]
+        shape = (s.rollout, n)
+        self.seen = [np.zeros((*shape, size), F) for size in (sizes if self.two_views else sizes[:1])]
+        self.actions = np.zeros((*shape, self.n_actions), F)
+        self.log_probs, self.rewards, self.values, self.advantages = (np.zeros(shape, F) for _ in range(4))
+        self.dones = np.zeros(shape, bool)
+        self.observed = self._views(envs.reset(seed=job.seed)[0])
+
+    def parts(self, vector: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Actor, logarithms of the standard deviations, and critic in a vector of parameters."""
+        end = parameter_count(self.actor_sizes)
+        return vector[:end], vector[end : end + self.n_actions], vector[end + self.n_actions :]
+
+    def _start_parameters(self) -> None:
+        """Orthogonal weights, small ones at the end of the actor, as usual for PPO; biases are zero."""
+        actor, log_std, critic = self.parts(self.theta)
+        for vector, sizes, last in ((actor, self.actor_sizes, 0.01), (critic, self.critic_sizes, 1.0)):
+            layers = layers_of(vector, sizes)
+            for i, (weight, _) in enumerate(layers):
+                weight[:] = (last if i == len(layers) - 1 else 2**0.5) * _orthogonal(self.rng, weight.shape)
+        log_std[:] = np.log(self.settings.initial_std)
+
+    def _views(self, observations: Any) -> list[NDArray[np.float32]]:
+        """What the actor sees, and what the critic sees if that is something else."""
+        views = [observations["policy"], observations["critic"]] if self.two_views else [observations]
+        return [np.ascontiguousarray(view, F) for view in views]
+
+    def iterate(self) -> dict[str, float]:
+        """Collect a rollout and learn from it; return what the log shows."""
+        s, done = self.settings, min(self.steps / self.settings.steps, 1.0)
+        if s.final_std:
+            self.parts(self.theta)[1][:] = np.log(geometric(s.initial_std, s.final_std, done))
+        start = time.perf_counter()
+        self.collect()
+        self.collect_seconds += time.perf_counter() - start
+        figures = self.learn(linear(s.entropy, s.final_entropy, done))
+        if s.target_kl:
+            self.rate = adapted_rate(self.rate, figures["train/approx_kl"], s.target_kl)
+        return figures
+
+    def collect(self) -> None:
+        """Act for one rollout, and estimate the advantages of its actions."""
+        s = self.settings
+        actor, log_std, critic = self.parts(self.theta)
+        means, clipped = np.zeros((s.num_envs, self.n_actions), F), np.zeros((s.num_envs, self.n_actions), F)
+        timed_out: list[tuple[int, NDArray, NDArray]] = []
+        for t in range(s.rollout):
+            for view, rows in zip(self.seen, self.observed, strict=True):
+                view[t] = rows
+            self._run(actor, self.actor_sizes, self.observed[0], means)
+            noise = self.rng.standard_normal(means.shape, F)
+            drawn(means, noise, log_std, self.actions[t], clipped, self.log_probs[t])
+            start = time.perf_counter()
+            observations, self.rewards[t], terminated, truncated, infos = self.envs.step(clipped)
+            self.step_seconds += time.perf_counter() - start
+            self.observed, self.dones[t] = self._views(observations), terminated | truncated
+            if self.dones[t].any():
+                self.episodes.add(self.dones[t], infos)
+                late = np.flatnonzero(truncated & ~terminated)
+                if len(late):
+                    timed_out.append((t, late, self._views(infos["final_obs"])[-1][late]))
+        self.steps += self.dones.size
+        self._estimate(critic, timed_out)
+
+    def _estimate(self, critic: NDArray, timed_out: list[tuple[int, NDArray, NDArray]]) -> None:
+        """Values and advantages; an episode that was cut off by time is worth what the critic thinks of its end."""
+        s, known = self.settings, self.seen[-1]
+        self._run(critic, self.critic_sizes, known.reshape(-1, known.shape[2]), self.values.reshape(-1, 1))
+        for t, rows, observations in timed_out:
+            worth = np.zeros((len(rows), 1), F)
+            self._run(critic, self.critic_sizes, observations, worth)
+            self.rewards[t, rows] += F(s.gamma) * worth[:, 0]
+        last = np.zeros((s.num_envs, 1), F)
+        self._run(critic, self.critic_sizes, self.observed[-1], last)
+        advantages_of(self.rewards, self.values, last[:, 0], self.dones, F(s.gamma), F(s.gae_lambda), self.advantages)
+
+    def _run(self, theta: NDArray, sizes: NDArray, observations: NDArray, result: NDArray) -> None:
+        """Run a network, in parts if there is much to do; where parts begin does not change a bit."""
+        parts = self.threads if len(observations) * len(theta) > 4e6 else 1
+        edges = [len(observations) * i // parts for i in range(parts + 1)]
+
+        def work(i: int) -> None:
+            rows = slice(edges[i], edges[i + 1])
+            outputs(theta, sizes, self.kind, observations[rows], result[rows], self.work[i % SHARES])
+
+        if parts == 1:
+            work(0)
+        else:
+            list(self.pool.map(work, range(min(parts, SHARES))))
+
+    def learn(self, entropy: float) -> dict[str, float]:
+        """Go over the rollout several times, in minibatches drawn anew; return means over the last time."""
+        s, n = self.settings, self.dones.size
+        returns = (self.advantages + self.values).reshape(n)
+        size, figures = -(-n // s.minibatches), []
+        for _ in range(s.epochs):
+            order = self.rng.permutation(n)
+            figures = [self._update(order[i : i + size], returns, F(entropy)) for i in range(0, n, size)]
+        means = np.mean(figures, axis=0).tolist()
+        result = {f"train/{name}": mean for name, mean in zip(FIGURES, means, strict=True)}
+        spread = float(np.var(returns))
+        unexplained = float(np.var(self.advantages)) / spread if spread else np.nan
+        std = float(np.exp(self.parts(self.theta)[1]).mean())
+        return result | {
+            "train/explained_variance": 1 - unexplained,
+            "train/std": std,
+            "train/learning_rate": self.rate,
+        }
+
+    def _update(self, rows: NDArray, returns: NDArray, entropy: np.float32) -> NDArray:
+        """One step of Adam on a minibatch; return `FIGURES`."""
+        s, n = self.settings, self.dones.size
+        seen, known = self.seen[0].reshape(n, -1), self.seen[-1].reshape(n, -1)
+        advantages = self.advantages.reshape(n)
+        samples = (seen, self.actions.reshape(n, -1), self.log_probs.reshape(n), advantages)
+        chosen = advantages[rows]
+        scaling = (chosen.mean(), F(1) / (chosen.std(ddof=1) + F(1e-8)), F(1 / len(rows)))
+        actor, log_std, critic = self.parts(self.theta)
+        figures = np.zeros((SHARES, len(FIGURES)), F)
+        self.gradients[:] = 0
+
+        def work(i: int, part: NDArray) -> None:
+            by_actor, by_log_std, by_critic = self.parts(self.gradients[i])
+            options = (scaling, F(s.clip), entropy)
+            actor_gradient(
+                actor, log_std, self.actor_sizes, self.kind, samples, part, *options, by_actor, by_log_std, figures[i],
+                self.work[i],
+            )  # fmt: skip
+            critic_gradient(
+                critic, self.critic_sizes, self.kind, (known, returns), part, scaling[2], F(s.value), by_critic,
+                figures[i], self.work[i],
+            )  # fmt: skip
+
+        list((self.pool.map if self.threads > 1 else map)(work, range(SHARES), np.array_split(rows, SHARES)))
+        self.updates += 1
+        gradient = self.gradients.sum(axis=0)
+        adam(self.theta, gradient, self.moments[0], self.moments[1], self.updates, self.rate, s.max_grad_norm)
+        return figures.sum(axis=0)
+
+    def actor(self) -> Actor:
+        """The layers that turn observations into mean actions, copies."""
+        layers = layers_of(self.parts(self.theta)[0], self.actor_sizes)
+        return Actor(tuple((weight.T.copy(), bias.copy()) for weight, bias in layers), self.settings.activation)
+
+    def state(self) -> dict[str, NDArray]:
+        """All that going on needs, as arrays: see `restore`."""
+        native: Any = self.envs.unwrapped
+        facts = {
+            "steps": self.steps, "updates": self.updates, "rate": self.rate, "rng": self.rng.bit_generator.state,
+            "sizes": [self.actor_sizes.tolist(), self.critic_sizes.tolist()], "activation": self.settings.activation,
+            "episodes": self.episodes.names,
+        }  # fmt: skip
+        found = {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
+        found |= {f"observed_{i}": view for i, view in enumerate(self.observed)} | {"episodes": self.episodes.rows()}
+        if hasattr(native, "snapshot"):
+            found |= {f"env/{name}": array for name, array in native.snapshot().items()}
+        return found
+
+    def restore(self, state: dict[str, NDArray]) -> None:
+        """Go on from a state; environments that cannot be restored, or are more or fewer, begin anew.
+
+        Raises:
+            ValueError: If it is of another network.
+        """
+        facts = json.loads(str(state["facts"]))
+        mine = [self.actor_sizes.tolist(), self.critic_sizes.tolist(), self.settings.activation]
+        if [*facts["sizes"], facts["activation"]] != mine:
+            raise ValueError(f"has layers {facts['sizes'][0]}, {facts['activation']}; expected {mine[0]}, {mine[2]}")
+        self.theta[:], self.moments[:] = state["theta"], state["moments"]
+        self.steps, self.updates, self.rate = facts["steps"], facts["updates"], facts["rate"]
+        self.rng.bit_generator.state = facts["rng"]
+        environments = {name.removeprefix("env/"): array for name, array in state.items() if name.startswith("env/")}
+        if environments and len(state["observed_0"]) == self.settings.num_envs:
+            native: Any = self.envs.unwrapped
+            native.restore(environments)
+            self.observed = [state[f"observed_{i}"] for i in range(len(self.observed))]
+            self.episodes.restore(facts["episodes"], state["episodes"])
+
+
+def _orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """A random matrix with orthonormal rows or columns, whichever are fewer."""
+    q, r = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))
+    q = q * np.sign(np.diag(r))
+    return (q if shape[0] >= shape[1] else q.T).astype(F)
+
+
+def train(job: Job) -> Trained:
+    """Train, and save the policy even if Ctrl-C ends training early.
+
+    Raises:
+        PolicyError: If the policy to resume does not fit the environment or the settings.
+    """
+    job.out.mkdir(parents=True, exist_ok=True)
+    options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
+    mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
+    n = job.settings.num_envs
+    envs = gymnasium.make_vec(job.env_id, num_envs=n, vectorization_mode=mode, **{**options, **job.env_kwargs})
+    try:
+        learner = FastPPO(envs, job)
+        if job.resume:
+            resume(learner, job.resume)
+        return _learn(learner, job)
+    finally:
+        envs.close()
+
+
+def _learn(learner: FastPPO, job: Job) -> Trained:
+    """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
+    s, start = job.settings, time.perf_counter()
+    curve = Curve(job.out / "curve.csv", _earlier(job.resume), learner.steps)
+    bar, log = ProgressBar(s.steps, learner.steps), Log(job.out / "progress.csv")
+
+    def record(finished: bool = False) -> dict[str, Any]:
+        seconds = time.perf_counter() - start
+        written = make_record(job, learner.envs.unwrapped, learner.steps, seconds, ("numba",))
+        return written | {"learner": "fast_ppo", "finished": finished}
+
+    every = max(s.steps // CHECKPOINTS, 1)
+    with StopInOrder(job.seconds) as stop:
+        while learner.steps < s.steps and not stop.due:
+            before = learner.steps // every
+            figures, means = learner.iterate(), learner.episodes.means()
+            curve.add(learner.steps, means)
+            log.add(learner.steps, time.perf_counter() - start, means, figures)
+            bar.advance(learner.steps)
+            bar.describe(means, learner.step_seconds, learner.collect_seconds)
+            if learner.steps // every > before and learner.steps < s.steps:
+                save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
+        bar.close()
+    written = record(finished=not stop.interrupted)
+    policy = save(learner, written, job.out / "policy")
+    return Trained(Policy(learner.actor(), written), written, policy, stop.interrupted)
+
+
+def save(learner: FastPPO, record: dict[str, Any], path: Path) -> Path:
+    """Write `path`.npz, .json and .learner.npz, each whole or not at all, and return the path of the policy."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = [path.with_name(f".{path.name}{kind}") for kind in (".learner.npz", ".json", ".npz")]
+    np.savez(fresh[0], allow_pickle=False, **learner.state())
+    fresh[1].write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    write_npz(learner.actor(), record, fresh[2])
+    for file in fresh:
+        file.replace(path.with_name(file.name[1:]))
+    return path.with_name(f"{path.name}.npz")
+
+
+def resume(learner: FastPPO, policy: Path) -> None:
+    """Let a learner go on from a policy.
+
+    Raises:
+        PolicyError: If what it was trained by is missing, damaged or of another network.
+    """
+    file = _learner_file(policy)
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            learner.restore({name: arrays[name] for name in arrays.files})
+    except FileNotFoundError:
+        raise PolicyError(f"{file}: no such file; expected what train/fast_ppo.py writes beside a policy") from None
+    except (OSError, LookupError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise PolicyError(f"{file}: cannot be gone on from: {' '.join(str(error).split())[:200]}") from None
+
+
+def _learner_file(policy: Path) -> Path:
+    return locate_policy(policy).with_suffix(".learner.npz")
+
+
+def _earlier(policy: Path | None) -> list[dict[str, float]]:
+    """The learning curve of the policy gone on from."""
+    return read_curve(locate_policy(policy).parent / "curve.csv") if policy else []
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line of this file."""
+    return run_jobs("fast_ppo.py", train, argv, folder="-fast")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

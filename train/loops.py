@@ -1,0 +1,71 @@
+"""What PPO does beside its networks, as compiled loops: drawing actions, advantages, Adam. Knows numbers only."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+from numba import njit as numba_njit
+
+njit = partial(numba_njit, error_model="numpy")
+"""Divisions are not checked, as numpy does it: what is checked cannot be a vector instruction."""
+
+ONE, ZERO = np.float32(1), np.float32(0)
+
+
+@njit(cache=True)
+def drawn(means, noise, log_std, actions, clipped, log_probs):
+    """Fill actions (n, n_actions), the same within -1..1, and log-probabilities (n,) of Gaussian actions.
+
+    `noise` (n, n_actions) is what was drawn from the normal distribution.
+    """
+    n_actions, std = len(log_std), np.exp(log_std)
+    constant = np.float32(n_actions * 0.5 * math.log(2 * math.pi))
+    for j in range(n_actions):
+        constant += log_std[j]
+    for i in range(len(means)):
+        square = ZERO
+        for j in range(n_actions):
+            a = means[i, j] + std[j] * noise[i, j]
+            square += noise[i, j] * noise[i, j]
+            actions[i, j] = a
+            a = a if a < ONE else ONE
+            clipped[i, j] = a if a > -ONE else -ONE
+        log_probs[i] = np.float32(-0.5) * square - constant
+
+
+@njit(cache=True)
+def adam(theta, gradient, first, second, step, rate, max_norm):
+    """One step of Adam (Kingma & Ba 2015) with the gradient clipped to a norm; all but the numbers in place."""
+    square = 0.0
+    for g in gradient:
+        square += float(g) * float(g)
+    shrink = np.float32(min(1.0, max_norm / (math.sqrt(square) + 1e-6)))
+    b1, b2, epsilon = np.float32(0.9), np.float32(0.999), np.float32(1e-5)
+    pace = np.float32(rate / (1 - 0.9**step))
+    spread = np.float32(1 / math.sqrt(1 - 0.999**step))
+    for i in range(len(theta)):
+        g = gradient[i] * shrink
+        first[i] = b1 * first[i] + (ONE - b1) * g
+        second[i] = b2 * second[i] + (ONE - b2) * g * g
+        theta[i] -= pace * first[i] / (np.sqrt(second[i]) * spread + epsilon)
+
+
+@njit(cache=True)
+def advantages_of(rewards, values, last_values, dones, gamma, decay, advantages):
+    """Generalised advantage estimates (Schulman et al. 2016) of rewards (n_steps, n_envs), into `advantages`.
+
+    `values` are those of the observations acted on, `last_values` (n_envs,) of those after the last step; where an
+    episode ended, nothing that comes after it counts.
+    """
+    n_steps, n_envs = rewards.shape
+    following = last_values.copy()
+    estimate = np.zeros(n_envs, np.float32)
+    for t in range(n_steps - 1, -1, -1):
+        for i in range(n_envs):
+            going = ZERO if dones[t, i] else ONE
+            delta = rewards[t, i] + gamma * going * following[i] - values[t, i]
+            estimate[i] = delta + gamma * decay * going * estimate[i]
+            advantages[t, i] = estimate[i]
+            following[i] = values[t, i]
