@@ -4,17 +4,14 @@ Knows numpy arrays and the calling convention; LLVM and files stay behind `loadi
 """
 
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from ce_gym.compile.arrays import ALIGNMENT, lane_count, tile_count
-from ce_gym.compile.layout import Layout
+from ce_gym.compile.layout import Layout, MachineCode
 from ce_gym.compile.program import Buffer
 from ce_gym.compile.threads import MemoryPool, run_chunks
-
-MachineCode = Callable[[int, int, int, int, int, int], None]
-"""Takes the addresses of the list of arrays, the repeat counts, scratch memory; first tile, end tile, environments."""
 
 KEYS, COUNTERS = np.dtype(np.uint64), np.dtype(np.int64)
 WORD = 8

@@ -5,11 +5,15 @@ Plain data that is stored beside the machine code, so that a cached kernel needs
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.program import Buffer, Program, Repeat
+
+MachineCode = Callable[[int, int, int, int, int, int], None]
+"""Takes the addresses of the list of arrays, the repeat counts, scratch memory; first tile, end tile, environments."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,12 @@ from ce_gym.compile.cache import announced, cache_folder, read_entry, write_entr
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.layout import layout_from, layout_of
 from ce_gym.compile.program import Program, check_program
-from ce_gym.compile.sources import source_fingerprint
+from ce_gym.compile.sources import source_fingerprint, toolchain
+
+SOURCES = tuple(
+    f"ce_gym.compile.{name}" for name in ("arrays", "layout", "loading", "lowering", "machine_code", "program")
+)
+"""What turns programs into entries of the cache."""
 
 _loaded: dict[tuple[Path | None, str], Kernel] = {}
 _lock = threading.RLock()
@@ -29,7 +34,8 @@ def load_kernel(key: str, build: Callable[[], Program], dtype: str = "float64") 
     """A kernel from the cache, or compiled and put there.
 
     Args:
-        key: names everything the program depends on; equal keys must mean equal programs.
+        key: names everything the program depends on, the sources that build it included (`source_fingerprint`); equal
+            keys must mean equal programs.
         build: makes the program; it is called only when the machine code is not in the cache.
         dtype: `float64` or `float32`.
 
@@ -42,13 +48,19 @@ def load_kernel(key: str, build: Callable[[], Program], dtype: str = "float64") 
     """
     dtype = np.dtype(dtype).name
     lane_count(dtype)  # refuses other dtypes
-    facts = repr((key, dtype, source_fingerprint("ce_gym")))
-    name = "kernel_" + hashlib.sha256(facts.encode()).hexdigest()[:24]
-    folder = cache_folder()
+    name, folder = kernel_name(key, dtype), cache_folder()
     with _lock:
         if (folder, name) not in _loaded:
             _loaded[folder, name] = _load(folder, name, build, dtype)
         return _loaded[folder, name]
+
+
+def kernel_name(key: str, dtype: str) -> str:
+    """The name under which a kernel is cached: what compiles it and the CPU count."""
+    from ce_gym.compile.machine_code import host_cpu
+
+    facts = repr((key, dtype, source_fingerprint(*SOURCES), toolchain(), host_cpu()))
+    return "kernel_" + hashlib.sha256(facts.encode()).hexdigest()[:24]
 
 
 def _load(folder: Path | None, name: str, build: Callable[[], Program], dtype: str) -> Kernel:

@@ -9,7 +9,7 @@ from functools import cache
 
 from llvmlite import binding, ir
 
-from ce_gym.compile.kernel import MachineCode
+from ce_gym.compile.layout import MachineCode
 from ce_gym.compile.lowering.vector import Builder, Value, loop
 
 Emit = Callable[[Builder, tuple[Value, ...]], None]

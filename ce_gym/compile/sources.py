@@ -1,4 +1,4 @@
-"""What the machine code of a program follows from, beside the program itself: our sources, versions, the CPU."""
+"""What a kernel follows from, beside its program's figures: the sources that trace and compile it, and versions."""
 
 import hashlib
 import importlib.util
@@ -11,29 +11,36 @@ COMPILERS = ("casadi", "llvmlite", "numpy")
 
 
 @cache
-def source_fingerprint(*packages: str) -> str:
-    """Hash of what the machine code follows from, beside the program itself.
+def source_fingerprint(*names: str) -> str:
+    """Hash of sources, for the keys of kernels whose programs they build.
 
     Args:
-        packages: importable packages whose .py files count.
+        names: importable modules, and packages with everything in them.
 
     Returns:
-        16 hexadecimal digits, over the sources, the versions of CasADi, llvmlite, numpy and Python, and the CPU's name
-        and features.
-    """
-    from ce_gym.compile.machine_code import host_cpu
+        16 hexadecimal digits.
 
+    Raises:
+        ValueError: when a name is not that of a module with Python sources.
+    """
     digest = hashlib.sha256()
-    for package in packages:
-        for path in _sources(package):
-            digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    facts = [f"{name} {version(name)}" for name in COMPILERS] + [platform.python_version(), platform.machine()]
-    digest.update("\n".join((*facts, *host_cpu())).encode())
+    for name in names:
+        for path in source_files(name):
+            digest.update(hashlib.sha256(path.read_bytes()).digest() + path.name.encode() + b"\n")
     return digest.hexdigest()[:16]
 
 
-def _sources(package: str) -> list[Path]:
-    spec = importlib.util.find_spec(package)
-    if spec is None or spec.submodule_search_locations is None:
-        raise ValueError(f"package {package!r}: not found, expected an importable package with Python sources")
-    return sorted(path for root in spec.submodule_search_locations for path in Path(root).rglob("*.py"))
+def source_files(name: str) -> list[Path]:
+    """The .py files of a module, or of a package with everything in it."""
+    spec = importlib.util.find_spec(name)
+    if spec is not None and spec.submodule_search_locations is not None:
+        return sorted(path for root in spec.submodule_search_locations for path in Path(root).rglob("*.py"))
+    if spec is None or spec.origin is None:
+        raise ValueError(f"module {name!r}: not found, expected an importable one with Python sources")
+    return [Path(spec.origin)]
+
+
+@cache
+def toolchain() -> str:
+    """Versions of what traces and compiles."""
+    return ", ".join([f"{name} {version(name)}" for name in COMPILERS] + [f"Python {platform.python_version()}"])

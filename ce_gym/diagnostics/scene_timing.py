@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.compile import Buffer, Call, Kernel, Program, Repeat, load_kernel
+from ce_gym.compile import Buffer, Call, Kernel, Program, Repeat, load_kernel, source_fingerprint
 from ce_gym.diagnostics.scene import SceneReport, SubStep
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
@@ -129,7 +129,7 @@ def _function_kernel(function: ca.Function) -> Kernel:
         call = Call(ca.Function(function.name(), arguments, results), tuple(function.name_in()), written)
         return Program(f"part of a scene: {function.name()}", tuple(buffers), (Repeat(TIMES, (call,)),))
 
-    return load_kernel(f"function {function.serialize()}", build, DTYPE)
+    return load_kernel(f"{source_fingerprint(__name__)} {function.serialize()}", build, DTYPE)
 
 
 def _clocked(work: Callable[[], object], units: int) -> float:

@@ -19,8 +19,9 @@ from ce_gym.dynamics.forces.scene import Control, Friction, Motors, StepOptions,
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import OUTPUTS
-from ce_gym.model import ContactMaterial, FunctionConstraint, Robot
+from ce_gym.model import ContactMaterial, Robot
 from ce_gym.sim.devices import Array, Device, Processor, device_named, to_numpy
+from ce_gym.sim.kernel_key import model_key
 from ce_gym.sim.pieces import piece_length, run_substeps
 from ce_gym.sim.placement import Placement
 from ce_gym.sim.retry import Retry
@@ -350,16 +351,6 @@ def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, .
     for name in sorted(wanted - known):
         _check("contacts", name, False, f"'all', groups or names among {', '.join(sorted(known - {'all'}))}")
     return tuple(c.name for c in robot.contacts if wanted & {"all", c.group, c.name})
-
-
-def model_key(model: Model) -> str:
-    """Return a text that is equal for equal models, for cache keys; where a robot was read from does not matter."""
-    figures = replace(model.robot, source="", notes=(), tasks=())
-    functions = [tie for tie in figures.constraints if isinstance(tie, FunctionConstraint)]
-    traced = [
-        model.casadi_function("loops").serialize() for _ in functions[:1]
-    ]  # their text is not part of the description
-    return f"{figures!r} {model.transmission} {model.locked_rotors} {model.eliminated} {traced}"
 
 
 def load_step_kernel(

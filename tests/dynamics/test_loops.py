@@ -26,6 +26,7 @@ from ce_gym.model import (
     register_constraint,
 )
 from ce_gym.model.mechanism import LEVELS
+from ce_gym.sim.kernel_key import model_key
 
 ROBOTS = {
     "four_bar": four_bar,
@@ -263,6 +264,16 @@ def test_functions_from_python():
     tau_b = backwards.actuator_matrix(q_b, ["arm", "elbow"]).T @ tau
     accelerations = backwards.spanning_acceleration(q_b, v_b, backwards.forward_dynamics(q_b, v_b, tau_b))
     np.testing.assert_allclose(accelerations, explicit.spanning_acceleration(q, v, vdot), rtol=1e-10)
+
+
+@pytest.mark.parametrize("dependent", [("cam",), ()])
+def test_a_kernel_is_not_taken_for_that_of_another_function_of_the_same_name(dependent):
+    robot = with_function(arguments=("elbow",) if dependent else ("elbow", "cam"), dependent=dependent)
+    keys = []
+    for gain in (0.5, 0.7, 0.5):
+        register_constraint("test_cam", lambda q, gain=gain: [sum(q[1:], gain * ca.sin(q[0]))])
+        keys.append(model_key(Model(robot)))
+    assert keys[0] == keys[2] != keys[1]
 
 
 def test_functions_that_are_wrong():

@@ -34,7 +34,7 @@ LAYERS = {
     "model/formats": "reading placement rotor_rule urdf yaml mjcf",
     "compile": "arrays program layout lowering ours cache critical threads kernel machine_code sources loading cuda",
     "dynamics": "algebra constraints recursion forces functions stepping model",
-    "sim": "tiles devices terrain placement substeps pieces retry simulator",
+    "sim": "tiles devices terrain placement substeps pieces retry kernel_key simulator",
     "envs": "terms task runtime policy_spec base rendering single gpu_vector vector registration custom",
     "viewer": "errors console rollouts page raytrace live window renderers cli",
     "bench": "measure peers friction instructions tracking soak digests speed throughput paper accuracy stability gpu"

@@ -13,9 +13,9 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
-from ce_gym.compile import Buffer, Call, Program, Repeat, aligned_zeros, lane_count, load_kernel
+from ce_gym.compile import Buffer, Call, Program, Repeat, aligned_zeros, lane_count, load_kernel, source_fingerprint
 from ce_gym.dynamics.model import Model
-from ce_gym.sim.simulator import model_key
+from ce_gym.sim.kernel_key import model_key
 
 SX = ca.SX
 
@@ -91,7 +91,7 @@ def robot(scene: Scene, n: int) -> Array:
         call = Call(step, tuple(step.name_in()), ("q", "v", "s"))
         return Program(f"{scene.robot.name} explicit contact", tuple(buffers), (Repeat("n", (call,)),))
 
-    kernel = load_kernel(f"bench explicit contact {model_key(model)}", build, "float64")
+    kernel = load_kernel(f"{source_fingerprint(__name__)} {model_key(model)}", build, "float64")
     lanes = lane_count("float64")
     arrays = {name: aligned_zeros((1, buffer.size, lanes), "float64") for name, buffer in kernel.buffers.items()}
     arrays["q"][0], arrays["v"][0], arrays["dt"][:] = scene.q[:, None], scene.v[:, None], HOLD / n

@@ -11,9 +11,10 @@ import numpy as np
 
 from ce_gym.bench.measure.timing import Competitor
 from ce_gym.bench.peers import mujoco as mujoco_peer
-from ce_gym.compile import Buffer, Call, Kernel, Program, aligned_zeros, lane_count, load_kernel
+from ce_gym.compile import Buffer, Call, Kernel, Program, aligned_zeros, lane_count, load_kernel, source_fingerprint
 from ce_gym.dynamics.model import Model
 from ce_gym.model.description import Robot
+from ce_gym.sim.kernel_key import model_key
 
 
 def kernel(robot: Robot, level: str, dtype: str) -> Kernel:
@@ -27,7 +28,7 @@ def kernel(robot: Robot, level: str, dtype: str) -> Kernel:
             f"{robot.name} {level} forward dynamics", tuple(Buffer(name, n, "tiles") for name, n in inputs), (call,)
         )
 
-    return load_kernel(f"bench forward dynamics {level} {robot!r}", build, dtype)
+    return load_kernel(f"{source_fingerprint(__name__)} {model_key(model)}", build, dtype)
 
 
 def random_states(model: Model, num_envs: int) -> dict[str, np.ndarray]:

@@ -9,7 +9,17 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.bench.measure.timing import Competitor
-from ce_gym.compile import Buffer, Call, Kernel, Program, Repeat, aligned_zeros, lane_count, load_kernel
+from ce_gym.compile import (
+    Buffer,
+    Call,
+    Kernel,
+    Program,
+    Repeat,
+    aligned_zeros,
+    lane_count,
+    load_kernel,
+    source_fingerprint,
+)
 
 CHAINS, LINKS = 16, 80
 """So many chains that they hide the latency of two units and stay in registers; so long that loads do not matter."""
@@ -48,4 +58,4 @@ def _kernel(dtype: str) -> Kernel:
         buffers = (Buffer("x", CHAINS, "tiles"), Buffer("factor", 2, "tiles"))
         return Program("chains of multiply-adds", buffers, (Repeat("times", (call,)),))
 
-    return load_kernel(f"bench peak {CHAINS} {LINKS}", build, dtype)
+    return load_kernel(source_fingerprint(__name__), build, dtype)

@@ -15,8 +15,10 @@ from ce_gym.compile.cuda.nvrtc import Usage, compile_cubin, compiler_version
 from ce_gym.compile.cuda.source import Source, emit_source
 from ce_gym.compile.layout import layout_from
 from ce_gym.compile.program import Program
-from ce_gym.compile.sources import source_fingerprint
+from ce_gym.compile.sources import source_fingerprint, toolchain
 
+SOURCES = tuple(f"ce_gym.compile.{name}" for name in ("arrays", "cuda", "layout", "lowering", "program"))
+"""What turns stages into entries of the cache."""
 Stages = Callable[[], Sequence[Program]]
 _loaded: dict[tuple[Path | None, str, int], CudaKernel] = {}
 _lock = threading.RLock()
@@ -26,7 +28,8 @@ def load_cuda_kernel(key: str, build: Stages, dtype: str, gpu: int = 0) -> CudaK
     """A kernel from the cache, or compiled and put there, on a GPU.
 
     Args:
-        key: names everything the stages depend on; equal keys must mean equal stages.
+        key: names everything the stages depend on, the sources that build them included; equal keys must mean equal
+            stages.
         build: makes the stages; called only when the machine code is not in the cache.
         dtype: `float64` or `float32`.
         gpu: number of the GPU.
@@ -48,7 +51,7 @@ def load_cuda_kernel(key: str, build: Stages, dtype: str, gpu: int = 0) -> CudaK
 
 def kernel_name(key: str, dtype: str, arch: str) -> str:
     """Return the name under which a kernel is cached: our sources, the architecture and the compiler count."""
-    facts = repr((key, dtype, arch, compiler_version(), source_fingerprint("ce_gym")))
+    facts = repr((key, dtype, arch, compiler_version(), source_fingerprint(*SOURCES), toolchain()))
     return "cuda_" + hashlib.sha256(facts.encode()).hexdigest()[:24]
 
 

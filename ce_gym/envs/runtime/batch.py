@@ -12,13 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.compile import Kernel, load_kernel
+from ce_gym.compile import Kernel, load_kernel, source_fingerprint
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.terrain_tiles import make_field
-from ce_gym.sim.simulator import model_key
+from ce_gym.sim.kernel_key import model_key
 from ce_gym.sim.substeps import FRAME, HEIGHTS
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
+SOURCES = ("ce_gym.envs.runtime", "ce_gym.envs.task", "ce_gym.envs.terms")
+"""What traces a task, beside what traces a model, and makes programs of it."""
 PROGRESS = {"level": "terrain_level", "grown": "times_grown"}
 """State of the curricula, and its names for those who watch."""
 
@@ -174,7 +176,8 @@ def _finite(values: NDArray) -> NDArray:
 
 def kernel_key(program: TaskProgram) -> str:
     """Return a text that names everything that the kernels of a task on a robot depend on."""
-    return f"{model_key(program.model)} {program.task!r} {program.contact_forces} {program.added_terms()}"
+    traced = f"{source_fingerprint(*SOURCES)} {model_key(program.model)}"
+    return f"{traced} {program.task!r} {program.contact_forces} {program.added_terms()}"
 
 
 def _kernels(program: TaskProgram, dtype: str) -> tuple[Kernel, Kernel]:
