@@ -6,6 +6,7 @@ Knows the order of these steps and nothing of how each is done. LLVM and CasADi 
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -86,3 +87,7 @@ def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> t
     with announced(f"{program.name} ({dtype})", folder, started):
         code = compile_object(lambda builder, arguments: emit_tile(builder, program, layout, arguments))
     return asdict(layout), code
+
+
+if hasattr(os, "register_at_fork"):  # a child could wait for ever for a thread of its parent that compiles
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)

@@ -198,16 +198,21 @@ class Simulator:
         Args:
             target: Positions [rad] or torques [N m], shape (num_envs, n) or (n,), in the order of `target_names`:
                 that of `model.joint_links` unless the motors are controlled.
-            n_substeps: Number of sub-steps of length `dt`.
+                On a GPU nobody looks whether they are finite, for that would need waiting.
+            n_substeps: Number of sub-steps of length `dt`; 0 does nothing.
 
         Raises:
-            ValueError: If the shape is wrong.
+            ValueError: If a shape is wrong, a target is not finite, or `n_substeps` is no such number.
             RuntimeError: If another thread steps or sets the same robots.
         """
         n = len(self.target_names)
         rows = self._device.rows(target, self.dtype)
         if tuple(rows.shape) not in ((n,), (self.num_envs, n)):
             raise ValueError(f"target has shape {tuple(rows.shape)}; expected ({n},) or ({self.num_envs}, {n})")
+        if isinstance(rows, np.ndarray) and not np.isfinite(rows).all():
+            raise ValueError(f"target holds a number that is not finite in {self.dtype}")
+        if isinstance(n_substeps, bool) or not isinstance(n_substeps, int | np.integer) or n_substeps < 0:
+            raise ValueError(f"n_substeps={n_substeps!r}; expected a whole number, at least 0")
         rows = self._device.rows(rows, self.dtype, (self.num_envs, n))
         with self._section:
             self._advance({"target": rows}, n_substeps)

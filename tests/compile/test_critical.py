@@ -6,10 +6,11 @@ import signal
 import threading
 import time
 
+import casadi as ca
 import numpy as np
 import pytest
 
-from ce_gym.compile import CriticalSection
+from ce_gym.compile import Buffer, Call, CriticalSection, Program, load_kernel
 from ce_gym.compile.threads import run_chunks
 
 
@@ -144,6 +145,33 @@ def test_a_child_forked_during_a_section_hears_ctrl_c():
         thread.start()
         thread.join()
     assert heard == [0]
+
+
+def doubling(name):
+    x = ca.SX.sym("x", 1)
+    call = Call(ca.Function("double", [x], [2 * x]), ("x",), ("x",))
+    return Program(name, (Buffer("x", 1, "tiles"),), (call,))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+def test_a_child_forked_during_a_compilation_compiles():
+    begun = threading.Event()
+
+    def slowly():
+        begun.set()
+        time.sleep(0.3)
+        return doubling("of the parent")
+
+    thread = threading.Thread(target=load_kernel, args=("fork, parent", slowly))
+    thread.start()
+    begun.wait()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)  # ends a child that waits for ever
+        load_kernel("fork, child", lambda: doubling("of the child"))
+        os._exit(0)
+    thread.join()
+    assert os.waitpid(child, 0)[1] == 0
 
 
 def test_every_part_is_worked_on_once():

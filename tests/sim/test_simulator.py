@@ -159,3 +159,35 @@ def test_fixed_base_robot_without_ground():
     sim.step(np.zeros(leg.nv), 2000)
     after = sum(leg.energy(sim.q, sim.v))[0]
     assert abs(after - before) < 0.01 * abs(leg.energy(sim.q, sim.v)[0][0] + 1.0)
+
+
+@pytest.mark.parametrize("n", [-1, 2.5, "3", True, None], ids=repr)
+def test_a_number_of_sub_steps_that_is_none(model: Model, n):
+    sim = Simulator(model, 2)
+    with pytest.raises(ValueError, match=r"^n_substeps=.*; expected a whole number, at least 0$"):
+        sim.step(model.standing_q[7:], n)
+    assert (sim.q == model.standing_q).all()
+
+
+def test_no_sub_steps_change_nothing(model: Model):
+    sim = Simulator(model, 2)
+    sim.step(model.standing_q[7:], 3)
+    q, v, forces = sim.q, sim.v, sim.contact_forces
+    sim.step(model.standing_q[7:] + 0.1, np.int64(0))
+    for before, after in ((q, sim.q), (v, sim.v), (forces, sim.contact_forces)):
+        np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize(("dtype", "figure"), [("float64", np.inf), ("float64", np.nan), ("float32", 1e300)])
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_targets_and_states_that_are_not_finite_change_nothing(model: Model, dtype: str, figure: float):
+    sim = Simulator(model, 2, dtype=dtype)
+    q, v, target = sim.q.astype(float), sim.v.astype(float), np.tile(model.standing_q[7:], (2, 1))
+    target[1, 3] = figure
+    with pytest.raises(ValueError, match=f"^target holds a number that is not finite in {dtype}$"):
+        sim.step(target)
+    v[1, 3] = figure
+    with pytest.raises(ValueError, match=f"^v holds a number that is not finite in {dtype}$"):
+        sim.set_state(q + 0.1, v)
+    np.testing.assert_array_equal(sim.q, q)
+    assert not sim.diverged.any()
