@@ -7,6 +7,7 @@
 `Terrain` is ground for it that is not flat.
 """
 
+from ce_gym.compile.system import usable_cores
 from ce_gym.diagnostics.scene_text import scene_report
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.custom import register_robot
@@ -42,6 +43,7 @@ __all__ = [
     "scene_report",
     "shipped_policies",
     "termination",
+    "usable_cores",
 ]
 
 register_environments()

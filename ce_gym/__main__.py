@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Sequence
 
 from ce_gym.viewer.cli import add_play_command, add_view_command
-from ce_gym.viewer.console import Parser, examples
+from ce_gym.viewer.console import Parser, examples, print_anything
 
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
 
@@ -30,6 +30,7 @@ Each has --help. In Python: gymnasium.make("ce_gym:ce_gym/MiniCheetahVelocity-v0
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0, or 2 if the user has something to mend."""
+    print_anything()
     argv = sys.argv[1:] if argv is None else list(argv)
     if not argv:
         print(WELCOME)

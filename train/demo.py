@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 from console import run
 from evaluate import EVALUATION_SEED, load_learner, report
-from job import Job, Trained, available_threads
+from job import Job, Trained
 from ppo import train
 from settings import config_file, load_settings
 from transfer import summary, table, transfer
 
+from ce_gym import usable_cores
 from ce_gym.policies import load_policy
 from ce_gym.viewer import Rollout, walk, write_html
 
@@ -64,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps (default: as in the settings file)")
     parser.add_argument("--minutes", type=float, default=4.0, metavar="M", help="longest time to train (default 4)")
-    parser.add_argument("--threads", type=int, default=available_threads(), metavar="N", help="default: all processors")
+    parser.add_argument("--threads", type=int, default=usable_cores(), metavar="N", help="default: all processors")
     parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes to judge it by (default 256)")
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     args = parser.parse_args(argv)

@@ -7,7 +7,6 @@ learner; no robots, no tasks.
 from __future__ import annotations
 
 import argparse
-import os
 import platform
 import sys
 import time
@@ -20,6 +19,7 @@ from typing import Any
 import gymnasium
 from settings import Settings, config_file, load_settings
 
+from ce_gym import usable_cores
 from ce_gym.policies import load_policy
 
 CHECKPOINTS = 10
@@ -109,11 +109,6 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def available_threads() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
     """The training runs a command line asks for; `folder` ends the names of folders that it does not give.
 
@@ -177,7 +172,7 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument(
         "--minutes", type=float, default=float("inf"), metavar="M", help="stop after so long at the latest"
     )
-    how.add_argument("--threads", type=int, default=available_threads(), metavar="N", help="default: all processors")
+    how.add_argument("--threads", type=int, default=usable_cores(), metavar="N", help="default: all processors")
     where = result.add_argument_group("where to")
     where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")
     where.add_argument("--no-tensorboard", dest="tensorboard", action="store_false", help="write no TensorBoard logs")

@@ -23,6 +23,7 @@ from evaluate import EVALUATION_SEED, add_arguments, env_kwargs, evaluate
 from settings import Settings, config_file, load_settings
 from stable_baselines3 import PPO
 
+from ce_gym import usable_cores
 from ce_gym.policies import WHERE, Policy, PolicyError, load_policy, locate_policy
 
 LEVELS = ("exact", "coupled", "armature", "none")
@@ -238,9 +239,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Train if asked to, judge, and write."""
-    from job import available_threads
-
-    args.threads = args.threads or available_threads()
+    args.threads = args.threads or usable_cores()
     try:
         policies = train_missing(args) if args.train else [locate_policy(path) for path in args.policies]
     except KeyboardInterrupt:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
-from ce_gym.viewer.console import Parser
+from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
     "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak", "gpu",
@@ -48,6 +48,7 @@ def listing() -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
+    print_anything()
     argv = sys.argv[1:] if argv is None else list(argv)
     if not argv or argv[0] in ("-h", "--help"):
         print(listing())

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
 from typing import Any
 
-from ce_gym.bench.measure import machine
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved
+from ce_gym.compile.system import resident_memory, usable_cores
 
 LEVELS = ("exact", "armature")
 DTYPES = ("float64", "float32")
@@ -45,12 +45,8 @@ CROWD, MOST_MEMORY = 65_536, 1024.0
 
 MEMORY = """
 import json, sys
-from pathlib import Path
 import gymnasium, numpy, ce_gym
-
-def peak(key):
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return int(next(line for line in lines if line.startswith(key)).split()[1]) / 1024
+from ce_gym.compile.system import peak_memory, resident_memory
 
 def steps(n):
     envs = gymnasium.make_vec(sys.argv[1], num_envs=n, autoreset_mode="SameStep")
@@ -60,9 +56,9 @@ def steps(n):
     return envs
 
 steps(8)
-before = peak("VmRSS")
+before = resident_memory()
 envs = steps(int(sys.argv[2]))
-print(json.dumps([before, peak("VmRSS"), peak("VmHWM")]))
+print(json.dumps([before, resident_memory(), peak_memory()]))
 """
 
 
@@ -79,14 +75,14 @@ def run(arguments: argparse.Namespace) -> Report:
     steps_per_second(arguments, report)
     overhead(arguments, report)
     first_step(arguments, report)
-    if Path("/proc/self/status").exists():
+    if not math.isnan(resident_memory()):
         memory(arguments, report)
     return report
 
 
 def steps_per_second(arguments: argparse.Namespace, report: Report) -> None:
     """Measure levels, types and thread counts in one run."""
-    cores = machine.usable_cores()
+    cores = usable_cores()
     settings = [(level, d, n) for level in LEVELS for d in DTYPES for n in sorted({1, cores}, reverse=True)]
     competitors = {
         setting: stepping(

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 
 from ce_gym.compile.ours import prepare_folder, read_file
+from ce_gym.compile.system import user_number
 
 FOLDER_VARIABLE = "CE_GYM_CACHE_DIR"
 DIGEST_BYTES = 32
@@ -27,9 +28,8 @@ def cache_folder() -> Path | None:
     A folder is passed over, in one line to the user, if it cannot be written or if other users could write it.
     """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
     wanted = os.environ.get(FOLDER_VARIABLE) or os.path.join(home, "ce_gym")
-    for place in (wanted, os.path.join(tempfile.gettempdir(), f"ce_gym-{user}")):
+    for place in (wanted, os.path.join(tempfile.gettempdir(), f"ce_gym-{user_number() or 0}")):
         folder = Path(os.path.realpath(place))  # links are followed once, here; what they lead to is judged
         try:
             prepare_folder(folder)

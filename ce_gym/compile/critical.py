@@ -7,7 +7,6 @@ when the section ends, or earlier where the section says so. A handler of anothe
 
 from __future__ import annotations
 
-import os
 import threading
 
 # The functions of `signal` turn what they take and return into enums, for ten times what the call itself costs.
@@ -15,6 +14,8 @@ from _signal import getsignal, signal  # pyright: ignore[reportMissingImports]
 from collections.abc import Callable
 from signal import SIGINT, raise_signal
 from typing import Any
+
+from ce_gym.compile.system import at_fork
 
 _noted = False
 """Whether SIGINT has come since it was held back. This and the next belong to the main thread alone."""
@@ -97,5 +98,4 @@ def _after_fork() -> None:
         signal(SIGINT, _handler)
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+at_fork(in_child=_after_fork)

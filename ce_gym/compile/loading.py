@@ -6,7 +6,6 @@ Knows the order of these steps and nothing of how each is done. LLVM and CasADi 
 from __future__ import annotations
 
 import hashlib
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.layout import layout_from, layout_of
 from ce_gym.compile.program import Program, check_program
 from ce_gym.compile.sources import source_fingerprint, toolchain
+from ce_gym.compile.system import at_fork
 
 SOURCES = tuple(
     f"ce_gym.compile.{name}" for name in ("arrays", "layout", "loading", "lowering", "machine_code", "program")
@@ -89,5 +89,5 @@ def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> t
     return asdict(layout), code
 
 
-if hasattr(os, "register_at_fork"):  # a child could wait for ever for a thread of its parent that compiles
-    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
+# A child could wait for ever for a thread of its parent that compiles.
+at_fork(before=_lock.acquire, in_parent=_lock.release, in_child=_lock.release)

@@ -8,8 +8,10 @@ import os
 import stat
 from pathlib import Path
 
+from ce_gym.compile.system import user_number
+
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
-HAS_MODES = hasattr(os, "geteuid")
+HAS_MODES = user_number() is not None
 
 
 def prepare_folder(folder: Path) -> None:
@@ -42,7 +44,7 @@ def _check(place: Path, may_be_sticky: bool) -> None:
 
 
 def _owned_by_others(status: os.stat_result) -> bool:
-    return status.st_uid not in (os.geteuid(), 0)
+    return status.st_uid not in (user_number(), 0)
 
 
 def read_file(path: Path) -> bytes:

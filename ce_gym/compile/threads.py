@@ -10,6 +10,7 @@ import numpy as np
 
 from ce_gym.compile.arrays import aligned_zeros
 from ce_gym.compile.critical import CriticalSection
+from ce_gym.compile.system import at_fork
 
 _pool: ThreadPoolExecutor | None = None
 _lock = threading.Lock()
@@ -81,5 +82,4 @@ def _after_fork() -> None:
     _pool, _lock = None, threading.Lock()
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+at_fork(in_child=_after_fork)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 from typing import Any, NoReturn
 
@@ -17,6 +18,13 @@ class Parser(argparse.ArgumentParser):
         """Print one line and leave with exit code 2."""
         print(f"ce_gym: {message}; {self.prog} --help shows what can be given", file=sys.stderr)
         sys.exit(2)
+
+
+def print_anything() -> None:
+    """Print question marks for characters that the output's encoding lacks, as that of files on Windows may."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def examples(*lines: str) -> str:

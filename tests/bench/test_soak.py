@@ -41,7 +41,7 @@ def test_it_notices_failures_that_are_not_flagged(monkeypatch: pytest.MonkeyPatc
 def test_it_notices_a_process_that_grows(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(soak, "WARM_UP", 0)
     memory = iter([100.0, 100.0 + soak.GROWTH + 1])
-    monkeypatch.setattr(soak, "resident", lambda: next(memory, 200.0))
+    monkeypatch.setattr(soak, "resident_memory", lambda: next(memory, 200.0))
     report = soak.run(arguments(minutes=0.02, env=IDS[:1], steps=20))
     assert not report.requirements[2].met
 

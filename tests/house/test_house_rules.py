@@ -32,7 +32,8 @@ MAY_IMPORT = {
 LAYERS = {
     "model": "errors table description constraint_functions clusters mechanism checks generators formats load listing",
     "model/formats": "reading placement rotor_rule urdf yaml mjcf",
-    "compile": "arrays program layout lowering ours cache critical threads kernel machine_code sources loading cuda",
+    "compile": "system arrays program layout lowering ours cache critical threads kernel machine_code sources loading"
+    " cuda",
     "dynamics": "algebra constraints recursion forces functions stepping model",
     "sim": "tiles devices terrain placement substeps pieces retry kernel_key simulator",
     "envs": "terms task runtime policy_spec base rendering single gpu_vector vector registration custom",
@@ -129,6 +130,18 @@ def test_no_robot_names_in_algorithms():
     for path in FILES:
         if room_of(path) in ("model", "dynamics", "compile", "sim"):
             assert not [s for s in strings_in_code(path) if any(name in s for name in robots)], path
+
+
+def test_only_one_file_asks_for_what_some_operating_system_lacks():
+    lacking = {"sched_getaffinity", "fork", "register_at_fork", "getuid", "geteuid", "getgid", "uname", "nice"}
+    modules = {"fcntl", "grp", "pwd", "resource", "termios", "pty"}
+    for path in [*FILES, *(PACKAGE.parent / "train").glob("*.py")]:
+        if path == PACKAGE / "compile" / "system.py":
+            continue
+        called = {node.attr for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute)}
+        assert not called & lacking, path
+        assert not imported_modules(path) & modules, path
+        assert not [text for text in strings_in_code(path) if "/proc/" in text], path
 
 
 def test_import_is_light():

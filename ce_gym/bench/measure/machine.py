@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import datetime
 import importlib.metadata
-import os
 import platform
-from pathlib import Path
+
+from ce_gym.compile.system import processor, usable_cores
 
 PACKAGES = ("ce_gym", "numpy", "llvmlite", "casadi", "gymnasium", "mujoco")
 
@@ -22,22 +22,6 @@ def describe() -> dict[str, str]:
         "python": platform.python_version(),
         **versions,
     }
-
-
-def processor() -> str:
-    """Return the model name of the CPU, or its architecture where the system does not tell."""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():
-            key, _, value = line.partition(":")
-            if key.strip() == "model name":
-                return value.strip()
-    return platform.processor() or platform.machine()
-
-
-def usable_cores() -> int:
-    """Return the number of cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _version(package: str) -> str:

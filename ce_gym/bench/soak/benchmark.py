@@ -12,7 +12,6 @@ import argparse
 import gc
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.bench.soak import interrupts
+from ce_gym.compile.system import resident_memory
 
 NUM_ENVS = 64
 """Robots in a batch."""
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> Report:
             if time.monotonic() > end and len(memory) > WARM_UP:
                 break
         gc.collect()
-        memory.append(resident())
+        memory.append(resident_memory())
     return reported(accounts, memory, arguments.minutes)
 
 
@@ -139,15 +139,6 @@ def inconsistent(
     if any((values[~over] != 0).any() for values in terms.values()):
         wrong.append("sums of an episode that has not ended")
     return wrong
-
-
-def resident() -> float:
-    """Return the resident memory of this process [MiB]; not a number where the system does not tell."""
-    status = Path("/proc/self/status")
-    if not status.exists():
-        return float("nan")
-    line = next(line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmRSS"))
-    return int(line.split()[1]) / 1024
 
 
 def reported(accounts: dict[str, Account], memory: list[float], minutes: float) -> Report:

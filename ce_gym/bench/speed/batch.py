@@ -6,10 +6,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ce_gym.bench.measure import machine
 from ce_gym.bench.measure.report import Cell, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved
 from ce_gym.bench.speed import stepping
+from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Robot
 from ce_gym.model.errors import RobotError
@@ -22,7 +22,7 @@ COLORS["MuJoCo, armature"] = "#E69F00"
 
 def measure(robot: Robot, sizes: Sequence[int], dt: float, rounds: int) -> Table:
     """Time batches of one robot; a column for each side, microseconds for one robot's sub-step."""
-    cores = machine.usable_cores()
+    cores = usable_cores()
     columns: list[str] = []
     rows: list[tuple[Cell, ...]] = []
     for size in sizes:

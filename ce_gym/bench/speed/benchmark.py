@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ce_gym.bench.measure import machine
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, Timing, interleaved, ratio
 from ce_gym.bench.peers import mujoco_settings, stand
 from ce_gym.bench.speed import batch as speed_batch
 from ce_gym.bench.speed import peak, stepping
 from ce_gym.bench.speed import robots as speed_robots
+from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Robot, load_robot, robots
 from ce_gym.sim import Simulator
@@ -112,7 +112,7 @@ def _all_robots(many: list[Robot], arguments: argparse.Namespace, report: Report
     """Measure every robot at every level."""
     if not many:
         return
-    one, cores = {d: peak.competitor(d) for d in DTYPES}, machine.usable_cores()
+    one, cores = {d: peak.competitor(d) for d in DTYPES}, usable_cores()
     most = {d: 1.0 / t.best for d, t in interleaved(one, arguments.rounds, time.thread_time).items()}
     every = {d: peak.competitor(d, cores) for d in DTYPES}
     together = {d: 1.0 / t.best for d, t in interleaved(every, arguments.rounds).items()}

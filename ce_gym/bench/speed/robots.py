@@ -9,10 +9,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from ce_gym.bench.measure import machine
 from ce_gym.bench.measure.report import Cell, Table
 from ce_gym.bench.measure.timing import Competitor, Timing, interleaved, ratio
 from ce_gym.bench.speed import forward, stepping
+from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Robot
 from ce_gym.model.errors import RobotError
@@ -51,7 +51,7 @@ class Measured:
 
 def measure(robot: Robot, level: str, num_envs: int, dt: float, rounds: int) -> Measured:
     """Time one robot at one level."""
-    model, cores = Model(robot, transmission=level), machine.usable_cores()
+    model, cores = Model(robot, transmission=level), usable_cores()
     competitors: dict[tuple[str, str, int], Competitor] = {}
     for dtype in DTYPES:
         for threads, n in ((1, 1), (0, cores)):

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any, get_args
 
+from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.runtime.batch import Batch
 from ce_gym.envs.runtime.program import TaskProgram
@@ -46,7 +47,7 @@ def make_batch(
         if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
             raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
     program = make_program(robot, task, **arguments)
-    return Batch(program, num_envs, dtype, num_threads or len(os.sched_getaffinity(0)))
+    return Batch(program, num_envs, dtype, num_threads or usable_cores())
 
 
 def checked_dtype(dtype: str) -> str:
