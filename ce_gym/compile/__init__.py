@@ -1,7 +1,6 @@
 """CasADi SX functions, and look-ups in tables between them, as batched SIMD kernels.
 
-Knows casadi, llvmlite and numpy; knows no physics and no other part of ce_gym. Importing this package imports
-none of the heavy ones: `load_kernel` does, when it is called.
+Importing this package imports none of the heavy ones: `load_kernel` does, when it is called.
 """
 
 from ce_gym.compile.arrays import aligned_zeros, lane_count

@@ -1,7 +1,7 @@
 """The folder of compiled kernels: one file to a kernel, all that is believed and executed under one digest.
 
-The digest guards against damage; against other users, `ce_gym.compile.ours` does. What cannot be read is compiled
-again, what cannot be written is done without. Knows files; knows nothing of kernels' contents.
+The digest guards against damage; against other users, `ce_gym.compile.private_files` does. What cannot be read is
+compiled again, what cannot be written is done without.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
-from ce_gym.compile.ours import prepare_folder, read_file
+from ce_gym.compile.private_files import prepare_folder, read_file
 from ce_gym.compile.system import user_number
 
 FOLDER_VARIABLE = "CE_GYM_CACHE_DIR"

@@ -1,4 +1,4 @@
-"""`CriticalSection`: work that one thread does at a time and that Ctrl-C does not cut in two. Knows no kernels.
+"""`CriticalSection`: work that one thread does at a time and that Ctrl-C does not cut in two.
 
 Python calls the handler of a signal in the main thread, between any two instructions there; that of SIGINT raises
 KeyboardInterrupt. While the main thread is in a section, the handler is one that takes a note; the one before is called

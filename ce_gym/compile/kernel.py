@@ -1,7 +1,4 @@
-"""A compiled kernel and how it is called: checks of its arguments, addresses, threads.
-
-Knows numpy arrays and the calling convention; LLVM and files stay behind `loading`.
-"""
+"""A compiled kernel and how it is called: checks of its arguments, addresses, threads."""
 
 import weakref
 from collections.abc import Mapping

@@ -1,6 +1,6 @@
 """`load_kernel`: from the cache folder, or built, compiled and put there.
 
-Knows the order of these steps and nothing of how each is done. LLVM and CasADi are imported when a step needs them.
+LLVM and CasADi are imported when a step needs them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Worker threads shared by all kernels, and memory lent to one thread at a time. Knows nothing of kernels."""
+"""Worker threads shared by all kernels, and memory lent to one thread at a time."""
 
 import os
 import threading

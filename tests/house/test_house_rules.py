@@ -32,8 +32,8 @@ MAY_IMPORT = {
 LAYERS = {
     "model": "errors table description constraint_functions clusters mechanism checks generators formats load listing",
     "model/formats": "reading placement rotor_rule urdf yaml mjcf",
-    "compile": "system arrays program layout lowering ours cache critical threads kernel machine_code sources loading"
-    " cuda",
+    "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
+    " loading cuda",
     "dynamics": "algebra constraints recursion forces functions stepping model",
     "sim": "tiles devices terrain placement substeps pieces retry kernel_key simulator",
     "envs": "terms task runtime policy_spec base rendering single gpu_vector vector registration custom",

@@ -7,7 +7,7 @@ import pytest
 
 from ce_gym.compile import cache
 from ce_gym.compile.cache import cache_folder, read_entry, write_entry
-from ce_gym.compile.ours import prepare_folder, read_file
+from ce_gym.compile.private_files import prepare_folder, read_file
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="permissions are not mode bits here")
 
