@@ -15,6 +15,7 @@ from ce_gym.compile import CriticalSection
 from ce_gym.envs.policy_spec import contract
 from ce_gym.envs.runtime.batch import Batch
 from ce_gym.envs.runtime.program import OBSERVATION_BOUND
+from ce_gym.envs.runtime.symmetry import Symmetry, left_right
 
 
 class BatchShell:
@@ -63,6 +64,18 @@ class BatchShell:
     def contract(self) -> dict[str, Any]:
         """What somebody must know to run a policy of this environment elsewhere; see `ce_gym.envs.policy_spec`."""
         return contract(self.batch.program, self.task)
+
+    @cached_property
+    def symmetry(self) -> Symmetry | None:
+        """The left-right reflection of observations and actions, None if the robot or its task has none.
+
+        Examples:
+            >>> symmetry = gymnasium.make("ce_gym/MiniCheetahVelocity-v0").unwrapped.symmetry
+            >>> observation = np.arange(48.0)
+            >>> print(symmetry.observation(observation)[:3], symmetry.action.index)
+            [ 0. -1.  2.] [ 3  4  5  0  1  2  9 10 11  6  7  8]
+        """
+        return left_right(self.batch.program)
 
     @cached_property
     def _look(self) -> ca.Function:

@@ -9,6 +9,7 @@ May know dynamics, sim, compile and the term files; no Gymnasium.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -29,7 +30,7 @@ from ce_gym.envs.task.randomisation import Randomised
 from ce_gym.envs.task.sampling import Draws
 from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.context import Snapshot
-from ce_gym.envs.terms.registry import find_term, is_added
+from ce_gym.envs.terms.registry import Term, find_term, is_added
 from ce_gym.sim.simulator import select_contacts
 from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
@@ -162,6 +163,14 @@ class TaskProgram:
         seen["failed"] = sum([term(s) for term in self.termination_terms], SX(0)) > 0
         everything = ca.vertcat(*seen.values())
         return traced("look", {n: x for n, x in state.items() if ca.depends_on(everything, x)}, seen)
+
+    def terms_function(self, terms: Mapping[str, Term]) -> ca.Function:
+        """Return the state buffers that terms look at, and the action before -> their values, one after the other."""
+        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}
+        state["previous_action"] = SX.sym("previous_action", self.n_actions)
+        s = self._snapshot(self._seen(state))
+        values = ca.vertcat(SX(0, 1), *[SX(term(s)) for term in terms.values()])
+        return traced("terms", {n: x for n, x in state.items() if ca.depends_on(values, x)}, {"values": values})
 
     def added_terms(self) -> str:
         """Return a text that changes with the terms that users have added, for cache keys."""
