@@ -6,7 +6,7 @@ differentiated and solved later. May know descriptions and spatial algebra.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import casadi as ca
 import numpy as np
@@ -86,7 +86,7 @@ def _reach(
     """
     chain = lineage(robot, body)
     inside = chain[: chain.index(ancestor)]
-    x, varying, fixed = constant(point), SX(0), float(np.dot(point, point)) / 2
+    x, varying, fixed = constant(point), SX(0), _square(point) / 2
     for name in inside:
         part = robot.body(str(name))
         axis, home = constant(snapped(np.array(part.joint.axis))), constant(snapped(np.array(part.placement.rotation)))
@@ -96,12 +96,18 @@ def _reach(
             x = home @ (x + axis * angles[part.name])
             varying, fixed = ca.sumsqr(x) / 2, 0.0
         offset = np.array(part.placement.position) - (origin if name == inside[-1] else np.zeros(3))
-        varying, fixed = varying + ca.dot(constant(offset), x), fixed + float(offset @ offset) / 2
+        varying, fixed = varying + ca.dot(constant(offset), x), fixed + _square(offset) / 2
         x = constant(offset) + x
     if inside:
         return x, varying, fixed
     away = np.array(point) - origin
-    return constant(away), SX(0), float(away @ away) / 2
+    return constant(away), SX(0), _square(away) / 2
+
+
+def _square(vector: Sequence[float] | np.ndarray) -> float:
+    """Return the squared length of a vector of three, added up in order; BLAS rounds as suits the CPU."""
+    x, y, z = map(float, vector)
+    return x * x + y * y + z * z
 
 
 def _loop(robot: Robot, loop: LoopConstraint, angles: Angles) -> SX:
