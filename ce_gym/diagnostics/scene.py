@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, get_args
+from typing import Any
 
 import casadi as ca
 import gymnasium
@@ -21,8 +21,9 @@ import gymnasium
 from ce_gym.compile import Call, Repeat
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import closures
+from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.parameters import PARAMETERS
-from ce_gym.dynamics.forces.scene import Friction, StepOptions, make_scene, symbolic_state
+from ce_gym.dynamics.forces.scene import StepOptions, make_scene, symbolic_state
 from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
@@ -103,7 +104,7 @@ class SceneReport:
         layers: Of a sub-step, in the order in which they are added; they sum to the sub-step.
         once: What is done once in each environment step: the action; then, in the order in which they are added,
             bookkeeping and the terms of the task.
-        sometimes: What is done only if some robot of a tile needs it: another attempt, a reset.
+        sometimes: What is done only if some robot of a tile needs it: another iteration, a reset.
         left_out: What each feature would add to a sub-step; less than 0 if it would save.
         terms_left_out: What each term would add to an environment step.
     """
@@ -152,7 +153,7 @@ def report_scene(env_id: str, **arguments: Any) -> SceneReport:
     outputs = ("torque", "contact_forces") if program.contact_forces else ("torque",)
     whole = SubStep(program.model, program.options, outputs)
     again = dict.fromkeys(call.function for call in whole.calls if call.only_if)
-    sometimes = [("another attempt at a sub-step", f) for f in again] + [("reset", program.function("begin"))]
+    sometimes = [("another iteration of a sub-step", f) for f in again] + [("reset", program.function("begin"))]
     return SceneReport(
         name=env_id,
         program=program,
@@ -208,7 +209,7 @@ def left_out(whole: SubStep) -> Iterator[tuple[str, SubStep]]:
     for group in dict.fromkeys(contact.group for contact in robot.contacts):
         wanted = tuple(dict.fromkeys((*options.contacts, *select_contacts(robot, group))))
         changes[f"contacts of group {group!r}"] = {"contacts": select_contacts(robot, wanted)}
-    for friction in get_args(Friction):
+    for friction in FRICTION:
         changes[f"friction={friction!r} instead"] = {"friction": friction}
     for method in METHODS:
         changes[f"method={method!r} instead"] = {"method": method}
@@ -227,7 +228,7 @@ def left_out(whole: SubStep) -> Iterator[tuple[str, SubStep]]:
     for level in LEVELS:
         if level != whole.model.transmission:
             yield f"transmission={level!r} instead", replace(whole, model=Model(robot, level))
-    missing = {"error"} if options.method != "extrapolated" else set()
+    missing = set() if METHODS[options.method].estimates else {"error"}
     missing |= set() if any(closures(whole.model.mechanism)) else {"loop_gap", "nearness"}
     for name in OUTPUTS:
         step = replace(whole, outputs=(*whole.outputs, name))

@@ -5,9 +5,16 @@ from dataclasses import replace
 from ce_gym.compile import source_fingerprint
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.residuals import residual
+from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.motors import MOTORS
+from ce_gym.dynamics.forces.normal import normal_law
+from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.trace import iteration_function
 from ce_gym.model import FunctionConstraint, Robot
+from ce_gym.model.mechanism import Mechanism
 
 SOURCES = ("ce_gym.model", "ce_gym.dynamics", "ce_gym.sim")
 """What traces a model and makes programs of it."""
@@ -18,6 +25,14 @@ def model_key(model: Model) -> str:
     robot = replace(model.robot, source="", notes=(), tasks=())
     options = f"{model.transmission} {model.locked_rotors} {model.eliminated}"
     return f"{source_fingerprint(*SOURCES)} {robot!r} {options} {_functions(robot)}"
+
+
+def laws_key(mechanism: Mechanism, options: StepOptions) -> str:
+    """Return a text that is equal for equal methods and laws, for cache keys; laws of others by what they trace to."""
+    laws = normal_law(options.normal_law, options.material), FRICTION[options.friction], MOTORS[options.motors]
+    ours = all(type(law).__module__.startswith("ce_gym.") for law in laws)
+    traced_laws = "" if ours else iteration_function(mechanism, options).serialize()
+    return f"{METHODS[options.method]!r} {traced_laws}"
 
 
 def _functions(robot: Robot) -> list[str]:

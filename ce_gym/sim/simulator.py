@@ -14,14 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import Buffer, CriticalSection, Program
+from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.motors import MOTORS
+from ce_gym.dynamics.forces.normal import NORMAL_LAWS
 from ce_gym.dynamics.forces.parameters import parameter_defaults
-from ce_gym.dynamics.forces.scene import Control, Friction, Motors, StepOptions, target_names
+from ce_gym.dynamics.forces.scene import Control, StepOptions, target_names
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import OUTPUTS
 from ce_gym.model import ContactMaterial, Robot
 from ce_gym.sim.devices import Array, Device, Processor, device_named, to_numpy
-from ce_gym.sim.kernel_key import model_key
+from ce_gym.sim.kernel_key import laws_key, model_key
 from ce_gym.sim.pieces import piece_length, run_substeps
 from ce_gym.sim.placement import Placement
 from ce_gym.sim.retry import Retry
@@ -46,8 +49,9 @@ class Simulator:
             "nearness" to compute; those left out cost nothing and read as errors.
         method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
             scenes).
-        friction: "tangent" solves steps with a change from stick to slip twice; "secant" is faster and slow to break
-            away.
+        normal_law: "kelvin_voigt" or "hunt_crossley", of the contacts' normal force; that of the material if None.
+        friction: "tangent" iterates where a contact changes between stick and slip; "secant" is faster and slow to
+            break away.
         motors: "ideal" for the joints' torque limits; "limited" for torque, torque-speed line and friction of the
             motors themselves.
         parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
@@ -87,6 +91,7 @@ class Simulator:
         material: ContactMaterial | None = None,
         outputs: Sequence[str] = ("torque", "contact_forces"),
         method: str = "euler",
+        normal_law: str | None = None,
         friction: str = "tangent",
         motors: str = "ideal",
         parameters: Sequence[str] = (),
@@ -101,8 +106,9 @@ class Simulator:
         _choice("dtype", dtype, ("float64", "float32"))
         _choice("control", control, get_args(Control))
         _choice("method", method, tuple(METHODS))
-        _choice("friction", friction, get_args(Friction))
-        _choice("motors", motors, get_args(Motors))
+        _choice("normal_law", normal_law, (None, *NORMAL_LAWS))
+        _choice("friction", friction, tuple(FRICTION))
+        _choice("motors", motors, tuple(MOTORS))
         for name in outputs:
             _choice("outputs", name, tuple(OUTPUTS))
         if terrain is not None and not isinstance(terrain, Terrain):
@@ -120,9 +126,10 @@ class Simulator:
             control=control,  # type: ignore[arg-type]
             contacts=self.contact_names,
             material=material or model.robot.material,
-            friction=friction,  # type: ignore[arg-type]
+            normal_law=normal_law,
+            friction=friction,
             method=method,
-            motors=motors,  # type: ignore[arg-type]
+            motors=motors,
             ground="field" if terrain is not None and self.contact_names else "flat",
             parameters=tuple(parameters),
         )
@@ -378,10 +385,11 @@ def load_step_kernel(
         buffers += [Buffer("target", joints, "rows_in")] if joints else []
         return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
 
-    return (device or Processor()).kernel(f"step {model_key(model)} {options!r} {outputs!r}", build, dtype)
+    key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r}"
+    return (device or Processor()).kernel(key, build, dtype)
 
 
-def _choice(argument: str, value: object, choices: tuple[str, ...]) -> None:
+def _choice(argument: str, value: object, choices: tuple[object, ...]) -> None:
     _check(argument, value, value in choices, " or ".join(repr(choice) for choice in choices))
 
 

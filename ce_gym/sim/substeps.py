@@ -1,8 +1,7 @@
-"""The sub-steps of a scene as the part of a kernel's program that they are. May know dynamics and compile."""
+"""The sub-steps of a scene as part of a kernel's program: the plan of its method, stage by stage."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -13,8 +12,10 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.stepping.ground_lookup import places_function, planes_function, touching_function
-from ce_gym.dynamics.stepping.step import further_attempts
-from ce_gym.dynamics.stepping.trace import attempt_function, extrapolation_function, step_function
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.plan import Plan, Rates
+from ce_gym.dynamics.stepping.step import iterations_needed
+from ce_gym.dynamics.stepping.trace import combination_function, iteration_function, step_function
 from ce_gym.model.mechanism import Mechanism
 
 TIMES = "n_substeps"
@@ -35,28 +36,23 @@ def substeps(
         field, and outputs; further buffers, for scratch and on a field the table `HEIGHTS`; and the steps. An output
         that is empty for this robot is left out.
     """
-    more = further_attempts(mechanism, options) if options.method in ("euler", "extrapolated") else 0
-    trace = attempt_function if more else step_function
-    function = trace(mechanism, options, outputs)
+    plan, most = METHODS[options.method], iterations_needed(mechanism, options)
+    staged = any(min(stage.iterations, most) for stage in plan.stages)
+    function = (iteration_function if staged else step_function)(mechanism, options, outputs)
     if empty := [name for name in outputs if not function.numel_out(name)]:
         return substeps(mechanism, options, tuple(name for name in outputs if name not in empty))
-    state = tuple(n.removesuffix("_next") for n in function.name_out() if n.endswith("_next") and n != "hints_next")
-    sizes = {name: function.numel_in(name) for name in function.name_in() if name != "hints"}
+    sizes = {name: function.numel_in(name) for name in function.name_in() if name != "iterate"}
+    state = tuple(name for name in sizes if f"{name}_next" in function.name_out())
     sizes |= {name: function.numel_out(name) for name in outputs}
     on_field = "ground" in sizes
-    further, look = _look_up(mechanism, options) if on_field else ([], ())
-    if not more:
-        buffers, before, each = _single(function, state, outputs)
-    elif options.method == "euler":
-        buffers, before, each = _attempts(function, state, outputs, more)
+    buffers, look = _look_up(mechanism, options) if on_field else ([], ())
+    if staged:
+        further, before, each = _staged(mechanism, options, plan, {name: sizes[name] for name in outputs})
     else:
-        again = _look_up(mechanism, options, "half_")[1] if on_field else ()
-        asked = {name: sizes[name] for name in outputs}
-        buffers, before, each = _extrapolated(mechanism, options, state, asked, more, again)
-    buffers, each = [*buffers, *further], (*look, *each)
+        further, before, each = [], (), (*look, Call(function, tuple(function.name_in()), (*state, *outputs)))
     if on_field:
         sizes = {name: size for name, size in sizes.items() if name != "ground"} | {FRAME: 3}
-    return sizes, buffers, (*before, Repeat(TIMES, each))
+    return sizes, [*further, *buffers], (*before, Repeat(TIMES, each))
 
 
 Parts: TypeAlias = tuple[list[Buffer], tuple[Step, ...], tuple[Step, ...]]
@@ -82,56 +78,49 @@ def _look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> tuple[
     return buffers, (*under, *beside)
 
 
-def _single(step: ca.Function, state: tuple[str, ...], outputs: tuple[str, ...]) -> Parts:
-    return [], (), (Call(step, tuple(step.name_in()), (*state, *outputs)),)
+def _staged(mechanism: Mechanism, options: StepOptions, plan: Plan, outputs: dict[str, int]) -> Parts:
+    """Every stage with the iterations that a tile needs, and the state after the step combined from them.
 
-
-def _attempts(attempt: ca.Function, state: tuple[str, ...], outputs: tuple[str, ...], more: int) -> Parts:
-    """A tile makes another attempt only if one of its robots needs it; the others come to the same result again."""
-    tried = tuple(f"tried_{name}" for name in state)
-    sizes = {f"tried_{name}": attempt.numel_in(name) for name in state}
-    values = [SX.sym(name, size) for name, size in sizes.items()]
-    none = SX(ca.DM.zeros(attempt.numel_in("hints")))
-    keep, forget = ca.Function("keep", values, [*values, none]), ca.Function("forget", [], [none])
-    sizes |= {"hints": attempt.numel_in("hints"), "misjudged": 1}
-    left = (*tried, "hints", "misjudged", *outputs)
-    first = Call(attempt, tuple(attempt.name_in()), left)
-    again = Call(attempt, tuple(attempt.name_in()), left, only_if="misjudged")
-    each = (first, *[again] * more, Call(keep, tried, (*state, "hints")))
-    return [Buffer(name, size, "scratch") for name, size in sizes.items()], (Call(forget, (), ("hints",)),), each
-
-
-STAGES = (("coarse", "", "whole"), ("half", "", "part"), ("fine", "half_", "part"))
-"""Steps that an extrapolated one is made of: name, what the buffers begin with that it starts from, and its length."""
-
-
-def _extrapolated(
-    mechanism: Mechanism, options: StepOptions, state: tuple[str, ...], outputs: Mapping[str, int], more: int,
-    look_again: tuple[Step, ...],
-) -> Parts:  # fmt: skip
-    """A whole Euler step and two halves, each with as many attempts as it needs, and what follows from them."""
-    asked = tuple(name for name in outputs if name != "error")
-    attempt = attempt_function(mechanism, replace(options, dt=None), asked)
-    combine = extrapolation_function(mechanism, options, outputs)
-    lengths, forget = _lengths(options), ca.Function("forget", [], [SX(ca.DM.zeros(attempt.numel_in("hints")))])
-    sizes = {name: attempt.numel_in(name) for name in state} | {name: attempt.numel_out(name) for name in asked}
-    buffers = {f"{stage}_{name}": size for stage, _, _ in STAGES for name, size in sizes.items()}
-    buffers |= {"hints": attempt.numel_in("hints"), "misjudged": 1, "whole": 1, "part": 1}
+    A tile iterates again only if one of its robots has not converged; the others reproduce their result.
+    """
+    alone = plan.single and plan.stages[0].length == 1
+    asked = tuple(name for name in outputs if plan.single or name != "error")
+    iteration = iteration_function(mechanism, options if alone else replace(options, dt=None), asked)
+    combine = combination_function(mechanism, options, {} if plan.single else outputs)
+    state = tuple(name.removesuffix("_next") for name in combine.name_out() if name.endswith("_next"))
+    most = iterations_needed(mechanism, options)
+    lengths, zeros = _lengths(options, plan), _zeros(iteration.numel_in("iterate"))
+    sizes = {name: iteration.numel_in(name) for name in state}
+    sizes |= {} if plan.single else {name: iteration.numel_out(name) for name in asked}
+    buffers = {f"{stage.name}_{name}": size for stage in plan.stages for name, size in sizes.items()}
+    buffers |= {"iterate": iteration.numel_in("iterate"), "unconverged": 1}
+    buffers |= {} if alone else dict.fromkeys(lengths.name_out(), 1)
     each: list[Step] = []
-    for stage, start, length in STAGES:
-        here = {name: f"{start}{name}" for name in state} | {"dt": length}
-        given = tuple(here.get(name, name) for name in attempt.name_in())
-        kept, told = (tuple(f"{stage}_{name}" for name in names) for names in (state, asked))
-        left = (*kept, "hints", "misjudged", *told)
-        each += look_again if stage == "fine" else ()
-        each += [Call(forget, (), ("hints",)), Call(attempt, given, left)]
-        each += [Call(attempt, given, left, only_if="misjudged")] * more
-    each.append(Call(combine, tuple(combine.name_in()), (*state, *outputs)))
-    before = Call(lengths, tuple(lengths.name_in()), ("whole", "part"))
-    return [Buffer(name, size, "scratch") for name, size in buffers.items()], (before,), tuple(each)
+    ground_at: str | None = None
+    for stage in plan.stages:
+        assert not isinstance(stage.start, Rates), "explicit stages do not iterate"
+        start = f"{stage.start}_" if stage.start else ""
+        if "ground" in iteration.name_in() and stage.start != ground_at:
+            each += _look_up(mechanism, options, start)[1]
+            ground_at = stage.start
+        here = {name: f"{start}{name}" for name in state} | {"dt": "dt" if alone else f"{stage.name}_dt"}
+        given = tuple(here.get(name, name) for name in iteration.name_in())
+        told = asked if plan.single else tuple(f"{stage.name}_{name}" for name in asked)
+        left = (*(f"{stage.name}_{name}" for name in state), "iterate", "unconverged", *told)
+        each += [Call(zeros, (), ("iterate",)), Call(iteration, given, left)]
+        each += [Call(iteration, given, left, only_if="unconverged")] * min(stage.iterations, most)
+    written = tuple(name.removesuffix("_next") for name in combine.name_out())
+    each.append(Call(combine, tuple(combine.name_in()), written))
+    before = () if alone else (Call(lengths, tuple(lengths.name_in()), tuple(lengths.name_out())),)
+    return [Buffer(name, size, "scratch") for name, size in buffers.items()], before, tuple(each)
 
 
-def _lengths(options: StepOptions) -> ca.Function:
-    """Return the function that gives the length of a step and of half of it [s]."""
+def _zeros(size: int) -> ca.Function:
+    return ca.Function("zeros", [], [SX(ca.DM.zeros(size))])
+
+
+def _lengths(options: StepOptions, plan: Plan) -> ca.Function:
+    """Return the function that gives the length of each stage [s]."""
     dt = SX.sym("dt") if options.dt is None else SX(options.dt)
-    return traced("lengths", {"dt": dt} if options.dt is None else {}, {"whole": dt, "part": dt / 2})
+    lengths = {f"{stage.name}_dt": stage.length * dt for stage in plan.stages}
+    return traced("lengths", {"dt": dt} if options.dt is None else {}, lengths)

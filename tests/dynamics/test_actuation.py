@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.forces.actuation import COULOMB_SPEED
+from ce_gym.dynamics.forces.motors import COULOMB_SPEED
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Motor, Placement, Robot, load_robot

@@ -13,7 +13,7 @@ from ce_gym import Simulator
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.parameters import PARAMETERS, parameter_defaults
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.stepping.trace import attempt_function, step_function
+from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import LinearConstraint, Robot, load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -213,8 +213,8 @@ def test_all_at_once(cheetah: Robot, states):
     assert_same(results(cheetah, states, values=defaults), results(cheetah, states))
 
 
-FEET_ATTEMPT, FEET_STEP = 9221, 33245
-"""Instructions of a sub-step of Mini Cheetah on its feet, as a kernel makes it and with all its attempts spelled out.
+FEET_ITERATION, FEET_STEP = 9221, 33245
+"""Instructions of a sub-step of Mini Cheetah on its feet, as a kernel makes it and with all its iterations unrolled.
 
 As counted when parameters, limited motors, fields and the methods of higher order were there but not asked for. A
 feature that is not asked for must not add to them; whoever makes the step cheaper may lower them."""
@@ -224,7 +224,7 @@ def test_what_is_not_declared_costs_nothing():
     model = Model("mini_cheetah")
     feet = tuple(contact.name for contact in model.robot.contacts if contact.group == "foot")
     plain = StepOptions(0.005, contacts=feet)
-    for trace, most in ((attempt_function, FEET_ATTEMPT), (step_function, FEET_STEP)):
+    for trace, most in ((iteration_function, FEET_ITERATION), (step_function, FEET_STEP)):
         function = trace(model.mechanism, plain)
         assert function.n_instructions() <= most
         assert not {"parameters", "ground"} & set(function.name_in())

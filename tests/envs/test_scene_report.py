@@ -13,8 +13,8 @@ from ce_gym.diagnostics.scene import SceneReport, SubStep, layers, left_out, rep
 from ce_gym.diagnostics.scene_text import as_text
 from ce_gym.diagnostics.scene_timing import SceneTimes
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.stepping.step import hint_count
-from ce_gym.dynamics.stepping.trace import attempt_function, step_function
+from ce_gym.dynamics.stepping.step import iterate_size
+from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.tasks import VELOCITY
 from ce_gym.model import ContactMaterial
@@ -37,11 +37,11 @@ def always(program: TaskProgram) -> dict[str, int]:
 def test_lines_add_up_to_the_kernel(report: SceneReport):
     """The calls of the very program that an environment is compiled from."""
     counts, n = always(report.program), report.program.task.n_substeps
-    assert report.sub_step == counts["attempt"] + counts["keep"]
+    assert report.sub_step == counts["iteration"] + counts["combination"] + counts["zeros"]
     assert report.env_step == n * report.sub_step + counts["act"] + counts["assess"]
     assert sum(group.instructions for group in report.groups) == counts["act"] + counts["assess"]
     assert {item.name: item.instructions for item in report.sometimes} == {
-        "another attempt at a sub-step": counts["attempt"],
+        "another iteration of a sub-step": counts["iteration"],
         "reset": report.program.reset_program().calls[0].function.n_instructions(),
     }
 
@@ -54,7 +54,7 @@ def test_lines_add_up_whatever_a_task_asks_for():
         friction="secant",
     )  # fmt: skip
     counts, n = always(report.program), report.program.task.n_substeps
-    assert report.sub_step == counts["attempt"] + counts["keep"]
+    assert report.sub_step == counts["iteration"] + counts["combination"] + counts["zeros"]
     once = counts["act"] + counts["assess"] + n * counts["arrive"] + counts["arrived"]
     assert report.env_step == n * report.sub_step + once
     layers_there = {item.name: item.instructions for item in report.layers}
@@ -96,8 +96,8 @@ def test_layers_are_what_is_compiled_in(report: SceneReport):
 )
 def test_a_left_out_feature_costs_what_it_adds_when_it_is_there(report: SceneReport, name: str, change: dict):
     mechanism, options = report.program.model.mechanism, report.program.options
-    without, with_it = (  # an attempt, and the forgetting of its hints
-        attempt_function(mechanism, o, ("torque",)).n_instructions() + hint_count(mechanism, o)
+    without, with_it = (  # an iteration, and the zeros it starts from
+        iteration_function(mechanism, o, ("torque",)).n_instructions() + iterate_size(mechanism, o)
         for o in (options, replace(options, **change))
     )
     assert cost(report, name) == with_it - without > 0
@@ -106,7 +106,7 @@ def test_a_left_out_feature_costs_what_it_adds_when_it_is_there(report: SceneRep
 def test_a_field_costs_its_look_up_too(report: SceneReport):
     mechanism, options = report.program.model.mechanism, report.program.options
     without, with_it = (
-        attempt_function(mechanism, o, ("torque",)).n_instructions()
+        iteration_function(mechanism, o, ("torque",)).n_instructions()
         for o in (options, replace(options, ground="field"))
     )
     assert cost(report, "ground='field'") > with_it - without > 0
@@ -117,12 +117,12 @@ def cost(report: SceneReport, name: str) -> int:
 
 
 def test_methods_and_friction_count_every_call(report: SceneReport):
-    """Alternatives change which calls there are: `keep` goes where no attempt is made twice."""
+    """Alternatives change which calls there are: the combination of stages goes where none iterates."""
     mechanism, options = report.program.model.mechanism, report.program.options
     explicit = step_function(mechanism, replace(options, method="rk4"), ("torque",)).n_instructions()
     assert cost(report, "method='rk4' instead") == explicit - report.sub_step
     tangent, secant = (
-        attempt_function(mechanism, o, ("torque",)).n_instructions()
+        iteration_function(mechanism, o, ("torque",)).n_instructions()
         for o in (options, replace(options, friction="secant"))
     )
     assert cost(report, "friction='secant' instead") == secant - tangent < 0

@@ -10,7 +10,7 @@ import pytest
 from ce_gym import Model, Simulator, Terrain
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.trace import attempt_function, step_function
+from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.sim.substeps import substeps
 
@@ -115,9 +115,9 @@ def test_flat_scenes_pay_nothing():
     """Without terrain there is not one instruction, buffer or look-up more."""
     options = Simulator(CHEETAH).options
     plain = StepOptions(options.dt, contacts=options.contacts, material=options.material)
-    counts = [attempt_function(CHEETAH.mechanism, o).n_instructions() for o in (options, plain)]
+    counts = [iteration_function(CHEETAH.mechanism, o).n_instructions() for o in (options, plain)]
     assert counts[0] == counts[1]
-    assert attempt_function(CHEETAH.mechanism, replace(options, ground="field")).n_instructions() > counts[0]
+    assert iteration_function(CHEETAH.mechanism, replace(options, ground="field")).n_instructions() > counts[0]
     sizes, further, _ = substeps(CHEETAH.mechanism, options, ())
     assert "frame" not in sizes
     assert not {"ground", "places", "heights"} & ({b.name for b in further} | set(sizes))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
-from ce_gym.dynamics.forces.scene import Friction, StepOptions
+from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.sim.simulator import load_step_kernel
 from ce_gym.sim.tiles import tiles, write_rows
@@ -26,7 +26,7 @@ class Ours:
         num_envs: Robots.
     """
 
-    def __init__(self, scene: Scene, method: str, level: str, friction: Friction, num_envs: int) -> None:
+    def __init__(self, scene: Scene, method: str, level: str, friction: str, num_envs: int) -> None:
         self.scene, self.num_envs = scene, num_envs
         self.model = Model(scene.robot, transmission=level)
         options = StepOptions(

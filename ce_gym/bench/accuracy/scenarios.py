@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.bench.speed.benchmark import bare
-from ce_gym.dynamics.forces.scene import Friction
 from ce_gym.dynamics.model import Model
 from ce_gym.model import (
     Body,
@@ -33,7 +32,7 @@ from ce_gym.model.description import Mat3
 
 Array = NDArray[np.float64]
 
-Way = tuple[str, str, Friction]
+Way = tuple[str, str, str]
 """Method, transmission level and friction of one of our curves."""
 
 HOLD = 0.02

@@ -11,12 +11,12 @@ its joints as it feels them alone, the other motors of the cluster at rest, in t
 
     kp_m,i = e_i^T W^-T diag(kp) W^-1 e_i        kp / N^2 behind a gear of ratio N, where both controls are the same
 
-As in actuation.py forces are taken one step ahead. May know actuation, kinematics and scenes.
+As in actuation.py forces are taken one step ahead.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import casadi as ca
@@ -26,53 +26,86 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.actuation import (
     Actuated,
-    JointForce,
     MotorForce,
     actuated_clusters,
     controller,
     deliver,
+    limit_count,
     motor_forces,
     within_joint_limits,
 )
+from ce_gym.dynamics.forces.law import JointForce
+from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.scene import Scene, target_names
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
-from ce_gym.model.description import Motor
 from ce_gym.model.mechanism import Mechanism
 
 
-def commanded_forces(
-    scene: Scene, kinematics: Kinematics, y: SX, yd: SX, target: SX, dt: float, hints: SX
-) -> MotorForce:
-    """Return what the motors deliver to the joints.
+@dataclass
+class Motors:
+    """What the motors of a robot do over one step: a `ForceLaw`.
 
-    Args:
+    Attributes:
         scene: The robot and what surrounds it.
         kinematics: Of the robot.
         y: Independent joint positions [rad or m], shape (nj,).
         yd: Their velocities, shape (nj,).
         target: See `target_names`, shape (n_targets,).
         dt: Length of the step [s].
-        hints: What the attempt before has found of limited torques, shape (limit_count,).
     """
-    if scene.options.control in ("position", "torque"):
-        return motor_forces(scene, kinematics, controller(scene, y, yd, target, dt), yd, dt, hints)
-    position, strength = scene.options.control == "motor_position", scene.figures.strength
-    names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.independent
-    undriven = [row for row, name in enumerate(joints) if name in names]
-    force = _joint_forces(scene, y, yd, target, dt, names, undriven)
-    for cluster in actuated_clusters(scene.mechanism, kinematics):
-        own = target[[names.index(motor.rotor) for motor in cluster.motors]]
-        if position:
-            kp, kd = _gains(scene, cluster)
-            damping = kd + dt * kp
-            asked = JointForce(kp * (own - cluster.angles) - damping * (cluster.W @ yd[cluster.rows]), dt * damping)
-        else:
+
+    scene: Scene
+    kinematics: Kinematics
+    y: SX
+    yd: SX
+    target: SX
+    dt: float
+
+    @property
+    def size(self) -> int:
+        """How many numbers its iterate has."""
+        return limit_count(self.scene.mechanism, self.scene.options)
+
+    def linearise(self, iterate: SX) -> MotorForce:
+        """Linearise about an iterate, shape (size,)."""
+        scene, y, yd, dt = self.scene, self.y, self.yd, self.dt
+        if scene.options.control in ("position", "torque"):
+            return motor_forces(scene, self.kinematics, controller(scene, y, yd, self.target, dt), yd, dt, iterate)
+        names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.independent
+        undriven = [row for row, name in enumerate(joints) if name in names]
+        force = self._at_joints(names, undriven, iterate.numel())
+        for cluster in actuated_clusters(scene.mechanism, self.kinematics):
+            own = self.target[[names.index(motor.rotor) for motor in cluster.motors]]
+            asked, model = self._at_motors(cluster, own), MOTORS[scene.options.motors]
+            deliver(model, force, asked, cluster, yd, scene.figures.strength, dt, iterate)
+        return within_joint_limits(scene, force, undriven, iterate)
+
+    def _at_motors(self, cluster: Actuated, own: SX) -> JointForce:
+        """Return what the motors of a cluster are asked for, given their targets, shape (n_motors,) both."""
+        strength = self.scene.figures.strength
+        if self.scene.options.control == "motor_torque":
             asked = JointForce(own, SX(own.numel(), 1))
-        if scene.options.motors == "ideal":
-            cluster = replace(cluster, motors=[Motor(motor.rotor, motor.torque) for motor in cluster.motors])
-        asked = JointForce(strength * asked.tau, ca.diag(strength * asked.slope))
-        deliver(force, asked, cluster, yd, strength, dt, hints)
-    return within_joint_limits(scene, force, undriven, hints)
+        else:
+            kp, kd = _gains(self.scene, cluster)
+            damping = kd + self.dt * kp
+            tau = kp * (own - cluster.angles) - damping * (cluster.W @ self.yd[cluster.rows])
+            asked = JointForce(tau, self.dt * damping)
+        return JointForce(strength * asked.tau, ca.diag(strength * asked.slope))
+
+    def _at_joints(self, names: tuple[str, ...], rows: list[int], size: int) -> MotorForce:
+        """Return what is asked of the joints that no motor drives, and nothing of the others."""
+        scene, n, strength = self.scene, self.y.numel(), self.scene.figures.strength
+        force = MotorForce(SX(n, 1), SX(n, n), size, {})
+        joints = scene.mechanism.robot.independent
+        control = "position" if scene.options.control == "motor_position" else "torque"
+        full = SX.zeros(n)
+        for row in rows:
+            full[row] = self.target[names.index(joints[row])]
+        scene = replace(scene, options=replace(scene.options, control=control))
+        asked = controller(scene, self.y, self.yd, full, self.dt)
+        for row in rows:
+            force.tau[row], force.slope[row, row] = strength * asked.tau[row], strength * asked.slope[row, row]
+        return force
 
 
 def motor_springs(scene: Scene, kinematics: Kinematics, y: SX, target: SX) -> tuple[SX, SX]:
@@ -114,20 +147,3 @@ def _gains(scene: Scene, cluster: Actuated) -> tuple[SX, SX]:
     known = standing_motors(scene.mechanism)
     squares = SX(ca.sparsify(ca.DM(np.array([known[motor.rotor][2] for motor in cluster.motors]) ** 2)))
     return squares @ scene.figures.kp[cluster.rows], squares @ scene.figures.kd[cluster.rows]
-
-
-def _joint_forces(
-    scene: Scene, y: SX, yd: SX, target: SX, dt: float, names: tuple[str, ...], rows: list[int]
-) -> MotorForce:
-    """Return what is asked of the joints that no motor drives, and nothing of the others."""
-    n, strength = y.numel(), scene.figures.strength
-    force = MotorForce(SX(n, 1), SX(n, n), {})
-    joints = scene.mechanism.robot.independent
-    control = "position" if scene.options.control == "motor_position" else "torque"
-    full = SX.zeros(n)
-    for row in rows:
-        full[row] = target[names.index(joints[row])]
-    asked = controller(replace(scene, options=replace(scene.options, control=control)), y, yd, full, dt)
-    for row in rows:
-        force.tau[row], force.slope[row, row] = strength * asked.tau[row], strength * asked.slope[row, row]
-    return force

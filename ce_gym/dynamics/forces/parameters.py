@@ -1,7 +1,4 @@
-"""Figures of a scene that may differ from robot to robot: constants folded into the code, or inputs when declared.
-
-May know descriptions, mechanisms and spatial algebra.
-"""
+"""Figures of a scene that may differ from robot to robot: constants folded into the code, or inputs when declared."""
 
 from __future__ import annotations
 

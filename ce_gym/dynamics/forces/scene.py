@@ -1,4 +1,4 @@
-"""What a scene consists of, and the state of one robot in it. May know descriptions, mechanisms and parameters."""
+"""What a scene consists of, and the state of one robot in it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from ce_gym.model.description import ContactMaterial
 from ce_gym.model.mechanism import Mechanism
 
 Control = Literal["position", "torque", "motor_position", "motor_torque"]
-Friction = Literal["tangent", "secant"]
-Motors = Literal["ideal", "limited"]
 Ground = Literal["flat", "field"]
 
 
@@ -27,10 +25,10 @@ class StepOptions:
             "motor_position" and "motor_torque" for angles and torques of the motors' rotors instead.
         contacts: Names of the contact spheres that can touch the ground.
         material: Compliance and friction of the contacts.
-        friction: "tangent" solves a step in which a contact sticks or slips against expectation a second time; "secant"
-            never does, and is slow to break away.
-        method: Name of a time-stepping method, see `METHODS`.
-        motors: "ideal" for the joints' torque limits; "limited" for the motors' own limits and friction.
+        normal_law: Name among `NORMAL_LAWS` of the contacts' normal force; None for that of the material.
+        friction: Name among `FRICTION` of the contacts' friction law.
+        method: Name among `METHODS` of a time-stepping method.
+        motors: Name among `MOTORS` of the model of the motors.
         ground: "flat" for the plane z = 0, "field" for a height and slope under each contact that the caller supplies.
         parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
     """
@@ -39,9 +37,10 @@ class StepOptions:
     control: Control = "position"
     contacts: tuple[str, ...] = ()
     material: ContactMaterial = field(default_factory=ContactMaterial)
-    friction: Friction = "tangent"
+    normal_law: str | None = None
+    friction: str = "tangent"
     method: str = "euler"
-    motors: Motors = "ideal"
+    motors: str = "ideal"
     ground: Ground = "flat"
     parameters: tuple[str, ...] = ()
 

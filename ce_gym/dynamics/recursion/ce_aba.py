@@ -35,7 +35,7 @@ from ce_gym.dynamics.algebra.spatial import (
     turning_force,
 )
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
-from ce_gym.dynamics.recursion.gyroscopic import Whirl, solve_turning
+from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, solve_turning
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
 from ce_gym.dynamics.recursion.rotors import lateral_inertia
 from ce_gym.model.clusters import Cluster
@@ -92,7 +92,7 @@ def inward_inertia_pass(
     kinematics: Kinematics,
     joints: JointTerms,
     external: dict[str, BodyTerms],
-    whirl: Whirl | None = None,
+    turning: TurningDamping | None = None,
 ) -> Articulation:
     """Collect articulated inertias and bias forces, tip to base (paper Alg. 1, inward pass).
 
@@ -101,7 +101,7 @@ def inward_inertia_pass(
         kinematics: From the outward velocity pass.
         joints: Forces on the independent coordinates.
         external: Forces on bodies, by name, such as contacts.
-        whirl: The step, if there is one.
+        turning: Damping of joints on turning bodies, if there is a step.
     """
     IA: dict[str, SX] = {}
     pA: dict[str, SX] = {}
@@ -123,8 +123,8 @@ def inward_inertia_pass(
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
         D = mirrored(condensed.D + joints.slope[rows, rows])
         U, u = condensed.U, joints.tau[rows] - condensed.bias - lateral_bias
-        if whirl is not None and cluster.output_body is not None:
-            more, drag = whirl.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
+        if turning is not None and cluster.output_body is not None:
+            more, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
             D, u = mirrored(D + more), u + drag
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
         articulation.handle_body[k] = handle.name if handle else None
@@ -157,7 +157,7 @@ def _add_lateral_inertias(
 
 
 def outward_acceleration_pass(
-    mechanism: Mechanism, kinematics: Kinematics, articulation: Articulation, turning: SX | None = None
+    mechanism: Mechanism, kinematics: Kinematics, articulation: Articulation, momentum: SX | None = None
 ) -> tuple[SX, dict[str, SX]]:
     """Compute accelerations, base to tip (paper Alg. 1, outward pass 2, without its misprint).
 
@@ -165,7 +165,7 @@ def outward_acceleration_pass(
         mechanism: The mechanism.
         kinematics: From the outward velocity pass.
         articulation: From the inward pass.
-        turning: Of a floating base, see `turning_momentum`, if there is a step.
+        momentum: Of a floating base, see `turning_momentum`, if there is a step.
 
     Returns:
         vdot, shape (nv,), in the coordinates of `v`; and the acceleration of every body *minus gravity*, body
@@ -180,7 +180,7 @@ def outward_acceleration_pass(
             base = cluster.bodies[0]
             inertia, force = articulation.base  # type: ignore[misc]
             a[base] = (
-                solve_positive_definite(inertia, force) if turning is None else solve_turning(inertia, turning, force)
+                solve_positive_definite(inertia, force) if momentum is None else solve_turning(inertia, momentum, force)
             )
             state = kinematics.bodies[base]
             vdot[rows] = a[base] + ca.vertcat(SX(3, 1), state.R.T @ gravity - cross(state.v[:3], state.v[3:]))

@@ -1,6 +1,6 @@
-"""Velocity products that an explicit step would make energy of: a base that turns, and joints on bodies that do.
+"""Gyroscopic terms to which explicit integration adds energy, stabilised: of a turning base, and of joints on one.
 
-*The base.* A body that turns freely feels `-w x L`, of which an explicit step makes energy, `dt^2 |w x L|^2 / (2 I)`
+*The base.* A body that turns freely feels `-w x L`, by which an explicit step adds energy, `dt^2 |w x L|^2 / (2 I)`
 each time: one that tumbles at 20 rad/s is lost within 15 s at 5 ms. Here a part is taken one step ahead, `(J w) x w+`,
 with J the inertia of the robot in its standing pose about its centre of mass, frozen into one rigid body. That adds the
 *antisymmetric* matrix `-dt skew(J w)` to the inertia of the base. For one rigid body the step then reads
@@ -12,7 +12,7 @@ Joints carried by a body that turns so are damped at a rate `4 a^4 / dt`, implic
 which is less than any joint's own friction and far below the error of the step; where a step turns the body by half a
 radian and resolves nothing any more, 50/s.
 
-Both vanish with the step and leave its order as it is. May know kinematics and mechanisms.
+Both vanish with the step and leave its order as it is.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from ce_gym.dynamics.algebra.spatial import SX, cross, skew, solve_positive_defi
 from ce_gym.dynamics.recursion.kinematics import constant, is_free, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
 
-WHIRL = 4.0
+TURNING_DAMPING = 4.0
 """Factor on the fourth power of the angle turned in a step, see above."""
 
 
 @dataclass(frozen=True)
-class Whirl:
+class TurningDamping:
     """The step in which joints on turning bodies are damped.
 
     Attributes:
@@ -43,7 +43,7 @@ class Whirl:
 
     def on(self, D: SX, rows: list[int], w: SX) -> tuple[SX, SX]:
         """Return the addition to a cluster's inertia `D`, and the force, given the turning of its carrier [rad/s]."""
-        share = WHIRL * (self.dt**2 * ca.sumsqr(w)) ** 2
+        share = TURNING_DAMPING * (self.dt**2 * ca.sumsqr(w)) ** 2
         return share * D, -share / self.dt * (D @ self.v[rows])
 
 

@@ -1,7 +1,6 @@
 """Mechanical energy of a robot in a scene: what moves, what can fall, and what is bent.
 
-Without motors nothing that the scene contains can give energy to the robot, so this sum must not grow. May know
-everything in this room but the methods and the trace.
+Without motors nothing that the scene contains can give energy to the robot, so this sum must not grow.
 """
 
 from __future__ import annotations
@@ -11,12 +10,12 @@ import math
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.actuation import limit_stiffness
 from ce_gym.dynamics.forces.motor_control import motor_springs
+from ce_gym.dynamics.forces.passive import limit_stiffness
 from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.functions import kinetic_and_potential
 from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
-from ce_gym.dynamics.stepping.step import no_hints, touching
+from ce_gym.dynamics.stepping.step import touching
 
 
 def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
@@ -38,7 +37,7 @@ def contact_energy(scene: Scene, state: State) -> SX:
     """Return the energy of contact springs and bristles [J]."""
     kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
     k, k_t = scene.figures.compliance.stiffness, scene.figures.compliance.bristle
-    touches = [contact.touch for contact in touching(scene, kinematics, state, 0.0, no_hints(scene))]
+    touches = [contact.touch for contact in touching(scene, kinematics, state, 0.0)]
     return sum((k * ca.fmax(t.depth, 0) ** 2 + k_t * ca.sumsqr(t.anchor) for t in touches), SX(0)) / 2
 
 

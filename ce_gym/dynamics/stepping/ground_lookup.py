@@ -4,8 +4,6 @@ A sphere touches sloping ground beside the place under its centre. So the field 
 and where a sphere on the plane found there would touch it. The plane at the second place is the one that the sphere
 meets, but for errors of second order in how much the ground turns over a radius. With the first alone forces would not
 be normal to the path on which a sphere can roll, and energy would grow. Spheres without radius need no second look.
-
-May know scenes, steps and kinematics.
 """
 
 from __future__ import annotations

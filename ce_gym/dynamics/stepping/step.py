@@ -2,21 +2,29 @@
 
 The step is linearly implicit: whatever is stiff (contact, friction, joint stops, damping, position control) is taken
 one step ahead, which adds to inertias and leaves the recursion as it is. A step of length 0 gives the acceleration of
-the moment. May know everything in this room but the methods that are made of such steps.
+the moment.
+
+Which contacts act, slip or stick and which motors are at their limits is an active set. `iteration` makes the step with
+the set that its iterate assumes, says whether that is the set it came to, and returns the next iterate.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.actuation import JointForce, MotorForce, limit_count, passive_forces
-from ce_gym.dynamics.forces.contact import Contact, ContactResponse, Hint, touch_ground
-from ce_gym.dynamics.forces.motor_control import commanded_forces
+from ce_gym.dynamics.forces.actuation import ITERATIONS, MotorForce, limit_count
+from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground
+from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.law import JointForce, Motion
+from ce_gym.dynamics.forces.motor_control import Motors
+from ce_gym.dynamics.forces.normal import normal_law
+from ce_gym.dynamics.forces.passive import passive_forces
 from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
 from ce_gym.dynamics.functions import guessed_coordinates
 from ce_gym.dynamics.recursion.ce_aba import (
@@ -26,7 +34,7 @@ from ce_gym.dynamics.recursion.ce_aba import (
     inward_inertia_pass,
     outward_acceleration_pass,
 )
-from ce_gym.dynamics.recursion.gyroscopic import Whirl, turning_momentum
+from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, turning_momentum
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.model.description import ContactSphere
 from ce_gym.model.mechanism import Mechanism
@@ -39,21 +47,19 @@ class Solved:
     Attributes:
         kinematics: At the start of the step.
         vdot: Acceleration, shape (nv,).
+        motion: The same of joints and bodies.
+        contacts: Forces of the contacts of the scene.
         motors: What the motors deliver to the joints.
-        contacts: The contacts of the scene.
-        responses: Their forces as functions of their velocities.
-        gains: What their velocities gain in the step, body axes [m/s], shape (3,) each.
     """
 
     kinematics: Kinematics
     vdot: SX
+    motion: Motion
+    contacts: list[LinearContact]
     motors: MotorForce
-    contacts: list[Contact]
-    responses: list[ContactResponse]
-    gains: list[SX]
 
 
-def solve(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Solved:
+def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Solved:
     """Find the acceleration of one robot over a step, by CE-ABA.
 
     Args:
@@ -61,30 +67,26 @@ def solve(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Solve
         state: At the start of the step.
         target: Targets or torques of what `target_names` says, shape (n_targets,).
         dt: Length of the step [s].
-        hints: What the attempt before has found, shape (hint_count,): of the contacts, Hint.SIZE each, then of the
-            limited torques; zero for the first.
+        iterate: From the iteration before: of each contact, then of the motors, shape (iterate_size,).
     """
     mechanism, n = scene.mechanism, len(scene.mechanism.robot.independent)
     y, yd = state.q[state.q.shape[0] - n :], state.v[state.v.shape[0] - n :]
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
 
-    motors = commanded_forces(scene, kinematics, y, yd, target, dt, hints[Hint.SIZE * len(scene.options.contacts) :])
-    joints = on_coordinates(mechanism, motors + passive_forces(mechanism.robot, y, yd, dt))
-    contacts = touching(scene, kinematics, state, dt, hints)
-    if scene.options.friction == "secant":
-        responses = [contact.secant() for contact in contacts]
-    else:
-        responses = [contact.tangent() for contact in contacts]
+    laws = touching(scene, kinematics, state, dt)
+    *of_contacts, of_motors = split(iterate, [law.size for law in laws])
+    contacts = [law.linearise(part) for law, part in zip(laws, of_contacts, strict=True)]
+    motors = Motors(scene, kinematics, y, yd, target, dt).linearise(of_motors)
 
+    joints = on_coordinates(mechanism, motors + passive_forces(mechanism.robot, y, yd, dt))
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    external = on_bodies(contacts, responses, gravity)
+    external = on_bodies(contacts, gravity)
     at_once = isinstance(dt, float) and dt == 0  # the acceleration of the moment
-    whirl = None if at_once else Whirl(state.v, dt)
-    turning = None if at_once else turning_momentum(mechanism, state.v, dt)
-    articulation = inward_inertia_pass(mechanism, kinematics, joints, external, whirl)
-    vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, turning)
-    gains = [r.velocity_gain(a[c.body], gravity[c.body]) for c, r in zip(contacts, responses, strict=True)]
-    return Solved(kinematics, vdot, motors, contacts, responses, gains)
+    turning = None if at_once else TurningDamping(state.v, dt)
+    momentum = None if at_once else turning_momentum(mechanism, state.v, dt)
+    articulation = inward_inertia_pass(mechanism, kinematics, joints, external, turning)
+    vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
+    return Solved(kinematics, vdot, Motion(vdot[vdot.numel() - n :], a, gravity), contacts, motors)
 
 
 @dataclass
@@ -93,95 +95,88 @@ class Stepped:
 
     Attributes:
         state: At the end of the step.
+        before: At its start.
         solved: How it came about.
         torque: Motor torque at each joint, mean over the step [N m or N], shape (nj,).
         contact_forces: Mean force on each contact over the step, world axes [N], shape (3, n_contacts).
-        misjudged: 1 if a contact or a motor did not do what it was taken to do, else 0.
-        hints: What to make another attempt with; if not misjudged, one that comes to the same.
+        unconverged: 1 if the active set of a contact or a motor is not the one that was assumed, else 0.
+        iterate: For the next iteration; once converged, a fixed point.
         error: Estimate of the error of the step in `v` [rad/s or m/s]; 0 for a method that has none.
     """
 
     state: State
+    before: State
     solved: Solved
     torque: SX
     contact_forces: SX
-    misjudged: SX
-    hints: SX
+    unconverged: SX
+    iterate: SX
     error: SX
 
 
-def attempt(scene: Scene, state: State, target: SX, dt: float, hints: SX) -> Stepped:
-    """Attempt one linearly implicit Euler step; arguments as for `solve`."""
-    solved = solve(scene, state, target, dt, hints)
-    kinematics, triples = solved.kinematics, list(zip(solved.contacts, solved.responses, solved.gains, strict=True))
+def iteration(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Stepped:
+    """Make one iteration of a linearly implicit Euler step; arguments as for `solve`."""
+    solved = solve(scene, state, target, dt, iterate)
+    kinematics, motion, motors = solved.kinematics, solved.motion, solved.motors
     q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.floating)
-    rotations = [kinematics.bodies[contact.body].R for contact in solved.contacts]
-    anchors = [(R @ c.anchor_after(gain))[:2] for R, (c, _, gain) in zip(rotations, triples, strict=True)]
+    contacts = [(kinematics.bodies[c.body].R, c, c.gain(motion)) for c in solved.contacts]
+    anchors = [(R @ c.anchor_after(gain))[:2] for R, c, gain in contacts]
     after = State(
         q=q,
         v=v,
-        load=stacked([ca.fmax(c.normal_after(gain), 0) for c, _, gain in triples]),
+        load=stacked([ca.fmax(c.normal_after(gain), 0) for _, c, gain in contacts]),
         anchor=stacked(anchors) if state.anchor.numel() else state.anchor,
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
     )
-    forces = [R @ r.force_after(gain) for R, (_, r, gain) in zip(rotations, triples, strict=True)]
-    ydd = solved.vdot[solved.vdot.shape[0] - solved.motors.tau.shape[0] :]
-    at_contacts = Hint.SIZE * len(triples)
-    of_torques, wrong = solved.motors.found(ydd, hints.numel() - at_contacts)
-    misjudged = ca.logic_or(wrong, ca.sum1(stacked([c.misjudged(r, gain) for c, r, gain in triples])) > 0)
-    of_contacts = stacked([c.hint_after(gain, r.slip) for c, r, gain in triples])
-    # A robot that was judged well makes the same step again if its tile does; torques found as they were taken to be.
-    of_contacts = ca.if_else(misjudged, of_contacts, hints[:at_contacts])
+    changed = ca.sum1(stacked([c.check(motion) for c in solved.contacts])) > 0
+    unconverged = ca.logic_or(motors.check(motion), changed)
+    of_contacts = stacked([c.next_iterate(motion) for c in solved.contacts])
+    # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of torques are fixed
+    # points by themselves.
+    of_contacts = ca.if_else(unconverged, of_contacts, iterate[: of_contacts.numel()])
     return Stepped(
         state=after,
+        before=state,
         solved=solved,
-        torque=solved.motors.tau - solved.motors.slope @ ydd,
-        contact_forces=ca.horzcat(SX(3, 0), *forces),
-        misjudged=misjudged,
-        hints=ca.vertcat(of_contacts, of_torques),
+        torque=motors.tau - motors.slope @ motion.ydd,
+        contact_forces=ca.horzcat(SX(3, 0), *[R @ c.force_after(gain) for R, c, gain in contacts]),
+        unconverged=unconverged,
+        iterate=ca.vertcat(of_contacts, motors.next_iterate(motion)),
         error=SX(0),
     )
 
 
-def implicit_step(scene: Scene, state: State, target: SX, dt: float) -> Stepped:
-    """Advance one robot by one linearly implicit Euler step, with further attempts where it was misjudged."""
-    stepped = attempt(scene, state, target, dt, no_hints(scene))
-    for _ in range(further_attempts(scene.mechanism, scene.options)):
-        stepped = attempt(scene, state, target, dt, stepped.hints)
-    return stepped
+def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
+    """Return how many iterations of a step may follow the first."""
+    contacts = FRICTION[options.friction].iterations if options.contacts else 0
+    return max(contacts, ITERATIONS if limit_count(mechanism, options) else 0)
 
 
-def further_attempts(mechanism: Mechanism, options: StepOptions) -> int:
-    """Return how many attempts at a step may follow the first: for limited torques, or else for contacts alone."""
-    contacts = options.contacts and options.friction != "secant"
-    return 4 if limit_count(mechanism, options) else 2 if contacts else 0
+def first_iterate(scene: Scene) -> SX:
+    """Return the iterate of a first iteration."""
+    return SX(iterate_size(scene.mechanism, scene.options), 1)
 
 
-def no_hints(scene: Scene) -> SX:
-    """Return the hints of a first attempt."""
-    return SX(hint_count(scene.mechanism, scene.options), 1)
+def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
+    """Return how many numbers an iteration leaves for the next."""
+    return Contact.size * len(options.contacts) + limit_count(mechanism, options)
 
 
-def hint_count(mechanism: Mechanism, options: StepOptions) -> int:
-    """Return how many numbers an attempt leaves for the next."""
-    return Hint.SIZE * len(options.contacts) + limit_count(mechanism, options)
-
-
-def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float, hints: SX) -> list[Contact]:
+def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:
     """Place every contact sphere of the scene against the ground."""
-    contacts = []
-    for i, sphere in enumerate(contact_spheres(scene.mechanism, scene.options)):
+    contacts, options = [], scene.options
+    normal, friction = normal_law(options.normal_law, options.material), FRICTION[options.friction]
+    for i, sphere in enumerate(contact_spheres(scene.mechanism, options)):
         body, position = kinematics.bodies[sphere.body], constant(np.array(sphere.position))
-        height, normal = SX(0), constant(np.array([0.0, 0.0, 1.0]))
-        if scene.options.ground == "field":
+        height, up = SX(0), constant(np.array([0.0, 0.0, 1.0]))
+        if options.ground == "field":
             height, slope = scene.ground[0, i], scene.ground[1:, i]
             if scene.looked_up.numel():
                 height += ca.dot(slope, body.point_position(position)[:2] - scene.looked_up[:, i])
-            normal = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
+            up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
-        hint = Hint.of(hints[Hint.SIZE * i : Hint.SIZE * (i + 1)])
-        touch = touch_ground(body, position, sphere.radius, height, normal, state.load[i], anchor)
-        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, dt, hint))
+        touch = touch_ground(body, position, sphere.radius, height, up, state.load[i], anchor)
+        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt))
     return contacts
 
 
@@ -211,15 +206,19 @@ def on_coordinates(mechanism: Mechanism, force: JointForce) -> JointTerms:
     return JointTerms(ca.vertcat(SX(base, 1), force.tau), ca.diagcat(SX(base, base), force.slope))
 
 
-def on_bodies(
-    contacts: list[Contact], responses: list[ContactResponse], gravity: dict[str, SX]
-) -> dict[str, BodyTerms]:
+def on_bodies(contacts: list[LinearContact], gravity: dict[str, SX]) -> dict[str, BodyTerms]:
     """Sum the contacts of each body."""
     terms: dict[str, BodyTerms] = {}
-    for contact, response in zip(contacts, responses, strict=True):
-        new, old = response.body_terms(gravity[contact.body]), terms.get(contact.body)
+    for contact in contacts:
+        new, old = contact.body_terms(gravity[contact.body]), terms.get(contact.body)
         terms[contact.body] = BodyTerms(old.inertia + new.inertia, old.force + new.force) if old else new
     return terms
+
+
+def split(column: SX, sizes: list[int]) -> list[SX]:
+    """Split a column into parts of some sizes, and the rest."""
+    ends = np.cumsum([0, *sizes]).tolist()
+    return [column[start:end] for start, end in pairwise((*ends, column.numel()))]
 
 
 def stacked(columns: list[SX]) -> SX:

@@ -1,7 +1,4 @@
-"""A time step as a traced function: state in, state out, a robot that has gone astray frozen where it was.
-
-May know everything in this room.
-"""
+"""A time step as traced functions: state in, state out, a diverged robot frozen where it was."""
 
 from __future__ import annotations
 
@@ -17,8 +14,10 @@ from ce_gym.dynamics.forces.scene import State, StepOptions, make_scene, symboli
 from ce_gym.dynamics.functions import loop_gap, loop_state, traced
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.stepping.energy import mechanical_energy
-from ce_gym.dynamics.stepping.methods import METHODS, beyond
-from ce_gym.dynamics.stepping.step import Stepped, attempt, hint_count, stacked
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.plan import AFTER, combined, error_estimate
+from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, stacked
+from ce_gym.dynamics.stepping.unroll import unrolled
 from ce_gym.model.mechanism import Mechanism
 
 LOST_LOOP = 1e-5
@@ -26,9 +25,9 @@ LOST_LOOP = 1e-5
 SINGULAR = 1e-3
 """A robot whose loops are nearer than this to a singularity (see `Model.nearness`) has diverged."""
 SANE_SPEED = 1e4
-"""A robot any of whose velocities is beyond this, or not a number, has diverged [rad/s or m/s]."""
+"""A robot any of whose velocities is beyond this, or NaN, has diverged [rad/s or m/s]."""
 SANE_DISTANCE = 1e6
-"""A robot any of whose positions is beyond this, or not a number, has diverged [rad or m]."""
+"""A robot any of whose positions is beyond this, or NaN, has diverged [rad or m]."""
 
 
 def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
@@ -44,63 +43,65 @@ def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str
         scene has; `given` is `target` if there are joints, `parameters` if any are declared, `ground` on a field, and
         `dt` if the options leave it open.
     """
-    given = _Given(mechanism, options)
-    method = METHODS[options.method]
-    stepped = method.step(given.scene, given.state, given.target, given.dt)
-    return traced("step", given.inputs(), given.results(stepped, outputs))
+    given, plan = _Given(mechanism, options), METHODS[options.method]
+    parts = unrolled(plan, given.scene, given.state, given.target, given.dt)
+    told = {name: given.output(name, plan.shares(name), parts) for name in outputs}
+    return traced("step", given.inputs(), given.guarded(parts[AFTER]) | told)
 
 
-def attempt_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
-    """Trace one attempt at an Euler step: called again with the hints it leaves, where it says so, it makes the step.
+def iteration_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
+    """Trace one iteration of an Euler step: repeated on its own iterate until it has converged, it makes the step.
 
     Returns:
-        Function (*state, diverged, *given, hints) -> (*state, diverged, hints, misjudged, *outputs), see
-        `step_function`; hints are zero at first, shape (hint_count,).
+        Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
+        `step_function`; the iterate is zero at first, shape (iterate_size,).
     """
-    given, hints = _Given(mechanism, options), SX.sym("hints", hint_count(mechanism, options))
-    stepped = attempt(given.scene, given.state, given.target, given.dt, hints)
-    results = given.results(stepped, outputs)
-    kept = {name: results.pop(name) for name in list(results) if name.endswith("_next")}
-    kept |= {"hints_next": stepped.hints, "misjudged": stepped.misjudged}
-    return traced("attempt", given.inputs() | {"hints": hints}, kept | results)
+    given, iterate = _Given(mechanism, options), SX.sym("iterate", iterate_size(mechanism, options))
+    stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
+    told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
+    left = {"iterate_next": stepped.iterate, "unconverged": stepped.unconverged}
+    return traced("iteration", given.inputs() | {"iterate": iterate}, given.guarded(stepped) | left | told)
 
 
-def extrapolation_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
-    """Trace what follows from a step and two of half the length, as `Extrapolated` has it.
+def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
+    """Trace what follows from the stages of a step, as the plan of its method has it.
 
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
-        outputs: Sizes of those among `OUTPUTS` that are asked for.
+        outputs: Sizes of those among `OUTPUTS` that are to be combined.
 
     Returns:
-        Function (*state, diverged, *of the steps) -> (*state, diverged, *outputs). Of the steps it is given those parts
-        it needs, by names such as `coarse_q`, `fine_v` and `half_torque`: the whole step, the second half and the
-        first half. A robot that diverges in one of them stays where it was.
+        Function (*state, diverged, *of the stages) -> (*state, diverged, *outputs). Of the stages it is given those
+        parts it needs, by names such as `coarse_q`, `fine_v` and `half_torque`. A robot that diverges in one of them
+        stays where it was.
     """
-    before = symbolic_state(mechanism, options)
-    coarse, fine = (symbolic_state(mechanism, options) for _ in range(2))
-    flags = {name: SX.sym(name) for name in ("diverged", "coarse_diverged", "half_diverged", "fine_diverged")}
-    inputs = dict(before.items()) | flags
-    inputs |= {f"coarse_{name}": getattr(coarse, name) for name in ("q", "v")}
-    inputs |= {f"fine_{name}": value for name, value in fine.items()}
-    v_fine = fine.v
-    fine.q, fine.v = beyond(coarse, fine, mechanism.robot.floating)
-    sane = ca.logic_and(ca.sumsqr(fine.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
-    results = {f"{name}_next": ca.if_else(sane, getattr(fine, name), value) for name, value in before.items()}
+    plan, before = METHODS[options.method], symbolic_state(mechanism, options)
+    ends = {stage.name: symbolic_state(mechanism, options) for stage in plan.stages}
+    flags = {"diverged": SX.sym("diverged")} | {f"{name}_diverged": SX.sym(name) for name in ends}
+    given = dict(before.items()) | flags
+    given |= {f"{stage}_{name}": value for stage, end in ends.items() for name, value in end.items()}
+    after = combined(plan, ends, mechanism.robot.floating)
+    sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
+    results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in before.items()}
     results["diverged_next"] = ca.if_else(sane, 0, 1)
+    if plan.single:  # which has seen to that
+        results = {f"{name}_next": value for name, value in after.items()}
+        results["diverged_next"] = flags[f"{plan.stages[0].name}_diverged"]
     for name, size in outputs.items():
         if name == "error":
-            results[name] = ca.norm_2(v_fine - coarse.v)
+            results[name] = error_estimate(plan, ends)
             continue
-        told = {stage: SX.sym(name, size) for stage in ("coarse", "half", "fine")}
-        if name in AT_START:
-            weights = {"coarse": 1.0}
-        else:
-            weights = {"half": 0.5, "fine": 0.5} if name in MEANS else {"fine": 2.0, "coarse": -1.0}
-        inputs |= {f"{stage}_{name}": told[stage] for stage in weights}
-        results[name] = sum((weight * told[stage] for stage, weight in weights.items()), SX(0))
-    return traced("extrapolation", inputs, results)
+        told = {stage: SX.sym(name, size) for stage in plan.shares(name)}
+        given |= {f"{stage}_{name}": value for stage, value in told.items()}
+        results[name] = weighted(plan.shares(name), told)
+    return traced("combination", _needed(given, results), results)
+
+
+def _needed(given: dict[str, SX], results: dict[str, SX]) -> dict[str, SX]:
+    """Return those symbols that results depend on."""
+    everything = ca.veccat(*results.values())
+    return {name: value for name, value in given.items() if ca.depends_on(everything, value)}
 
 
 OUTPUTS = {
@@ -114,8 +115,6 @@ OUTPUTS = {
     "nearness": "distance from a singularity, see `Model.nearness`, start of the step",
 }
 """What a step can report, if asked."""
-AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "contact_forces")
-"""Outputs that belong to the start of a step, or to the whole of it; the others belong to its end."""
 
 
 class _Given:
@@ -138,19 +137,24 @@ class _Given:
         given |= {"dt": self.dt} if isinstance(self.dt, SX) else {}
         return dict(self.state.items()) | {"diverged": self.diverged} | given
 
-    def results(self, stepped: Stepped, outputs: tuple[str, ...]) -> dict[str, SX]:
-        """State after the step, or as it was if the robot has diverged now or before, and outputs."""
+    def guarded(self, stepped: Stepped) -> dict[str, SX]:
+        """State after the step, or as it was if the robot has diverged now or before."""
         after = stepped.state
         size = ca.sumsqr(after.v) + ca.sumsqr(after.anchor)
-        sane = ca.logic_and(size < SANE_SPEED**2, self.diverged < 0.5)  # false if it is not a number:
+        sane = ca.logic_and(size < SANE_SPEED**2, self.diverged < 0.5)  # false for NaN
         sane = ca.logic_and(sane, ca.sumsqr(after.q) < SANE_DISTANCE**2)  # not all positions act on velocities
         if any(closures(self.mechanism)):
             sane = ca.logic_and(sane, loops_close(self.mechanism, stepped.solved.kinematics, after))
         results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in self.state.items()}
-        results["diverged_next"] = ca.if_else(sane, 0, 1)
-        return results | {name: ca.vec(self._output(name, stepped)) for name in outputs}
+        return results | {"diverged_next": ca.if_else(sane, 0, 1)}
 
-    def _output(self, name: str, stepped: Stepped) -> SX:
+    def output(self, name: str, shares: Mapping[str, float], parts: Mapping[str, Stepped]) -> SX:
+        """Return an output, combined from parts of a step."""
+        if name == "error":
+            return parts[AFTER].error
+        return ca.vec(weighted(shares, {part: self._of(parts[part], name) for part in shares}))
+
+    def _of(self, stepped: Stepped, name: str) -> SX:
         n = len(self.mechanism.robot.independent)
         yd = stepped.state.v[stepped.state.v.numel() - n :]
         kinematics = stepped.solved.kinematics
@@ -163,6 +167,13 @@ class _Given:
         if name == "loop_gap":
             return loop_gap(self.mechanism, kinematics)
         return loop_state(kinematics)[1] if name == "nearness" else getattr(stepped, name)
+
+
+def weighted(weights: Mapping[str, float], values: Mapping[str, SX]) -> SX:
+    """Return a weighted sum of values by name."""
+    if len(set(weights.values())) == 1:
+        return next(iter(weights.values())) * sum((values[name] for name in weights), SX(0))
+    return sum((weight * values[name] for name, weight in weights.items()), SX(0))
 
 
 def loops_close(mechanism: Mechanism, before: Kinematics, after: State) -> SX:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ce_gym.compile import Kernel, load_kernel, source_fingerprint
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.terrain_tiles import make_field
-from ce_gym.sim.kernel_key import model_key
+from ce_gym.sim.kernel_key import laws_key, model_key
 from ce_gym.sim.substeps import FRAME, HEIGHTS
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
@@ -176,8 +176,9 @@ def _finite(values: NDArray) -> NDArray:
 
 def kernel_key(program: TaskProgram) -> str:
     """Return a text that names everything that the kernels of a task on a robot depend on."""
+    laws = laws_key(program.model.mechanism, program.options)
     traced = f"{source_fingerprint(*SOURCES)} {model_key(program.model)}"
-    return f"{traced} {program.task!r} {program.contact_forces} {program.added_terms()}"
+    return f"{traced} {program.task!r} {program.contact_forces} {program.added_terms()} {laws}"
 
 
 def _kernels(program: TaskProgram, dtype: str) -> tuple[Kernel, Kernel]:

@@ -6,10 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
+from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.envs.task.tasks import Actions
 from ce_gym.envs.task.terrain_tiles import checked_terrain
 
-CHOICES = {"actions": get_args(Actions), "friction": ("tangent", "secant"), "motors": ("ideal", "limited")}
+CHOICES = {"actions": get_args(Actions), "friction": FRICTION, "motors": MOTORS}
 POSITIVE = ("action_scale", "command_period", "gait_period", "dt")
 COUNTS = ("history", "n_substeps", "episode_length", "max_episode_steps")
 LARGEST = {"dt": 0.1, "standing_fraction": 1.0}

@@ -1,0 +1,49 @@
+"""Viscous friction and stops of the joints, taken one step ahead."""
+
+from __future__ import annotations
+
+import math
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.law import JointForce
+from ce_gym.model.description import Robot
+
+LIMIT_FREQUENCY = 2 * math.pi * 20.0
+"""Stiffness over damping of a soft joint limit [1/s]; the stop relaxes in the inverse of it, 8 ms."""
+
+
+def passive_forces(robot: Robot, y: SX, yd: SX, dt: float) -> JointForce:
+    """Return viscous friction and stops of all independent joints."""
+    total = [_viscous_damping(yd[i], robot.body(name).joint.damping, dt) for i, name in enumerate(robot.independent)]
+    for i, name in enumerate(robot.independent):
+        stiffness, damping = limit_stiffness(robot, name)
+        tau, slope = _stop(y[i], yd[i], robot.body(name).joint.position, stiffness, damping, dt)
+        total[i] = total[i][0] + tau, total[i][1] + slope
+    tau, slopes = ca.vertcat(SX(0, 1), *[t for t, _ in total]), ca.vertcat(SX(0, 1), *[s for _, s in total])
+    return JointForce(tau, ca.diag(slopes))
+
+
+def limit_stiffness(robot: Robot, name: str) -> tuple[float, float]:
+    """Return stiffness [N m/rad] and damping [N m s/rad] of a joint's stops: full torque at 0.02 rad, well damped."""
+    torque = robot.body(name).joint.torque
+    stiffness = 50.0 * torque if math.isfinite(torque) else 1e3
+    return stiffness, stiffness / LIMIT_FREQUENCY
+
+
+def _viscous_damping(yd: SX, damping: float, dt: float) -> tuple[SX, SX]:
+    return SX(-damping * yd), SX(dt * damping)
+
+
+def _stop(y: SX, yd: SX, limits: tuple[float, float], stiffness: float, damping: float, dt: float) -> tuple[SX, SX]:
+    """One-sided springs at the ends of a joint's range, active if it will be beyond one by the end of the step."""
+    tau, total, slope = SX(0), SX(0), damping + dt * stiffness
+    for bound, side in ((limits[0], 1.0), (limits[1], -1.0)):
+        if math.isinf(bound):
+            continue
+        depth, speed = side * (bound - y), side * yd
+        push = stiffness * depth - slope * speed
+        active = ca.logic_and(depth - dt * speed > 0, push > 0)
+        tau, total = tau + side * ca.if_else(active, push, 0), total + ca.if_else(active, dt * slope, 0)
+    return tau, total

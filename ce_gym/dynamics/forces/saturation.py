@@ -1,0 +1,78 @@
+"""A torque kept within limits, of a joint or of a motor, linearly implicit in the step.
+
+Within its limits it is what is asked for; at a limit it is the limit, and answers to accelerations only as the limit
+does. Which of the three it is depends on the acceleration, and that on it. The first iteration goes by what is asked
+for at zero acceleration, further ones by the torque that the iteration before predicts for the end of the step. It
+matters on light links: deciding saturation at zero acceleration applies an excessive impulse there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.law import JointForce
+
+
+@dataclass
+class Saturation:
+    """A torque that is kept within limits.
+
+    Attributes:
+        asked: What is asked for at zero acceleration [N m or N], and how it answers: `tau - slope @ ydd`.
+        high, low: Limits likewise; a torque-speed line answers to accelerations too.
+        expected: The torque [N m or N] whose place among the limits is the active set.
+    """
+
+    asked: JointForce
+    high: JointForce
+    low: JointForce
+    expected: SX
+
+    @staticmethod
+    def about(iterate: SX, place: int, asked: JointForce, high: JointForce, low: JointForce) -> Saturation:
+        """Return a torque as an iterate has it at a place; in the first iteration as it is at zero acceleration."""
+        one = Saturation(asked, high, low, asked.tau)
+        return replace(one, expected=ca.if_else(iterate[-1] > 0, iterate[place], asked.tau)) if one.answers else one
+
+    @property
+    def answers(self) -> bool:
+        """Whether the active set depends on accelerations at all."""
+        return any(ca.sparsify(force.slope).nnz() for force in (self.asked, self.high, self.low))
+
+    @property
+    def at_high(self) -> SX:
+        """1 if it is taken to be at its upper limit, else 0."""
+        return self.expected > self.high.tau
+
+    @property
+    def at_low(self) -> SX:
+        """1 if it is taken to be at its lower limit, else 0."""
+        return self.expected < self.low.tau
+
+    @property
+    def free(self) -> SX:
+        """1 if what is asked for is given, else 0."""
+        return ca.logic_not(ca.logic_or(self.at_high, self.at_low))
+
+    @property
+    def given(self) -> SX:
+        """What is given at zero acceleration [N m or N]."""
+        return ca.if_else(self.at_high, self.high.tau, ca.if_else(self.at_low, self.low.tau, self.asked.tau))
+
+    def after(self, ydd: SX) -> Saturation:
+        """Return it with the active set at the end of the step, given the accelerations.
+
+        The predicted end-of-step torque keeps its violation of a limit as the next guess. It never goes from beyond one
+        limit to beyond the other: what is between has not been tried then.
+        """
+        asked = self.asked.tau - self.asked.slope @ ydd
+        if ca.sparsify(self.high.slope).nnz() or ca.sparsify(self.low.slope).nnz():
+            over = asked - (self.high.tau - self.high.slope @ ydd)
+            under = self.low.tau - self.low.slope @ ydd - asked
+            within = ca.fmax(self.low.tau, ca.fmin(self.high.tau, asked))
+            asked = ca.if_else(over > 0, self.high.tau + over, ca.if_else(under > 0, self.low.tau - under, within))
+        kept = ca.if_else(self.at_low, ca.fmin(asked, self.high.tau), asked)
+        return replace(self, expected=ca.if_else(self.at_high, ca.fmax(asked, self.low.tau), kept))

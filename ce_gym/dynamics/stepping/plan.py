@@ -1,0 +1,128 @@
+"""What a time step consists of, as data: stages that evaluate the physics, and how they are combined.
+
+A plan has two readers: `unroll` makes one expression of it, `ce_gym.sim.substeps` calls of a compiled program. Both
+leave the arithmetic of combining stages to this file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.integration import between, turned_by
+from ce_gym.dynamics.algebra.spatial import SX, quaternion_to_rotation
+from ce_gym.dynamics.forces.scene import State
+
+AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "contact_forces")
+"""Outputs that belong to the start of a step, or are means over it; the others belong to its end."""
+AFTER = "after"
+"""Name of the step as a whole, where outputs are evaluated at its end and not combined from stages."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """The state before the step, moved by `dt` times a weighted sum of the stages' rates of change.
+
+    Attributes:
+        weights: Of the stages, in their order; those left out count as 0.
+    """
+
+    weights: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ends:
+    """A weighted sum of the states at the ends of stages, on the group of orientations.
+
+    What contacts remember and guesses of dependent coordinates are taken from the last stage.
+
+    Attributes:
+        weights: Of each stage, by name, the last one first; they sum to 1.
+        means: Of each stage in what is a mean over the step; they sum to 1.
+        error: The two stages whose distance in `v` estimates the error of the step; empty if there is no estimate.
+    """
+
+    weights: Mapping[str, float]
+    means: Mapping[str, float]
+    error: tuple[str, str] | tuple[()] = ()
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One evaluation of the physics.
+
+    A stage with a length is a linearly implicit Euler step, iterated until its active set is the one it assumed. One of
+    length 0 evaluates forces and accelerations of the moment. Where it does not start from the state before the step,
+    the ground is looked up again.
+
+    Attributes:
+        name: In buffers and weights.
+        start: Name of the stage at whose end it starts, "" for the state before the step; or `Rates` of earlier stages.
+        length: As a fraction of the step.
+        iterations: How many iterations may follow the first; fewer if the forces of the scene never need as many.
+    """
+
+    name: str
+    start: str | Rates = ""
+    length: float = 1.0
+    iterations: int = 4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A time-stepping method.
+
+    Attributes:
+        order: Its global error is of this order in the step length, where the motion is smooth.
+        stages: In the order in which they are evaluated; the first starts from the state before the step.
+        end: How the state after the step follows from them.
+    """
+
+    order: int
+    stages: tuple[Stage, ...]
+    end: Ends | Rates = field(default_factory=Rates)
+
+    @property
+    def single(self) -> bool:
+        """Whether the step is its only stage."""
+        return isinstance(self.end, Ends) and len(self.stages) == 1
+
+    @property
+    def estimates(self) -> bool:
+        """Whether it estimates its error."""
+        return isinstance(self.end, Ends) and bool(self.end.error)
+
+    def shares(self, output: str) -> Mapping[str, float]:
+        """Return the weight of each stage in an output."""
+        if isinstance(self.end, Rates):
+            return {AFTER: 1.0}
+        if output in AT_START:
+            return {self.stages[0].name: 1.0}
+        return self.end.means if output in MEANS else self.end.weights
+
+
+def combined(plan: Plan, ends: Mapping[str, State], floating: bool) -> State:
+    """Return the state after a step, given the states at the ends of its stages; of a plan whose `end` is `Ends`."""
+    assert isinstance(plan.end, Ends)
+    weights, last = plan.end.weights, ends[plan.stages[-1].name]
+    if plan.single:
+        return last
+    q = sum((weight * ends[name].q for name, weight in weights.items()), SX(0))
+    v = sum((weight * ends[name].v for name, weight in weights.items()), SX(0))
+    if floating:
+        others = [(weight, ends[name].q[3:7]) for name, weight in weights.items() if ends[name] is not last]
+        turned = sum((-weight * between(other, last.q[3:7]) for weight, other in others), SX(0))
+        q[3:7] = turned_by(last.q[3:7], turned)
+        world = [w * (quaternion_to_rotation(ends[s].q[3:7]) @ ends[s].v[3:6]) for s, w in weights.items()]
+        v[3:6] = quaternion_to_rotation(q[3:7]).T @ sum(world, SX(0))
+    return State(q, v, last.load, last.anchor, last.dependent)
+
+
+def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:
+    """Return the estimated error of a step in `v` [rad/s or m/s]; 0 for a plan that has none."""
+    if isinstance(plan.end, Rates) or not plan.end.error:
+        return SX(0)
+    one, other = plan.end.error
+    return ca.norm_2(ends[one].v - ends[other].v)

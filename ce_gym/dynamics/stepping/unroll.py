@@ -1,0 +1,112 @@
+"""A plan as one expression: every stage with all the iterations it may need, one after the other.
+
+Explicit stages work on positions and on the momentum of the base in the world. The unit quaternion is advanced in the
+four-dimensional space around it, by a vector field that keeps its length, and scaled back at the end of the step, which
+does not lower the order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_product, quaternion_to_rotation
+from ce_gym.dynamics.forces.scene import Scene, State
+from ce_gym.dynamics.functions import guessed_coordinates
+from ce_gym.dynamics.stepping.plan import AFTER, Plan, Rates, combined, error_estimate
+from ce_gym.dynamics.stepping.step import (
+    Solved,
+    Stepped,
+    first_iterate,
+    iteration,
+    iterations_needed,
+    looked_up_from,
+    stacked,
+)
+
+
+def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> dict[str, Stepped]:
+    """Make one step of a robot.
+
+    Args:
+        plan: How.
+        scene: The robot and what surrounds it.
+        before: State before the step.
+        target: Held constant over it, see `solve`.
+        dt: Length of the step [s].
+
+    Returns:
+        What each stage left, by its name, and the step as a whole as `AFTER`.
+    """
+    parts: dict[str, Stepped] = {}
+    floating = scene.mechanism.robot.floating
+    for stage in plan.stages:
+        if isinstance(stage.start, Rates):
+            start = _moved(stage.start, before, list(parts.values()), dt, floating)
+        else:
+            start = parts[stage.start].state if stage.start else before
+        if parts and stage.start:  # the ground is known as it is around the start of the step
+            scene = looked_up_from(scene, parts[plan.stages[0].name].solved.kinematics)
+        parts[stage.name] = iterated(scene, start, target, stage.length * dt, stage.iterations)
+    first = parts[plan.stages[0].name]
+    if isinstance(plan.end, Rates):
+        after = replace(_moved(plan.end, before, list(parts.values()), dt, floating), load=first.state.load)
+    else:
+        after = combined(plan, {name: part.state for name, part in parts.items()}, floating)
+    error = error_estimate(plan, {name: part.state for name, part in parts.items()})
+    return parts | {AFTER: replace(first, state=after, error=error)}
+
+
+def _moved(rates: Rates, before: State, parts: list[Stepped], dt: float, floating: bool) -> State:
+    """Return the state before a step, moved along rates of its stages."""
+    terms = [
+        weight * _rate(part.before, part.solved, floating)
+        for weight, part in zip(rates.weights, parts, strict=False)
+        if weight
+    ]
+    moved = _from_flat(_flat(before, floating) + dt * sum(terms, SX(0)), before, floating)
+    if rates.weights:
+        first = parts[0].solved
+        moved.dependent = guessed_coordinates(first.kinematics, first.vdot, dt * sum(rates.weights))
+    return moved
+
+
+def iterated(scene: Scene, state: State, target: SX, dt: float, most: int) -> Stepped:
+    """Advance one robot by one linearly implicit Euler step with all its iterations, `most` after the first."""
+    stepped = iteration(scene, state, target, dt, first_iterate(scene))
+    for _ in range(min(most, iterations_needed(scene.mechanism, scene.options))):
+        stepped = iteration(scene, state, target, dt, stepped.iterate)
+    return stepped
+
+
+def _flat(state: State, floating: bool) -> SX:
+    """Stack positions, velocities with the base's linear one in the world, and anchors."""
+    v = state.v
+    if floating:
+        v = ca.vertcat(v[:3], quaternion_to_rotation(state.q[3:7]) @ v[3:6], v[6:])
+    return ca.vertcat(state.q, v, state.anchor)
+
+
+def _from_flat(flat: SX, like: State, floating: bool) -> State:
+    q, v, anchor = ca.vertsplit(flat, [0, like.q.numel(), like.q.numel() + like.v.numel(), flat.numel()])
+    if floating:
+        quaternion = q[3:7] / ca.norm_2(q[3:7])
+        q = ca.vertcat(q[:3], quaternion, q[7:])
+        v = ca.vertcat(v[:3], quaternion_to_rotation(quaternion).T @ v[3:6], v[6:])
+    return State(q=q, v=v, load=like.load, anchor=anchor, dependent=like.dependent)
+
+
+def _rate(state: State, solved: Solved, floating: bool) -> SX:
+    """Time derivative of what `_flat` stacks."""
+    q, v, vdot = state.q, state.v, solved.vdot
+    slides = [
+        ca.if_else(c.normal_slope > 0, (solved.kinematics.bodies[c.body].R @ c.sliding)[:2], 0) for c in solved.contacts
+    ]
+    anchor = stacked(slides) if state.anchor.numel() else state.anchor
+    if not floating:
+        return ca.vertcat(v, vdot, anchor)
+    R, w, u = quaternion_to_rotation(q[3:7]), v[:3], v[3:6]
+    turning = quaternion_product(q[3:7], ca.vertcat(0, w)) / 2
+    u_world = R @ (vdot[3:6] + cross(w, u))
+    return ca.vertcat(R @ u, turning, v[6:], vdot[:3], u_world, vdot[6:], anchor)

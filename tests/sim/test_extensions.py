@@ -1,0 +1,151 @@
+"""What others add to the step: a law, a motor model, an integrator, each one class or table here and one name."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from ce_gym import Model, Simulator
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.contact import Compliance, LinearContact, TangentialForce, Touch
+from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.motors import MOTORS, Line
+from ce_gym.dynamics.forces.normal import NORMAL_LAWS
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.plan import Ends, Plan, Stage
+from ce_gym.envs.task.checks import checked_value
+from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Motor, Placement, Robot
+from ce_gym.sim.kernel_key import laws_key
+
+MASS, DT, DRAG = 2.0, 0.005, 3.0
+
+
+def block() -> Robot:
+    """A block on four feet."""
+    inertia = ((0.02, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.02))
+    body = Body("block", "link", None, Placement(), Joint("free"), Inertial(MASS, (0.0, 0.0, 0.0), inertia))
+    contacts = tuple(ContactSphere(f"{x} {y}", "block", (0.1 * x, 0.1 * y, 0.0), 0.0) for x in (-1, 1) for y in (-1, 1))
+    return Robot("block", (body,), contacts=contacts, material=ContactMaterial(2e4, 200.0, 0.5, 0.01, 0.0))
+
+
+class Oil:
+    """Friction of a film: proportional to the speed, without a cone."""
+
+    iterations = 0
+
+    def linearise(self, contact: LinearContact) -> TangentialForce:
+        """Return the force at the start of the step and its slope."""
+        return TangentialForce(DRAG * contact.sliding, SX(DRAG), SX(3, 1), SX(3, 1))
+
+    def check(self, contact: LinearContact, slip: SX, gain: SX) -> SX:
+        """Return that nothing changes."""
+        return SX(0)
+
+
+def test_a_friction_law(monkeypatch: pytest.MonkeyPatch):
+    """A block on four feet slows down as an implicit step of the exponential, exactly."""
+    monkeypatch.setitem(FRICTION, "oil", Oil())
+    sim = Simulator(Model(block()), 1, DT, friction="oil", outputs=())
+    depth = MASS * 9.81 / 4 / 2e4
+    sim.set_state([0.0, 0.0, -depth, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    speed = 1.0
+    for _ in range(40):
+        sim.step(np.zeros(0))
+        speed /= 1 + DT * 4 * DRAG / MASS
+        assert sim.v[0, 3] == pytest.approx(speed, rel=1e-9)
+    with pytest.raises(ValueError, match="expected 'tangent' or 'secant' or 'oil'"):
+        Simulator(Model(block()), friction="water")
+    with pytest.raises(ValueError, match="expected 'tangent' or 'secant' or 'oil'"):
+        checked_value("friction", "water", "tangent")
+
+
+class Hardening:
+    """A spring whose force grows with the cube of the depth."""
+
+    def force(self, touch: Touch, compliance: Compliance, dt: float) -> tuple[SX, SX]:
+        """Return the force at no velocity, and the slope of the spring one step ahead with the damper's."""
+        depth = ca.fmax(touch.depth, 0)
+        return 1e9 * depth**3, compliance.damping + dt * 3e9 * depth**2
+
+
+def test_a_law_of_the_normal_force(monkeypatch: pytest.MonkeyPatch):
+    """A block comes to rest where four such springs carry it."""
+    monkeypatch.setitem(NORMAL_LAWS, "hardening", Hardening())
+    sim = Simulator(Model(block()), 1, DT, normal_law="hardening", outputs=("contact_forces",))
+    sim.set_state([0.0, 0.0, 0.001, 1.0, 0.0, 0.0, 0.0], np.zeros(6))
+    sim.step(np.zeros(0), 1000)
+    assert sim.q[0, 2] == pytest.approx(-np.cbrt(MASS * 9.81 / 4 / 1e9), rel=1e-6)
+    assert sim.contact_forces[0, :, 2] == pytest.approx([MASS * 9.81 / 4] * 4, rel=1e-6)
+
+
+class Windage:
+    """Motors without limits that lose torque with the square of their speed."""
+
+    at_motors = True
+
+    def limits(self, motor: Motor, speed: SX, strength: SX, dt: float) -> tuple[Line, Line] | None:
+        """Return none."""
+        return None
+
+    def damping(self, motor: Motor, speed: SX) -> SX:
+        """Return the coefficient at the present speed."""
+        return 1e-3 * ca.fabs(speed)
+
+
+def wheel() -> Model:
+    """A driven wheel on the world."""
+    inertia = ((1e-3, 0.0, 0.0), (0.0, 1e-3, 0.0), (0.0, 0.0, 1e-3))
+    joint = Joint("revolute", (0.0, 0.0, 1.0))
+    body = Body("wheel", "link", None, Placement(), joint, Inertial(1.0, (0.0, 0.0, 0.0), inertia))
+    return Model(Robot("wheel", (body,), (), ("wheel",), motors=(Motor("wheel"),)))
+
+
+def test_a_motor_model(monkeypatch: pytest.MonkeyPatch):
+    """A wheel runs up to the speed at which its motor loses all that is asked for."""
+    monkeypatch.setitem(MOTORS, "windage", Windage())
+    sim = Simulator(wheel(), 1, DT, control="torque", motors="windage")
+    sim.step([0.9], 2000)
+    assert sim.v[0, 0] == pytest.approx(np.sqrt(0.9 / 1e-3), rel=1e-9)
+    assert sim.torque[0, 0] == pytest.approx(0.0, abs=1e-9)
+
+
+THIRDS = [Stage(f"third_{i}", start=f"third_{i - 1}" if i > 1 else "", length=1 / 3) for i in (1, 2, 3)]
+THIRD_ORDER = Plan(
+    3,
+    (Stage("coarse"), Stage("half", length=1 / 2), Stage("fine", start="half", length=1 / 2), *THIRDS),
+    Ends(
+        {"third_3": 9 / 2, "fine": -4.0, "coarse": 1 / 2},
+        means={"third_1": 1 / 3, "third_2": 1 / 3, "third_3": 1 / 3},
+        error=("third_3", "fine"),
+    ),
+)
+"""Linearly implicit Euler, extrapolated twice: a whole step, two halves, three thirds."""
+
+
+def swing(method: str, dt: float) -> np.ndarray:
+    """Joint angles of a leg that swings for 0.1 s, its motors at their limits."""
+    model = Model("planar_leg_linkage")
+    sim = Simulator(model, 1, dt, method=method, outputs=())
+    sim.step(model.standing_q + 0.05, round(0.1 / dt))
+    return sim.q[0]
+
+
+def test_an_integrator(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(METHODS, "third", THIRD_ORDER)
+    exact = swing("rk4", 1e-4)
+    errors = [np.linalg.norm(swing("third", dt) - exact) for dt in (0.002, 0.001)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(3, abs=0.4)
+
+
+def test_a_changed_law_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
+    """Kernels of laws of others are kept by what the laws trace to, not by their names."""
+    keys = []
+    for drag in (1.0, 2.0, 1.0):
+        law = Windage()
+        monkeypatch.setattr(law, "damping", lambda motor, speed, drag=drag: SX(drag))
+        monkeypatch.setitem(MOTORS, "windage", law)
+        options = StepOptions(DT, control="torque", motors="windage")
+        keys.append(laws_key(wheel().mechanism, options))
+    assert keys[0] == keys[2] != keys[1]
