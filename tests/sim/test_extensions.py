@@ -93,6 +93,10 @@ class Windage:
         """Return the coefficient at the present speed."""
         return 1e-3 * ca.fabs(speed)
 
+    def friction(self, motor: Motor) -> float:
+        """Return none."""
+        return 0.0
+
 
 def wheel() -> Model:
     """A driven wheel on the world."""

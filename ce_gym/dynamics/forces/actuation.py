@@ -11,7 +11,7 @@ Limits and friction there do not depend on the transmission level.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 
@@ -30,12 +30,15 @@ class MotorForce(JointForce):
     """What motors deliver to the joints: a `LinearForce`.
 
     Attributes:
-        size: Of its iterate: the expected torque of each of the joints and motors, and 1 once there is one.
+        size: Of its iterate: the expected torque of each of the joints, of the motors, and of the motors' dry friction
+            if there is any; and 1 once there is an iterate.
         limited: The torques that are kept within limits, at their places in the iterate.
+        held: Rows of `y` that all motors of a cluster hold by dry friction, each with 1 if they do, else 0.
     """
 
     size: int
-    limited: dict[int, Saturation]
+    limited: dict[int, Saturation] = field(default_factory=dict)
+    held: dict[int, SX] = field(default_factory=dict)
 
     def check(self, motion: Motion) -> SX:
         """Return 1 if a torque is not where it was taken to be among its limits; else 0."""
@@ -58,6 +61,8 @@ class MotorForce(JointForce):
         return iterate
 
 
+STICK_SPEED = 1e-4
+"""Rotor speed at which dry friction that sticks carries its full torque [rad/s]."""
 ITERATIONS = 4
 """How many iterations of a step saturation may ask for after the first."""
 
@@ -74,7 +79,8 @@ def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
     limited = any(map(math.isfinite, joints)) or any(end is not None for end in ends)
     answering = any(ca.sparsify(slope).nnz() for end in ends if end is not None for _, slope in end)
     asked = options.control.endswith("position") and limited
-    return len(joints) + len(motors) + 1 if asked or answering else 0
+    rubbing = any(model.friction(motor) for motor in motors)
+    return len(joints) + (1 + rubbing) * len(motors) + 1 if asked or answering or rubbing else 0
 
 
 def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce:
@@ -88,7 +94,7 @@ def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce
 def motor_forces(scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float, iterate: SX) -> MotorForce:
     """Return what the motors deliver of the torques they are asked for."""
     strength = scene.figures.strength
-    force = MotorForce(strength * asked.tau, strength * asked.slope, iterate.numel(), {})
+    force = MotorForce(strength * asked.tau, strength * asked.slope, iterate.numel())
     model = MOTORS[scene.options.motors]
     actuated = actuated_clusters(scene.mechanism, kinematics) if model.at_motors else []
     for cluster in actuated:
@@ -176,20 +182,48 @@ def deliver(
     speed, tau, slope = W @ yd[rows], SX(asked.tau), asked.slope
     turning = SX(len(motors), yd.numel())
     turning[:, rows] = W
-    free, own = SX.eye(len(motors)), SX(len(motors), len(motors))
-    for i, motor in enumerate(motors):
+    free, own, sticks = SX.eye(len(motors)), SX(len(motors), len(motors)), []
+    for i, (motor, place) in enumerate(zip(motors, cluster.places, strict=True)):
         if (limits := model.limits(motor, speed[i], strength, dt)) is not None:
-            place = yd.numel() + cluster.places[i]
             (high, forwards), (low, backwards) = limits
             ends = (JointForce(high, forwards * turning[i, :]), JointForce(low, backwards * turning[i, :]))
-            one = Saturation.about(iterate, place, JointForce(tau[i], slope[i, :] @ turning), *ends)
-            force.limited[place] = one
+            one = Saturation.about(iterate, yd.numel() + place, JointForce(tau[i], slope[i, :] @ turning), *ends)
+            force.limited[yd.numel() + place] = one
             tau[i], free[i, i] = one.given, one.free
             own[i, i] = ca.if_else(one.at_high, forwards, ca.if_else(one.at_low, backwards, 0))
         damping = model.damping(motor, speed[i])
         tau[i] -= damping * speed[i]
         own[i, i] += dt * damping
+        if friction := model.friction(motor):
+            last = iterate.numel() - 1  # before it, the frictions of all motors, as many as there are before those
+            one = dry_friction(friction, speed[i], turning[i, :], dt, iterate, (last + yd.numel()) // 2 + place)
+            force.limited[(last + yd.numel()) // 2 + place] = one
+            tau[i] += one.given
+            own[i, i] += ca.if_else(one.free, dt * friction / STICK_SPEED, 0)
+            sticks.append(one.free)
+    if len(sticks) == len(motors) == len(rows):
+        all_stick = SX(ca.sum1(ca.vertcat(*sticks)) > len(sticks) - 0.5)
+        force.held |= dict.fromkeys(rows, all_stick)
     force.tau[rows], force.slope[rows, rows] = W.T @ tau, W.T @ (free @ slope @ free + own) @ W
+
+
+def dry_friction(friction: float, speed: SX, turning: SX, dt: float, iterate: SX, place: int) -> Saturation:
+    """Return the dry friction of a rotor: what would stop it, up to what friction has.
+
+    It sticks by a damping so large that the rotor is at rest at the end of the step but for `STICK_SPEED`; where that
+    would take more than it has it slips, and is a constant torque against the motion at the end of the step.
+
+    Args:
+        friction: Its largest torque [N m].
+        speed: Of the rotor [rad/s].
+        turning: Speed of the rotor for unit velocities of all independent joints, shape (1, nj).
+        dt: Length of the step [s].
+        iterate: From the iteration before, shape (limit_count,).
+        place: Of this torque in it.
+    """
+    sticking, still = friction / STICK_SPEED, SX(1, turning.numel())
+    ends = JointForce(SX(friction), still), JointForce(SX(-friction), still)
+    return Saturation.about(iterate, place, JointForce(-sticking * speed, dt * sticking * turning), *ends)
 
 
 def _effort_matrix(W: SX) -> SX:

@@ -95,7 +95,7 @@ class Motors:
     def _at_joints(self, names: tuple[str, ...], rows: list[int], size: int) -> MotorForce:
         """Return what is asked of the joints that no motor drives, and nothing of the others."""
         scene, n, strength = self.scene, self.y.numel(), self.scene.figures.strength
-        force = MotorForce(SX(n, 1), SX(n, n), size, {})
+        force = MotorForce(SX(n, 1), SX(n, n), size)
         joints = scene.mechanism.robot.independent
         control = "position" if scene.options.control == "motor_position" else "torque"
         full = SX.zeros(n)

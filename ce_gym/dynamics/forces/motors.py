@@ -13,8 +13,6 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.model.description import Motor
 
-COULOMB_SPEED = 0.1
-"""Rotor speed at which the dry friction of a motor reaches 1/sqrt(2) of its full value [rad/s]."""
 Line: TypeAlias = tuple[SX, SX]
 """A torque [N m] at the present speed, and how it falls with the rotor's acceleration [kg m^2]."""
 
@@ -37,6 +35,10 @@ class MotorModel(Protocol):
         """Return the viscous damping of a motor [N m s/rad]."""
         ...
 
+    def friction(self, motor: Motor) -> float:
+        """Return the dry friction of a motor [N m]."""
+        ...
+
 
 class Ideal:
     """Motors that deliver what joints are asked for up to the joints' limits, at any speed and without loss."""
@@ -51,6 +53,10 @@ class Ideal:
     def damping(self, motor: Motor, speed: SX) -> SX:
         """Return none."""
         return SX(0)
+
+    def friction(self, motor: Motor) -> float:
+        """Return none."""
+        return 0.0
 
 
 class Limited:
@@ -79,9 +85,12 @@ class Limited:
         return ends[0], ends[1]
 
     def damping(self, motor: Motor, speed: SX) -> SX:
-        """Return viscous and dry friction."""
-        dry = motor.friction / ca.sqrt(speed**2 + COULOMB_SPEED**2) if motor.friction else 0
-        return SX(motor.damping + dry)
+        """Return the motor's damping, whatever its speed."""
+        return SX(motor.damping)
+
+    def friction(self, motor: Motor) -> float:
+        """Return the motor's dry friction."""
+        return motor.friction
 
 
 MOTORS: dict[str, MotorModel] = {"ideal": Ideal(), "limited": Limited()}

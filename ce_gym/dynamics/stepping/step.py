@@ -119,6 +119,9 @@ def iteration(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
     solved = solve(scene, state, target, dt, iterate)
     kinematics, motion, motors = solved.kinematics, solved.motion, solved.motors
     q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.floating)
+    for row, held in motors.held.items():  # a joint that dry friction holds does not move at all
+        place = q.numel() - motors.tau.numel() + row
+        q[place] = ca.if_else(held, state.q[place], q[place])
     contacts = [(kinematics.bodies[c.body].R, c, c.gain(motion)) for c in solved.contacts]
     anchors = [(R @ c.anchor_after(gain))[:2] for R, c, gain in contacts]
     after = State(
