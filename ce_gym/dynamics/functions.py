@@ -32,7 +32,8 @@ from ce_gym.model.mechanism import Mechanism
 def traced(name: str, inputs: dict[str, SX], outputs: dict[str, SX]) -> ca.Function:
     """Make a function of named expressions, with dense outputs and common sub-expressions shared."""
     shared = ca.cse([ca.densify(expression) for expression in outputs.values()])
-    return ca.Function(name, list(inputs.values()), shared, list(inputs), list(outputs))
+    names = list(inputs), list(outputs)
+    return ca.Function(name, list(inputs.values()), shared, *names, {"allow_free": True})  # figures may be symbols
 
 
 def state_symbols(mechanism: Mechanism) -> tuple[SX, SX, SX]:

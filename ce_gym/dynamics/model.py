@@ -1,24 +1,20 @@
 """`Model`: one robot at one transmission level, and its dynamics on numpy arrays.
 
-Every quantity is traced once, on first use, into a CasADi function; the methods evaluate that function on arrays with
-any leading batch shape. Thousands of states at a time, or steps in time, are the business of `ce_gym.Simulator`.
-May know the algorithms of this room and descriptions; no compilation.
+The methods take arrays with any leading batch shape, see `ce_gym.dynamics.evaluation`. Thousands of states at a time,
+or steps in time, are the business of `ce_gym.Simulator`. May know the algorithms of this room and descriptions; no
+compilation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.dynamics.algebra.batched import evaluate
-from ce_gym.dynamics.constraints.closure import closures, loop_report, reference_guess
-from ce_gym.dynamics.constraints.continuation import follow
-from ce_gym.dynamics.functions import FUNCTIONS
+from ce_gym.dynamics.constraints.closure import loop_report
+from ce_gym.dynamics.evaluation import Evaluator
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
 from ce_gym.model.mechanism import build_mechanism
@@ -26,7 +22,7 @@ from ce_gym.model.mechanism import build_mechanism
 Array = NDArray[np.float64]
 
 
-class Model:
+class Model(Evaluator):
     """The dynamics of one robot at one transmission level.
 
     `q = [base position (3) [m], base quaternion wxyz (4), independent joint positions]`,
@@ -60,29 +56,16 @@ class Model:
         locked_rotors: bool = True,
         eliminate_rotors: bool = True,
     ) -> None:
-        self.robot = robot if isinstance(robot, Robot) else load_robot(robot)
+        described = robot if isinstance(robot, Robot) else load_robot(robot)
         self.transmission = transmission
         self.locked_rotors = locked_rotors
         self.eliminated = eliminate_rotors
-        self.mechanism = build_mechanism(
-            self.robot, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors
+        super().__init__(
+            build_mechanism(described, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors)
         )
-        self.guess = reference_guess(self.mechanism)
-        self._has_loops = any(closures(self.mechanism))
-        self._functions: dict[str, ca.Function] = {}
 
     def __repr__(self) -> str:
         return f"Model({self.robot.name!r}, transmission={self.transmission!r}, nq={self.nq}, nv={self.nv})"
-
-    @property
-    def nv(self) -> int:
-        """Number of independent velocities, six for a floating base included."""
-        return len(self.robot.independent) + (6 if self.robot.floating else 0)
-
-    @property
-    def nq(self) -> int:
-        """Number of position coordinates, seven for a floating base included."""
-        return len(self.robot.independent) + (7 if self.robot.floating else 0)
 
     @property
     def joint_links(self) -> tuple[str, ...]:
@@ -114,38 +97,6 @@ class Model:
     def contact_names(self) -> tuple[str, ...]:
         """The contact spheres, in the order of contact outputs."""
         return tuple(contact.name for contact in self.robot.contacts)
-
-    @cached_property
-    def standing_q(self) -> Array:
-        """The standing pose, upright at the origin, shape (nq,)."""
-        angles = dict(self.robot.pose.joints)
-        joints = [angles.get(name, 0.0) for name in self.joint_links]
-        base = [0.0, 0.0, self.robot.pose.height, 1.0, 0.0, 0.0, 0.0] if self.robot.floating else []
-        return np.array(base + joints)
-
-    def casadi_function(self, name: str) -> ca.Function:
-        """Return a quantity as a CasADi SX function of column vectors.
-
-        Args:
-            name: "forward_dynamics" (q, v, tau) -> vdot; "inverse_dynamics" (q, v, vdot) -> tau; "mass_matrix" q -> M;
-                "bias_force" (q, v) -> tau at vdot = 0; "spanning" (q, v) -> (q_span, v_span); "implicit_constraint"
-                (q, v) -> (K, k); "body_poses" q -> positions (3, n), rotations (3, 3 n); "body_velocities" (q, v) ->
-                angular (3, n), linear (3, n); "contact_points" (q, v) -> positions (3, n), velocities (3, n);
-                "contact_accelerations" (q, v, vdot) -> accelerations (3, n); "energy" (q, v) -> kinetic, potential.
-                Robots with loops that no formula closes have one input more, see `dependent_guess`.
-
-        Raises:
-            KeyError: If there is no such quantity.
-        """
-        if name not in self._functions:
-            if name not in FUNCTIONS:
-                raise KeyError(f"no function {name!r}; expected one of {', '.join(FUNCTIONS)}")
-            self._functions[name] = FUNCTIONS[name](self.mechanism)
-        return self._functions[name]
-
-    def n_instructions(self, name: str) -> int:
-        """Return the number of instructions of a traced quantity, the cost measure of the paper."""
-        return self.casadi_function(name).n_instructions()
 
     def forward_dynamics(
         self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: dict[str, ArrayLike] | None = None
@@ -289,47 +240,6 @@ class Model:
         G = self._evaluate("spanning_jacobian", q)[0]
         return G[..., [base + self.spanning_names.index(name) for name in chosen], :]
 
-    def loop_gap(self, q: ArrayLike) -> Array:
-        """Return the norm of the residuals of all loops, rods and functions, redundant rows included, shape (...).
-
-        In metres for loops and rods; 0 if there are none, not a number where loops cannot be closed by their formulas.
-        """
-        return self._evaluate("loops", q)[1][..., 0, 0]
-
-    def nearness(self, q: ArrayLike) -> Array:
-        """Return how far a configuration is from a singularity of the independent joints, shape (...).
-
-        It is 1 at the reference pose, and smaller or negative nearer to or beyond a singularity: the smallest
-        determinant among the blocks of the constraint Jacobian of the dependent joints, relative to that pose. It is -1
-        where the loops cannot be closed.
-        """
-        return self._evaluate("loops", q)[2][..., 0, 0]
-
-    def dependent_guess(self, q: ArrayLike) -> Array:
-        """Return the dependent coordinates that no formula gives, followed from the reference pose to `q`.
-
-        Args:
-            q: Positions, shape (..., nq).
-
-        Returns:
-            The input `guess` of the traced functions [rad or m], shape (..., n_guess).
-
-        Raises:
-            ValueError: If a loop does not close at `q` or on the straight way there.
-        """
-        q = np.asarray(q, dtype=float)
-        if q.ndim == 0 or q.shape[-1] != self.nq:
-            raise ValueError(f"q has shape {q.shape}; expected (..., {self.nq})")
-        flat = q.reshape(-1, self.nq)
-        if self.guess.size == 0 or len(flat) == 0:
-            return np.zeros((*q.shape[:-1], len(self.guess)))
-        guess, gap, nearness = follow(self.casadi_function("loops"), self.standing_q, self.guess, flat)
-        if not nearness > 0.0:
-            raise ValueError(f"the loops of {self.robot.name} pass a singularity on the way to this q")
-        if not gap < 1e-9:
-            raise ValueError(f"the loops of {self.robot.name} do not close at this q: gap {gap:.2g}")
-        return guess.reshape(*q.shape[:-1], len(self.guess))
-
     def body_poses(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return where all bodies are, in the order of `body_names`.
 
@@ -385,15 +295,3 @@ class Model:
             *(["", self.loop_report()] if self.loop_report() else []),
         ]
         return "\n".join(lines)
-
-    def _evaluate(self, name: str, *arguments: ArrayLike) -> list[Array]:
-        """Evaluate a traced quantity on arrays that share leading batch dimensions; outputs (..., rows, columns)."""
-        function = self.casadi_function(name)
-        arrays = [np.asarray(a, dtype=float) for a in arguments]
-        if "guess" in function.name_in():
-            arrays.append(self.dependent_guess(arrays[0]))
-        results = evaluate(function, arrays)
-        unusable, given = any(np.isnan(r).any() for r in results), not any(np.isnan(a).any() for a in arrays)
-        if self._has_loops and name != "loops" and unusable and given:
-            raise ValueError(f"{name}: the loops of {self.robot.name} cannot be closed at this q")
-        return results

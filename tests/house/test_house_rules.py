@@ -34,7 +34,7 @@ LAYERS = {
     "model/formats": "reading placement rotor_rule urdf yaml mjcf",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
-    "dynamics": "algebra constraints recursion forces functions stepping model",
+    "dynamics": "algebra constraints recursion forces functions derivatives stepping evaluation model",
     "sim": "tiles devices terrain placement substeps pieces retry kernel_key simulator",
     "envs": "terms task runtime policy_spec base rendering single gpu_vector vector registration custom",
     "viewer": "errors console rollouts page raytrace live window renderers cli",
