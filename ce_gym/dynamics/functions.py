@@ -1,7 +1,7 @@
 """The quantities of a mechanism as traced CasADi functions, by name.
 
 Each entry of `FUNCTIONS` takes a mechanism and returns an SX function of dense columns with common sub-expressions
-shared. May know the algorithms of this room.
+shared.
 """
 
 from __future__ import annotations

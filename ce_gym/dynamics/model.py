@@ -1,8 +1,7 @@
 """`Model`: one robot at one transmission level, and its dynamics on numpy arrays.
 
 The methods take arrays with any leading batch shape, see `ce_gym.dynamics.evaluation`. Thousands of states at a time,
-or steps in time, are the business of `ce_gym.Simulator`. May know the algorithms of this room and descriptions; no
-compilation.
+or steps in time, are the business of `ce_gym.Simulator`.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ the body that carries it, so total mass, coordinates and limits are the same at 
 | `none`     | nothing                                                                                      |
 
 At `exact`, a rotor that spins about a principal axis through its centre of mass never has to become a body of the
-recursion: its mass, its axial and its mean lateral inertia are constant in its carrier's frame. Its spin, and the
-difference of its lateral moments if it is not symmetric, enter as a `Spin`. Any other rotor stays a body of its
+recursion: its mass, its axial and its mean transverse inertia are constant in its carrier's frame. Its spin, and the
+difference of its transverse moments if it is not symmetric, enter as a `Spin`. Any other rotor stays a body of its
 cluster. That is decided here, rotor by rotor. May know descriptions and numpy, nothing symbolic.
 """
 
@@ -39,24 +39,24 @@ AXISYMMETRY_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Spin:
-    """The spin of a rotor whose inertia at rest has been merged into its carrier, all but `lateral`.
+    """The spin of a rotor whose inertia at rest has been merged into its carrier, all but `transverse`.
 
     Attributes:
         rotor: Name of the rotor.
         carrier: Name of the body it is mounted on; None is the world.
         axis: Unit spin axis in the carrier's frame, shape (3,).
         inertia: Moment of inertia about the axis [kg m^2].
-        lateral: Half the difference of the two lateral principal moments [kg m^2], where it has not been merged because
-            it turns with the rotor: at the exact level, if the rotor is not symmetric. Otherwise 0.
-        heavy_axis: Unit lateral principal axis of the larger moment at rotor angle zero, in the carrier's frame, shape
-            (3,); any lateral axis if `lateral` is 0.
+        transverse: Half the difference of the two transverse principal moments [kg m^2], where it has not been merged
+            because it turns with the rotor: at the exact level, if the rotor is not symmetric. Otherwise 0.
+        heavy_axis: Unit transverse principal axis of the larger moment at rotor angle zero, in the carrier's frame,
+            shape (3,); any transverse axis if `transverse` is 0.
     """
 
     rotor: str
     carrier: str | None
     axis: Array
     inertia: float
-    lateral: float
+    transverse: float
     heavy_axis: Array
 
 
@@ -228,6 +228,6 @@ def _spin(rotor: Body, merged: Body) -> Spin:
         carrier=rotor.parent,
         axis=snapped(to_carrier @ axis),
         inertia=moment + rotor.inertial.mass * com_offset,
-        lateral=float(moments[-1]),
+        transverse=float(moments[-1]),
         heavy_axis=snapped(to_carrier @ axes[:, -1]),
     )

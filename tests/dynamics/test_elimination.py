@@ -13,7 +13,7 @@ from ce_gym.model import Placement, Robot, RobotError
 from ce_gym.model.mechanism import LEVELS
 
 LOPSIDED = 1e-3
-"""Makes the lateral moments of a rotor differ by more than half of its axial moment."""
+"""Makes the transverse moments of a rotor differ by more than half of its axial moment."""
 
 
 def both(robot: Robot) -> tuple[Model, Model]:

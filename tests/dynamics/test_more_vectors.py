@@ -103,7 +103,7 @@ def test_rotors_are_eliminated(model: Model, eliminate: bool):
     """All rotors of the one robot are symmetric about their axes; of the other only those about z."""
     rotors = {rotor.name for rotor in model.robot.rotors()}
     assert rotors & set(model.mechanism.bodies) == (set() if eliminate else rotors)
-    lopsided = [spin.rotor for spins in model.mechanism.spins for spin in spins if spin.lateral > 0.0]
+    lopsided = [spin.rotor for spins in model.mechanism.spins for spin in spins if spin.transverse > 0.0]
     assert len(lopsided) == (18 if model.robot.name == "jvrc1" and eliminate else 0)
 
 

@@ -2,7 +2,7 @@
 
 Velocities first, then positions with the new velocities. The base's linear momentum is integrated in the world frame,
 so that free flight is a straight line whatever the spin; its orientation moves by the exponential map and the
-quaternion is scaled back to unit length. May know spatial algebra.
+quaternion is scaled back to unit length.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The reference pose is the robot's standing pose for the independent joints and its `assembly` for the others, completed
 so that every constraint is met. It decides which rows of the constraints are redundant, which linear rows are
-eliminated, and on which branch the loops are. May know descriptions, residuals and numpy.
+eliminated, and on which branch the loops are.
 """
 
 from __future__ import annotations

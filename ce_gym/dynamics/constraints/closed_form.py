@@ -6,7 +6,7 @@
 | one row, `P sin wz + Q cos wz + R`        | a rod that ends on a crank      | one `atan2`, on the reference branch  |
 | two rows, two revolute unknowns, in plane | a pin that closes a four-bar    | the same, then a second `atan2`       |
 
-Whether a row has a shape is tried on random numbers; the coefficients are derivatives at zero. May know CasADi.
+Whether a row has a shape is tried on random numbers; the coefficients are derivatives at zero.
 """
 
 from __future__ import annotations

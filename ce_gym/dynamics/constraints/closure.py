@@ -6,7 +6,7 @@ which a simulation carries along. Velocities follow by differentiating the rows 
 
     Phi_z zd = -Phi_y yd,    Phi_z zdd = -Phi_y ydd - (second derivative of phi along [yd; zd])
 
-block by block again, whichever way `z` was found. May know descriptions, residuals and CasADi.
+block by block again, whichever way `z` was found.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ a subset of them. All that the recursions need is
     q = gamma(y),   qd = G yd,   qdd = G ydd + g        (constraint-embedding paper, eq. explicit_constraints)
 
 `G` and `g` are derived by automatic differentiation, never by hand. Here for clusters whose constraints are all
-linear; closure.py does the others. May know descriptions and CasADi.
+linear; closure.py does the others.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What each kind of constraint says must vanish: `phi(q)` over a robot's joint coordinates.
 
 Closed loops and rods are written in the frame where their expressions are shortest, because the same expressions are
-differentiated and solved later. May know descriptions and spatial algebra.
+differentiated and solved later.
 """
 
 from __future__ import annotations

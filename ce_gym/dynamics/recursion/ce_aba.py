@@ -15,7 +15,7 @@ pure couple). With `thd = G_r yd`, `a_c = X_c a + S_c ydd + z_c` it adds
     u -= G_r^T (J g_r + h^T z_c) + S_c^T f               p += X_c^T f,   f = h g_r + v_c x* h thd
 
 where S_c and z_c vanish if c is the output body. A rotor that is not symmetric adds a little more to its carrier and to
-u, see rotors.py. May know kinematics, spatial algebra and mechanisms.
+u, see rotors.py.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from ce_gym.dynamics.algebra.spatial import (
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, solve_turning
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
-from ce_gym.dynamics.recursion.rotors import lateral_inertia
+from ce_gym.dynamics.recursion.rotors import transverse_inertia
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, snapped
 
@@ -118,11 +118,11 @@ def inward_inertia_pass(
             base = cluster.bodies[0]
             articulation.base = IA[base], joints.tau[rows] - pA[base]
             continue
-        lateral_bias = _add_lateral_inertias(mechanism, kinematics, k, IA, pA)
+        transverse_bias = _add_transverse_inertias(mechanism, kinematics, k, IA, pA)
         handle = _handle_body(mechanism, cluster, mechanism.spins[k])
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
         D = mirrored(condensed.D + joints.slope[rows, rows])
-        U, u = condensed.U, joints.tau[rows] - condensed.bias - lateral_bias
+        U, u = condensed.U, joints.tau[rows] - condensed.bias - transverse_bias
         if turning is not None and cluster.output_body is not None:
             more, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
             D, u = mirrored(D + more), u + drag
@@ -139,20 +139,20 @@ def inward_inertia_pass(
     return articulation
 
 
-def _add_lateral_inertias(
+def _add_transverse_inertias(
     mechanism: Mechanism, kinematics: Kinematics, k: int, IA: dict[str, SX], pA: dict[str, SX]
 ) -> SX:
-    """Add the lateral inertia of a cluster's rotors to their carriers, in place; return the cluster's bias, (d,)."""
+    """Add the transverse inertia of a cluster's rotors to their carriers, in place; return the cluster's bias, (d,)."""
     bias = SX(len(kinematics.rows[k]), 1)
     coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
     for spin in mechanism.spins[k]:
         if spin.carrier is not None:
             row = coordinates.index[spin.rotor]
             w = kinematics.bodies[spin.carrier].v[:3]
-            lateral = lateral_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
-            IA[spin.carrier] += symmetric_blocks(lateral.inertia, SX(3, 3), SX(3, 3))
-            pA[spin.carrier] += ca.vertcat(lateral.couple, SX(3, 1))
-            bias += coordinates.G[row, :].T * lateral.torque
+            transverse = transverse_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
+            IA[spin.carrier] += symmetric_blocks(transverse.inertia, SX(3, 3), SX(3, 3))
+            pA[spin.carrier] += ca.vertcat(transverse.couple, SX(3, 1))
+            bias += coordinates.G[row, :].T * transverse.torque
     return bias
 
 

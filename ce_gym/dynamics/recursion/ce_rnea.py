@@ -3,7 +3,7 @@
 Bodies are visited one by one: accelerations base to tip, forces tip to base, and the cluster's constraint Jacobian
 projects the spanning torques, `tau_y = G^T tau_span`. A rotor's spin adds the couple `h thdd + v_c x* h thd` to its
 carrier and `G_r^T (J thdd + h^T a_c)` to the torques, see ce_aba.py for the symbols; for that of rotors that are not
-symmetric see rotors.py. May know kinematics and spatial algebra.
+symmetric see rotors.py.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX, cross, turning_force
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.recursion.ce_aba import gravity_acceleration
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
-from ce_gym.dynamics.recursion.rotors import lateral_inertia
+from ce_gym.dynamics.recursion.rotors import transverse_inertia
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -78,9 +78,14 @@ def inward_force_pass(
                 spanning[row] = J * qdd[k][row]
                 if spin.carrier is not None:
                     h, w, wd = J * constant(spin.axis), kinematics.bodies[spin.carrier].v[:3], a[spin.carrier][:3]
-                    lateral = lateral_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
-                    spanning[row] += ca.dot(h, wd) + lateral.torque
-                    couple = h * qdd[k][row] + cross(w, h * coordinates.qd[row]) + lateral.inertia @ wd + lateral.couple
+                    transverse = transverse_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
+                    spanning[row] += ca.dot(h, wd) + transverse.torque
+                    couple = (
+                        h * qdd[k][row]
+                        + cross(w, h * coordinates.qd[row])
+                        + transverse.inertia @ wd
+                        + transverse.couple
+                    )
                     f[spin.carrier] += ca.vertcat(couple, SX(3, 1))
         for body in reversed(mechanism.moving(cluster)):
             state = kinematics.bodies[body.name]

@@ -5,8 +5,7 @@ fixed base has only `y` and `yd`. `y` are the independent coordinates in the rob
 
 Accelerations of bodies are classical everywhere in this room: [angular; that of the material point at the origin], not
 Featherstone's spatial ones, from which they differ by `[0; w x v_origin]` (2008, section 2.11). Both transform by `X`,
-so the recursions are the same; but these need no linear velocities, which saves 5 to 10 % of all instructions. May know
-spatial algebra, constraints and mechanisms.
+so the recursions are the same; but these need no linear velocities, which saves 5 to 10 % of all instructions.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ A rotor that spins by theta about a principal axis u of its inertia, centre of m
 
     T = m |v_com|^2 / 2 + w^T I(theta) w / 2 + J thd u^T w + J thd^2 / 2        (w of the carrier, all in its frame)
 
-because I(theta) u = J u at every angle. Its two lateral principal moments, mean +- lateral, turn with it:
+because I(theta) u = J u at every angle. Its two transverse principal moments, mean +- transverse, turn with it:
 
-    I(theta) = I_mean + dI,   dI = lateral (cos(2 theta) (e e^T - n n^T) + sin(2 theta) (e n^T + n e^T)),   n = u x e
+    I(theta) = I_mean + dI,   dI = transverse (cos(2 theta) (e e^T - n n^T) + sin(2 theta) (e n^T + n e^T)),   n = u x e
 
 with the axis e of the larger one at theta = 0. I_mean is constant and merged into the carrier; the terms with J are
 those of a symmetric rotor, see ce_aba.py. Since (d dI/dtheta) w = 2 u x (dI w), Lagrange's equations leave
@@ -14,7 +14,7 @@ those of a symmetric rotor, see ce_aba.py. Since (d dI/dtheta) w = 2 u x (dI w),
     couple on the carrier   dI wd + (w + 2 thd u) x (dI w)
     torque about the axis   -w^T (d dI/dtheta) w / 2 = u^T (w x (dI w))
 
-and no force. May know spatial algebra and mechanisms.
+and no force.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from ce_gym.model.mechanism import Spin
 
 
 @dataclass
-class LateralInertia:
-    """What the lateral difference of a rotor's moments adds at one state; nothing for a symmetric rotor.
+class TransverseInertia:
+    """What the transverse difference of a rotor's moments adds at one state; nothing for a symmetric rotor.
 
     Attributes:
         inertia: dI, added to the angular inertia of the carrier [kg m^2], carrier's frame, shape (3, 3).
@@ -44,7 +44,7 @@ class LateralInertia:
     torque: SX
 
 
-def lateral_inertia(spin: Spin, angle: SX, rate: SX, w: SX) -> LateralInertia:
+def transverse_inertia(spin: Spin, angle: SX, rate: SX, w: SX) -> TransverseInertia:
     """Evaluate a rotor that has a carrier.
 
     Args:
@@ -55,7 +55,7 @@ def lateral_inertia(spin: Spin, angle: SX, rate: SX, w: SX) -> LateralInertia:
     """
     e, n = spin.heavy_axis, np.cross(spin.axis, spin.heavy_axis)
     at_zero, at_quarter = np.outer(e, e) - np.outer(n, n), np.outer(e, n) + np.outer(n, e)
-    c, s = spin.lateral * ca.cos(2 * angle), spin.lateral * ca.sin(2 * angle)
+    c, s = spin.transverse * ca.cos(2 * angle), spin.transverse * ca.sin(2 * angle)
     inertia = ca.sparsify(mirrored(c * constant(at_zero) + s * constant(at_quarter)))
     momentum, axis = ca.sparsify(inertia @ w), constant(spin.axis)
-    return LateralInertia(inertia, cross(w + 2 * rate * axis, momentum), ca.dot(axis, cross(w, momentum)))
+    return TransverseInertia(inertia, cross(w + 2 * rate * axis, momentum), ca.dot(axis, cross(w, momentum)))
