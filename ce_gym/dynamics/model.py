@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.dynamics.constraints.closure import loop_report
 from ce_gym.dynamics.evaluation import Evaluator
+from ce_gym.dynamics.standing import check_standing
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
 from ce_gym.model.mechanism import build_mechanism
@@ -37,7 +38,8 @@ class Model(Evaluator):
             algorithm, with every rotor a body: the same result, for more work.
 
     Raises:
-        RobotError: If the robot file or the level is not valid.
+        RobotError: If the robot file or the level is not valid, or the robot cannot stand in its standing pose: its
+            mass matrix there is not positive definite, a joint is beyond its limits, contacts are below ground.
 
     Examples:
         >>> model = ce_gym.Model("tello", transmission="exact")
@@ -62,6 +64,7 @@ class Model(Evaluator):
         super().__init__(
             build_mechanism(described, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors)
         )
+        check_standing(self.mechanism)
 
     def __repr__(self) -> str:
         return f"Model({self.robot.name!r}, transmission={self.transmission!r}, nq={self.nq}, nv={self.nv})"

@@ -17,7 +17,10 @@ _SHORT.maxstring = _SHORT.maxother = _LONGEST_VALUE
 
 
 class RobotError(ValueError):
-    """A robot description that cannot be used; the message is one line."""
+    """A robot description that cannot be used; the message is one line, without control characters."""
+
+    def __init__(self, message: str):
+        super().__init__(printable(message))
 
 
 class InertiaWarning(UserWarning):
@@ -25,7 +28,7 @@ class InertiaWarning(UserWarning):
 
 
 class LossyImportWarning(UserWarning):
-    """A file says things that a `Robot` cannot; the message lists them all."""
+    """A file says things that a `Robot` cannot; the message is a short list, `Robot.notes` has all of them."""
 
 
 def bad(file: str, key: str, value: object, expected: str) -> RobotError:
@@ -46,6 +49,11 @@ def unknown(file: str, key: str, value: object, known: Iterable[str], what: str)
     close = difflib.get_close_matches(str(value), names, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else f" ({', '.join(names) or 'there are none'})"
     return bad(file, key, value, f"{what}{hint}")
+
+
+def printable(text: str) -> str:
+    """Return text with what could move a terminal's cursor, such as an escape sequence, spelled out."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
 
 
 def shown(value: object) -> str:

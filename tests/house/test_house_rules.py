@@ -31,10 +31,10 @@ MAY_IMPORT = {
 """What the modules of a folder may import from other folders."""
 LAYERS = {
     "model": "errors table description constraint_functions clusters mechanism checks generators formats load listing",
-    "model/formats": "reading placement rotor_rule urdf yaml mjcf",
+    "model/formats": "text_file reading placement standing rotor_rule urdf yaml mjcf",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
-    "dynamics": "algebra constraints recursion forces functions derivatives stepping evaluation model",
+    "dynamics": "algebra constraints standing recursion forces functions derivatives stepping evaluation model",
     "sim": "tiles devices terrain placement substeps pieces retry kernel_key simulator",
     "envs": "terms task runtime policy_spec base rendering single gpu_vector vector registration custom",
     "viewer": "errors console rollouts page raytrace live window renderers cli",

@@ -76,7 +76,7 @@ TIE = '<equality><joint joint1="j" joint2="k" polycoef="{}"/></equality>'
 MJCF = {
     # file: content, and what the message must say, in this order
     "empty": ("", ["empty.xml", "root element", "missing", "<mujoco>"]),
-    "truncated": (mjcf()[:-20], ["truncated.xml", "MuJoCo refuses", "XML"]),
+    "truncated": (mjcf()[:-20], ["truncated.xml", "malformed XML"]),
     "a URDF": ('<robot name="r"><link name="a"/></robot>', ["root element", "'robot'", "<mujoco>"]),
     "an SDF": ("<!-- <mujoco/> --><sdf/>", ["root element", "'sdf'", "<mujoco>"]),
     "nothing": ("<mujoco/>", ["bodies", "at least one body that moves"]),
@@ -87,7 +87,7 @@ MJCF = {
     "mass nan": (mjcf(body(geom=mass("nan"))), ["mass", "'nan'", "finite"]),
     "mass inf": (mjcf(body(geom=mass("inf"))), ["body_mass", "inf", "finite"]),
     "mass below 0": (mjcf(body(geom=mass("-1"))), ["MuJoCo refuses", "mass and inertia", "larger"]),
-    "mass huge": (mjcf(body(geom=mass("1e308", "1e308 1e308 1e308"))), ["inertia", "inf", "finite"]),
+    "mass huge": (mjcf(body(geom=mass("1e308", "1e308 1e308 1e308"))), ["body_inertia", "1e+308", "finite"]),
     "mass a word": (mjcf(body(geom=mass("heavy"))), ["MuJoCo refuses"]),
     "no mass": (mjcf(body(geom="")), ["MuJoCo refuses", "mass and inertia"]),
     "inertia": (mjcf(body(geom=mass("1", "1 1 9"))), ["MuJoCo refuses", "A + B >= C"]),
@@ -95,7 +95,10 @@ MJCF = {
     "axis nan": (mjcf(body(inside='<joint axis="nan 0 0"/>')), ["axis", "'nan 0 0'", "finite"]),
     "axis inf": (mjcf(body(inside='<joint axis="inf 0 0"/>')), ["finite"]),
     "axis 0": (mjcf(body(inside='<joint axis="0 0 0"/>')), ["MuJoCo refuses", "axis too small"]),
-    "range": (mjcf(body(inside='<joint range="3 1" limited="true"/>')), ["MuJoCo refuses", "range"]),
+    "range": (
+        mjcf(body(inside='<joint range="3 1" limited="true"/>')),
+        ["<joint> range", "'3 1'", "not above the upper"],
+    ),
     "damping": (mjcf(body(inside='<joint damping="-3"/>')), ["damping", "-3.0", "0 or more"]),
     "armature below 0": (mjcf(body(inside='<joint armature="-3"/>')), ["armature", "-3.0", "0 or more"]),
     "armature nan": (mjcf(body(inside='<joint armature="nan"/>')), ["armature", "'nan'", "finite"]),
@@ -106,7 +109,7 @@ MJCF = {
     ),
     "same name": (mjcf(body() + body()), ["MuJoCo refuses", "repeated name 'b'"]),
     "unknown joint": (mjcf(rest='<equality><joint joint1="x"/></equality>'), ["MuJoCo refuses", "unknown element 'x'"]),
-    "ratio inf": (mjcf(TWO, TIE.format("0 inf 0 0 0")), ["equality0", "coefficient", "-inf", "finite"]),
+    "ratio inf": (mjcf(TWO, TIE.format("0 inf 0 0 0")), ["eq_data", "inf", "finite"]),
     "ratio nan": (mjcf(TWO, TIE.format("0 nan 0 0 0")), ["polycoef", "nan", "finite"]),
     "too many ties": (
         mjcf(TWO, TIE.format("0 1 0 0 0") + TIE.format("1 2 0 0 0")),
@@ -139,12 +142,15 @@ MJCF = {
     "itself": ('<mujoco><include file="itself.xml"/></mujoco>', ["MuJoCo refuses", "already included"]),
     "missing include": ('<mujoco><include file="x.xml"/></mujoco>', ["MuJoCo refuses", "x.xml"]),
     "missing mesh": (mjcf(rest='<asset><mesh name="m" file="m.stl"/></asset>'), ["MuJoCo refuses", "m.stl"]),
-    "a million copies": (mjcf(f'<replicate count="1000000">{body()}</replicate>'), ["count", "'1000000'", "at most"]),
+    "a million copies": (
+        mjcf(f'<replicate count="1000000">{body()}</replicate>'),
+        ["<replicate>", "1000000 copies", "at most"],
+    ),
     "a field of gigabytes": (
         mjcf(rest='<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>'),
         ["nrow", "'100000'", "at most"],
     ),
-    "a stack of terabytes": (mjcf(rest='<size memory="100000G"/>'), ["MuJoCo refuses", "memory"]),
+    "a stack of terabytes": (mjcf(rest='<size memory="100000G"/>'), ["<size> memory", "'100000G'", "at most"]),
     "nested": (mjcf("<body>" * 3000 + "</body>" * 3000), ["MuJoCo refuses", "too deep"]),
 }
 

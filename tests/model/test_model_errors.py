@@ -188,8 +188,8 @@ def test_one_line_says_where_and_what(write_robot, edit, parts):
         ("# nothing\n", ["r.yaml", "empty", "a mapping"]),
         ("- a\n- b\n", ["r.yaml", "top level", "['a', 'b']", "a mapping"]),
         ("just text", ["r.yaml", "top level", "'just text'", "a mapping"]),
-        ("a: &a [*a]\nurdf: *a\n", ["r.yaml", "'a'", "a key that exists"]),
-        ("name: &a [&b [*a, *b], *a]\nurdf: *a\n", ["r.yaml", "urdf", "text"]),
+        ("a: &a [*a]\nurdf: *a\n", ["r.yaml", "line 1", "'a' stands inside"]),
+        ("name: &a [&b [*a, *b], *a]\nurdf: *a\n", ["r.yaml", "line 1", "'a' stands inside"]),
         ("\x00", ["r.yaml", "malformed YAML"]),
     ],
 )

@@ -14,6 +14,8 @@ from ce_gym.model.description import Body, Joint
 from ce_gym.model.errors import bad
 
 RELATIVE_TOLERANCE = 1e-9
+LARGEST_FIGURE = 1e12
+"""Largest length, mass, inertia, ratio, gain and so on [SI units]; its cube is within the range of single precision."""
 
 
 def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
@@ -26,6 +28,7 @@ def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
     massless = body.kind == "rotor" or (may_be_massless and not np.any(body.inertial.inertia))
     if not math.isfinite(mass) or mass < 0.0 or (mass == 0.0 and not massless):
         raise bad(file, f"{where} mass", mass, "a mass of 0 or more" if massless else "a mass above 0 [kg]")
+    check_finite(file, f"{where} mass", (mass,))
     check_finite(file, f"{where} centre of mass", body.inertial.com)
     _check_inertia(file, f"{where} inertia", np.array(body.inertial.inertia))
     check_finite(file, f"{where} position", body.placement.position)
@@ -47,19 +50,25 @@ def _check_joint(file: str, where: str, joint: Joint) -> None:
     for name, value in (("torque", joint.torque), ("velocity", joint.velocity)):
         if not value >= 0.0:
             raise bad(file, f"{where} joint {name}", value, "0 or more")
-    if not 0.0 <= joint.damping < math.inf:
-        raise bad(file, f"{where} joint damping", joint.damping, "0 or more, finite")
+    check_not_negative(file, f"{where} joint damping", joint.damping)
 
 
 def check_finite(file: str, key: str, values: Iterable[float]) -> None:
-    """Check that all values are finite numbers."""
-    if not all(map(math.isfinite, values)):
-        raise bad(file, key, tuple(values), "finite numbers")
+    """Check that all values are finite numbers of a usable size."""
+    if not all(abs(value) <= LARGEST_FIGURE for value in values):
+        raise bad(file, key, tuple(values), f"finite numbers, up to {LARGEST_FIGURE:g} in size")
+
+
+def check_not_negative(file: str, key: str, value: float, unit: str = "") -> None:
+    """Check that a value is 0 or more, and of a usable size."""
+    if not 0.0 <= value <= LARGEST_FIGURE:
+        raise bad(file, key, value, f"0 or more{unit}, up to {LARGEST_FIGURE:g}")
 
 
 def _check_inertia(file: str, key: str, inertia: np.ndarray) -> None:
-    if inertia.shape != (3, 3) or not np.isfinite(inertia).all():
+    if inertia.shape != (3, 3):
         raise bad(file, key, inertia.tolist(), "3 x 3 finite numbers")
+    check_finite(file, key, inertia.ravel().tolist())
     scale = np.abs(inertia).max()
     if np.abs(inertia - inertia.T).max() > RELATIVE_TOLERANCE * scale:
         raise bad(file, key, inertia.tolist(), "a symmetric matrix")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from ce_gym.model.checks.body import RELATIVE_TOLERANCE, check_finite
+from ce_gym.model.checks.body import LARGEST_FIGURE, RELATIVE_TOLERANCE, check_finite
 from ce_gym.model.constraint_functions import constraint_function
 from ce_gym.model.description import (
     Constraint,
@@ -48,8 +48,9 @@ def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
 
 def _check_linear(constraint: LinearConstraint, key: str, file: str) -> None:
     for body, coefficient in constraint.coefficients:
-        if not math.isfinite(coefficient) or coefficient == 0.0:
-            raise bad(file, f"{key} coefficient of {body!r}", coefficient, "a finite number other than 0")
+        if not 0.0 < abs(coefficient) <= LARGEST_FIGURE:
+            expected = f"a finite number other than 0, up to {LARGEST_FIGURE:g} in size"
+            raise bad(file, f"{key} coefficient of {body!r}", coefficient, expected)
     check_finite(file, f"{key} offset", (constraint.offset,))
 
 
@@ -64,8 +65,8 @@ def _check_loop(constraint: LoopConstraint, key: str, file: str) -> None:
 
 def _check_rod(constraint: RodConstraint, key: str, file: str) -> None:
     check_finite(file, f"{key} points", (*constraint.first_point, *constraint.second_point))
-    if not 0.0 < constraint.length < math.inf:
-        raise bad(file, f"{key} length", constraint.length, "a length above 0 [m]")
+    if not 0.0 < constraint.length <= LARGEST_FIGURE:
+        raise bad(file, f"{key} length", constraint.length, f"a length above 0 [m], up to {LARGEST_FIGURE:g}")
 
 
 def _check_function(constraint: FunctionConstraint, key: str, file: str) -> None:

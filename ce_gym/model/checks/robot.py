@@ -13,11 +13,24 @@ from functools import cache
 
 import numpy as np
 
-from ce_gym.model.checks.body import check_body, check_finite, moves_inertia, violates_triangle_inequality
+from ce_gym.model.checks.body import (
+    check_body,
+    check_finite,
+    check_not_negative,
+    moves_inertia,
+    violates_triangle_inequality,
+)
 from ce_gym.model.checks.constraint import check_constraint
 from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.description import LinearConstraint, Robot
 from ce_gym.model.errors import InertiaWarning, bad, unknown
+
+MOST_BODIES = 500
+"""Most bodies of a robot: what is done with them takes more than in proportion, and none has as many."""
+LIMIT_TOLERANCE = 1e-6
+"""How far a standing pose may be over a joint's limit, where both were rounded [rad or m]."""
+LONGEST_NAME = 200
+"""Most characters of a name."""
 
 
 def check_robot(robot: Robot) -> None:
@@ -31,6 +44,7 @@ def check_robot(robot: Robot) -> None:
             knowingly; said once per process and robot.
     """
     file = robot.source or robot.name
+    _check_names(robot, file)
     _check_tree(robot, file)
     supported = {body.parent for body in robot.bodies} | _dependent(robot)
     for body in robot.bodies:
@@ -42,6 +56,21 @@ def check_robot(robot: Robot) -> None:
     _check_motors(robot, file)
     _check_pose_and_gains(robot, file)
     _check_inertia(robot, file)
+
+
+def _check_names(robot: Robot, file: str) -> None:
+    """Names can be printed, on one line: an escape sequence in a file moves nobody's cursor."""
+    if len(robot.bodies) > MOST_BODIES:
+        raise bad(file, "number of bodies", len(robot.bodies), f"at most {MOST_BODIES}")
+    names = {"name": [robot.name], "task": [name for name, _ in robot.tasks]}
+    names |= {f"{kind} name": [body.name for body in robot.bodies if body.kind == kind] for kind in ("link", "rotor")}
+    names["constraint name"] = [constraint.name for constraint in robot.constraints]
+    names["contact name"] = [contact.name for contact in robot.contacts]
+    names["contact group"] = [contact.group for contact in robot.contacts]
+    for key, given in names.items():
+        for name in given:
+            if not name or not name.isprintable() or len(name) > LONGEST_NAME:
+                raise bad(file, key, name, f"1 to {LONGEST_NAME} characters that can be printed")
 
 
 def _check_inertia(robot: Robot, file: str) -> None:
@@ -135,12 +164,11 @@ def _check_contacts(robot: Robot, file: str) -> None:
         if robot.body(contact.body).kind == "rotor":
             raise bad(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
         check_finite(file, f"{key}.position", contact.position)
-        if not 0.0 <= contact.radius < math.inf:
-            raise bad(file, f"{key}.radius", contact.radius, "0 or more [m]")
+        check_not_negative(file, f"{key}.radius", contact.radius, " [m]")
     for name in ("stiffness", "damping", "friction", "bristle", "dissipation"):
         value = getattr(robot.material, name)
-        if value is not None and not 0.0 <= value < math.inf:
-            raise bad(file, f"material.{name}", value, "0 or more")
+        if value is not None:
+            check_not_negative(file, f"material.{name}", value)
     if not 0.0 < robot.material.slip_speed < math.inf:
         raise bad(file, "material.slip_speed", robot.material.slip_speed, "more than 0 [m/s]")
 
@@ -153,7 +181,9 @@ def _check_motors(robot: Robot, file: str) -> None:
             raise unknown(file, "motors", motor.rotor, rotors, "the name of a rotor")
         for name in ("torque", "velocity", "stall", "damping", "friction"):
             value = getattr(motor, name)
-            if value is not None and not value >= 0.0:
+            if name in ("damping", "friction"):
+                check_not_negative(file, f"motors.{motor.rotor}.{name}", value)
+            elif value is not None and not value >= 0.0:
                 raise bad(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
         if motor.velocity == 0.0:
             raise bad(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
@@ -163,15 +193,24 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
     check_finite(file, "pose.height", (robot.pose.height,))
     check_finite(file, "gravity", robot.gravity)
     _check_joint_values(robot, file, "pose.joints", robot.pose.joints)
+    _check_within_limits(robot, file)
     _check_assembly(robot, file)
     for key, pairs in (("gains.kp", robot.gains.kp), ("gains.kd", robot.gains.kd)):
         _check_joint_values(robot, file, key, pairs)
         for joint, gain in pairs:
-            if gain < 0.0:
-                raise bad(file, f"{key}.{joint}", gain, "0 or more")
+            check_not_negative(file, f"{key}.{joint}", gain)
         for joint in robot.independent:
             if pairs and joint not in dict(pairs):
                 raise bad(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")
+
+
+def _check_within_limits(robot: Robot, file: str) -> None:
+    pose, limits = dict(robot.pose.joints), {body.name: body.joint.position for body in robot.bodies}
+    for joint in robot.independent:
+        (lower, upper), angle = limits[joint], pose.get(joint, 0.0)
+        if not lower - LIMIT_TOLERANCE <= angle <= upper + LIMIT_TOLERANCE:
+            expected = f"a standing pose within the joint's limits, {lower:g} to {upper:g}"
+            raise bad(file, f"pose.joints.{joint}", angle, expected)
 
 
 def _check_assembly(robot: Robot, file: str) -> None:

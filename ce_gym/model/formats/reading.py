@@ -1,6 +1,6 @@
 """YAML text -> plain values, each checked for type and finiteness as it is taken out.
 
-Knows YAML and error messages; nothing about robots.
+A file of any content is read in a time that its size bounds: values are counted as they are read, aliases included.
 """
 
 from __future__ import annotations
@@ -12,14 +12,41 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+import yaml.composer
+import yaml.constructor
 
 from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.formats.text_file import one_line, read_text
 
 _REQUIRED: Any = object()
 
 
+LARGEST_TREE = 50_000
+"""Most values that a file may hold, those that aliases repeat counted each time."""
+LONGEST_SCALAR = 10_000
+"""Most characters of one value."""
+
+
 class _Loader(yaml.SafeLoader):
-    """Safe YAML with two repairs: `5e4` is a number (as in YAML 1.2), and a key may stand only once in a mapping."""
+    """Safe YAML of limited size, in which `5e4` is a number (as in YAML 1.2) and a mapping has every key once."""
+
+    def __init__(self, stream: str):
+        super().__init__(stream)
+        self._total = 0  # values so far, aliases included
+        self._sizes: dict[int, int] = {}  # values in each finished node
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        event, before = self.peek_event(), self._total
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_SCALAR:
+            raise _refused(event, f"a value of {len(event.value)} characters: expected at most {LONGEST_SCALAR}")
+        node = super().compose_node(parent, index)
+        if isinstance(event, yaml.AliasEvent) and id(node) not in self._sizes:
+            raise _refused(event, f"alias {event.anchor!r} stands inside what it names: expected no self-reference")
+        self._total += self._sizes[id(node)] if isinstance(event, yaml.AliasEvent) else 1
+        self._sizes.setdefault(id(node), self._total - before)
+        if self._total > LARGEST_TREE:
+            raise _refused(event, f"more than {LARGEST_TREE} values, aliases counted: expected fewer")
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
@@ -34,20 +61,21 @@ class _Loader(yaml.SafeLoader):
 
 
 _Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
 )
+
+
+def _refused(event: yaml.Event, problem: str) -> yaml.composer.ComposerError:
+    return yaml.composer.ComposerError(None, None, problem, event.start_mark)
 
 
 def read_yaml(path: Path) -> Section:
     """Read a YAML file that holds one mapping.
 
     Raises:
-        RobotError: The file is missing, malformed, empty, or holds something else.
+        RobotError: The file is missing, malformed, too large, empty, or holds something else.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise RobotError(f"{path}: cannot be read: expected a YAML file ({_one_line(error)})") from None
+    text = read_text(path, "a YAML file")
     try:
         data = yaml.load(text, _Loader)
     except Exception as error:  # PyYAML also lets IndexError, AttributeError and others out, as for `!!int ''`
@@ -58,13 +86,9 @@ def read_yaml(path: Path) -> Section:
 
 
 def _problem(error: Exception) -> str:
-    problem = getattr(error, "problem", None) or _one_line(error)
+    problem = getattr(error, "problem", None) or one_line(error)
     mark = getattr(error, "problem_mark", None)
     return f"line {mark.line + 1}: {problem}" if mark else problem
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 class Section:

@@ -18,7 +18,7 @@ from ce_gym.model.formats.mjcf.source import MjcfSource
 
 
 def read_actuators(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...]) -> Gains:
-    """Set the torque limits of the tree's joints and return the gains; what else there is goes to `left_out`."""
+    """Set the torque limits of the tree's joints and return the gains; what else there is is left out."""
     model = source.model
     kp, kd = dict.fromkeys(independent, 0.0), dict.fromkeys(independent, 0.0)
     limits: dict[str, float] = {}
@@ -45,11 +45,11 @@ def _gains(source: MjcfSource, kp: dict[str, float], kd: dict[str, float]) -> Ga
     """Return gains for all joints if there is a position controller at all."""
     if not any(kp.values()):
         if any(kd.values()):
-            source.left_out.append("velocity actuators (there is no position actuator)")
+            source.leave_out("velocity actuators (there is no position actuator)")
         return Gains()
     without = [joint for joint, gain in kp.items() if gain == 0.0]
-    if without:
-        source.left_out.append(f"a position gain for {', '.join(without)} (no position actuator in the file; it is 0)")
+    for joint in without:
+        source.leave_out("a position gain for {} (no position actuator in the file; it is 0)", joint)
     return Gains(tuple(kp.items()), tuple(kd.items()))
 
 
@@ -61,15 +61,15 @@ def _driven(source: MjcfSource, tree: MjcfTree, a: int, independent: tuple[str, 
     biases = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
     fixed = model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
     if body is None or not fixed or int(model.actuator_biastype[a]) not in biases:
-        source.left_out.append(f"actuator {name} (not a motor or controller of one joint)")
+        source.leave_out("actuator {} (not a motor or controller of one joint)", name)
         return None
     if body not in independent:
-        source.left_out.append(f"actuator {name} (its joint is not independent)")
+        source.leave_out("actuator {} (its joint is not independent)", name)
         return None
     if model.actuator_dyntype[a] != mujoco.mjtDyn.mjDYN_NONE:
-        source.left_out.append(f"the activation dynamics of actuator {name}")
+        source.leave_out("the activation dynamics of actuator {}", name)
     if np.any(getattr(model, "actuator_damping", np.zeros(model.nu))[a]):
-        source.left_out.append(f"the damping of actuator {name}")
+        source.leave_out("the damping of actuator {}", name)
     return body
 
 

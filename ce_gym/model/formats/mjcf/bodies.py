@@ -161,15 +161,16 @@ def _report_forces(source: MjcfSource) -> None:
     for attribute, what in (("dof_frictionloss", "dry friction"), ("dof_dampingpoly", "nonlinear damping")):
         values = np.atleast_1d(getattr(model, attribute, np.zeros(model.nv)))
         joints = {int(model.dof_jntid[dof]) for dof in range(model.nv) if np.any(values[dof])}
-        source.left_out += [f"{what} of joint {source.name('joint', j)}" for j in sorted(joints)]
+        for j in sorted(joints):
+            source.leave_out(f"{what} of joint {{}}", source.name("joint", j))
     for j in range(model.njnt):
         if model.jnt_stiffness[j] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[j]):
-            source.left_out.append(f"spring of joint {source.name('joint', j)}")
+            source.leave_out("spring of joint {}", source.name("joint", j))
     for i in range(1, model.nbody):
         if model.body_gravcomp[i]:
-            source.left_out.append(f"gravity compensation of body {source.name('body', i)}")
+            source.leave_out("gravity compensation of body {}", source.name("body", i))
         if model.body_mocapid[i] >= 0:
-            source.left_out.append(f"motion capture of body {source.name('body', i)}")
+            source.leave_out("motion capture of body {}", source.name("body", i))
 
 
 def shapes(source: MjcfSource, tree: MjcfTree) -> Iterator[tuple[str, Shape]]:
@@ -192,4 +193,4 @@ def shapes(source: MjcfSource, tree: MjcfTree) -> Iterator[tuple[str, Shape]]:
         red, green, blue, alpha = (float(x) for x in model.geom_rgba[geom])
         yield carrier, Shape(kind, size, pose, (red, green, blue, alpha))  # type: ignore[arg-type]
     if undrawn:
-        source.left_out.append(f"the drawing of {undrawn} geoms (meshes and ellipsoids)")
+        source.leave_out("the drawing of {} geoms (meshes and ellipsoids)", str(undrawn))

@@ -25,8 +25,8 @@ FOOT_BAND = 0.02
 _DEFAULT_SOLVER = ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0))  # MuJoCo's solref and solimp
 
 
-def read_contacts(source: MjcfSource, tree: MjcfTree) -> tuple[tuple[ContactSphere, ...], ContactMaterial]:
-    """Return the contact spheres and their material; what cannot be one is added to `source.left_out`."""
+def read_contacts(source: MjcfSource, tree: MjcfTree) -> tuple[tuple[ContactSphere, ...], ContactMaterial, float]:
+    """Return the contact spheres, their material, and how high their lowest underside is [m] (0 without any)."""
     geoms = [g for g in range(source.model.ngeom) if _carrier(source, tree, g) is not None]
     ground = [g for g in range(source.model.ngeom) if _carrier(source, tree, g) is None]
     touching = [g for g in geoms if _touches(source, g, ground)]
@@ -40,7 +40,7 @@ def read_contacts(source: MjcfSource, tree: MjcfTree) -> tuple[tuple[ContactSphe
             spheres.append(ContactSphere(name, str(body), transform_point(frame, vec3(point)), radius))
             world = source.data.geom_xpos[geom] + source.data.geom_xmat[geom].reshape(3, 3) @ centre
             heights.append(float(world[2]) - radius)
-    return _grouped(spheres, heights, tree), _material(source, touching, ground)
+    return _grouped(spheres, heights, tree), _material(source, touching, ground), min(heights, default=0.0)
 
 
 def _carrier(source: MjcfSource, tree: MjcfTree, geom: int) -> str | None:
@@ -86,7 +86,7 @@ def _spheres(source: MjcfSource, geom: int) -> Iterator[tuple[str, NDArray[np.fl
         for i, signs in enumerate(product((1.0, -1.0), repeat=3)):
             yield f"{name}_corner{i + 1}", np.array(signs) * (a, b, c), 0.0
     else:
-        source.left_out.append(f"contact of geom {name}, which is no sphere, capsule or box")
+        source.leave_out("contact of geom {}, which is no sphere, capsule or box", name)
 
 
 def _grouped(spheres: list[ContactSphere], heights: list[float], tree: MjcfTree) -> tuple[ContactSphere, ...]:
@@ -113,12 +113,12 @@ def _material(source: MjcfSource, touching: list[int], ground: list[int]) -> Con
     values = sorted({max(float(model.geom_friction[g][0]), rough) for g in touching})
     if len(values) > 1:
         every = ", ".join(f"{value:g}" for value in values)
-        source.left_out.append(f"friction other than {values[-1]:g} (the file has {every})")
+        source.leave_out("friction other than {}", f"{values[-1]:g} (the file has {every})")
     if any(model.geom_condim[g] > 3 for g in touching):
-        source.left_out.append("torsional and rolling friction")
+        source.leave_out("torsional and rolling friction")
     solvers = [(tuple(map(float, model.geom_solref[g])), tuple(map(float, model.geom_solimp[g]))) for g in touching]
     if any(not np.allclose(np.hstack(solver), np.hstack(_DEFAULT_SOLVER)) for solver in solvers):
-        source.left_out.append("the compliance of contacts (solref, solimp)")
+        source.leave_out("the compliance of contacts (solref, solimp)")
     return ContactMaterial(friction=values[-1]) if values else ContactMaterial()
 
 
@@ -128,7 +128,7 @@ def _report_ground(source: MjcfSource, ground: list[int]) -> None:
         normal, height = source.data.geom_xmat[g].reshape(3, 3)[:, 2], source.data.geom_xpos[g][2]
         flat = model.geom_type[g] == plane and np.allclose(normal, (0, 0, 1)) and abs(height) < 1e-9
         if _solid(source, g) and not flat:
-            source.left_out.append(f"obstacle {source.name('geom', g)} (the ground is the plane z = 0)")
+            source.leave_out("obstacle {} (the ground is the plane z = 0)", source.name("geom", g))
 
 
 def _report_between(source: MjcfSource, tree: MjcfTree, geoms: list[int]) -> None:
@@ -139,5 +139,5 @@ def _report_between(source: MjcfSource, tree: MjcfTree, geoms: list[int]) -> Non
             first, second = str(_carrier(source, tree, a)), str(_carrier(source, tree, b))
             apart = first != second and first != parents[second] and second != parents[first]
             if apart and _match(source, a, b):
-                source.left_out.append("contact between bodies of the robot")
+                source.leave_out("contact between bodies of the robot")
                 return

@@ -49,21 +49,21 @@ def locked_joints(source: MjcfSource) -> dict[int, float]:
 
 
 def read_constraints(source: MjcfSource, tree: MjcfTree, locked: dict[int, float]) -> tuple[Constraint, ...]:
-    """Return the constraints; what cannot be one is added to `source.left_out`.
+    """Return the constraints; what cannot be one is left out.
 
     An equality that has been left out is switched off in `source.data`, so that its Jacobian is that of the rest.
     """
     found: list[Constraint] = []
     for i in range(source.model.neq):
-        name = f"equality {source.name('equality', i)}"
+        name = source.name("equality", i)
         if not source.model.eq_active0[i]:
-            source.left_out.append(f"{name}, which is not active")
+            source.leave_out("equality {}, which is not active", name)
             continue
         if source.model.eq_type[i] == source.mujoco.mjtEq.mjEQ_JOINT and source.model.eq_obj2id[i] < 0:
             continue  # a weld in the tree
         constraints = list(_constraint(source, tree, i, locked))
         if not constraints:
-            source.left_out.append(name)
+            source.leave_out("equality {}", name)
             source.data.eq_active[i] = 0
         found += constraints
     return tuple(found)
@@ -197,7 +197,7 @@ def _linear(
     constant, ratio, *higher = (float(x) for x in source.model.eq_data[i][:5])
     name = source.name("equality", i)
     if second[0] and any(higher):
-        source.left_out.append(f"the polynomial of equality {name} beyond its linear part")
+        source.leave_out("the polynomial of equality {} beyond its linear part", name)
     coefficients = dict(first[0])
     for joint, value in second[0].items():
         coefficients[joint] = coefficients.get(joint, 0.0) - ratio * value

@@ -9,8 +9,8 @@
 | actuators                        | torque limits and gains (`mjcf_actuators.py`)                                  |
 | the first keyframe               | the standing pose, and the branch in which loops are assembled                 |
 
-What else acts on the robot in MuJoCo is listed in one `LossyImportWarning`. Cameras, lights, sensors and textures act
-on nothing and are passed over. Knows the compiled model and the robot description.
+What else acts on the robot in MuJoCo is in its notes, and summed up in one `LossyImportWarning`. Cameras, lights,
+sensors and textures act on nothing and are passed over.
 """
 
 from __future__ import annotations
@@ -30,11 +30,14 @@ from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, shapes
 from ce_gym.model.formats.mjcf.contacts import read_contacts
 from ce_gym.model.formats.mjcf.equalities import choose_independent, locked_joints, read_constraints
 from ce_gym.model.formats.mjcf.rotors import add_rotors
-from ce_gym.model.formats.mjcf.source import MjcfSource, read_mjcf
+from ce_gym.model.formats.mjcf.source import MjcfSource, read_mjcf, summary
 from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.rotor_rule import with_rotors
 
 Angles = tuple[tuple[str, float], ...]  # pairs (body, joint coordinate [rad or m])
+
+DEEPEST = 0.01
+"""A reference pose in which contacts are further below ground than this is raised [m]."""
 
 
 def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) -> Robot:
@@ -49,7 +52,7 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
         RobotError: `mujoco` is missing or refuses the file, or the file describes something that cannot be.
 
     Warns:
-        LossyImportWarning: Something in the file has no counterpart; all of it in one message.
+        LossyImportWarning: Something in the file has no counterpart; `Robot.notes` has all of it.
     """
     source = read_mjcf(path)
     locked = locked_joints(source)
@@ -60,12 +63,12 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
     ]
     independent = choose_independent(source, tree, spinning)
     gains = read_actuators(source, tree, independent)
-    contacts, material = read_contacts(source, tree)
+    contacts, material, lowest = read_contacts(source, tree)
     _add_shapes(source, tree)
     links = {*independent, *(contact.body for contact in contacts)}  # what touches the ground spins outside
     tree.bodies[:] = with_rotors(tree.bodies, constraints, [b for b in tree.moved_by.values() if b not in links])
     gears = add_rotors(source, tree, gear_ratios or {})
-    pose, assembly = _pose(source, tree, independent)
+    pose, assembly = _pose(source, tree, independent, lowest)
     robot = Robot(
         name=_name(source, path),
         bodies=tuple(tree.bodies),
@@ -82,8 +85,8 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
     check_robot(robot)
     _report_world(source)
     if source.left_out:
-        warnings.warn(f"{path}: left out: {'; '.join(source.left_out)}", LossyImportWarning, stacklevel=3)
-    return replace(robot, notes=tuple(f"left out: {what}" for what in source.left_out))
+        warnings.warn(f"{path}: left out: {summary(source.left_out)}", LossyImportWarning, stacklevel=3)
+    return replace(robot, notes=tuple(f"left out: {what.format(name)}" for what, name in source.left_out))
 
 
 def _name(source: MjcfSource, path: Path) -> str:
@@ -98,20 +101,33 @@ def _add_shapes(source: MjcfSource, tree: MjcfTree) -> None:
     tree.bodies[:] = [replace(body, shapes=tuple(drawn.get(body.name, ()))) for body in tree.bodies]
 
 
-def _pose(
-    source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...]
-) -> tuple[Pose, tuple[tuple[str, float], ...]]:
-    """Return the standing pose, and the dependent coordinates at it."""
+def _pose(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...], lowest: float) -> tuple[Pose, Angles]:
+    """Return the standing pose, and the dependent coordinates at it.
+
+    Args:
+        source: The compiled file.
+        tree: Its bodies.
+        independent: Bodies whose joint coordinates are independent.
+        lowest: Height of the lowest contact sphere's underside [m].
+    """
     model, qpos = source.model, source.data.qpos
     height, angles = 0.0, {}
+    limits = {body.name: body.joint.position for body in tree.bodies}
     for j, body in tree.moved_by.items():
         address = model.jnt_qposadr[j]
         if model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE:
             height = float(qpos[address + 2])
             if not np.allclose(qpos[address + 3 : address + 7], (1, 0, 0, 0), atol=1e-9):
-                source.left_out.append("the inclination of the base in the reference pose")
-        else:
-            angles[body] = float(qpos[address])
+                source.leave_out("the inclination of the base in the reference pose")
+            if lowest < -DEEPEST:
+                source.leave_out("the height of the base in the reference pose ({} m)", f"{height:g}, under ground")
+                height -= lowest
+            continue
+        angles[body] = float(qpos[address])
+        allowed = min(max(angles[body], limits[body][0]), limits[body][1])
+        if body in independent and abs(allowed - angles[body]) > 1e-6:
+            source.leave_out("the angle in the reference pose, beyond its limits, of {}", body)
+            angles[body] = allowed
     dependent = tuple((body, angle) for body, angle in angles.items() if body not in independent)
     return Pose(height, tuple((body, angles[body]) for body in independent)), dependent
 
@@ -121,11 +137,11 @@ def _report_world(source: MjcfSource) -> None:
     model = source.model
     for what, value in (("wind", model.opt.wind), ("density", model.opt.density), ("viscosity", model.opt.viscosity)):
         if np.any(value):
-            source.left_out.append(f"{what} of the medium")
+            source.leave_out("{} of the medium", what)
     for count, what in ((model.nflex, "deformable bodies"), (model.nplugin, "plugins")):
         if count:
-            source.left_out.append(what)
+            source.leave_out(what)
     for t in range(model.ntendon):
         acts = [getattr(model, f"tendon_{key}")[t] for key in ("stiffness", "damping", "frictionloss", "limited")]
         if any(map(np.any, acts)):
-            source.left_out.append(f"spring, damper, friction or limit of tendon {source.name('tendon', t)}")
+            source.leave_out("spring, damper, friction or limit of tendon {}", source.name("tendon", t))

@@ -77,7 +77,7 @@ def _mount(
     known = [armature for armature in armatures if armature.ratio is not None]
     if known and not _take_out(tree, carrier, [_rotor(tree, carrier, armature) for armature in known]):
         names = ", ".join(armature.name for armature in known)
-        source.left_out.append(f"the gear ratio at {names} (such rotors have more inertia than {carrier})")
+        source.leave_out("the gear ratio at {}", f"{names} (such rotors have more inertia than {carrier})")
         armatures = [replace(armature, ratio=None) for armature in armatures]
     for armature in armatures:
         rotor = _rotor(tree, carrier, armature)
@@ -155,7 +155,7 @@ def _joint_armatures(source: MjcfSource, tree: MjcfTree, ratios: Mapping[int, fl
         reflected = float(model.dof_armature[model.jnt_dofadr[j]])
         if model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE:
             if reflected:
-                source.left_out.append(f"armature of the free joint {source.name('joint', j)}")
+                source.leave_out("armature of the free joint {}", source.name("joint", j))
         elif reflected:
             found.append(_Armature(body, {j: 1.0}, reflected, ratios.get(j)))
     return found
@@ -168,7 +168,7 @@ def _tendon_armatures(source: MjcfSource) -> list[_Armature]:
         name, reflected = source.name("tendon", t), float(getattr(model, "tendon_armature", np.zeros(model.ntendon))[t])
         coefficients = tendon_coefficients(source, t)
         if reflected and coefficients is None:
-            source.left_out.append(f"armature of the spatial tendon {name}")
+            source.leave_out("armature of the spatial tendon {}", name)
         elif reflected:
             found.append(_Armature(name, coefficients or {}, reflected, None))
     return found
@@ -186,7 +186,7 @@ def _motor_armatures(source: MjcfSource) -> list[_Armature]:
         if model.actuator_trntype[a] == source.mujoco.mjtTrn.mjTRN_TENDON:
             joints = tendon_coefficients(source, target)
         if inertia and joints is None:
-            source.left_out.append(f"armature of actuator {name}")
+            source.leave_out("armature of actuator {}", name)
         elif inertia and joints:
             found.append(_Armature(name, joints, inertia * gear**2, None if abs(gear) in (0.0, 1.0) else gear))
     return found

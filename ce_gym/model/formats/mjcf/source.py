@@ -7,7 +7,6 @@ poses. (MuJoCo's compiled modules carry no types, hence the line above.)
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,20 +16,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.model.checks.body import LARGEST_FIGURE
+from ce_gym.model.checks.robot import MOST_BODIES
 from ce_gym.model.description import Placement
-from ce_gym.model.errors import RobotError, bad
+from ce_gym.model.errors import RobotError, bad, printable
+from ce_gym.model.formats.mjcf.limits import check_file
 from ce_gym.model.formats.placement import exact_right_angles, vec3
+from ce_gym.model.formats.text_file import one_line
 
-LARGEST_SIZE = 10_000
-"""Largest number of copies, rows or pixels that an element may ask for; MuJoCo's compiler would try any."""
+MOST_KINDS, MOST_NAMES = 8, 3
+"""How many kinds of things, and names of each, a summary of what was left out has."""
 
-_SIZES = ("count", "nrow", "ncol", "width", "height", "gridsize")
 _FIGURES = (
     *("body_pos", "body_quat", "body_ipos", "body_iquat", "body_inertia", "body_mass"),
     *("jnt_pos", "jnt_axis", "jnt_range", "qpos0", "site_pos", "site_quat"),
     *("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rgba"),
     *("actuator_gear", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
+    *("dof_armature", "dof_damping", "eq_data", "tendon_length0"),
 )
+_LIMITS = ("jnt_range", "actuator_forcerange")
 
 
 @dataclass
@@ -42,27 +46,49 @@ class MjcfSource:
         mujoco: The package.
         model: `MjModel`.
         data: `MjData` at the reference pose: the first keyframe, or all joints at their `ref`.
-        left_out: What the robot will lack; each entry completes "... is left out".
+        left_out: What the robot will lack: a text that completes "... is left out", and the name to put in it.
     """
 
     file: str
     mujoco: Any
     model: Any
     data: Any
-    left_out: list[str] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
 
     def name(self, kind: str, index: int) -> str:
         """Return the name of element `index` of a kind, such as "body"; one like "body3" if it has none."""
-        return getattr(self.model, kind)(int(index)).name or f"{kind}{index}"
+        return printable(getattr(self.model, kind)(int(index)).name) or f"{kind}{index}"
+
+    def leave_out(self, what: str, name: str = "") -> None:
+        """Note what the robot will lack, `{}` in it standing for the name of an element."""
+        self.left_out.append((what, name))
 
     def enabled(self, feature: str) -> bool:
         """Whether a part of the physics, such as "GRAVITY", is not switched off in the file's <option>."""
         return not self.model.opt.disableflags & int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{feature}"))
 
     def forward(self) -> None:
-        """Compute everything that follows from the reference pose."""
+        """Compute everything that follows from the reference pose, contacts apart, of which there could be many."""
+        options = self.model.opt
+        flags = options.disableflags
+        options.disableflags = flags | int(self.mujoco.mjtDisableBit.mjDSBL_CONTACT)
         with _without_log(self.mujoco):
             self.mujoco.mj_forward(self.model, self.data)
+        options.disableflags = flags
+
+
+def summary(left_out: list[tuple[str, str]]) -> str:
+    """Return what was left out in one line: each kind of thing once, with the names of a few."""
+    kinds: dict[str, list[str]] = {}
+    for what, name in left_out:
+        kinds.setdefault(what, []).append(name)
+    parts = []
+    for what, names in list(kinds.items())[:MOST_KINDS]:
+        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+        parts.append(what.format(", ".join(names[:MOST_NAMES]) + more))
+    if len(kinds) > MOST_KINDS:
+        parts.append(f"{len(kinds) - MOST_KINDS} other kinds of things")
+    return "; ".join(parts) + (" (Robot.notes has all)" if len(left_out) > len(parts) else "")
 
 
 def read_mjcf(path: Path) -> MjcfSource:
@@ -71,7 +97,7 @@ def read_mjcf(path: Path) -> MjcfSource:
     Raises:
         RobotError: `mujoco` is not installed, or it refuses the file.
     """
-    _refuse_early(path)
+    check_file(path)
     try:
         import mujoco
     except ImportError:
@@ -81,8 +107,8 @@ def read_mjcf(path: Path) -> MjcfSource:
             model = mujoco.MjModel.from_xml_path(str(path))
             source = MjcfSource(str(path), mujoco, model, mujoco.MjData(model))
     except Exception as error:  # MuJoCo raises ValueError, FatalError, MemoryError and others
-        raise RobotError(f"{path}: MuJoCo refuses the file: expected valid MJCF ({_one_line(error)})") from None
-    _refuse_nonfinite(str(path), model)
+        raise RobotError(f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})") from None
+    _check_figures(str(path), model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, source.data, 0)
     source.forward()
@@ -100,39 +126,17 @@ def _without_log(mujoco: Any) -> Iterator[None]:
         mujoco.set_mju_user_warning(handler)
 
 
-def _refuse_early(path: Path) -> None:
-    """Refuse files that are no MJCF, and what MuJoCo would try to build without end or complain of on the terminal."""
-    file = str(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise RobotError(f"{path}: cannot be read: expected an MJCF file ({_one_line(error)})") from None
-    if "<!DOCTYPE" in text:
-        raise RobotError(f"{path}: there is a <!DOCTYPE>: expected MJCF without document type and entities")
-    text = re.sub(r"<!--.*?-->|<\?.*?\?>", "", text, flags=re.DOTALL)
-    root = re.search(r"<([^\s/>]*)", text)
-    if root is None or root[1] != "mujoco":
-        raise bad(file, "root element", root and root[1], "<mujoco>")
-    for key, value in re.findall(r"(\w+)\s*=\s*[\"']([^\"']*)", text):
-        words = value.lower().split()
-        if key in _SIZES and any(word.isdigit() and (len(word) > 9 or int(word) > LARGEST_SIZE) for word in words):
-            raise bad(file, key, value, f"at most {LARGEST_SIZE}")
-        if key != "name" and any(word.lstrip("+-") == "nan" for word in words):
-            raise bad(file, key, value, "finite numbers")
-
-
-def _refuse_nonfinite(file: str, model: Any) -> None:
-    """Refuse figures that MuJoCo lets pass."""
+def _check_figures(file: str, model: Any) -> None:
+    """Refuse figures that MuJoCo lets pass, and robots of too many bodies."""
     for name in _FIGURES:
         values = np.asarray(getattr(model, name))
-        if not np.isfinite(values).all():
-            raise bad(file, name, values[~np.isfinite(values)][0], "finite numbers")
+        usable = np.isfinite(values) & ((np.abs(values) <= LARGEST_FIGURE) | (name in _LIMITS))
+        if not usable.all():
+            raise bad(file, name, float(values[~usable][0]), f"finite numbers, up to {LARGEST_FIGURE:g} in size")
     if (model.dof_armature < 0.0).any():
         raise bad(file, "armature", float(model.dof_armature.min()), "0 or more [kg m^2 or kg]")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]
+    if max(model.nbody - 1, model.nv) > MOST_BODIES:
+        raise bad(file, "number of bodies", model.nbody - 1, f"at most {MOST_BODIES} and as many joints")
 
 
 def placement(position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> Placement:

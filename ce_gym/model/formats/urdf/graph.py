@@ -12,8 +12,11 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.formats.text_file import one_line, read_text
 from ce_gym.model.formats.urdf import elements as read
 
+MOST_LINKS = 1000
+"""Most links of a file, those included that fixed joints weld to others."""
 MOVING = ("revolute", "continuous", "prismatic", "floating")
 
 
@@ -77,6 +80,8 @@ class UrdfGraph:
             if name in links:
                 raise bad(self.file, "link name", name, "a name that no other link has")
             links[name] = element
+        if len(links) > MOST_LINKS:
+            raise bad(self.file, "number of links", len(links), f"at most {MOST_LINKS}")
         if not links:
             raise bad(self.file, "<robot>", None, "at least one <link>")
         return links
@@ -129,20 +134,13 @@ class UrdfGraph:
 
 
 def _parse(path: Path) -> Element:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise RobotError(f"{path}: cannot be read: expected a URDF file ({_reason(error)})") from None
+    text = read_text(path, "a URDF file")
     if "<!DOCTYPE" in text:  # it can define entities, which read other files or grow without bound
         raise RobotError(f"{path}: there is a <!DOCTYPE>: expected a URDF without document type and entities")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise RobotError(f"{path}: malformed XML: expected a URDF file ({_reason(error)})") from None
+        raise RobotError(f"{path}: malformed XML: expected a URDF file ({one_line(error)})") from None
     if root.tag != "robot":
         raise bad(str(path), "root element", root.tag, "<robot>")
     return root
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -21,10 +21,11 @@ from typing import Literal
 from xml.etree.ElementTree import Element
 
 from ce_gym.model.checks.robot import check_robot
-from ce_gym.model.description import Body, LinearConstraint, LoopConstraint, Robot
+from ce_gym.model.description import Body, LinearConstraint, LoopConstraint, Pose, Robot
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.formats.rotor_rule import with_rotors
+from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.graph import UrdfGraph
 from ce_gym.model.formats.urdf.tree import Base, Frame, UrdfTree, read_tree
@@ -53,7 +54,8 @@ def robot_from_graph(graph: UrdfGraph, base: Base | None = None) -> Robot:
     independent = tuple(_independent(graph, tree))
     dependent = [body.name for body in tree.bodies if body.name not in independent]
     bodies = with_rotors(tree.bodies, constraints, dependent) if graph.is_plus else tree.bodies
-    robot = Robot(tree.name, bodies, constraints, independent, source=graph.file, notes=tree.notes)
+    pose = Pose(joints=with_limits((), bodies, independent))
+    robot = Robot(tree.name, bodies, constraints, independent, pose=pose, source=graph.file, notes=tree.notes)
     check_robot(robot)
     return robot
 

@@ -27,6 +27,7 @@ from ce_gym.model.description import (
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, symmetric, transform_point, vec3
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
+from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.urdf.elements import unit_axis
 from ce_gym.model.formats.urdf.tree import Base, Frame, read_urdf
 from ce_gym.model.formats.yaml.constraints import coefficients, frame_named, read_constraints
@@ -36,15 +37,6 @@ _KEYS = (
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
 )
 _ROTOR_KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
-
-
-def robot_from_urdf(path: Path) -> Robot:
-    """Read a plain URDF: no rotors, no contacts; <mimic> joints become constraints."""
-    tree = read_urdf(path)
-    independent = _default_independent(tree.bodies, tree.constraints)
-    robot = Robot(tree.name, tree.bodies, tree.constraints, independent, source=str(path), notes=tree.notes)
-    check_robot(robot)
-    return robot
 
 
 def robot_from_yaml(path: Path) -> Robot:
@@ -70,7 +62,7 @@ def robot_from_yaml(path: Path) -> Robot:
         contacts=tuple(_contacts(file.section("contacts"), frames)),
         material=_material(file.section("material")),
         motors=tuple(_motors(file.section("motors"))),
-        pose=Pose(pose.number("height", 0.0), pose.section("joints").numbers()),
+        pose=Pose(pose.number("height", 0.0), with_limits(pose.section("joints").numbers(), bodies, independent)),
         gains=_gains(file.section("gains"), independent),
         assembly=file.section("assembly").numbers(),
         gravity=vec3(file.vector("gravity", 3, (0.0, 0.0, -9.81))),

@@ -1,0 +1,165 @@
+"""A mechanism in its standing pose, in numbers: what must hold there before anything is traced.
+
+The mass matrix is the sum `J^T I J` over bodies, with each body's Jacobian `J` from its parent's, plus what rotors that
+are no bodies of their own add (see recursion/rotors.py). An independent way to the figure that `Model` traces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.dynamics.constraints.closure import Closure, closures
+from ce_gym.dynamics.constraints.cluster_constraints import linear_solution
+from ce_gym.model.clusters import Cluster
+from ce_gym.model.errors import RobotError, bad
+from ce_gym.model.mechanism import Mechanism, Spin, skew
+
+Array = NDArray[np.float64]
+
+SMALLEST_EIGENVALUE = 1e-12
+"""Of the mass matrix scaled to ones on its diagonal: with less, accelerations have no correct digits [-]."""
+DEEPEST_CONTACT = 0.1
+"""How far contacts may be below ground in the standing pose [m]."""
+FURTHEST_BEYOND = 0.01
+"""How far dependent joints may be beyond their limits, where loops are assembled from rounded figures [rad or m]."""
+
+
+@dataclass
+class Standing:
+    """A mechanism in its standing pose.
+
+    Attributes:
+        q: Joint coordinates by body [rad or m], a floating base's left out.
+        G: Rows of the constraint Jacobian by body, shape (nv,) each.
+        R: Rotations, body to world, by body.
+        p: Origins in the world [m], by body.
+        J: Spatial velocities in body axes for unit independent velocities, shape (6, nv), by body.
+    """
+
+    q: dict[str, float]
+    G: dict[str, Array]
+    R: dict[str | None, Array]
+    p: dict[str | None, Array]
+    J: dict[str | None, Array]
+
+
+def check_standing(mechanism: Mechanism) -> None:
+    """Check that a mechanism can stand, and move, in its standing pose.
+
+    Raises:
+        RobotError: Its mass matrix is not positive definite, a dependent joint is beyond its limits, or contacts are
+            far below ground.
+    """
+    standing = standing_pose(mechanism)
+    file = mechanism.robot.source or mechanism.robot.name
+    for body in mechanism.robot.bodies:
+        (lower, upper), angle = body.joint.position, standing.q.get(body.name, 0.0)
+        if not lower - FURTHEST_BEYOND <= angle <= upper + FURTHEST_BEYOND:
+            expected = f"a standing pose that keeps every joint within its limits, here {lower:g} to {upper:g}"
+            raise bad(file, f"joint {body.name!r} in the standing pose", angle, expected)
+    _check_mass_matrix(mechanism, mass_matrix(mechanism, standing), file)
+    for contact in mechanism.robot.contacts if mechanism.robot.floating else ():
+        centre = standing.p[contact.body] + standing.R[contact.body] @ np.array(contact.position)
+        if centre[2] - contact.radius < -DEEPEST_CONTACT:
+            expected = f"a height that keeps contact {contact.name!r}, now {centre[2]:.3g} m high, above ground"
+            raise bad(file, "pose.height", mechanism.robot.pose.height, expected)
+
+
+def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:
+    base = ["the floating base"] * 6 if mechanism.robot.floating else []
+    names = [*base, *mechanism.robot.independent]
+    scale = np.sqrt(np.diag(M).clip(1e-300))
+    if np.isfinite(M).all():
+        values, vectors = np.linalg.eigh(M / scale[:, None] / scale)
+        if values[0] > SMALLEST_EIGENVALUE and (np.diag(M) > 0.0).all():
+            return
+        moving = np.abs(vectors[:, 0])
+    else:
+        moving = (~np.isfinite(M)).any(axis=0).astype(float)
+    joints = dict.fromkeys(name for name, x in zip(names, moving, strict=True) if x > 0.1 * moving.max())
+    raise RobotError(
+        f"{file}: the mass matrix at the standing pose is not positive definite in {', '.join(list(joints)[:6])}: "
+        f"expected mass or inertia that every motion of the joints moves, and gear ratios that leave it visible"
+    )
+
+
+def standing_pose(mechanism: Mechanism) -> Standing:
+    """Place all bodies of a mechanism in its standing pose, base to tip."""
+    nv = len(mechanism.robot.independent) + (6 if mechanism.robot.floating else 0)
+    column = {name: nv - len(mechanism.robot.independent) + i for i, name in enumerate(mechanism.robot.independent)}
+    standing = Standing({}, {}, {None: np.eye(3)}, {None: np.zeros(3)}, {None: np.zeros((6, nv))})
+    for cluster, closure in zip(mechanism.tree.clusters, closures(mechanism), strict=True):
+        if cluster.bodies[0] in mechanism.bodies and mechanism.bodies[cluster.bodies[0]].joint_type == "free":
+            base = cluster.bodies[0]
+            standing.R[base], standing.p[base] = np.eye(3), np.array([0.0, 0.0, mechanism.robot.pose.height])
+            standing.J[base] = np.eye(6, nv)
+            continue
+        q, G = _coordinates(mechanism, cluster, closure)
+        for i, name in enumerate(cluster.bodies):
+            standing.q[name], standing.G[name] = float(q[i]), np.zeros(nv)
+            standing.G[name][[column[joint] for joint in cluster.independent]] = G[i]
+        for body in mechanism.moving(cluster):
+            _place(standing, mechanism, body.name)
+    return standing
+
+
+def _coordinates(mechanism: Mechanism, cluster: Cluster, closure: Closure | None) -> tuple[Array, Array]:
+    """Return spanning coordinates (n,) of a cluster and their derivatives by the independent ones (n, d)."""
+    pose = dict(mechanism.robot.pose.joints)
+    y = np.array([pose.get(name, 0.0) for name in cluster.independent])
+    if closure is None:
+        G, q0 = linear_solution(cluster)
+        return G @ y + q0, G
+    z = closure.reference[len(y) :]
+    return closure.assembly.q, np.array(closure.rates(y, z, np.zeros(len(y)))[0].full())
+
+
+def _place(standing: Standing, mechanism: Mechanism, name: str) -> None:
+    """Place one body, its parent being placed."""
+    body, parent = mechanism.bodies[name], mechanism.bodies[name].parent
+    axis, q = body.axis, standing.q[name]
+    turn, slide = (0.0, 1.0) if body.joint_type == "prismatic" else (1.0, 0.0)
+    position, rotation = body.position + body.rotation @ axis * (slide * q), body.rotation @ turned(axis, turn * q)
+    standing.R[name] = standing.R[parent] @ rotation
+    standing.p[name] = standing.p[parent] + standing.R[parent] @ position
+    w, v = standing.J[parent][:3], standing.J[parent][3:]
+    carried = np.vstack([rotation.T @ w, rotation.T @ (v - skew(position) @ w)])
+    standing.J[name] = carried + np.outer(np.concatenate([turn * axis, slide * axis]), standing.G[name])
+
+
+def turned(axis: Array, angle: float) -> Array:
+    """Return the rotation by an angle [rad] about a unit axis, shape (3, 3) (Rodrigues)."""
+    u = skew(axis)
+    return np.eye(3) + np.sin(angle) * u + (1.0 - np.cos(angle)) * u @ u
+
+
+def mass_matrix(mechanism: Mechanism, standing: Standing) -> Array:
+    """Return the mass matrix of the independent coordinates in the standing pose, shape (nv, nv)."""
+    with np.errstate(all="ignore"):
+        bodies = [standing.J[name].T @ body.inertia @ standing.J[name] for name, body in mechanism.bodies.items()]
+        M = np.sum(bodies, axis=0)
+        for spins in mechanism.spins:
+            M = M + _reflected(mechanism, spins, standing)
+    return M
+
+
+def _reflected(mechanism: Mechanism, spins: tuple[Spin, ...], standing: Standing) -> Array:
+    """Return what the rotors of a cluster add that are no bodies of the recursion, at the level of the mechanism."""
+    nv = len(standing.J[None][0])
+    if mechanism.level == "none" or not spins:
+        return np.zeros((nv, nv))
+    G = np.array([standing.G[spin.rotor] for spin in spins])
+    reflected = G.T @ (np.array([[spin.inertia] for spin in spins]) * G)
+    if mechanism.level != "exact":
+        return np.diag(np.diag(reflected)) if mechanism.level == "armature" else reflected
+    for spin, row in zip(spins, G, strict=True):
+        w = standing.J[spin.carrier][:3]
+        coupling = spin.inertia * np.outer(row, spin.axis @ w)
+        e = turned(spin.axis, standing.q[spin.rotor]) @ spin.heavy_axis
+        n = np.cross(spin.axis, e)
+        transverse = spin.transverse * (np.outer(e, e) - np.outer(n, n))
+        reflected = reflected + coupling + coupling.T + w.T @ transverse @ w
+    return reflected
