@@ -1,4 +1,4 @@
-"""The transmission report in words: `transmission_report(model)`. Knows reports, not how they are worked out."""
+"""The transmission report in words: `transmission_report(model)`."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Model(Evaluator):
 
     Raises:
         RobotError: If the robot file or the level is not valid, or the robot cannot stand in its standing pose: its
-            mass matrix there is not positive definite, a joint is beyond its limits, contacts are below ground.
+            mass matrix is not positive definite, a joint is beyond its limits, contacts are below ground.
 
     Examples:
         >>> model = ce_gym.Model("tello", transmission="exact")

@@ -61,7 +61,8 @@ def check_standing(mechanism: Mechanism) -> None:
             expected = f"a standing pose that keeps every joint within its limits, here {lower:g} to {upper:g}"
             raise bad(file, f"joint {body.name!r} in the standing pose", angle, expected)
     _check_mass_matrix(mechanism, mass_matrix(mechanism, standing), file)
-    for contact in mechanism.robot.contacts if mechanism.robot.floating else ():
+    placed = mechanism.robot.floating and mechanism.robot.pose.height != 0.0  # a height of 0 is one that nobody gave
+    for contact in mechanism.robot.contacts if placed else ():
         centre = standing.p[contact.body] + standing.R[contact.body] @ np.array(contact.position)
         if centre[2] - contact.radius < -DEEPEST_CONTACT:
             expected = f"a height that keeps contact {contact.name!r}, now {centre[2]:.3g} m high, above ground"

@@ -1,4 +1,4 @@
-"""What linear constraints say about joints: every coordinate as a linear function of a few. Knows descriptions, numpy.
+"""What linear constraints say about joints: every coordinate as a linear function of a few.
 
 The dynamics does the same cluster by cluster, and then solves the loops too; here is what can be said without that.
 """

@@ -1,7 +1,6 @@
 """A robot as MJCF text, so that MuJoCo simulates the same machine at the same transmission level.
 
-Knows descriptions, mechanisms and the MJCF schema (https://mujoco.readthedocs.io/en/stable/XMLreference.html); needs
-no MuJoCo. What MJCF cannot say is said in `to_mjcf`.
+What MJCF cannot say is said in `to_mjcf`. Source: https://mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def to_mjcf(
     - `armature`: no rotor bodies; the diagonal of the reflected inertia as joint armature.
     - `none`: no rotor bodies, no armature.
 
-    Loops are closed by connects and rods by spatial tendons at every level, see mjcf_export_ties.py. So armature of
+    Loops are closed by connects and rods by spatial tendons at every level, see mjcf_equalities.py. So armature of
     a joint inside a loop is reflected to the independent ones as the pose demands, velocity terms included: `coupled`
     is exact there too. At `armature` a diagonal that varies with the pose would be needed, which MJCF does not have.
 

@@ -17,8 +17,6 @@ Where rotors are left out and `coupled` keeps what they reflect, that is
 | several joints of one chain  | a fixed tendon with armature                                                       |
 | joints of several chains     | a massless body whose joint has the armature, tied by a tendon equality: of tendon |
 |                              | armature MuJoCo keeps only what its sparse mass matrix has room for (tested, 4.0)  |
-
-Knows descriptions, mechanisms and the MJCF schema.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Numbers and rotations as MJCF writes them. Knows numpy alone."""
+"""Numbers and rotations as MJCF writes them."""
 
 from __future__ import annotations
 

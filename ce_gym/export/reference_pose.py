@@ -2,7 +2,7 @@
 
 For whoever has to draw or write down a robot without its dynamics. It finds the configuration that the dynamics
 starts from: the standing pose for independent joints, and for the others the solution of all constraints that is
-nearest to the robot's `assembly`. Knows descriptions and numpy, nothing symbolic.
+nearest to the robot's `assembly`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The cluster tree: which bodies must be treated together because constraints tie their joints.
 
-Found by analysis of the graph, for any robot. Knows only the robot description.
+Found by analysis of the graph, for any robot.
 
 A constraint over the *joints* of some bodies makes one cluster of those bodies and of everything between them: take
 the nearest common ancestor of their parents; every body on the way from there (exclusive) to each of them (inclusive)

@@ -1,7 +1,7 @@
 """Constraint functions that users register from Python, by name.
 
-A description holds the name only, so that it stays plain data. Knows nothing about what is passed through the
-functions: the dynamics calls them with CasADi expressions.
+A description holds the name only, so that it stays plain data. The dynamics calls the functions with
+CasADi expressions.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ bodies, each moved by one joint against its parent, plus the constraints that ti
 enough: "the angle of FL_hip_link" is the coordinate of the joint between FL_hip_link and its parent.
 
 Numbers are plain floats in tuples, so that two robots are equal if and only if their figures are, and a robot
-can be hashed into a cache key. Units are SI and radians. Knows nothing about algorithms, arrays or files.
+can be hashed into a cache key. Units are SI and radians.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What a user sees when a robot file is wrong: one line, no traceback of a dependency.
-
-Knows nothing about robots or file formats.
-"""
+"""What a user sees when a robot file is wrong: one line, no traceback of a dependency."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 Two families, both planar about z. *Branched chains* hang on a floating base: several equal branches, each a row of
 equal units (a link with its rotor, a pair of links with two belts, a four-bar). *Parallel chains* stand on the ground
 and are tied together at one depth, so that the tie makes a cluster as large as one likes. Where a chain has closed
-loops, its standing pose and assembly close them away from singularities. Knows only the robot description.
+loops, its standing pose and assembly close them away from singularities.
 
 Source of the rules and figures: Chignoli, Adrian, Kim, Wensing, arXiv:2311.13732, and the authors' library
 ROAM-Lab-ND/generalized_rbda 45fa7c4, Benchmarking/urdfs/*.xacro. Rotors have no mass there, so deleting them and

@@ -1,4 +1,4 @@
-"""The robots that come with the package, in a table. Knows descriptions, clusters and where robots are found."""
+"""The robots that come with the package, in a table."""
 
 from __future__ import annotations
 

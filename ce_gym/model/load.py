@@ -1,7 +1,4 @@
-"""Where robots are found: by name in the assets folder, or by path.
-
-Knows the layout of the assets folder and which reader a file needs.
-"""
+"""Where robots are found: by name in the assets folder, or by path."""
 
 from __future__ import annotations
 

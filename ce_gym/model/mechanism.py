@@ -13,7 +13,7 @@ the body that carries it, so total mass, coordinates and limits are the same at 
 At `exact`, a rotor that spins about a principal axis through its centre of mass never has to become a body of the
 recursion: its mass, its axial and its mean transverse inertia are constant in its carrier's frame. Its spin, and the
 difference of its transverse moments if it is not symmetric, enter as a `Spin`. Any other rotor stays a body of its
-cluster. That is decided here, rotor by rotor. May know descriptions and numpy, nothing symbolic.
+cluster. That is decided here, rotor by rotor.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Aligned plain-text tables for people to read in a terminal. Knows nothing of robots."""
+"""Aligned plain-text tables for people to read in a terminal."""
 
 from __future__ import annotations
 

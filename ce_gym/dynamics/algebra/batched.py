@@ -1,4 +1,4 @@
-"""A traced function on numpy arrays with any leading batch shape. Knows CasADi and numpy only."""
+"""A traced function on numpy arrays with any leading batch shape."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 Motion and force vectors are (6, 1) columns [angular; linear] in body coordinates. A `Transform` takes motion vectors
 from a parent frame to a child frame and, transposed, forces and inertias back. Everything is written on 3x3 blocks
 and on upper triangles, because structural zeros and shared nodes are what keeps traced code short: a symmetric
-matrix holds the *same* node in both halves. Knows no robots.
+matrix holds the *same* node in both halves.
 """
 
 from __future__ import annotations

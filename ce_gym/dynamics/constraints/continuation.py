@@ -1,4 +1,4 @@
-"""Dependent coordinates that no formula gives, followed from where they are known. Knows CasADi and numpy only."""
+"""Dependent coordinates that no formula gives, followed from where they are known."""
 
 from __future__ import annotations
 

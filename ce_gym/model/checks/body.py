@@ -1,6 +1,6 @@
 """Is this body possible? Checks of mass properties, placement and joint of one body.
 
-Knows only the robot description. Each check raises a `RobotError` of one line.
+Each check raises a `RobotError` of one line.
 """
 
 from __future__ import annotations

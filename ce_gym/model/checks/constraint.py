@@ -1,6 +1,6 @@
 """Is this constraint possible? Checks of one constraint of each kind against the bodies it names.
 
-Knows only the robot description. Each check raises a `RobotError` of one line. Whether the constraints of a robot can
+Each check raises a `RobotError` of one line. Whether the constraints of a robot can
 be met together is a matter of solving them, which the dynamics does.
 """
 

@@ -1,6 +1,6 @@
 """Is this robot possible? Checks of finished descriptions, whoever made them.
 
-Knows only the robot description. Each check raises a `RobotError` of one line for the first thing that is wrong.
+Each check raises a `RobotError` of one line for the first thing that is wrong.
 """
 
 from __future__ import annotations

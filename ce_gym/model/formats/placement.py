@@ -1,6 +1,6 @@
 """Poses and mass properties, seen from another frame: what loaders need to merge bodies that do not move.
 
-Plain numbers in, plain numbers out. Knows the description's `Placement` and `Inertial`, and nothing about files.
+Plain numbers in, plain numbers out.
 """
 
 from __future__ import annotations

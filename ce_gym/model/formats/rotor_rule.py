@@ -1,7 +1,7 @@
 """Which bodies of a file that has no word for it are rotors? One rule for URDF+ and MJCF.
 
 Both formats write a rotor as a link like any other. It matters which is which: transmission levels differ in what they
-keep of *rotors*. At the exact level the answer changes nothing. Knows only the robot description.
+keep of *rotors*. At the exact level the answer changes nothing.
 """
 
 from __future__ import annotations

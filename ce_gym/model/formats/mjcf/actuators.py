@@ -1,8 +1,7 @@
 """The actuators of a compiled MJCF file -> torque limits and gains of joints.
 
 An actuator on a joint gives `gear * (gain * control + bias)`. With an affine bias it is a position controller, whose
-gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up. Knows the compiled model
-and the robot description.
+gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up.
 """
 
 from __future__ import annotations

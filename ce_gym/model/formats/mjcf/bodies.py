@@ -2,8 +2,7 @@
 
 MuJoCo's body may have no joint (then it is welded to its parent) or several (then all but the last move massless links
 in between), a joint may turn about a point other than the body's origin, and `ref` gives a name to the angle at which
-the file was drawn. Here, a body turns about its own origin and its coordinate is MuJoCo's `qpos`. Knows the compiled
-model and the robot description.
+the file was drawn. Here, a body turns about its own origin and its coordinate is MuJoCo's `qpos`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A sphere is one sphere, a capsule the two at its ends, a box its eight corners. A geom can touch the ground if MuJoCo
 would let it touch one of the geoms that do not move, or, in a file without any, anything at all. The ground is the
 plane z = 0. Groups follow from the reference pose: "torso" is what the base carries, "foot" what is lowest of the
-rest, "knee" what is not. Knows the compiled model and the robot description.
+rest, "knee" what is not.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@
 | connect                         | a ball joint                                                           |
 | weld                            | two revolute joints with crossed axes: together they leave no freedom  |
 
-MuJoCo holds them softly; here they are exact. Knows the compiled model and the robot description.
+MuJoCo holds them softly; here they are exact.
 """
 
 from __future__ import annotations

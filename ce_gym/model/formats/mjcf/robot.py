@@ -2,11 +2,11 @@
 
 | in the file                      | in the robot                                                                   |
 |----------------------------------|--------------------------------------------------------------------------------|
-| bodies, hinge, slide, free joint | bodies (`mjcf_bodies.py`)                                                      |
-| equalities                       | exact constraints (`mjcf_ties.py`)                                             |
-| armature                         | rotors behind gears (`mjcf_rotors.py`)                                         |
-| geoms                            | contact spheres, and shapes to draw (`mjcf_contacts.py`)                       |
-| actuators                        | torque limits and gains (`mjcf_actuators.py`)                                  |
+| bodies, hinge, slide, free joint | bodies (`bodies.py`)                                                           |
+| equalities                       | exact constraints (`equalities.py`)                                            |
+| armature                         | rotors behind gears (`rotors.py`)                                              |
+| geoms                            | contact spheres, and shapes to draw (`contacts.py`)                            |
+| actuators                        | torque limits and gains (`actuators.py`)                                       |
 | the first keyframe               | the standing pose, and the branch in which loops are assembled                 |
 
 What else acts on the robot in MuJoCo is in its notes, and summed up in one `LossyImportWarning`. Cameras, lights,
@@ -46,7 +46,7 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
     Args:
         path: The file.
         gear_ratios: For joints with armature whose gear ratio is not the `gear` of their actuator: the ratio, by the
-            name of the joint. Only the exact level depends on it, see `mjcf_rotors.py`.
+            name of the joint. Only the exact level depends on it, see `rotors.py`.
 
     Raises:
         RobotError: `mujoco` is missing or refuses the file, or the file describes something that cannot be.

@@ -11,7 +11,7 @@ gyroscope. Here every armature becomes a rotor, a thin disc about the joint axis
   there is, and `exact` equals MuJoCo too.
 
 The rotor has no mass, and its inertia at rest is taken out of the body that carries it, where a published inertia has
-it already: total mass and inertia stay those of the file. Knows the compiled model and the robot description.
+it already: total mass and inertia stay those of the file.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """A compiled MJCF file: the one object that the parts of the MJCF reader share.
 
-Knows the Python API of `mujoco`, which is imported only when a file is read; not the robot description beyond plain
-poses. (MuJoCo's compiled modules carry no types, hence the line above.)
+`mujoco` is imported only when a file is read; its compiled modules carry no types, hence the line above.
 """
 
 from __future__ import annotations

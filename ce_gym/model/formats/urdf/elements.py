@@ -1,6 +1,6 @@
 """Single URDF elements -> numbers, placements, inertials, joints and shapes, each checked as it is read.
 
-Knows the URDF format (wiki.ros.org/urdf/XML) element by element; the tree they form is in `urdf.py`.
+Source: wiki.ros.org/urdf/XML.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A URDF file -> its links and joints, known to form one tree.
-
-Knows XML and the graph that a URDF describes, not what its links and joints are like.
-"""
+"""A URDF file -> its links and joints, known to form one tree."""
 
 from __future__ import annotations
 

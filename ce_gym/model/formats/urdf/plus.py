@@ -11,7 +11,7 @@ URDF+ is the format in which the paper's authors publish robots with loops and t
 The base is as in a plain URDF: a joint of type "floating" makes it free, a root link without mass is the world, and
 the caller can decide. URDF+ does not say which links are rotors: `rotor_rule.py` does.
 
-Knows the format and the robot description. Source: github.com/ROAM-Lab-ND/generalized_rbda, `robot-models/`.
+Source: github.com/ROAM-Lab-ND/generalized_rbda, `robot-models/`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A plain URDF file -> bodies in a tree.
 
 Links joined by fixed joints become one body that has the name of the link nearest to the root; the names of the
-others stay known as frames. A body has the name of its link, and its joint has the name of its body. Knows the URDF
-format and the robot description; what URDF cannot say (rotors, transmissions, contacts) is in `yaml_file.py`.
+others stay known as frames. A body has the name of its link, and its joint has the name of its body.
 """
 
 from __future__ import annotations

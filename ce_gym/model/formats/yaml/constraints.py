@@ -1,7 +1,4 @@
-"""The `constraints` of the project's robot files: gears and differentials, closed loops, rods, users' functions.
-
-Knows the description and YAML sections.
-"""
+"""The `constraints` of the project's robot files: gears and differentials, closed loops, rods, users' functions."""
 
 from __future__ import annotations
 
