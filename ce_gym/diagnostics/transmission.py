@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ce_gym.dynamics.model import Model
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.description import LinearConstraint
 from ce_gym.model.mechanism import LEVELS, Spin, is_axisymmetric
 
 Array = NDArray[np.float64]
@@ -184,7 +183,7 @@ def random_states(model: Model, count: int, rng: np.random.Generator) -> tuple[A
     q = np.tile(model.standing_q, (count, 1))
     q[:, base:] += rng.uniform(-POSITION_SPREAD, POSITION_SPREAD, (count, len(limits)))
     q[:, base:] = np.clip(q[:, base:], limits[:, 0], limits[:, 1])
-    if not all(isinstance(constraint, LinearConstraint) for constraint in model.robot.constraints):
+    if not all(constraint.linear for constraint in model.robot.constraints):
         q = q[[_closes(model, row) for row in q]]
     v = rng.normal(0.0, SPEED_SPREAD, (len(q), model.nv))
     tau = model.inverse_dynamics(q, v, rng.normal(0.0, ACCELERATION_SPREAD, v.shape))

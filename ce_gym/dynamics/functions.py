@@ -25,7 +25,6 @@ from ce_gym.dynamics.recursion.ce_aba import (
 )
 from ce_gym.dynamics.recursion.ce_rnea import inverse_dynamics, outward_acceleration
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free, outward_velocity_pass
-from ce_gym.model.description import LinearConstraint
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -252,7 +251,7 @@ def kinetic_and_potential(mechanism: Mechanism, q: SX, v: SX, guess: SX) -> tupl
 def loop_gap(mechanism: Mechanism, kinematics: Kinematics) -> SX:
     """Return the norm of the residuals of all loops, rods and functions, redundant rows included [m or -]."""
     angles, _ = spanning_coordinates(mechanism, kinematics)
-    loops = [tie for tie in mechanism.robot.constraints if not isinstance(tie, LinearConstraint)]
+    loops = [tie for tie in mechanism.robot.constraints if not tie.linear]
     rows = [constraint_gap(mechanism.robot, tie, angles) for tie in loops]
     return ca.norm_2(ca.vertcat(*rows)) if rows else SX(0)
 

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.export.joint_ties import clusters_with_loops, joint_ties
+from ce_gym.dynamics.standing import standing_pose, turned
+from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf_equalities import add_ties, check_expressible, held_rotors, joint_armature
 from ce_gym.export.mjcf_text import quaternion, text
-from ce_gym.export.reference_pose import reference_pose, turned
 from ce_gym.model.description import Robot, Shape
 from ce_gym.model.mechanism import MovingBody, build_mechanism
 
@@ -88,10 +88,11 @@ def to_mjcf(
             left out but independent or part of a loop, or the varying diagonal of `armature`.
     """
     mechanism = build_mechanism(robot, transmission, eliminate=False)
-    ties = joint_ties(robot)
+    ties = joint_ties(mechanism)
     check_expressible(mechanism, ties)
-    standing = reference_pose(robot, ties)
-    reference = {name: standing[name] for cluster in clusters_with_loops(robot) for name in cluster.bodies}
+    standing = standing_pose(mechanism).q
+    in_loops = [name for cluster in mechanism.tree.clusters if not cluster.linear for name in cluster.bodies]
+    reference = {name: standing[name] for name in in_loops}
     solver = {key: text(value) for key, value in (("solref", solref), ("solimp", solimp)) if value is not None}
     root = ET.Element("mujoco", model=f"{robot.name}_{transmission}")
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")

@@ -22,7 +22,7 @@ Where rotors are left out and `coupled` keeps what they reflect, that is
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 from ce_gym.export.joint_ties import Tie
 from ce_gym.export.mjcf_text import quaternion, text
 from ce_gym.model.description import (
-    FunctionConstraint,
-    LinearConstraint,
+    Constraint,
     LoopConstraint,
     Placement,
     Robot,
@@ -55,10 +54,10 @@ def check_expressible(mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:
     """
     robot, level = mechanism.robot, mechanism.level
     for constraint in robot.constraints:
-        if isinstance(constraint, FunctionConstraint):
-            what = f"constraint {constraint.name!r} is a function, which MJCF cannot say"
+        if type(constraint) not in EXPORTS and not constraint.linear:
+            what = f"constraint {constraint.name!r} is of a kind that MJCF cannot say"
             raise _error(robot, what, "type linear, loop or rod")
-        for body in constraint.bodies if not isinstance(constraint, LinearConstraint) else ():
+        for body in constraint.bodies if not constraint.linear else ():
             if body not in mechanism.bodies:
                 what = f"constraint {constraint.name!r} ends on rotor {body!r}, which {level!r} leaves out"
                 raise _error(robot, what, "transmission 'exact' for MJCF")
@@ -141,10 +140,8 @@ def add_ties(
         if name in ties and name not in ties[name].ratios:
             _add_linear(tendons, equalities, name, ties[name], reference, solver)
     for constraint in mechanism.robot.constraints:
-        if isinstance(constraint, LoopConstraint):
-            _add_loop(elements, equalities, constraint, solver)
-        elif isinstance(constraint, RodConstraint):
-            _add_rod(elements, tendons, equalities, constraint, solver)
+        if not constraint.linear:
+            EXPORTS[type(constraint)](elements, tendons, equalities, constraint, solver)
     if mechanism.level == "coupled":
         for spin in _spins(mechanism):
             if len(ties[spin.rotor].ratios) > 1 and spin.rotor not in held:
@@ -180,7 +177,11 @@ def _fixed_tendon(tendons: ET.Element, name: str, ratios: Mapping[str, float]) -
 
 
 def _add_loop(
-    elements: Mapping[str | None, ET.Element], equalities: ET.Element, loop: LoopConstraint, solver: Mapping[str, str]
+    elements: Mapping[str | None, ET.Element],
+    tendons: ET.Element,
+    equalities: ET.Element,
+    loop: LoopConstraint,
+    solver: Mapping[str, str],
 ) -> None:
     """Hold two bodies together at a point, or at two points along the axis of a hinge."""
     ends = ((loop.first, loop.first_placement), (loop.second, loop.second_placement))
@@ -232,3 +233,7 @@ def _from_z(axis: Array) -> Array:
 
 def _error(robot: Robot, problem: str, expected: str) -> RobotError:
     return RobotError(f"{robot.source or robot.name}: {problem}: expected {expected}")
+
+
+EXPORTS: dict[type[Constraint], Callable[..., None]] = {LoopConstraint: _add_loop, RodConstraint: _add_rod}
+"""Functions (elements, tendons, equalities, constraint, solver) that add a kind of constraint that is not linear."""

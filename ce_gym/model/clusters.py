@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from ce_gym.model.description import Constraint, LoopConstraint, Robot, RodConstraint
+from ce_gym.model.description import Constraint, Robot
 from ce_gym.model.errors import bad
 
 
@@ -46,6 +46,11 @@ class Cluster:
     independent: tuple[str, ...]
     parent: int | None
     output_body: str | None
+
+    @property
+    def linear(self) -> bool:
+        """Whether all constraints are linear."""
+        return all(constraint.linear for constraint in self.constraints)
 
 
 @dataclass(frozen=True)
@@ -116,15 +121,12 @@ def _ancestors(body: str | None, parents: dict[str, str | None]) -> list[str | N
 
 def _constraint_span(constraint: Constraint, parents: dict[str, str | None], robot: Robot) -> list[str]:
     """Return the bodies that one constraint makes a cluster of."""
-    if isinstance(constraint, LoopConstraint | RodConstraint):
-        ends: list[str | None] = [constraint.first, constraint.second]
-        span = _between(ends, ends, parents)
-    else:
-        span = _between(constraint.bodies, [parents[body] for body in constraint.bodies], parents)
+    if not constraint.ends:
+        return _between(constraint.bodies, [parents[body] for body in constraint.bodies], parents)
+    span = _between(constraint.ends, constraint.ends, parents)
     if not span:
-        ends = [constraint.first, constraint.second]  # type: ignore[union-attr]
         key = f"constraint {constraint.name!r}"
-        raise bad(robot.source or robot.name, key, tuple(ends), "two bodies that can move against each other")
+        raise bad(robot.source or robot.name, key, constraint.ends, "two bodies that can move against each other")
     return span
 
 

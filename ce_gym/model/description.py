@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 Vec3 = tuple[float, float, float]
 Mat3 = tuple[Vec3, Vec3, Vec3]
@@ -111,20 +111,42 @@ class Body:
 
 
 @dataclass(frozen=True)
-class LinearConstraint:
+class Constraint:
+    """What all kinds of constraints have in common; each kind has checks, a residual and a reader beside its figures.
+
+    Attributes:
+        name: For messages.
+        linear: Whether it is linear in joint coordinates.
+    """
+
+    name: str
+    linear: ClassVar[bool] = False
+
+    @property
+    def ends(self) -> tuple[str | None, ...]:
+        """The bodies that it ties wherever their joints are, None for the world; empty if it ties joint coordinates."""
+        return ()
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies, or of the bodies whose joint coordinates, it ties together, the world left out."""
+        return tuple(body for body in self.ends if body is not None)
+
+
+@dataclass(frozen=True)
+class LinearConstraint(Constraint):
     """`sum(coefficient * angle of body) = offset`: gears, belts, planetary stages, averaging differentials.
 
     A gear of ratio N between a rotor and a link is `{rotor: 1, link: -N}`.
 
     Attributes:
-        name: For messages.
         coefficients: Pairs (body, coefficient), at least two, none zero.
         offset: Right-hand side [rad or m].
     """
 
-    name: str
     coefficients: tuple[tuple[str, float], ...]
     offset: float = 0.0
+    linear: ClassVar[bool] = True
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -133,11 +155,10 @@ class LinearConstraint:
 
 
 @dataclass(frozen=True)
-class LoopConstraint:
+class LoopConstraint(Constraint):
     """A joint that closes a loop: a frame on one body and a frame on another share their origin, and perhaps an axis.
 
     Attributes:
-        name: For messages.
         joint: "revolute" shares origin and axis (5 rows, of which a planar loop needs 2); "ball" only the origin (3).
         first: A body, or None for the world.
         second: Another body, or None for the world.
@@ -146,7 +167,6 @@ class LoopConstraint:
         axis: Unit axis of a revolute joint in the joint frame.
     """
 
-    name: str
     joint: Literal["revolute", "ball"]
     first: str | None
     second: str | None
@@ -155,17 +175,16 @@ class LoopConstraint:
     axis: Vec3 = (0.0, 0.0, 1.0)
 
     @property
-    def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies that the joint holds together, the world left out."""
-        return tuple(body for body in (self.first, self.second) if body is not None)
+    def ends(self) -> tuple[str | None, ...]:
+        """The two bodies, None for the world."""
+        return (self.first, self.second)
 
 
 @dataclass(frozen=True)
-class RodConstraint:
+class RodConstraint(Constraint):
     """A massless rod with ball joints at its ends: a point of one body keeps its distance from a point of another.
 
     Attributes:
-        name: For messages.
         first: A body, or None for the world.
         second: Another body, or None for the world.
         first_point: Where the rod ends on `first` [m].
@@ -173,7 +192,6 @@ class RodConstraint:
         length: [m].
     """
 
-    name: str
     first: str | None
     second: str | None
     first_point: Vec3
@@ -181,26 +199,24 @@ class RodConstraint:
     length: float
 
     @property
-    def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies that the rod ties together, the world left out."""
-        return tuple(body for body in (self.first, self.second) if body is not None)
+    def ends(self) -> tuple[str | None, ...]:
+        """The two bodies, None for the world."""
+        return (self.first, self.second)
 
 
 @dataclass(frozen=True)
-class FunctionConstraint:
+class FunctionConstraint(Constraint):
     """A function of joint coordinates that a user registered under a name, see `register_constraint`.
 
     With `dependent` empty the function is implicit, `phi(coordinates of arguments) = 0`; otherwise it is explicit,
     `coordinates of dependent = gamma(coordinates of arguments)`.
 
     Attributes:
-        name: For messages.
         function: Name under which the function is registered.
         arguments: Bodies whose joint coordinates are its arguments, in order.
         dependent: Bodies whose joint coordinates an explicit function returns, in order.
     """
 
-    name: str
     function: str
     arguments: tuple[str, ...]
     dependent: tuple[str, ...] = ()
@@ -209,9 +225,6 @@ class FunctionConstraint:
     def bodies(self) -> tuple[str, ...]:
         """Names of the bodies whose joint coordinates the constraint ties together."""
         return (*self.dependent, *self.arguments)
-
-
-Constraint = LinearConstraint | LoopConstraint | RodConstraint | FunctionConstraint
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics.model import Model
-from ce_gym.export.mjcf import joint_ties, mass_properties, quaternion, to_mjcf, valid_inertia
+from ce_gym.export.joint_ties import joint_ties
+from ce_gym.export.mjcf import mass_properties, quaternion, to_mjcf, valid_inertia
 from ce_gym.model import Constraint, LinearConstraint, RobotError, load_robot
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import LEVELS, build_mechanism
 
 ROBOTS = ("mini_cheetah", "mit_humanoid_leg")
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -102,7 +103,7 @@ def test_offsets_of_constraints_are_kept():
         for c in robot.constraints
     )
     robot = dataclasses.replace(robot, constraints=shifted)
-    assert joint_ties(robot)["hip_rz_rotor"].offset == pytest.approx(0.3)
+    assert joint_ties(build_mechanism(robot))["hip_rz_rotor"].offset == pytest.approx(0.3)
     equality = next(e for e in ET.fromstring(to_mjcf(robot)).iter("joint") if e.get("joint1") == "hip_rz_rotor")
     assert float(equality.get("polycoef").split()[0]) == pytest.approx(0.3)
 
@@ -142,5 +143,5 @@ def test_errors_are_one_line():
         robot, independent=robot.independent[:-1], constraints=(*robot.constraints[:-1], tie, tie)
     )
     with pytest.raises(RobotError, match="do not determine") as caught:
-        joint_ties(twice)
+        joint_ties(build_mechanism(twice))
     assert "\n" not in str(caught.value)

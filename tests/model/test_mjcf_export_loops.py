@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
+from ce_gym.dynamics.standing import standing_pose
 from ce_gym.export.mjcf import to_mjcf
-from ce_gym.export.reference_pose import reference_pose
 from ce_gym.model import (
     Body,
     FunctionConstraint,
@@ -245,7 +245,7 @@ def test_the_file_starts_assembled(name):
     np.testing.assert_allclose(peer.data.qpos, peer.positions(q_span), atol=1e-12)
     for qpos in (peer.model.qpos0, peer.data.qpos.copy()):
         assert np.abs(peer.rows(qpos)[0]).max() < 1e-12
-    pose = reference_pose(robot)
+    pose = standing_pose(model.mechanism).q
     assert [pose[joint] for joint in model.spanning_names] == pytest.approx(q_span[7 * robot.floating :], abs=1e-12)
 
 
@@ -335,7 +335,7 @@ CAM = FunctionConstraint("cam", "export_cam", ("crank",), ("slider",))
         (
             {"constraints": (CAM, *slider_crank().constraints[1:])},
             "exact",
-            "'cam' is a function, which MJCF cannot say",
+            "'cam' is of a kind that MJCF cannot say",
         ),
         (
             {"independent": ("swing", "wheel")},

@@ -84,7 +84,7 @@ class Coordinates:
         names = [model.joint(i).name for i in range(model.njnt)]
         if robot.floating:
             names = names[1:]
-        ties = joint_ties(robot)
+        ties = joint_ties(build_mechanism(robot))
         matrix = np.array([[ties[name].ratios.get(y, 0.0) for y in robot.independent] for name in names])
         return cls(robot.floating, matrix, np.array([ties[name].offset for name in names]))
 

@@ -18,10 +18,10 @@ import pinocchio as pin  # type: ignore[import-not-found]
 from numpy.typing import NDArray
 
 from ce_gym.bench.measure.timing import Competitor
+from ce_gym.dynamics.standing import standing_pose
 from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf import mass_properties
 from ce_gym.export.mjcf_equalities import joint_armature
-from ce_gym.export.reference_pose import reference_pose
 from ce_gym.model.description import LinearConstraint, LoopConstraint, Robot
 from ce_gym.model.errors import RobotError
 from ce_gym.model.mechanism import Mechanism, build_mechanism
@@ -53,7 +53,7 @@ class Peer:
 
     def positions(self, q: Array) -> Array:
         """Return Pinocchio's positions for ours, shape (nq,) to (model.nq,); loops are as in the standing pose."""
-        joints = reference_pose(self.robot, joint_ties(self.robot))
+        joints = standing_pose(build_mechanism(self.robot)).q
         base = 7 if self.robot.floating else 0
         joints = joints | dict(zip(self.robot.independent, q[base:], strict=True))
         head = [*q[:3], *q[4:7], q[3]] if base else []
@@ -100,7 +100,8 @@ def load(robot: Robot) -> Peer:
     Raises:
         RobotError: If the robot has something that Pinocchio's forward dynamics does not.
     """
-    mechanism, ties = build_mechanism(robot, "armature", eliminate=False), joint_ties(robot)
+    mechanism = build_mechanism(robot, "armature", eliminate=False)
+    ties = joint_ties(mechanism)
     for constraint in robot.constraints:
         moving = [body for body in constraint.bodies if body in mechanism.bodies]
         if isinstance(constraint, LinearConstraint):

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.constraints.elimination import eliminate, linear_rows
 from ce_gym.dynamics.constraints.residuals import residual
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.description import LinearConstraint, Robot
+from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
 
 Array = NDArray[np.float64]
@@ -54,15 +55,8 @@ class Assembly:
 def nonlinear_rows(robot: Robot, cluster: Cluster, q: SX) -> SX:
     """Return the rows of a cluster's constraints that are not linear, at spanning coordinates `q` (n,)."""
     angles = {body: q[i] for i, body in enumerate(cluster.bodies)}
-    ties = [tie for tie in cluster.constraints if not isinstance(tie, LinearConstraint)]
+    ties = [tie for tie in cluster.constraints if not tie.linear]
     return ca.vertcat(*[residual(robot, tie, angles) for tie in ties])
-
-
-def linear_rows(cluster: Cluster) -> tuple[Array, Array]:
-    """Return `A` (rows, n) and `b` (rows,) of the linear constraints `A q = b`."""
-    ties = [tie for tie in cluster.constraints if isinstance(tie, LinearConstraint)]
-    A = np.array([[dict(tie.coefficients).get(body, 0.0) for body in cluster.bodies] for tie in ties])
-    return A.reshape(len(ties), len(cluster.bodies)), np.array([tie.offset for tie in ties])
 
 
 class Assembler:
@@ -110,8 +104,8 @@ class Assembler:
                 f"does not close at the standing pose, gap {gap:.2g}: expected `pose` and `assembly` near"
             )
         condition = self._condition(q, rows)
-        B, q0, unknown = self._eliminate()
-        return Assembly(q, B, q0, unknown, rows, self.n_rows - len(rows), condition)
+        linear = eliminate(self.cluster, last=self.appears)
+        return Assembly(q, linear.B, linear.q0, linear.unknown, rows, self.n_rows - len(rows), condition)
 
     def _error(self, problem: str) -> RobotError:
         names = ", ".join(tie.name for tie in self.cluster.constraints)
@@ -177,28 +171,6 @@ class Assembler:
             expected = f"expected independent joints that determine {names} at the standing pose, unlike {chosen}"
             raise self._error(f"is singular: {expected}")
         return float(values[0] / values[-1])
-
-    def _eliminate(self) -> tuple[Array, Array, tuple[int, ...]]:
-        """Solve the linear rows, first for coordinates that appear in no other row."""
-        M = np.column_stack([self.A, self.b])
-        left, pivots = list(range(len(self.A))), {}
-        for quiet in (True, False):
-            columns = [i for i in self.dependent if (i in self.appears) != quiet]
-            while left and columns and np.abs(M[np.ix_(left, columns)]).max() > 1e-9:
-                block = np.abs(M[np.ix_(left, columns)])
-                r, c = divmod(int(block.argmax()), len(columns))
-                row, column = left.pop(r), columns.pop(c)
-                M[row] = M[row] / M[row, column]
-                others = [i for i in range(len(M)) if i != row]
-                M[others] -= np.outer(M[others, column], M[row])
-                pivots[column] = row
-        unknown = tuple(i for i in self.dependent if i not in pivots)
-        kept = [*self.independent, *unknown]
-        B, q0 = np.zeros((self.n, len(kept))), np.zeros(self.n)
-        B[kept, range(len(kept))] = 1.0
-        for column, row in pivots.items():
-            B[column], q0[column] = -M[row, kept], M[row, -1]
-        return np.where(np.abs(B) < 1e-13, 0.0, B), q0, unknown
 
 
 def _smallest(K: Array) -> float:

@@ -29,7 +29,7 @@ from ce_gym.dynamics.constraints.closed_form import (
     solve_single,
 )
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.description import LinearConstraint, Robot
+from ce_gym.model.description import Robot
 from ce_gym.model.mechanism import Mechanism
 
 NEWTON_ITERATIONS = 3
@@ -202,11 +202,6 @@ def constant_matrix(x: np.ndarray) -> SX:
     return ca.sparsify(SX(ca.DM(x)))
 
 
-def is_linear(cluster: Cluster) -> bool:
-    """Whether all constraints of a cluster are linear."""
-    return all(isinstance(tie, LinearConstraint) for tie in cluster.constraints)
-
-
 @lru_cache(maxsize=64)
 def closures(mechanism: Mechanism) -> tuple[Closure | None, ...]:
     """Return the closure of each cluster of a mechanism; None where all constraints are linear.
@@ -215,7 +210,7 @@ def closures(mechanism: Mechanism) -> tuple[Closure | None, ...]:
         RobotError: Loops do not close, or independent joints do not determine the others.
     """
     robot = mechanism.robot
-    return tuple(None if is_linear(cluster) else Closure(robot, cluster) for cluster in mechanism.tree.clusters)
+    return tuple(None if cluster.linear else Closure(robot, cluster) for cluster in mechanism.tree.clusters)
 
 
 def reference_guess(mechanism: Mechanism) -> np.ndarray:

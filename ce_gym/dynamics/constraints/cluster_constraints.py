@@ -17,8 +17,8 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.constraints.closure import Closure
+from ce_gym.dynamics.constraints.elimination import eliminate
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.description import LinearConstraint
 from ce_gym.model.errors import RobotError
 
 SX = ca.SX
@@ -107,22 +107,8 @@ def linear_solution(cluster: Cluster) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         RobotError: If the independent coordinates do not determine the others.
     """
-    rows = {name: i for i, name in enumerate(cluster.bodies)}
-    constraints = [c for c in cluster.constraints if isinstance(c, LinearConstraint)]
-    K, b = np.zeros((len(constraints), len(rows))), np.zeros(len(constraints))
-    for row, constraint in enumerate(constraints):
-        b[row] = constraint.offset
-        for body, coefficient in constraint.coefficients:
-            K[row, rows[body]] += coefficient
-    independent = [rows[name] for name in cluster.independent]
-    dependent = [i for i in range(len(rows)) if i not in independent]
-    G, q0 = np.zeros((len(rows), len(independent))), np.zeros(len(rows))
-    G[independent, range(len(independent))] = 1.0
-    if dependent:
-        K_d = K[:, dependent]
-        if K_d.shape[0] != K_d.shape[1] or np.linalg.matrix_rank(K_d) < len(dependent):
-            tied = ", ".join(cluster.bodies[i] for i in dependent)
-            raise RobotError(f"cluster of {cluster.bodies[0]!r}: its constraints do not determine {tied}")
-        G[dependent] = np.linalg.solve(K_d, -K[:, independent])
-        q0[dependent] = np.linalg.solve(K_d, b)
-    return np.where(np.abs(G) < 1e-14, 0.0, G), q0
+    solved = eliminate(cluster)
+    if solved.unknown or solved.left:
+        dependent = ", ".join(name for name in cluster.bodies if name not in cluster.independent)
+        raise RobotError(f"cluster of {cluster.bodies[0]!r}: its constraints do not determine {dependent}")
+    return solved.B, solved.q0

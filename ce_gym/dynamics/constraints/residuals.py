@@ -6,7 +6,9 @@ differentiated and solved later.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -44,19 +46,16 @@ def residual(robot: Robot, constraint: Constraint, angles: Angles) -> SX:
         `phi`, zero where the constraint is met, shape (rows,): half the excess of squared length for rods [m^2], [m]
         for origins and [-] for axes of loops, the user's unit for functions.
     """
-    if isinstance(constraint, LinearConstraint):
-        return sum((a * angles[body] for body, a in constraint.coefficients), SX(-constraint.offset))
-    if isinstance(constraint, RodConstraint):
-        return _rod(robot, constraint, angles)
-    if isinstance(constraint, LoopConstraint):
-        return _loop(robot, constraint, angles)
-    return _function(robot, constraint, angles)
+    return KINDS[type(constraint)].rows(robot, constraint, angles)
 
 
 def gap(robot: Robot, constraint: Constraint, angles: Angles) -> SX:
     """Return the rows of one constraint scaled so that those of rods are lengths too [m], shape (rows,)."""
-    rows = residual(robot, constraint, angles)
-    return rows / constraint.length if isinstance(constraint, RodConstraint) else rows
+    return residual(robot, constraint, angles) / KINDS[type(constraint)].scale(constraint)
+
+
+def _linear(robot: Robot, constraint: LinearConstraint, angles: Angles) -> SX:
+    return sum((a * angles[body] for body, a in constraint.coefficients), SX(-constraint.offset))
 
 
 def _rod(robot: Robot, rod: RodConstraint, angles: Angles) -> SX:
@@ -188,3 +187,24 @@ def across_axis(axis: np.ndarray) -> list[np.ndarray]:
 def constant(x: object) -> SX:
     """Return figures as a sparse SX, so that their zeros are structural."""
     return SX(ca.sparsify(ca.DM(np.asarray(x, dtype=float))))
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What the dynamics knows of a kind of constraint.
+
+    Attributes:
+        rows: Function (robot, constraint, angles) -> rows that vanish, see `residual`.
+        scale: Function constraint -> what the rows are divided by to be lengths or angles.
+    """
+
+    rows: Callable[[Robot, Any, Angles], SX]
+    scale: Callable[[Any], float] = lambda constraint: 1.0
+
+
+KINDS: dict[type[Constraint], Kind] = {
+    LinearConstraint: Kind(_linear),
+    LoopConstraint: Kind(_loop),
+    RodConstraint: Kind(_rod, lambda rod: rod.length),
+    FunctionConstraint: Kind(_function),
+}

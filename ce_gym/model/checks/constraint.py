@@ -7,10 +7,13 @@ be met together is a matter of solving them, which the dynamics does.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from ce_gym.model.checks.body import LARGEST_FIGURE, RELATIVE_TOLERANCE, check_finite
 from ce_gym.model.constraint_functions import constraint_function
 from ce_gym.model.description import (
+    Body,
     Constraint,
     FunctionConstraint,
     LinearConstraint,
@@ -28,22 +31,20 @@ def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
     for body in constraint.bodies:
         if body not in names:
             raise unknown(file, key, body, names, "the name of a body")
-    if isinstance(constraint, LoopConstraint | RodConstraint):
-        if constraint.first == constraint.second:
-            raise bad(file, key, (constraint.first, constraint.second), "two different bodies")
-        _check_loop(constraint, key, file) if isinstance(constraint, LoopConstraint) else _check_rod(
-            constraint, key, file
-        )
-        return
+    if constraint.ends and len(set(constraint.ends)) < len(constraint.ends):
+        raise bad(file, key, constraint.ends, "two different bodies")
+    if not constraint.ends:
+        _check_joints(constraint, names, key, file)
+    CHECKS[type(constraint)](constraint, key, file)
+
+
+def _check_joints(constraint: Constraint, names: Mapping[str, Body], key: str, file: str) -> None:
+    """Check the bodies of a constraint that ties joint coordinates."""
     for body in constraint.bodies:
         if names[body].joint.type == "free":
             raise bad(file, key, body, "a body whose joint has one degree of freedom")
     if len(set(constraint.bodies)) < 2 or len(set(constraint.bodies)) < len(constraint.bodies):
         raise bad(file, key, constraint.bodies, "at least two different bodies, each once")
-    if isinstance(constraint, LinearConstraint):
-        _check_linear(constraint, key, file)
-    else:
-        _check_function(constraint, key, file)
 
 
 def _check_linear(constraint: LinearConstraint, key: str, file: str) -> None:
@@ -76,3 +77,12 @@ def _check_function(constraint: FunctionConstraint, key: str, file: str) -> None
         constraint_function(constraint.function)
     except RobotError as error:
         raise RobotError(f"{file}: {key}: {error}") from None
+
+
+CHECKS: dict[type[Constraint], Callable[[Any, str, str], None]] = {
+    LinearConstraint: _check_linear,
+    LoopConstraint: _check_loop,
+    RodConstraint: _check_rod,
+    FunctionConstraint: _check_function,
+}
+"""Functions (constraint, key, file) that check the figures of a kind of constraint."""

@@ -121,11 +121,8 @@ def _check_independent(robot: Robot, file: str) -> None:
             raise unknown(file, "independent", joint, names, "the name of a body whose joint has one degree of freedom")
     _check_unique(file, "independent", robot.independent)
     for cluster in cluster_tree(robot).clusters:
-        linear = all(isinstance(constraint, LinearConstraint) for constraint in cluster.constraints)
-        if (
-            linear and robot.body(cluster.bodies[0]).joint.type != "free"
-        ):  # others are solved to be checked: a Model does
-            _check_determined(cluster, file)
+        if cluster.linear and robot.body(cluster.bodies[0]).joint.type != "free":
+            _check_determined(cluster, file)  # others are solved to be checked: a Model does
 
 
 def _check_determined(cluster: Cluster, file: str) -> None:

@@ -50,5 +50,5 @@ def _tied_across_branches(bodies: tuple[Body, ...], constraints: tuple[Constrain
     """Names in linear constraints that do not name the body's carrier, less those that are part of a loop."""
     parents = {body.name: body.parent for body in bodies}
     linear = [c for c in constraints if isinstance(c, LinearConstraint)]
-    loops = {name for c in constraints if not isinstance(c, LinearConstraint) for name in c.bodies}
+    loops = {name for c in constraints if not c.linear for name in c.bodies}
     return {name for c in linear for name in c.bodies if parents.get(name) not in c.bodies} - loops

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from ce_gym.model.description import (
     Body,
@@ -31,15 +31,7 @@ def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Fr
     names = [body.name for body in bodies]
     for i, data in enumerate(file.list("constraints")):
         entry = Section(file.file, f"constraints[{i}]", data)
-        kind = entry.text("type", choices=("linear", "loop", "rod", "function"))
-        if kind == "linear":
-            yield _linear(entry, names)
-        elif kind == "loop":
-            yield _loop(entry, frames)
-        elif kind == "rod":
-            yield _rod(entry, frames)
-        else:
-            yield _function(entry)
+        yield READERS[entry.text("type", choices=tuple(READERS))](entry, names, frames)
 
 
 def frame_named(section: Section, key: str, frames: dict[str, Frame]) -> Frame:
@@ -60,13 +52,13 @@ def coefficients(section: Section, names: list[str]) -> tuple[tuple[str, float],
     return section.numbers()
 
 
-def _linear(entry: Section, names: list[str]) -> LinearConstraint:
+def _linear(entry: Section, names: list[str], frames: dict[str, Frame]) -> LinearConstraint:
     entry.allow("name", "type", "coefficients", "offset")
     pairs = coefficients(entry.section("coefficients"), names)
     return LinearConstraint(entry.text("name"), pairs, entry.number("offset", 0.0))
 
 
-def _loop(entry: Section, frames: dict[str, Frame]) -> LoopConstraint:
+def _loop(entry: Section, names: list[str], frames: dict[str, Frame]) -> LoopConstraint:
     entry.allow("name", "type", "joint", "axis", "first", "second")
     joint = entry.text("joint", choices=("revolute", "ball"))
     if joint == "ball" and "axis" in entry:
@@ -86,7 +78,7 @@ def _loop_end(entry: Section, end: str, frames: dict[str, Frame]) -> Frame:
     return body, compose(pose, Placement(vec3(section.vector("xyz", 3, (0.0, 0.0, 0.0))), rotation))
 
 
-def _rod(entry: Section, frames: dict[str, Frame]) -> RodConstraint:
+def _rod(entry: Section, names: list[str], frames: dict[str, Frame]) -> RodConstraint:
     entry.allow("name", "type", "length", "first", "second")
     ends = []
     for end in ("first", "second"):
@@ -97,8 +89,17 @@ def _rod(entry: Section, frames: dict[str, Frame]) -> RodConstraint:
     return RodConstraint(entry.text("name"), first, second, first_point, second_point, entry.number("length"))
 
 
-def _function(entry: Section) -> FunctionConstraint:
+def _function(entry: Section, names: list[str], frames: dict[str, Frame]) -> FunctionConstraint:
     entry.allow("name", "type", "function", "arguments", "dependent")
     return FunctionConstraint(
         entry.text("name"), entry.text("function"), entry.texts("arguments"), entry.texts("dependent")
     )
+
+
+READERS: dict[str, Callable[[Section, list[str], dict[str, Frame]], Constraint]] = {
+    "linear": _linear,
+    "loop": _loop,
+    "rod": _rod,
+    "function": _function,
+}
+"""Functions (entry, names of bodies, frames) that read a kind of constraint, by its `type`."""

@@ -119,7 +119,7 @@ def _gears(section: Section, bodies: Iterable[Body]) -> Iterator[LinearConstrain
 
 
 def _independent(file: Section, bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> tuple[str, ...]:
-    if "independent" not in file and not all(isinstance(tie, LinearConstraint) for tie in constraints):
+    if "independent" not in file and not all(tie.linear for tie in constraints):
         expected = "the joints whose coordinates are independent, because loops and functions do not say which are"
         raise bad(file.file, "independent", None, expected)
     return file.texts("independent") if "independent" in file else _default_independent(bodies, constraints)
