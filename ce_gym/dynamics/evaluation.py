@@ -43,12 +43,12 @@ class Evaluator:
     @property
     def nv(self) -> int:
         """Number of independent velocities, six for a floating base included."""
-        return len(self.robot.independent) + (6 if self.robot.floating else 0)
+        return self.robot.base_nv + len(self.robot.independent)
 
     @property
     def nq(self) -> int:
         """Number of position coordinates, seven for a floating base included."""
-        return len(self.robot.independent) + (7 if self.robot.floating else 0)
+        return self.robot.base_nq + len(self.robot.independent)
 
     @cached_property
     def standing_q(self) -> Array:

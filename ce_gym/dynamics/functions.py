@@ -12,40 +12,43 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, axis_rotation, cross
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.assembly import linear_rows, nonlinear_rows
 from ce_gym.dynamics.constraints.closure import closures, reference_guess
-from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
-from ce_gym.dynamics.constraints.residuals import gap as constraint_gap
 from ce_gym.dynamics.recursion.ce_aba import (
-    BodyTerms,
     JointTerms,
     gravity_acceleration,
     inward_inertia_pass,
     outward_acceleration_pass,
 )
 from ce_gym.dynamics.recursion.ce_rnea import inverse_dynamics, outward_acceleration
-from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free, outward_velocity_pass
+from ce_gym.dynamics.recursion.derived import (
+    external_wrenches,
+    guessed_coordinates,
+    kinetic_and_potential,
+    loop_gap,
+    loop_state,
+    spanning_coordinates,
+)
+from ce_gym.dynamics.recursion.kinematics import constant, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
-
-
-def traced(name: str, inputs: dict[str, SX], outputs: dict[str, SX]) -> ca.Function:
-    """Make a function of named expressions, with dense outputs and common sub-expressions shared."""
-    shared = ca.cse([ca.densify(expression) for expression in outputs.values()])
-    names = list(inputs), list(outputs)
-    return ca.Function(name, list(inputs.values()), shared, *names, {"allow_free": True})  # figures may be symbols
 
 
 def state_symbols(mechanism: Mechanism) -> tuple[SX, SX, SX]:
     """Return fresh symbols for positions (nq,), velocities (nv,) and guesses of dependent positions (n_guess,)."""
-    joints = len(mechanism.robot.independent)
-    floating = mechanism.robot.floating
-    q, v = SX.sym("q", joints + (7 if floating else 0)), SX.sym("v", joints + (6 if floating else 0))
+    robot = mechanism.robot
+    q, v = SX.sym("q", robot.base_nq + len(robot.independent)), SX.sym("v", robot.base_nv + len(robot.independent))
     return q, v, SX.sym("guess", len(reference_guess(mechanism)))
 
 
 def _function(name: str, guess: SX, inputs: dict[str, SX], outputs: dict[str, SX]) -> ca.Function:
     """Trace a function that has an input `guess` only if the robot needs one."""
     return traced(name, inputs | ({"guess": guess} if guess.numel() else {}), outputs)
+
+
+def _base(x: SX, count: int) -> list[SX]:
+    """Return the first `count` rows, if any, to be stacked; of a scalar, `x[:0]` would be one row in CasADi."""
+    return [x[:count]] if count else []
 
 
 def _forward_dynamics(mechanism: Mechanism) -> ca.Function:
@@ -94,10 +97,9 @@ def _spanning(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
     positions, velocities = spanning_coordinates(mechanism, kinematics)
-    floating = mechanism.robot.floating
-    names = [body.name for body in mechanism.robot.bodies if body.joint.type != "free"]
-    q_span = ca.vertcat(*([q[:7]] if floating else []), *[positions[name] for name in names])
-    v_span = ca.vertcat(*([v[:6]] if floating else []), *[velocities[name] for name in names])
+    robot = mechanism.robot
+    q_span = ca.vertcat(*_base(q, robot.base_nq), *[positions[name] for name in robot.joints])
+    v_span = ca.vertcat(*_base(v, robot.base_nv), *[velocities[name] for name in robot.joints])
     return _function("spanning", guess, {"q": q, "v": v}, {"q_span": q_span, "v_span": v_span})
 
 
@@ -110,26 +112,23 @@ def _spanning_acceleration(mechanism: Mechanism) -> ca.Function:
         if coordinates is not None:
             qdd = coordinates.G @ vdot[rows] + coordinates.g
             accelerations |= {name: qdd[i] for name, i in coordinates.index.items()}
-    names = [body.name for body in mechanism.robot.bodies if body.joint.type != "free"]
-    base = [vdot[:6]] if mechanism.robot.floating else []
-    spanning = ca.vertcat(*base, *[accelerations[name] for name in names])
+    robot = mechanism.robot
+    spanning = ca.vertcat(*_base(vdot, robot.base_nv), *[accelerations[name] for name in robot.joints])
     return _function("spanning_acceleration", guess, {"q": q, "v": v, "vdot": vdot}, {"vdot_span": spanning})
 
 
 def _spanning_jacobian(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     _, velocities = spanning_coordinates(mechanism, outward_velocity_pass(mechanism, q, v, guess))
-    names = [body.name for body in mechanism.robot.bodies if body.joint.type != "free"]
-    base = [v[:6]] if mechanism.robot.floating else []
-    G = ca.jacobian(ca.vertcat(*base, *[velocities[name] for name in names]), v)
+    robot = mechanism.robot
+    G = ca.jacobian(ca.vertcat(*_base(v, robot.base_nv), *[velocities[name] for name in robot.joints]), v)
     return _function("spanning_jacobian", guess, {"q": q}, {"G": G})
 
 
 def _implicit_constraint(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    order = [body.name for body in mechanism.robot.bodies if body.joint.type != "free"]
-    base = 6 if mechanism.robot.floating else 0
+    order, base = mechanism.robot.joints, mechanism.robot.base_nv
     jacobians, biases = [SX(0, base + len(order))], [SX(0, 1)]
     for cluster, closure, coordinates in zip(
         mechanism.tree.clusters, closures(mechanism), kinematics.coordinates, strict=True
@@ -231,88 +230,6 @@ def _energy(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinetic, potential = kinetic_and_potential(mechanism, q, v, guess)
     return _function("energy", guess, {"q": q, "v": v}, {"kinetic": kinetic, "potential": potential})
-
-
-def kinetic_and_potential(mechanism: Mechanism, q: SX, v: SX, guess: SX) -> tuple[SX, SX]:
-    """Return kinetic and potential energy [J] of a mechanism at positions (nq,) and velocities (nv,)."""
-    kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    at_rest = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
-    momentum = inverse_dynamics(mechanism, at_rest, v) - inverse_dynamics(mechanism, at_rest, SX(*v.shape))
-    potential = SX(0)
-    gravity = gravity_acceleration(mechanism)
-    for name, body in mechanism.bodies.items():
-        mass = body.inertia[3, 3]
-        moment = constant(np.array([body.inertia[2, 4], body.inertia[0, 5], body.inertia[1, 3]]))  # mass * com
-        state = kinematics.bodies[name]
-        potential -= ca.dot(gravity, mass * state.p + state.R @ moment)
-    return ca.dot(v, momentum) / 2, potential
-
-
-def loop_gap(mechanism: Mechanism, kinematics: Kinematics) -> SX:
-    """Return the norm of the residuals of all loops, rods and functions, redundant rows included [m or -]."""
-    angles, _ = spanning_coordinates(mechanism, kinematics)
-    loops = [tie for tie in mechanism.robot.constraints if not tie.linear]
-    rows = [constraint_gap(mechanism.robot, tie, angles) for tie in loops]
-    return ca.norm_2(ca.vertcat(*rows)) if rows else SX(0)
-
-
-def loop_state(kinematics: Kinematics) -> tuple[SX, SX]:
-    """Return the largest gap and the smallest nearness of all clusters with closed loops, see `LoopState`."""
-    gap, nearness = SX(0), SX(1)
-    for coordinates in kinematics.coordinates:
-        if coordinates is not None and coordinates.loop is not None:
-            gap, nearness = ca.fmax(gap, coordinates.loop.gap), ca.fmin(nearness, coordinates.loop.nearness)
-    return gap, nearness
-
-
-def guessed_coordinates(kinematics: Kinematics, vdot: SX, dt: float) -> SX:
-    """Return the dependent coordinates that were found from a guess, a time `dt` [s] later, shape (n_guess,)."""
-    later = [SX(0, 1)]
-    for coordinates, rows in zip(kinematics.coordinates, kinematics.rows, strict=True):
-        if coordinates is not None and coordinates.loop is not None and coordinates.loop.guessed:
-            qdd = coordinates.G @ vdot[rows] + coordinates.g / 2  # positions move by dt * (G yd_next + dt / 2 * g)
-            later.append((coordinates.q + dt * (coordinates.qd + dt * qdd))[list(coordinates.loop.guessed)])
-    return ca.vertcat(*later)
-
-
-def external_wrenches(mechanism: Mechanism, kinematics: Kinematics, wrenches: SX) -> tuple[dict[str, BodyTerms], SX]:
-    """Take wrenches in the world to forces on the bodies of the recursion and on the independent coordinates.
-
-    Args:
-        mechanism: The mechanism.
-        kinematics: From the outward velocity pass.
-        wrenches: [moment about the world's origin; force] on each body of the robot, world axes, shape (6, n_bodies).
-    """
-    on_bodies: dict[str, SX] = {}
-    tau = SX(sum(len(rows) for rows in kinematics.rows), 1)
-    for i, body in enumerate(mechanism.robot.bodies):
-        moment, force = wrenches[:3, i], wrenches[3:, i]
-        carrier = body.name if body.name in kinematics.bodies else body.parent
-        if carrier is not None:
-            state = kinematics.bodies[carrier]
-            about_origin = moment - cross(state.p, force)
-            old = on_bodies.get(carrier, SX(6, 1))
-            on_bodies[carrier] = old + ca.vertcat(state.R.T @ about_origin, state.R.T @ force)
-        if carrier != body.name:  # a rotor that is no body of the recursion still turns
-            k = mechanism.tree.cluster_of(body.name)
-            coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
-            R, p = (state.R, state.p) if carrier is not None else (SX.eye(3), SX(3, 1))
-            axis = R @ constant(np.array(body.placement.rotation) @ np.array(body.joint.axis))
-            at = p + R @ constant(np.array(body.placement.position))
-            G_r = coordinates.G[coordinates.index[body.name], :]
-            tau[kinematics.rows[k]] += G_r.T * ca.dot(axis, moment - cross(at, force))
-    return {name: BodyTerms(SX(6, 6), force) for name, force in on_bodies.items()}, tau
-
-
-def spanning_coordinates(mechanism: Mechanism, kinematics: Kinematics) -> tuple[dict[str, SX], dict[str, SX]]:
-    """Return position and velocity of every joint but a floating base's, by the name of the body it moves."""
-    positions, velocities = {}, {}
-    for cluster, coordinates in zip(mechanism.tree.clusters, kinematics.coordinates, strict=True):
-        if coordinates is None or is_free(mechanism, cluster):
-            continue
-        for name, i in coordinates.index.items():
-            positions[name], velocities[name] = coordinates.q[i], coordinates.qd[i]
-    return positions, velocities
 
 
 def turned(axis: Sequence[float], angle: SX) -> SX:

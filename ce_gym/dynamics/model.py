@@ -93,7 +93,7 @@ class Model(Evaluator):
     @property
     def spanning_names(self) -> tuple[str, ...]:
         """The body that each spanning joint moves, in the order of `spanning`, the floating base not included."""
-        return tuple(body.name for body in self.robot.bodies if body.joint.type != "free")
+        return self.robot.joints
 
     @property
     def contact_names(self) -> tuple[str, ...]:
@@ -165,7 +165,7 @@ class Model(Evaluator):
                 another way than the robot's reference pose is assembled.
         """
         q_span, v_span = np.asarray(q_span, dtype=float), np.asarray(v_span, dtype=float)
-        base = (7, 6) if self.robot.floating else (0, 0)
+        base = (self.robot.base_nq, self.robot.base_nv)
         joints = [self.spanning_names.index(name) for name in self.joint_links]
         q = q_span[..., [*range(base[0]), *(base[0] + i for i in joints)]]
         v = v_span[..., [*range(base[1]), *(base[1] + i for i in joints)]]
@@ -238,9 +238,8 @@ class Model(Evaluator):
         for name in chosen:
             if name not in self.spanning_names:
                 raise ValueError(f"actuated {name!r}: expected the name of a body with a joint of {self.robot.name}")
-        base = 6 if self.robot.floating else 0
         G = self._evaluate("spanning_jacobian", q)[0]
-        return G[..., [base + self.spanning_names.index(name) for name in chosen], :]
+        return G[..., [self.robot.base_nv + self.spanning_names.index(name) for name in chosen], :]
 
     def body_poses(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return where all bodies are, in the order of `body_names`.

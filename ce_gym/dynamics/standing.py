@@ -70,8 +70,7 @@ def check_standing(mechanism: Mechanism) -> None:
 
 
 def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:
-    base = ["the floating base"] * 6 if mechanism.robot.floating else []
-    names = [*base, *mechanism.robot.independent]
+    names = [*["the floating base"] * mechanism.robot.base_nv, *mechanism.robot.independent]
     scale = np.sqrt(np.diag(M).clip(1e-300))
     if np.isfinite(M).all():
         values, vectors = np.linalg.eigh(M / scale[:, None] / scale)
@@ -89,8 +88,8 @@ def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:
 
 def standing_pose(mechanism: Mechanism) -> Standing:
     """Place all bodies of a mechanism in its standing pose, base to tip."""
-    nv = len(mechanism.robot.independent) + (6 if mechanism.robot.floating else 0)
-    column = {name: nv - len(mechanism.robot.independent) + i for i, name in enumerate(mechanism.robot.independent)}
+    base, joints = mechanism.robot.base_nv, mechanism.robot.independent
+    nv, column = base + len(joints), {name: base + i for i, name in enumerate(joints)}
     standing = Standing({}, {}, {None: np.eye(3)}, {None: np.zeros(3)}, {None: np.zeros((6, nv))})
     for cluster, closure in zip(mechanism.tree.clusters, closures(mechanism), strict=True):
         if cluster.bodies[0] in mechanism.bodies and mechanism.bodies[cluster.bodies[0]].joint_type == "free":

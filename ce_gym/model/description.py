@@ -370,6 +370,21 @@ class Robot:
         return bool(self.bodies) and self.bodies[0].joint.type == "free"
 
     @property
+    def base_nq(self) -> int:
+        """Number of position coordinates of the base: position and quaternion if it is floating, or none."""
+        return 7 if self.floating else 0
+
+    @property
+    def base_nv(self) -> int:
+        """Number of velocities of the base."""
+        return 6 if self.floating else 0
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The body that each joint moves, a floating base left out."""
+        return tuple(body.name for body in self.bodies if body.joint.type != "free")
+
+    @property
     def total_mass(self) -> float:
         """Mass of all bodies [kg]."""
         return sum(body.inertial.mass for body in self.bodies)

@@ -82,8 +82,7 @@ class Kinematics:
 
 def independent_rows(mechanism: Mechanism) -> list[list[int]]:
     """Return, for each cluster, the rows of `v` (and of tau) that are its own."""
-    first = 6 if mechanism.robot.floating else 0
-    row = {name: first + i for i, name in enumerate(mechanism.robot.independent)}
+    row = {name: mechanism.robot.base_nv + i for i, name in enumerate(mechanism.robot.independent)}
     return [
         list(range(6)) if is_free(mechanism, cluster) else [row[name] for name in cluster.independent]
         for cluster in mechanism.tree.clusters
@@ -108,7 +107,7 @@ def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None =
     guess = SX(reference_guess(mechanism)) if guess is None else guess
     used = 0
     kinematics = Kinematics(rows=independent_rows(mechanism))
-    position_offset = 1 if mechanism.robot.floating else 0  # the quaternion has one entry more than its velocity
+    position_offset = mechanism.robot.base_nq - mechanism.robot.base_nv
     for k in mechanism.tree.base_to_tip():
         cluster, rows = mechanism.tree.clusters[k], kinematics.rows[k]
         if is_free(mechanism, cluster):
