@@ -92,10 +92,10 @@ def standing_pose(mechanism: Mechanism) -> Standing:
     nv, column = base + len(joints), {name: base + i for i, name in enumerate(joints)}
     standing = Standing({}, {}, {None: np.eye(3)}, {None: np.zeros(3)}, {None: np.zeros((6, nv))})
     for cluster, closure in zip(mechanism.tree.clusters, closures(mechanism), strict=True):
-        if cluster.bodies[0] in mechanism.bodies and mechanism.bodies[cluster.bodies[0]].joint_type == "free":
-            base = cluster.bodies[0]
-            standing.R[base], standing.p[base] = np.eye(3), np.array([0.0, 0.0, mechanism.robot.pose.height])
-            standing.J[base] = np.eye(6, nv)
+        first = cluster.bodies[0]
+        if mechanism.robot.floating and first == mechanism.robot.bodies[0].name:
+            standing.R[first], standing.p[first] = np.eye(3), np.array([0.0, 0.0, mechanism.robot.pose.height])
+            standing.J[first] = np.eye(6, nv)
             continue
         q, G = _coordinates(mechanism, cluster, closure)
         for i, name in enumerate(cluster.bodies):
@@ -121,7 +121,7 @@ def _place(standing: Standing, mechanism: Mechanism, name: str) -> None:
     """Place one body, its parent being placed."""
     body, parent = mechanism.bodies[name], mechanism.bodies[name].parent
     axis, q = body.axis, standing.q[name]
-    turn, slide = (0.0, 1.0) if body.joint_type == "prismatic" else (1.0, 0.0)
+    turn, slide = body.joint.turn, body.joint.slide
     position, rotation = body.position + body.rotation @ axis * (slide * q), body.rotation @ turned(axis, turn * q)
     standing.R[name] = standing.R[parent] @ rotation
     standing.p[name] = standing.p[parent] + standing.R[parent] @ position

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ce_gym.dynamics.standing import standing_pose, turned
 from ce_gym.export.joint_ties import joint_ties
-from ce_gym.export.mjcf_equalities import add_ties, check_expressible, held_rotors, joint_armature
+from ce_gym.export.mjcf_equalities import MJCF_JOINTS, add_ties, check_expressible, held_rotors, joint_armature
 from ce_gym.export.mjcf_text import quaternion, text
 from ce_gym.model.description import Robot, Shape
 from ce_gym.model.mechanism import MovingBody, build_mechanism
@@ -129,17 +129,17 @@ def _add_body(
     """Add a body where it is when its joint is at `ref`."""
     body, ref = robot.body(moving.name), reference.get(moving.name, 0.0)
     position, rotation = moving.position, moving.rotation
-    if moving.joint_type == "prismatic":
-        position = position + rotation @ moving.axis * ref
-    elif ref:
-        rotation = rotation @ turned(moving.axis, ref)
+    if ref:
+        position = position + rotation @ moving.axis * (moving.joint.slide * ref)
+        rotation = rotation @ turned(moving.axis, moving.joint.turn * ref)
     pose = {"pos": text(position), "quat": text(quaternion(rotation))}
     element = ET.SubElement(parent, "body", {"name": body.name, **pose})
-    if moving.joint_type == "free":
+    if moving.joint.type == "free":
         ET.SubElement(element, "freejoint", name=body.name)
     else:
-        kind = {"revolute": "hinge", "prismatic": "slide"}[moving.joint_type]
-        joint = ET.SubElement(element, "joint", name=body.name, type=kind, axis=text(moving.axis))
+        joint = ET.SubElement(
+            element, "joint", name=body.name, type=MJCF_JOINTS[body.joint.type], axis=text(moving.axis)
+        )
         if math.isfinite(body.joint.position[0]) or math.isfinite(body.joint.position[1]):
             joint.set("range", text(np.clip(body.joint.position, -NO_LIMIT, NO_LIMIT)))
         for key, value in (

@@ -41,6 +41,8 @@ from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 Array = NDArray[np.float64]
 
+MJCF_JOINTS = {"revolute": "hinge", "prismatic": "slide"}
+"""Types of joints in MJCF."""
 HINGE_SPAN = 0.1
 """Distance between the two points at which a hinge that closes a loop is held [m]: about the width of a bearing."""
 
@@ -53,6 +55,11 @@ def check_expressible(mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:
             inertia varies with the pose and only its diagonal is wanted.
     """
     robot, level = mechanism.robot, mechanism.level
+    for body in robot.bodies:
+        if body.joint.type not in MJCF_JOINTS and body.joint.type != "free":
+            raise _error(
+                robot, f"joint {body.name!r} is {body.joint.type}", f"one of {', '.join(MJCF_JOINTS)} for MJCF"
+            )
     for constraint in robot.constraints:
         if type(constraint) not in EXPORTS and not constraint.linear:
             what = f"constraint {constraint.name!r} is of a kind that MJCF cannot say"
@@ -94,7 +101,7 @@ def held_rotors(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, tupl
             rotor = mechanism.robot.body(spin.rotor)
             rotation, position = np.array(rotor.placement.rotation), np.array(rotor.placement.position)
             axis, nothing = np.array(rotor.joint.axis), np.zeros((6, 6))
-            moving = MovingBody(rotor.name, rotor.parent, rotation, position, rotor.joint.type, axis, nothing)
+            moving = MovingBody(rotor.name, rotor.parent, rotation, position, rotor.joint, axis, nothing)
             held[rotor.name] = moving, spin
     return held
 

@@ -52,7 +52,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Joint:
-    """The tree joint between a body and its parent.
+    """The tree joint between a body and its parent: free, or with one coordinate, a screw motion along its axis.
 
     Attributes:
         type: "free" (six degrees of freedom, only against the world), "revolute" or "prismatic".
@@ -69,6 +69,20 @@ class Joint:
     torque: float = float("inf")
     velocity: float = float("inf")
     damping: float = 0.0
+
+    @property
+    def turn(self) -> float:
+        """Angle about the axis for a unit of the coordinate [-]."""
+        return SCREWS[self.type][0]
+
+    @property
+    def slide(self) -> float:
+        """Travel along the axis for a unit of the coordinate [m/rad or -]."""
+        return SCREWS[self.type][1]
+
+
+SCREWS: dict[str, tuple[float, float]] = {"revolute": (1.0, 0.0), "prismatic": (0.0, 1.0)}
+"""Types of joints with one coordinate: how it turns [-] and slides [-]. All algorithms go by that."""
 
 
 @dataclass(frozen=True)

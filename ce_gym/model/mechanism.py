@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
-from ce_gym.model.description import Body, Robot
+from ce_gym.model.description import Body, Joint, Robot
 from ce_gym.model.errors import RobotError
 
 Level = Literal["exact", "coupled", "armature", "none"]
@@ -69,7 +69,7 @@ class MovingBody:
         parent: Its parent body; None is the world.
         rotation: Columns are its axes in the parent frame at joint coordinate zero, shape (3, 3).
         position: Its origin in the parent frame at joint coordinate zero [m], shape (3,).
-        joint_type: "free", "revolute" or "prismatic".
+        joint: Its joint.
         axis: Unit joint axis in its own frame, shape (3,).
         inertia: Spatial inertia about its own origin, angular part first, shape (6, 6).
     """
@@ -78,7 +78,7 @@ class MovingBody:
     parent: str | None
     rotation: Array
     position: Array
-    joint_type: str
+    joint: Joint
     axis: Array
     inertia: Array
 
@@ -200,7 +200,7 @@ def _moving_body(body: Body, inertia: Array) -> MovingBody:
         parent=body.parent,
         rotation=snapped(np.array(body.placement.rotation)),
         position=np.array(body.placement.position),
-        joint_type=body.joint.type,
+        joint=body.joint,
         axis=snapped(np.array(body.joint.axis)),
         inertia=inertia,
     )

@@ -166,7 +166,7 @@ def _tree(mechanism: Mechanism, armature: dict[str, float]) -> tuple[pin.Model, 
         body = mechanism.bodies[waiting.pop()]
         waiting += children.get(body.name, [])[::-1]
         placement = pin.SE3(np.array(body.rotation), np.array(body.position))
-        ids[body.name] = model.addJoint(ids[body.parent], _joint(body.joint_type, body.axis), placement, body.name)
+        ids[body.name] = model.addJoint(ids[body.parent], _joint(body.joint.type, body.axis), placement, body.name)
         mass, com, inertia = mass_properties(body.inertia)
         model.appendBodyToJoint(ids[body.name], pin.Inertia(mass, com, inertia), pin.SE3.Identity())
         if body.name in armature:

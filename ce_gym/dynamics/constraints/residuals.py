@@ -89,10 +89,11 @@ def _reach(
     for name in inside:
         part = robot.body(str(name))
         axis, home = constant(snapped(np.array(part.joint.axis))), constant(snapped(np.array(part.placement.rotation)))
-        if part.joint.type == "revolute":
-            x = home @ axis_rotation(axis, angles[part.name]).T @ x
+        turn, slide, angle = part.joint.turn, part.joint.slide, angles[part.name]
+        if not slide:
+            x = home @ axis_rotation(axis, turn * angle).T @ x
         else:
-            x = home @ (x + axis * angles[part.name])
+            x = home @ ((axis_rotation(axis, turn * angle).T @ x if turn else x) + axis * (slide * angle))
             varying, fixed = ca.sumsqr(x) / 2, 0.0
         offset = np.array(part.placement.position) - (origin if name == inside[-1] else np.zeros(3))
         varying, fixed = varying + ca.dot(constant(offset), x), fixed + _square(offset) / 2
@@ -165,8 +166,9 @@ def frame_in(robot: Robot, body: str | None, ancestor: str | None, angles: Angle
     for name in reversed(chain[: chain.index(ancestor)]):
         part = robot.body(str(name))
         frame = within(frame, part.placement)
-        axis, q = constant(snapped(np.array(part.joint.axis))), angles[str(name)]
-        turned, moved = (axis_rotation(axis, q).T, SX(3, 1)) if part.joint.type == "revolute" else (SX.eye(3), axis * q)
+        axis, q, joint = constant(snapped(np.array(part.joint.axis))), angles[str(name)], part.joint
+        turned = axis_rotation(axis, joint.turn * q).T if joint.turn else SX.eye(3)
+        moved = axis * (joint.slide * q) if joint.slide else SX(3, 1)
         frame = frame[0] @ turned, frame[1] + frame[0] @ moved
     return frame
 

@@ -216,7 +216,7 @@ def _handle_body(mechanism: Mechanism, cluster: Cluster, spins: tuple[Spin, ...]
     """
     moving = mechanism.moving(cluster)
     roots = [body for body in moving if body.parent == cluster.output_body]
-    if len(roots) != 1 or roots[0].joint_type != "revolute":
+    if len(roots) != 1 or roots[0].joint.type != "revolute":
         return None
     axis = roots[0].rotation @ roots[0].axis
     on_output = [spin for spin in spins if spin.carrier == cluster.output_body]

@@ -91,7 +91,7 @@ def independent_rows(mechanism: Mechanism) -> list[list[int]]:
 
 def is_free(mechanism: Mechanism, cluster: Cluster) -> bool:
     """Whether a cluster is the floating base."""
-    return mechanism.bodies[cluster.bodies[0]].joint_type == "free" if cluster.bodies[0] in mechanism.bodies else False
+    return mechanism.robot.floating and cluster.bodies[0] == mechanism.robot.bodies[0].name
 
 
 def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None = None) -> Kinematics:
@@ -150,10 +150,13 @@ def _outward(body: MovingBody, parent: BodyState | None, q: SX, qd: SX, g: SX) -
 
 def joint_transform(body: MovingBody, q: SX) -> tuple[Transform, SX]:
     """Return a one-degree-of-freedom joint's transform from the parent body, and its motion subspace (6, 1)."""
-    axis, to_home = constant(body.axis), constant(body.rotation.T)
-    if body.joint_type == "prismatic":
-        return Transform(to_home, constant(body.position) + to_home.T @ axis * q), ca.vertcat(SX(3, 1), axis)
-    return Transform(axis_rotation(axis, q) @ to_home, constant(body.position)), ca.vertcat(axis, SX(3, 1))
+    turn, slide = body.joint.turn, body.joint.slide
+    axis, E, p, still = constant(body.axis), constant(body.rotation.T), constant(body.position), SX(3, 1)
+    if slide:
+        p = p + E.T @ axis * (slide * q)
+    if turn:
+        E = axis_rotation(axis, turn * q) @ E
+    return Transform(E, p), ca.vertcat(turn * axis if turn else still, slide * axis if slide else still)
 
 
 def constant(x: np.ndarray | SX) -> SX:

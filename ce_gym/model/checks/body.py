@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ce_gym.model.description import Body, Joint
+from ce_gym.model.description import SCREWS, Body, Joint
 from ce_gym.model.errors import bad
 
 RELATIVE_TOLERANCE = 1e-9
@@ -40,8 +40,8 @@ def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
 
 
 def _check_joint(file: str, where: str, joint: Joint) -> None:
-    if joint.type not in ("revolute", "prismatic"):
-        raise bad(file, f"{where} joint type", joint.type, "free, revolute or prismatic")
+    if joint.type not in SCREWS:
+        raise bad(file, f"{where} joint type", joint.type, f"one of free, {', '.join(SCREWS)}")
     if len(joint.axis) != 3 or not math.isclose(math.hypot(*joint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
         raise bad(file, f"{where} joint axis", joint.axis, "a unit axis")
     lower, upper = joint.position
@@ -87,7 +87,6 @@ def moves_inertia(body: Body) -> bool:
     inertia, axis = np.array(body.inertial.inertia), np.array(body.joint.axis)
     if body.joint.type == "free":
         return bool(body.inertial.mass > 0.0 and np.linalg.matrix_rank(inertia) == 3)
-    if body.joint.type == "prismatic":
-        return body.inertial.mass > 0.0
     offset = np.cross(axis, np.array(body.inertial.com))
-    return bool(axis @ inertia @ axis + body.inertial.mass * (offset @ offset) > 0.0)
+    turned = axis @ inertia @ axis + body.inertial.mass * (offset @ offset)
+    return bool(body.joint.turn**2 * turned + body.joint.slide**2 * body.inertial.mass > 0.0)
