@@ -17,7 +17,7 @@ import numpy as np
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot, load_robot
-from ce_gym.model.description import Mat3
+from ce_gym.model.frames import Mat3
 from ce_gym.sim import Simulator
 
 MASS, SIZE, MU, G = 10.0, (0.2, 0.2, 0.1), 0.5, 9.81

@@ -29,14 +29,10 @@ from numpy.typing import NDArray
 
 from ce_gym.export.joint_ties import Tie
 from ce_gym.export.mjcf_text import quaternion, text
-from ce_gym.model.description import (
-    Constraint,
-    LoopConstraint,
-    Placement,
-    Robot,
-    RodConstraint,
-)
+from ce_gym.model.constraints import Constraint, LoopConstraint, RodConstraint
+from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
+from ce_gym.model.frames import Placement
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 Array = NDArray[np.float64]

@@ -3,29 +3,21 @@
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
 from ce_gym.model.constraint_functions import constraint_function, register_constraint
+from ce_gym.model.constraints import Constraint, FunctionConstraint, LinearConstraint, LoopConstraint, RodConstraint
 from ce_gym.model.description import (
-    IDENTITY,
-    ZERO,
     Body,
-    Constraint,
     ContactMaterial,
     ContactSphere,
-    FunctionConstraint,
     Gains,
     Inertial,
     Joint,
-    LinearConstraint,
-    LoopConstraint,
-    Mat3,
     Motor,
-    Placement,
     Pose,
     Robot,
-    RodConstraint,
     Shape,
-    Vec3,
 )
 from ce_gym.model.errors import InertiaWarning, LossyImportWarning, RobotError
+from ce_gym.model.frames import IDENTITY, ZERO, Mat3, Placement, Vec3
 from ce_gym.model.load import assets_folder, load_robot, robots
 
 __all__ = [

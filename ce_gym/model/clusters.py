@@ -24,7 +24,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from ce_gym.model.description import Constraint, Robot
+from ce_gym.model.constraints import Constraint
+from ce_gym.model.description import Robot
 from ce_gym.model.errors import bad
 
 

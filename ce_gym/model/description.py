@@ -13,26 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
-Vec3 = tuple[float, float, float]
-Mat3 = tuple[Vec3, Vec3, Vec3]
-
-IDENTITY: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-ZERO: Vec3 = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Pose of a frame in its parent frame: `x_parent = rotation @ x + position`.
-
-    Attributes:
-        position: Origin of the frame in the parent frame [m].
-        rotation: Columns are the axes of the frame in the parent frame.
-    """
-
-    position: Vec3 = ZERO
-    rotation: Mat3 = IDENTITY
+from ce_gym.model.constraints import Constraint
+from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3
 
 
 @dataclass(frozen=True)
@@ -99,7 +83,7 @@ class Shape:
 
     type: Literal["box", "cylinder", "capsule", "sphere"]
     size: tuple[float, ...]
-    placement: Placement = Placement()
+    placement: Placement = ORIGIN
     color: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
 
 
@@ -122,123 +106,6 @@ class Body:
     joint: Joint
     inertial: Inertial
     shapes: tuple[Shape, ...] = ()
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """What all kinds of constraints have in common; each kind has checks, a residual and a reader beside its figures.
-
-    Attributes:
-        name: For messages.
-        linear: Whether it is linear in joint coordinates.
-    """
-
-    name: str
-    linear: ClassVar[bool] = False
-
-    @property
-    def ends(self) -> tuple[str | None, ...]:
-        """The bodies that it ties wherever their joints are, None for the world; empty if it ties joint coordinates."""
-        return ()
-
-    @property
-    def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies, or of the bodies whose joint coordinates, it ties together, the world left out."""
-        return tuple(body for body in self.ends if body is not None)
-
-
-@dataclass(frozen=True)
-class LinearConstraint(Constraint):
-    """`sum(coefficient * angle of body) = offset`: gears, belts, planetary stages, averaging differentials.
-
-    A gear of ratio N between a rotor and a link is `{rotor: 1, link: -N}`.
-
-    Attributes:
-        coefficients: Pairs (body, coefficient), at least two, none zero.
-        offset: Right-hand side [rad or m].
-    """
-
-    coefficients: tuple[tuple[str, float], ...]
-    offset: float = 0.0
-    linear: ClassVar[bool] = True
-
-    @property
-    def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies whose joint coordinates the constraint ties together."""
-        return tuple(body for body, _ in self.coefficients)
-
-
-@dataclass(frozen=True)
-class LoopConstraint(Constraint):
-    """A joint that closes a loop: a frame on one body and a frame on another share their origin, and perhaps an axis.
-
-    Attributes:
-        joint: "revolute" shares origin and axis (5 rows, of which a planar loop needs 2); "ball" only the origin (3).
-        first: A body, or None for the world.
-        second: Another body, or None for the world.
-        first_placement: Pose of the joint frame in `first`.
-        second_placement: Pose of the joint frame in `second`.
-        axis: Unit axis of a revolute joint in the joint frame.
-    """
-
-    joint: Literal["revolute", "ball"]
-    first: str | None
-    second: str | None
-    first_placement: Placement = Placement()
-    second_placement: Placement = Placement()
-    axis: Vec3 = (0.0, 0.0, 1.0)
-
-    @property
-    def ends(self) -> tuple[str | None, ...]:
-        """The two bodies, None for the world."""
-        return (self.first, self.second)
-
-
-@dataclass(frozen=True)
-class RodConstraint(Constraint):
-    """A massless rod with ball joints at its ends: a point of one body keeps its distance from a point of another.
-
-    Attributes:
-        first: A body, or None for the world.
-        second: Another body, or None for the world.
-        first_point: Where the rod ends on `first` [m].
-        second_point: Where the rod ends on `second` [m].
-        length: [m].
-    """
-
-    first: str | None
-    second: str | None
-    first_point: Vec3
-    second_point: Vec3
-    length: float
-
-    @property
-    def ends(self) -> tuple[str | None, ...]:
-        """The two bodies, None for the world."""
-        return (self.first, self.second)
-
-
-@dataclass(frozen=True)
-class FunctionConstraint(Constraint):
-    """A function of joint coordinates that a user registered under a name, see `register_constraint`.
-
-    With `dependent` empty the function is implicit, `phi(coordinates of arguments) = 0`; otherwise it is explicit,
-    `coordinates of dependent = gamma(coordinates of arguments)`.
-
-    Attributes:
-        function: Name under which the function is registered.
-        arguments: Bodies whose joint coordinates are its arguments, in order.
-        dependent: Bodies whose joint coordinates an explicit function returns, in order.
-    """
-
-    function: str
-    arguments: tuple[str, ...]
-    dependent: tuple[str, ...] = ()
-
-    @property
-    def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies whose joint coordinates the constraint ties together."""
-        return (*self.dependent, *self.arguments)
 
 
 @dataclass(frozen=True)

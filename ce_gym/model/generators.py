@@ -15,19 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ce_gym.model.description import (
-    Body,
-    Constraint,
-    Inertial,
-    Joint,
-    LinearConstraint,
-    LoopConstraint,
-    Placement,
-    Pose,
-    Robot,
-    Vec3,
-)
+from ce_gym.model.constraints import Constraint, LinearConstraint, LoopConstraint
+from ce_gym.model.description import Body, Inertial, Joint, Pose, Robot
 from ce_gym.model.errors import bad
+from ce_gym.model.frames import Placement, Vec3
 
 GEAR_RATIO = 6.0
 BASE = "base"

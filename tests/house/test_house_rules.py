@@ -30,7 +30,8 @@ MAY_IMPORT = {
 }  # fmt: skip
 """What the modules of a folder may import from other folders."""
 LAYERS = {
-    "model": "errors table description constraint_functions clusters mechanism checks generators formats load listing",
+    "model": "errors table frames constraints description constraint_functions clusters mechanism checks generators"
+    " formats load listing",
     "model/formats": "text_file reading placement standing rotor_rule urdf yaml mjcf",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ce_gym.model.description import Body, ContactSphere, Inertial, Joint, Placement, Robot, Shape
+from ce_gym.model.description import Body, ContactSphere, Inertial, Joint, Robot, Shape
+from ce_gym.model.frames import Placement
 from ce_gym.viewer import Rollout
 
 QUARTER = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))

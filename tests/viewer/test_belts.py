@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ce_gym.model import load_robot
-from ce_gym.model.description import LinearConstraint
+from ce_gym.model.constraints import LinearConstraint
 from ce_gym.viewer.page.belts import belt_parts
 
 

@@ -16,7 +16,7 @@ from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.trace import step_function
-from ce_gym.model.description import LinearConstraint
+from ce_gym.model.constraints import LinearConstraint
 
 
 def ours(scene: Scene, n: int, level: str = "exact") -> Array:

@@ -28,7 +28,7 @@ from ce_gym.model import (
     Robot,
     load_robot,
 )
-from ce_gym.model.description import Mat3
+from ce_gym.model.frames import Mat3
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf import SMALLEST_INERTIA, mass_properties, to_mjcf
 from ce_gym.export.mjcf_text import quaternion
-from ce_gym.model.description import LinearConstraint, Robot
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
 from ce_gym.model.mechanism import build_mechanism
 

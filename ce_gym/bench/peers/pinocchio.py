@@ -22,7 +22,8 @@ from ce_gym.dynamics.standing import standing_pose
 from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf import mass_properties
 from ce_gym.export.mjcf_equalities import joint_armature
-from ce_gym.model.description import LinearConstraint, LoopConstraint, Robot
+from ce_gym.model.constraints import LinearConstraint, LoopConstraint
+from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
 from ce_gym.model.mechanism import Mechanism, build_mechanism
 

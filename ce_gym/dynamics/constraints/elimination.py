@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.description import LinearConstraint
+from ce_gym.model.constraints import LinearConstraint
 
 Array = NDArray[np.float64]
 

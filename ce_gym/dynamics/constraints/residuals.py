@@ -15,18 +15,10 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, axis_rotation
 from ce_gym.model.constraint_functions import constraint_function
-from ce_gym.model.description import (
-    Body,
-    Constraint,
-    FunctionConstraint,
-    LinearConstraint,
-    LoopConstraint,
-    Placement,
-    Robot,
-    RodConstraint,
-    Vec3,
-)
+from ce_gym.model.constraints import Constraint, FunctionConstraint, LinearConstraint, LoopConstraint, RodConstraint
+from ce_gym.model.description import Body, Robot
 from ce_gym.model.errors import RobotError, shown
+from ce_gym.model.frames import Placement, Vec3
 from ce_gym.model.mechanism import snapped
 
 Angles = Mapping[str, SX]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ce_gym.dynamics.algebra.spatial import SX, skew
 from ce_gym.dynamics.forces.contact import Compliance
-from ce_gym.model.description import ContactMaterial, LinearConstraint, Robot
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import ContactMaterial, Robot
 from ce_gym.model.mechanism import Mechanism, MovingBody
 
 PARAMETERS = {

@@ -12,15 +12,8 @@ from typing import Any
 
 from ce_gym.model.checks.body import LARGEST_FIGURE, RELATIVE_TOLERANCE, check_finite
 from ce_gym.model.constraint_functions import constraint_function
-from ce_gym.model.description import (
-    Body,
-    Constraint,
-    FunctionConstraint,
-    LinearConstraint,
-    LoopConstraint,
-    Robot,
-    RodConstraint,
-)
+from ce_gym.model.constraints import Constraint, FunctionConstraint, LinearConstraint, LoopConstraint, RodConstraint
+from ce_gym.model.description import Body, Robot
 from ce_gym.model.errors import RobotError, bad, unknown
 
 

@@ -22,7 +22,8 @@ from ce_gym.model.checks.body import (
 )
 from ce_gym.model.checks.constraint import check_constraint
 from ce_gym.model.clusters import Cluster, cluster_tree
-from ce_gym.model.description import LinearConstraint, Robot
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import Robot
 from ce_gym.model.errors import InertiaWarning, bad, unknown
 
 MOST_BODIES = 500

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ce_gym.model.description import IDENTITY, Inertial, Mat3, Placement, Vec3
+from ce_gym.model.description import Inertial
+from ce_gym.model.frames import IDENTITY, Mat3, Placement, Vec3
 
 # Entries this close to 0 or 1 come from a rounded right angle. They are made exact because the compiler of the
 # dynamics drops multiplications by 0 and 1: sin(pi) = 1.2e-16 would keep them all.

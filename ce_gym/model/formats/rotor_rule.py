@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from ce_gym.model.description import Body, Constraint, LinearConstraint
+from ce_gym.model.constraints import Constraint, LinearConstraint
+from ce_gym.model.description import Body
 from ce_gym.model.mechanism import is_axisymmetric
 
 _NAMES = ("rotor", "motor")

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.description import Body, LinearConstraint, Placement, Robot, Shape
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import Body, Robot, Shape
+from ce_gym.model.frames import Placement
 from ce_gym.viewer.page.fallback_shapes import DARK, LIGHT, frame_along, rotor_discs
 
 Array = NDArray[np.float64]

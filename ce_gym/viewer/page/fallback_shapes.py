@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.description import Body, Placement, Robot, Shape, Vec3
+from ce_gym.model.description import Body, Robot, Shape
+from ce_gym.model.frames import Placement, Vec3
 from ce_gym.viewer.page.three import Color
 
 Array = NDArray[np.float64]

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.description import Body, Placement, Robot, Shape
+from ce_gym.model.description import Body, Robot, Shape
+from ce_gym.model.frames import Placement
 from ce_gym.viewer.page import animation, three
 from ce_gym.viewer.page.belts import Part, belt_parts
 from ce_gym.viewer.page.fallback_shapes import DARK, LIGHT, rotor_discs, shapes_of

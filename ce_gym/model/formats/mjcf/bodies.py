@@ -12,10 +12,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ce_gym.model.description import ZERO, Body, Inertial, Joint, Placement, Shape, Vec3
+from ce_gym.model.description import Body, Inertial, Joint, Shape
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement, rotation
 from ce_gym.model.formats.placement import compose, mat3, merge_inertials, transform_inertial, vec3
+from ce_gym.model.frames import ZERO, Placement, Vec3
 
 _UNLIMITED = (-float("inf"), float("inf"))
 

@@ -18,17 +18,11 @@ from collections.abc import Collection, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.description import (
-    Constraint,
-    LinearConstraint,
-    LoopConstraint,
-    Placement,
-    RodConstraint,
-    Vec3,
-)
+from ce_gym.model.constraints import Constraint, LinearConstraint, LoopConstraint, RodConstraint
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement
 from ce_gym.model.formats.placement import compose, transform_point, vec3
+from ce_gym.model.frames import Placement, Vec3
 
 RANK_TOLERANCE = 1e-8
 """Relative size of a row or column of a constraint Jacobian that counts as zero."""

@@ -21,12 +21,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ce_gym.model.description import ZERO, Body, Inertial, Joint, LinearConstraint, Placement
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import Body, Inertial, Joint
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.equalities import drives_joint, tendon_coefficients
 from ce_gym.model.formats.mjcf.source import MjcfSource
 from ce_gym.model.formats.placement import mat3
+from ce_gym.model.frames import ZERO, Placement
 
 UNKNOWN_RATIO = 1e6
 """Gear ratio in place of one that is not known: the rotor's own inertia is then 1e-12 of the reflected one."""

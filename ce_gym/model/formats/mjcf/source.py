@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ce_gym.model.checks.body import LARGEST_FIGURE
 from ce_gym.model.checks.robot import MOST_BODIES
-from ce_gym.model.description import Placement
 from ce_gym.model.errors import RobotError, bad, printable
 from ce_gym.model.formats.mjcf.limits import check_file
 from ce_gym.model.formats.placement import exact_right_angles, vec3
 from ce_gym.model.formats.text_file import one_line
+from ce_gym.model.frames import Placement
 
 MOST_KINDS, MOST_NAMES = 8, 3
 """How many kinds of things, and names of each, a summary of what was left out has."""

@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 from xml.etree.ElementTree import Element
 
-from ce_gym.model.description import Inertial, Joint, Placement, Shape, Vec3
+from ce_gym.model.description import Inertial, Joint, Shape
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.placement import rotation_from_rpy, symmetric, transform_inertial, vec3
+from ce_gym.model.frames import Placement, Vec3
 
 Color = tuple[float, float, float, float]
 

@@ -21,7 +21,8 @@ from typing import Literal
 from xml.etree.ElementTree import Element
 
 from ce_gym.model.checks.robot import check_robot
-from ce_gym.model.description import Body, LinearConstraint, LoopConstraint, Pose, Robot
+from ce_gym.model.constraints import LinearConstraint, LoopConstraint
+from ce_gym.model.description import Body, Pose, Robot
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.formats.rotor_rule import with_rotors

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Literal
 
 from ce_gym.model.checks.body import check_body
-from ce_gym.model.description import Body, Joint, LinearConstraint, Placement, Shape
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import Body, Joint, Shape
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import compose, merge_inertials, transform_inertial
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.graph import UrdfGraph, UrdfJoint
+from ce_gym.model.frames import Placement
 
 Base = Literal["floating", "fixed"]
 Frame = tuple[str | None, Placement]  # the body (None: the world) that carries a frame, and the frame's pose in it

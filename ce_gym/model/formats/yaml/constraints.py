@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 
-from ce_gym.model.description import (
-    Body,
-    Constraint,
-    FunctionConstraint,
-    LinearConstraint,
-    LoopConstraint,
-    Placement,
-    RodConstraint,
-)
+from ce_gym.model.constraints import Constraint, FunctionConstraint, LinearConstraint, LoopConstraint, RodConstraint
+from ce_gym.model.description import Body
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform_point, vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.urdf.elements import unit_axis
 from ce_gym.model.formats.urdf.tree import WORLD, Frame
+from ce_gym.model.frames import Placement
 
 
 def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Frame]) -> Iterator[Constraint]:

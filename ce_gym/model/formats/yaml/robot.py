@@ -10,20 +10,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from ce_gym.model.checks.robot import check_robot
-from ce_gym.model.description import (
-    Body,
-    Constraint,
-    ContactMaterial,
-    ContactSphere,
-    Gains,
-    Inertial,
-    Joint,
-    LinearConstraint,
-    Motor,
-    Placement,
-    Pose,
-    Robot,
-)
+from ce_gym.model.constraints import Constraint, LinearConstraint
+from ce_gym.model.description import Body, ContactMaterial, ContactSphere, Gains, Inertial, Joint, Motor, Pose, Robot
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, symmetric, transform_point, vec3
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
@@ -31,6 +19,7 @@ from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.urdf.elements import unit_axis
 from ce_gym.model.formats.urdf.tree import Base, Frame, read_urdf
 from ce_gym.model.formats.yaml.constraints import coefficients, frame_named, read_constraints
+from ce_gym.model.frames import Placement
 
 _KEYS = (
     *("name", "urdf", "base", "sources", "notes", "kept_inertia", "gravity"),
