@@ -16,6 +16,8 @@ from ce_gym.envs.runtime.batch import Batch
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.checks import checked_value, number
 from ce_gym.envs.task.tasks import TASKS, Task
+from ce_gym.model.description import Robot
+from ce_gym.model.errors import RobotError, bad, unknown
 from ce_gym.model.mechanism import Level
 
 
@@ -96,12 +98,31 @@ def make_program(
     if transmission not in get_args(Level):
         raise ValueError(f"transmission={transmission!r}; expected one of {', '.join(get_args(Level))}")
     model = Model(robot, transmission)
-    own = {key: value for name, group in model.robot.tasks if name == task for key, value in group}
-    weights = {**dict(own.pop("reward_weights", ())), **(reward_weights or {})}
-    wanted, groups = TASKS[task].contacts, {contact.group for contact in model.robot.contacts}
+    figures = changed_task(own_task(model.robot, task), reward_weights or {}, changes)
+    if figures.actions.endswith("_pd") and not model.robot.gains.kp:
+        file, expected = model.robot.source or model.robot.name, f"gains, because actions={figures.actions!r} need them"
+        raise bad(file, "gains.kp", None, expected)
+    return TaskProgram(model, figures, contact_forces)
+
+
+def own_task(robot: Robot, task: str) -> Task:
+    """Return a task with the figures that a robot's file has for it.
+
+    Raises:
+        RobotError: A figure cannot be, or a task in the file does not exist.
+    """
+    file = robot.source or robot.name
+    for name, _ in robot.tasks:
+        if name not in TASKS:
+            raise unknown(file, "tasks", name, TASKS, "the name of a task")
+    own = {key: value for name, group in robot.tasks if name == task for key, value in group}
+    wanted, groups = TASKS[task].contacts, {contact.group for contact in robot.contacts}
     if not isinstance(wanted, str):  # tasks ask for knees, too, but not every robot has some
         own.setdefault("contacts", tuple(group for group in wanted if group in groups))
-    return TaskProgram(model, changed_task(TASKS[task], weights, {**own, **changes}), contact_forces)
+    try:
+        return changed_task(TASKS[task], dict(own.pop("reward_weights", ())), own)
+    except (ValueError, TypeError) as error:
+        raise RobotError(f"{file}: tasks.{task}: {error}") from None
 
 
 def changed_task(task: Task, reward_weights: Mapping[str, float], changes: Mapping[str, Any]) -> Task:

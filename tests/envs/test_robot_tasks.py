@@ -1,0 +1,43 @@
+"""What a robot's file says about tasks is checked with the file's name, before anything is traced."""
+
+import pytest
+import yaml
+
+from ce_gym.envs.runtime.setup import make_program
+from ce_gym.model import RobotError, assets_folder
+
+FOLDER = assets_folder() / "mini_cheetah"
+
+
+def edited(tmp_path, **changes):
+    """Write Mini Cheetah's file with other top-level keys and return its path."""
+    data = yaml.safe_load((FOLDER / "mini_cheetah.yaml").read_text()) | changes
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not None}))
+    (tmp_path / "mini_cheetah.urdf").write_bytes((FOLDER / "mini_cheetah.urdf").read_bytes())
+    return path
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.InertiaWarning")
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tasks": {"velocitty": {"dt": 0.01}}}, r"robot\.yaml: tasks is 'velocitty': .*did you mean 'velocity'"),
+        ({"tasks": {"velocity": {"dt": -1}}}, r"robot\.yaml: tasks\.velocity: dt=-1"),
+        ({"tasks": {"velocity": {"dtt": 1}}}, r"robot\.yaml: tasks\.velocity: .*'dtt'"),
+        ({"tasks": {"velocity": {"reward_weights": {"pose": "x"}}}}, r"robot\.yaml: tasks\.velocity: reward_weights"),
+        ({"tasks": {"velocity": {"reward_weights": 3}}}, r"robot\.yaml: tasks\.velocity: "),
+        ({"gains": None}, r"robot\.yaml: gains\.kp is missing: expected gains"),
+    ],
+)
+def test_tasks_in_a_file(tmp_path, changes, message):
+    path = edited(tmp_path, **changes)
+    with pytest.raises(RobotError, match=message) as caught:
+        make_program(str(path), "velocity")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.InertiaWarning")
+def test_a_robot_without_gains_can_have_torques(tmp_path):
+    path = str(edited(tmp_path, gains=None))
+    assert make_program(path, "velocity", actions="joint_torque").task.actions == "joint_torque"
