@@ -7,6 +7,7 @@ instant. Errors that a user can mend are one line on stderr and exit code 2.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import re
 import sys
@@ -108,7 +109,7 @@ def _inspect(args: argparse.Namespace) -> int:
     from ce_gym.diagnostics.transmission_text import transmission_report
     from ce_gym.dynamics import Model
 
-    if re.fullmatch(r"ce_gym/.*-v\d+", args.name):
+    if re.search(r"-v\d+$", args.name) and not args.name.endswith((".yaml", ".urdf", ".xml")):
         return _inspect_environment(args)
     model = Model(args.name, transmission=args.transmission)
     print(f"{model.describe()}\n", flush=True)
@@ -117,13 +118,16 @@ def _inspect(args: argparse.Namespace) -> int:
 
 
 def _inspect_environment(args: argparse.Namespace) -> int:
-    from ce_gym import environment_ids
     from ce_gym.diagnostics.scene_text import scene_report
     from ce_gym.model import RobotError
 
-    if args.name not in environment_ids():
-        raise RobotError(f"environment {args.name!r}: expected one of {', '.join(environment_ids())}")
-    print(scene_report(args.name, timing=not args.no_timing))
+    module, _, name = args.name.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)  # registers it, as in `gymnasium.make`
+        print(scene_report(name, timing=not args.no_timing))
+    except (ImportError, ValueError) as error:
+        raise RobotError(f"environment {args.name!r}: {error}") from error
     return 0
 
 

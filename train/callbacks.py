@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from progress import Curve, ProgressBar, StopInOrder, adapted_rate, episode_means, geometric, linear
+from run_folder import going_on
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.utils import FloatSchedule
 
 
@@ -114,6 +116,23 @@ class Checkpoints(_Quiet):
         if self.num_timesteps >= self.next:
             self.save()
             self.next = self.num_timesteps + self.every
+
+
+class Lenient(KVWriter):
+    """A log writer that lets training go on when its disk is full."""
+
+    def __init__(self, writer: KVWriter) -> None:
+        self.writer = writer
+
+    def write(self, *args: Any) -> None:
+        """Write figures, see `KVWriter`."""
+        with going_on():
+            self.writer.write(*args)
+
+    def close(self) -> None:
+        """Close the file."""
+        with going_on():
+            self.writer.close()
 
 
 class Stop(BaseCallback):

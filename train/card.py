@@ -12,20 +12,21 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import Any
 
-from console import Table, add_json_argument, markdown, positive, print_result, run
+from console import EPISODES, Parser, Table, add_json_argument, markdown, print_result, run, whole
 from effort import effort
-from evaluate import EVALUATION_SEED, evaluate
+from evaluate import EVALUATION_SEED, add_env_argument, evaluate
 from pictures import draw_curve
 from progress import read_curve
 from pushes import direction_name, push_envelope
 from settings import config_file, load_settings
 from transfer import LEVELS
 
-from ce_gym.policies import Policy, PolicyError, locate_policy, read_actor, shelf, write_npz
+from ce_gym.policies import Policy, PolicyError, environment_of, locate_policy, read_actor, shelf, write_npz
 
 
 def judged(policy: Policy, episodes: int, sim2sim_robots: int, seed: int = EVALUATION_SEED) -> dict[str, Any]:
@@ -172,9 +173,17 @@ def _sim2sim(result: dict[str, Any]) -> str:
 
 
 def short_name(record: dict[str, Any]) -> str:
-    """The name under which a policy is shipped."""
-    contract = record["contract"]
-    return f"{contract['robot']}_{contract['task']}_{record['transmission']}"
+    """The name under which a policy is shipped.
+
+    Raises:
+        PolicyError: If the record says nothing that can be the name of a folder.
+    """
+    name = "_".join(
+        str(x) for x in (*(record["contract"].get(key) for key in ("robot", "task")), record["transmission"])
+    )
+    if not re.fullmatch(r"[\w-]+", name):
+        raise PolicyError(f"contract: robot, task and level {name!r}; expected letters, digits, _ and - only")
+    return name
 
 
 def portable(record: dict[str, Any]) -> dict[str, Any]:
@@ -185,18 +194,22 @@ def portable(record: dict[str, Any]) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         description="Judge the policy of a training run and write its card, its learning curve and policy.npz."
     )
     parser.add_argument("run", help="folder of train/ppo.py, or the policy.zip in it")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--out", type=Path, metavar="FOLDER", help="where to write (default: the run's folder)")
     where.add_argument("--ship", action="store_true", help="write to assets/policies/<robot>_<task>_<level>")
-    parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes on each level (default 256)")
-    parser.add_argument("--robots", type=int, default=50, metavar="N", help="robots in MuJoCo; 0: none (default 50)")
+    parser.add_argument(
+        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes on each level (default 256)"
+    )
+    parser.add_argument(
+        "--robots", type=whole(0, 100_000), default=50, metavar="N", help="robots in MuJoCo; 0: none (default 50)"
+    )
+    add_env_argument(parser)
     add_json_argument(parser)
     args = parser.parse_args(argv)
-    positive(parser, episodes=args.episodes)
     return run("card.py", lambda: _work(args))
 
 
@@ -207,7 +220,8 @@ def _work(args: argparse.Namespace) -> int:
     record, curve = portable(record), read_curve(source.parent / "curve.csv")
     name = short_name(record)
     out = shelf() / name if args.ship else args.out or source.parent
-    result = judged(Policy(actor, record), args.episodes, args.robots)
+    policy = Policy(actor, record | {"env": environment_of(record, args.env)})
+    result = judged(policy, args.episodes, args.robots)
     out.mkdir(parents=True, exist_ok=True)
     write_npz(actor, record, out / "policy.npz")
     if curve:

@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 
@@ -23,15 +23,24 @@ Table = list[list[str]]
 
 
 def run(program: str, work: Callable[[], int]) -> int:
-    """Do the work of a program and return its exit code: 2 after a mistake that a user can mend, told in one line."""
+    """Do the work of a program and return its exit code: 2 after a mistake that a user can mend, told in one line.
+
+    130 after Ctrl-C.
+    """
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: print(f"{program}: warning: {message}", file=sys.stderr)
             return work()
     except ModuleNotFoundError as error:
         return say_missing(program, error)
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr)
+        return 130
     except OSError as error:
-        print(f"{program}: {error.filename}: {error.strerror or error}", file=sys.stderr)
+        print(f"{program}: {said(error)}", file=sys.stderr)
+        return 2
+    except MemoryError as error:
+        print(f"{program}: not enough memory: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except (ValueError, gymnasium.error.Error) as error:
         print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
@@ -52,6 +61,55 @@ def say_missing(program: str, error: ModuleNotFoundError) -> int:
     return 2
 
 
+def said(error: OSError) -> str:
+    """Return what went wrong with a file."""
+    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror or str(error)
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that tells mistakes in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and leave with exit code 2."""
+        self.exit(2, f"{self.prog}: {message}; --help shows what can be given\n")
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """Return what reads an argument that is a whole number within limits."""
+
+    def read(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            number = low - 1
+        if not low <= number <= high:
+            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number from {low} to {high}")
+        return number
+
+    return read
+
+
+def above_zero(text: str) -> float:
+    """Read an argument that is a number above 0, which may be inf."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not number > 0:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected a number above 0")
+    return number
+
+
+SEED = whole(0, 2**31 - 1)
+"""Reads `--seed`."""
+
+THREADS = whole(1, 1024)
+"""Reads `--threads`."""
+
+EPISODES = whole(1, 1_000_000)
+"""Reads `--episodes`."""
+
+
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """Add `--json`, which `print_result` understands."""
     text = "write the result to FILE as JSON as well; without FILE, print JSON and nothing else"
@@ -68,13 +126,6 @@ def print_result(result: Any, text: str, json_file: str | None) -> None:
     print(data if json_file == "-" else text)
     if json_file not in (None, "-"):
         Path(str(json_file)).write_text(data + "\n", encoding="utf-8")
-
-
-def positive(parser: argparse.ArgumentParser, **arguments: float) -> None:
-    """End the program with one line if an argument that must be above 0 is not."""
-    for name, value in arguments.items():
-        if not value > 0:
-            parser.error(f"--{name}: {value:g}; expected more than 0")
 
 
 def markdown(table: Table) -> str:

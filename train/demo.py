@@ -12,8 +12,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from console import run
-from evaluate import EVALUATION_SEED, load_learner, report
+from console import EPISODES, SEED, THREADS, Parser, above_zero, run
+from evaluate import EVALUATION_SEED, report
 from job import Job, Trained
 from ppo import train
 from settings import config_file, load_settings
@@ -31,8 +31,8 @@ def obtain_policy(args: argparse.Namespace) -> Path:
     policy = args.out / "policy.zip"
     resume = None
     if policy.exists() and not args.fresh:
-        _, record = load_learner(policy)
-        if record["finished"] and record["env"] == args.env:
+        record = load_policy(policy).record
+        if record.get("finished") and record["env"] == args.env:
             print(f"Using the policy trained earlier: {policy}, {record['steps']:,} steps. --fresh trains a new one.")
             return policy
         resume = policy if record["env"] == args.env else None
@@ -59,14 +59,18 @@ def _announce(trained: Trained) -> Path:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(description="Train a robot on exact transmissions, judge it, and show it.")
+    parser = Parser(description="Train a robot on exact transmissions, judge it, and show it.")
     parser.add_argument("--env", default=ENV, metavar="ID", help=f"environment id (default {ENV})")
     parser.add_argument("--fresh", action="store_true", help="train anew even if there is a policy from an earlier run")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps (default: as in the settings file)")
-    parser.add_argument("--minutes", type=float, default=4.0, metavar="M", help="longest time to train (default 4)")
-    parser.add_argument("--threads", type=int, default=usable_cores(), metavar="N", help="default: all processors")
-    parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes to judge it by (default 256)")
+    parser.add_argument(
+        "--minutes", type=above_zero, default=4.0, metavar="M", help="longest time to train (default 4)"
+    )
+    parser.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all processors")
+    parser.add_argument(
+        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes to judge it by (default 256)"
+    )
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     args = parser.parse_args(argv)
     return run("demo.py", lambda: show(obtain_policy(args), args.episodes, args.out))

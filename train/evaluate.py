@@ -10,49 +10,39 @@ long ones. Uses public names of ce_gym only, and no name of a robot or task.
 from __future__ import annotations
 
 import argparse
-import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from console import add_json_argument, positive, print_result, run
+from console import EPISODES, SEED, Parser, add_json_argument, print_result, run
 from effort import effort
 from pushes import push_envelope, push_table
-from stable_baselines3 import PPO
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
-from ce_gym.policies import WHERE, Policy, PolicyError, load_policy, locate_policy
+from ce_gym.policies import WHERE, Policy, environment_of, load_policy
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
 
 EVALUATION_SEED = 1_000_000
 """Far from training seeds, so that a policy is judged on commands and starts it has not met."""
 
 
-def load_learner(path: str | Path) -> tuple[PPO, dict[str, Any]]:
-    """Read a policy with all that training it on needs, and the record that training wrote beside it.
-
-    Only for files you trust: Stable-Baselines3 unpickles objects, which can run any code. To judge or show a policy,
-    `ce_gym.load_policy` reads its weights and nothing else.
+def load(path: str | Path, env: str | None = None, transmission: str | None = None) -> Policy:
+    """Read a policy to judge; its record then names the environment to judge it in.
 
     Args:
-        path: Of the policy, `<name>.zip`, or of its folder; its record is `<name>.json`.
-
-    Returns:
-        The policy and its record: environment, transmission level, steps, seed and so on.
+        path: See `ce_gym.load_policy`.
+        env: What the user's command line names; the environment of the record if None.
+        transmission: Level that it will run on.
 
     Raises:
-        PolicyError: If one of the two files is missing or damaged.
+        PolicyError: If it cannot be used, or its environment is one that the user must name: see
+            `ce_gym.policies.environment_of`.
     """
-    policy = locate_policy(path).with_suffix(".zip")
-    for file in (policy, policy.with_suffix(".json")):
-        if not file.exists():
-            raise PolicyError(
-                f"{file}: no such file; expected a policy.zip and its policy.json as training writes them"
-            )
-    try:
-        record = json.loads(policy.with_suffix(".json").read_text(encoding="utf-8"))
-        return PPO.load(policy, device="cpu"), record
-    except Exception as error:
-        raise PolicyError(f"{policy}: not a policy that can be read: {error}") from None
+    policy = load_policy(path, transmission)
+    return replace(policy, record=policy.record | {"env": environment_of(policy.record, env)})
 
 
 def env_kwargs(record: dict[str, Any], transmission: str | None = None) -> dict[str, Any]:
@@ -172,16 +162,26 @@ def _effort_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     return rows
 
 
+def add_env_argument(parser: argparse.ArgumentParser) -> None:
+    """Add `--env`, for `load`."""
+    text = (
+        "environment to act in, such as my_module:ce_gym/MyRobotVelocity-v0 (default: as trained); a module that only "
+    )
+    parser.add_argument("--env", metavar="ID", help=text + "the policy's file names is not imported")
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments shared by the programs that judge policies, apart from the policies."""
-    parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes, side by side (default 256)")
-    parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")
+    """Arguments shared by the programs that judge policies, apart from the policies and `--env`."""
+    parser.add_argument(
+        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes, side by side (default 256)"
+    )
+    parser.add_argument("--seed", type=SEED, default=EVALUATION_SEED, help="seed of the first episode")
     add_json_argument(parser)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         description="Judge a trained policy: tracking errors, falls, what it asks of the motors, how hard it can be "
         "pushed. Torques and powers are those of sub-steps, as shares of what the motors can give."
     )
@@ -190,15 +190,15 @@ def main(argv: list[str] | None = None) -> int:
         "--transmission", metavar="LEVEL", help="exact, coupled, armature or none (default: as trained)"
     )
     parser.add_argument("--pushes", action="store_true", help="also push it, from all sides, harder and harder")
+    add_env_argument(parser)
     add_arguments(parser)
     args = parser.parse_args(argv)
-    positive(parser, episodes=args.episodes)
     return run("evaluate.py", lambda: _judge(args))
 
 
 def _judge(args: argparse.Namespace) -> int:
     """Do everything that the command line asks for."""
-    model = load_policy(args.policy, args.transmission)
+    model = load(args.policy, args.env, args.transmission)
     kwargs = env_kwargs(model.record, args.transmission)
     result: dict[str, Any] = evaluate(model, model.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
     if found := effort(model, episodes=min(args.episodes, 32), seed=args.seed, **kwargs):

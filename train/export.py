@@ -10,13 +10,13 @@ file as JSON. Only weights are read from the policy, no pickled code is run. No 
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import onnx
+from console import Parser
 from onnx import TensorProto, helper, numpy_helper
 
 from ce_gym.policies import RECORD_KEY, Actor, PolicyError, read_actor
@@ -70,7 +70,7 @@ def write(model: onnx.ModelProto, record: dict[str, Any], out: Path) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(description="Write a trained policy as ONNX with its contract.")
+    parser = Parser(description="Write a trained policy as ONNX with its contract.")
     parser.add_argument("policy", type=Path, help="policy.zip written by train/ppo.py (its policy.json lies beside it)")
     parser.add_argument(
         "out", type=Path, nargs="?", help="ONNX file to write (default: exported.onnx beside the policy)"

@@ -7,8 +7,8 @@ learner; no robots, no tasks.
 from __future__ import annotations
 
 import argparse
+import json
 import platform
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,10 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-from settings import Settings, config_file, load_settings
+from console import EPISODES, SEED, THREADS, Parser, above_zero, run
+from run_folder import make_folder
+from settings import NETWORK, Settings, config_file, load_settings, make_settings, parsed
 
 from ce_gym import usable_cores
-from ce_gym.policies import load_policy
+from ce_gym.policies import PolicyError, environment_of, load_policy, locate_policy
 
 CHECKPOINTS = 10
 """Checkpoints per training run."""
@@ -109,21 +111,51 @@ def _version(package: str) -> str:
         return "not installed"
 
 
+def resumed_record(job: Job) -> dict[str, Any]:
+    """Return the record of the policy that a training run goes on from.
+
+    Raises:
+        PolicyError: If that has another network than the settings ask for, or does not say how long it was trained.
+    """
+    file: Any = job.resume
+    record = load_policy(file).record
+    wanted, found = json.loads(json.dumps(job.settings.as_dict())), _settings_of(record)
+    for key in NETWORK:
+        if found.get(key) != wanted[key]:
+            told = f"trained with {found.get(key)}, asked for {wanted[key]}"
+            raise PolicyError(f"{file}: {key}: {told}; expected the same to go on")
+    if type(record.get("steps")) is not int or record["steps"] < 0:
+        raise PolicyError(f"{file}: steps: {record.get('steps')!r}; expected the steps that it was trained for")
+    return record
+
+
+def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
+    """The settings in the record of a policy, as plain data; none if there are none."""
+    found = record.get("settings")
+    return found if isinstance(found, dict) else {}
+
+
 def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
     """The training runs a command line asks for; `folder` ends the names of folders that it does not give.
 
     Raises:
         ValueError: If the command line, a settings file or a policy cannot be used.
     """
-    record = load_policy(args.resume).record if args.resume else {}
-    env_id = args.env or record.get("env")
-    if not env_id:
+    resume = locate_policy(args.resume) if args.resume else None
+    record = load_policy(resume).record if resume else {}
+    if not (args.env or record):
         raise ValueError("--env: missing; expected an environment id, or --resume with a policy")
+    env_id = environment_of(record, args.env)
     overrides = list(args.set)
     overrides += [f"steps={args.steps}"] if args.steps else []
     overrides += [f"num_envs={args.num_envs}"] if args.num_envs else []
     path = args.config or config_file(env_id)
-    settings = load_settings(path, overrides)
+    if record and not args.config:
+        settings = make_settings(
+            {**load_settings(path).as_dict(), **_settings_of(record), **parsed(overrides)}, source=str(resume)
+        )
+    else:
+        settings = load_settings(path, overrides)
     kwargs = dict(record.get("env_kwargs", {}))
     kwargs |= {"transmission": args.transmission} if args.transmission else {}
     kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
@@ -139,7 +171,7 @@ def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
             env_kwargs=kwargs,
             seed=seed,
             threads=args.threads,
-            resume=args.resume,
+            resume=resume,
             seconds=60.0 * args.minutes,
             tensorboard=args.tensorboard,
         )
@@ -149,8 +181,8 @@ def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
 
 def parser() -> argparse.ArgumentParser:
     """The command line of every learner."""
-    result = argparse.ArgumentParser(
-        description="Train a policy with PPO. Ctrl-C stops in good order and saves; --resume goes on.",
+    result = Parser(
+        description="Train a policy with PPO. Ctrl-C and SIGTERM stop in good order and save; --resume goes on.",
         epilog="Settings not named here are in the settings file; --set KEY=VALUE changes any of them.",
     )
     what = result.add_argument_group("what to train")
@@ -160,23 +192,29 @@ def parser() -> argparse.ArgumentParser:
         "--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees, such as base_height"
     )
     what.add_argument(
-        "--resume", type=Path, metavar="FILE", help="policy to go on from; --steps counts its steps too"
-    )  # fmt: skip
-    what.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
-    what.add_argument("--seeds", type=int, nargs="+", metavar="N", help="several seeds, one run after the other")
+        "--resume",
+        type=Path,
+        metavar="FILE",
+        help="policy to go on from, with its settings unless --config says otherwise; --steps counts its steps too; "
+        "nothing in it is run",
+    )
+    what.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
+    what.add_argument("--seeds", type=SEED, nargs="+", metavar="N", help="several seeds, one run after the other")
     how = result.add_argument_group("how")
     how.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the one in train/config)")
     how.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change, such as gamma=0.98")
     how.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
     how.add_argument("--num-envs", metavar="N", help="environments stepped at once")
     how.add_argument(
-        "--minutes", type=float, default=float("inf"), metavar="M", help="stop after so long at the latest"
+        "--minutes", type=above_zero, default=float("inf"), metavar="M", help="stop after so long at the latest"
     )
-    how.add_argument("--threads", type=int, default=usable_cores(), metavar="N", help="default: all processors")
+    how.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all processors")
     where = result.add_argument_group("where to")
     where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")
     where.add_argument("--no-tensorboard", dest="tensorboard", action="store_false", help="write no TensorBoard logs")
-    where.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes of the evaluation at the end")
+    where.add_argument(
+        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation at the end"
+    )
     return result
 
 
@@ -189,20 +227,22 @@ def main(program: str, train: Callable[[Job], Trained], argv: list[str] | None =
         argv: Arguments of the command line.
         folder: Ends the names of folders, so that policies of different learners do not mix.
     """
+    args = parser().parse_args(argv)
+    return run(program, lambda: _train_all(program, train, args, folder))
+
+
+def _train_all(program: str, train: Callable[[Job], Trained], args: argparse.Namespace, folder: str) -> int:
+    """Do what a command line asks for; return the exit code."""
     from evaluate import evaluate, report  # what judges is not needed before
 
-    args = parser().parse_args(argv)
-    try:
-        for job in jobs(args, folder):
-            print(f"training {job.env_id}, seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", flush=True)
-            trained = train(job)
-            print(f"saved {trained.policy} after {trained.record['steps']:,} steps", flush=True)
-            if trained.interrupted:
-                print(f"interrupted; go on with: python train/{program} --resume {trained.policy}")
-                return 130
-            result = evaluate(trained.model, job.env_id, episodes=args.episodes, **job.env_kwargs)
-            print(report(result), flush=True)
-    except (ValueError, gymnasium.error.Error) as error:
-        print(f"{program}: {error}", file=sys.stderr)
-        return 2
+    for job in jobs(args, folder):
+        make_folder(job.out)
+        print(f"training {job.env_id}, seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", flush=True)
+        trained = train(job)
+        print(f"saved {trained.policy} after {trained.record['steps']:,} steps", flush=True)
+        if trained.interrupted:
+            print(f"interrupted; go on with: python train/{program} --resume {trained.policy}")
+            return 130
+        result = evaluate(trained.model, job.env_id, episodes=args.episodes, **job.env_kwargs)
+        print(report(result), flush=True)
     return 0

@@ -12,48 +12,51 @@ ce_gym only, and no name of a robot or task.
 
 from __future__ import annotations
 
+import io
 import json
-import os
 import time
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import torch
 from callbacks import (
     AdaptiveLearningRate,
     Checkpoints,
     EntropySchedule,
     EpisodeLog,
+    Lenient,
     NoiseSchedule,
     ShowProgress,
     Stop,
     WriteCurve,
 )
-from evaluate import PolicyError
-from job import CHECKPOINTS, Job, Trained, make_record
+from job import CHECKPOINTS, Job, Trained, make_record, resumed_record
 from job import main as run_jobs
 from learner import ThreadedPPO
 from progress import StopInOrder, read_curve
+from run_folder import going_on, make_folder, save_somewhere, write_whole
 from stable_baselines3 import PPO
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.utils import FloatSchedule
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
 from ce_gym.adapters.sb3_asymmetric import AsymmetricPolicy
+from ce_gym.policies import PolicyError, read_weights
 
 TRANSIENT = ["_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"]
 """What the learner holds that is of no use in a saved policy."""
 
 
 def train(job: Job) -> Trained:
-    """Train, and save the policy even if Ctrl-C ends training early.
+    """Train, and save the policy even if Ctrl-C or SIGTERM ends training early.
 
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
     torch.set_num_threads(1)  # threads belong to the learner and to the kernel, see learner.py
-    job.out.mkdir(parents=True, exist_ok=True)
+    make_folder(job.out)
     envs = make_sb3_vec_env(
         job.env_id, job.settings.num_envs, job.seed, num_threads=job.threads, **job.env_kwargs
     )  # fmt: skip
@@ -66,7 +69,8 @@ def train(job: Job) -> Trained:
 
 def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
-    model.set_logger(configure(str(job.out), ["csv", "tensorboard"] if job.tensorboard else ["csv"]))
+    logger = configure(str(job.out), ["csv", "tensorboard"] if job.tensorboard else ["csv"])
+    model.set_logger(Logger(str(job.out), [Lenient(writer) for writer in logger.output_formats]))
     settings, before = job.settings, model.num_timesteps
     earlier = read_curve(job.resume.parent / "curve.csv") if job.resume else []
     start = time.perf_counter()
@@ -77,7 +81,8 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
         return written | {"activation": model.policy.activation_fn.__name__, "finished": finished}  # type: ignore[union-attr]
 
     def checkpoint() -> None:
-        save(model, record(), job.out / "checkpoints" / f"policy_{model.num_timesteps}")
+        with going_on():
+            save(model, record(), job.out / "checkpoints" / f"policy_{model.num_timesteps}")
 
     with StopInOrder(job.seconds) as stop:
         callbacks = [Stop(stop), Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog()]
@@ -91,7 +96,8 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
             model.learn(settings.steps - before, callbacks, reset_num_timesteps=False)  # type: ignore[arg-type]
     model.logger.close()
     written = record(finished=not stop.interrupted)
-    return Trained(model, written, save(model, written, job.out / "policy"), stop.interrupted)
+    policy = save_somewhere(lambda folder: save(model, written, folder / "policy"), job.out)
+    return Trained(model, written, policy, stop.interrupted)
 
 
 def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
@@ -121,30 +127,60 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
         "stats_window_size": s.num_envs,
         "device": "cpu",
     }
-    if job.resume is None:
-        policy = AsymmetricPolicy if isinstance(envs.observation_space, gymnasium.spaces.Dict) else "MlpPolicy"
-        model = ThreadedPPO(policy, envs, policy_kwargs=network, seed=job.seed, **options)
-        model.threads = job.threads
-        return model
-    try:
-        model = ThreadedPPO.load(job.resume, envs, **options)
-    except ValueError as error:
-        raise PolicyError(f"{job.resume}: does not fit {job.env_id}: {error}") from None
+    policy = AsymmetricPolicy if isinstance(envs.observation_space, gymnasium.spaces.Dict) else "MlpPolicy"
+    model = ThreadedPPO(policy, envs, policy_kwargs=network, seed=job.seed, **options)
     model.threads = job.threads
-    if s.target_kl:  # go on with the rate it had been adapted to
-        model.lr_schedule = FloatSchedule(model.policy.optimizer.param_groups[0]["lr"])
+    if job.resume:
+        restore(model, job)
     return model
 
 
+def restore(model: PPO, job: Job) -> None:
+    """Let a fresh learner go on from `job.resume`: weights, the state of the optimiser, the steps done.
+
+    Arrays are read and nothing else: Stable-Baselines3's own `PPO.load` unpickles objects, which can run any code.
+    Environments and random numbers begin anew.
+
+    Raises:
+        PolicyError: If the saved policy does not fit the environment or the settings.
+    """
+    file, record = Path(job.resume), resumed_record(job)  # type: ignore[arg-type]
+    if file.suffix != ".zip":
+        raise PolicyError(f"{file}: expected a policy.zip of train/ppo.py, which has what training needs")
+    try:
+        weights, optimizer = (tensors(read_weights(file, f"{name}.pth")) for name in ("policy", "policy.optimizer"))
+        model.policy.load_state_dict(weights)
+        model.policy.optimizer.load_state_dict(optimizer)
+    except Exception as error:  # damage shows in every kind of them
+        raise PolicyError(f"{file}: does not fit {job.env_id}: {' '.join(str(error).split())[:300]}") from None
+    if not all(torch.isfinite(parameter).all() for parameter in model.policy.parameters()):
+        raise PolicyError(f"{file}: a weight is NaN or infinite; expected finite numbers")
+    model.num_timesteps = record["steps"]
+    if job.settings.target_kl:  # go on with the rate it had been adapted to
+        model.lr_schedule = FloatSchedule(model.policy.optimizer.param_groups[0]["lr"])
+
+
+def tensors(found: Any) -> Any:
+    """Return dictionaries and lists of arrays as the same of tensors."""
+    if isinstance(found, dict):
+        return {key: tensors(value) for key, value in found.items()}
+    if isinstance(found, list | tuple):
+        return type(found)(tensors(value) for value in found)
+    return torch.tensor(found) if isinstance(found, np.ndarray) else found
+
+
 def save(model: PPO, record: dict[str, Any], path: Path) -> Path:
-    """Write `path`.zip and `path`.json, each whole or not at all, and return the path of the policy."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(f".{path.name}.zip")
-    model.save(fresh, exclude=TRANSIENT)
-    text = path.with_name(f".{path.name}.json")
-    text.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    os.replace(text, path.with_name(f"{path.name}.json"))
-    return fresh.replace(path.with_name(f"{path.name}.zip"))
+    """Write `path`.zip and `path`.json, both or neither, and return the path of the policy.
+
+    Raises:
+        OSError: If they cannot be written.
+    """
+    packed = io.BytesIO()
+    model.save(packed, exclude=TRANSIENT)
+    text = json.dumps(record, indent=2) + "\n"
+    policy = path.with_name(f"{path.name}.zip")
+    write_whole({policy: packed.getvalue(), path.with_name(f"{path.name}.json"): text.encode()})
+    return policy
 
 
 def main(argv: list[str] | None = None) -> int:

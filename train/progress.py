@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from run_folder import going_on
 from tqdm import tqdm
 
 CURVE: tuple[str, ...] = ("steps", "seconds", "reward", "length")
@@ -88,7 +89,7 @@ class Curve:
             self._write([dict(zip(CURVE, values, strict=True))], "a")
 
     def _write(self, rows: list[dict[str, float]], mode: str) -> None:
-        with self.file.open(mode, newline="", encoding="utf-8") as file:
+        with going_on(), self.file.open(mode, newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, CURVE)
             if mode == "w":
                 writer.writeheader()
@@ -163,29 +164,32 @@ def geometric(start: float, end: float, done: float) -> float:
 
 
 class StopInOrder:
-    """Ends training at a deadline or at Ctrl-C, at a moment when the policy is whole.
+    """Ends training at a deadline, at Ctrl-C or at SIGTERM, at a moment when the policy is whole.
 
-    A second Ctrl-C interrupts at once. Use as a context manager around learning.
+    A second signal interrupts at once. Use as a context manager around learning.
 
     Args:
         seconds: Longest time to train [s].
 
     Attributes:
-        interrupted: Whether Ctrl-C ended training.
+        interrupted: Whether a signal ended training.
     """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self, seconds: float = float("inf")) -> None:
         self.seconds, self.interrupted = seconds, False
 
     def __enter__(self) -> StopInOrder:
-        self._previous = signal.signal(signal.SIGINT, self._on_interrupt)
+        self._previous = {number: signal.signal(number, self._on_signal) for number in self.SIGNALS}
         self._deadline = time.monotonic() + self.seconds
         return self
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._previous)
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)
 
-    def _on_interrupt(self, _signal: int, _frame: FrameType | None) -> None:
+    def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
         if self.interrupted:
             raise KeyboardInterrupt
         self.interrupted = True

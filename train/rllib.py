@@ -12,7 +12,6 @@ only, and no name of a robot or task. (Ray is not installed where types are chec
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 import ray
+from console import SEED, THREADS, Parser, above_zero, run, whole
 from export import to_onnx, write
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from run_folder import make_folder
 from settings import Settings, SettingsError, config_file, load_settings
 
 import ce_gym  # noqa: F401  (registers the environments in this process)
-from ce_gym.policies import Actor, PolicyError
+from ce_gym.policies import Actor
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
@@ -131,37 +132,42 @@ def train(algo: Algorithm, steps: float, seconds: float) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(description="Train a policy with RLlib's PPO.")
+    parser = Parser(description="Train a policy with RLlib's PPO.")
     parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
     parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
-    parser.add_argument("--env-runners", type=int, default=2, metavar="N", help="processes that step (default 2)")
-    parser.add_argument("--learners", type=int, default=0, metavar="N", help="processes that learn (default: this one)")
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads of each process (default 1)")
+    parser.add_argument(
+        "--env-runners", type=whole(0, 10_000), default=2, metavar="N", help="processes that step (default 2)"
+    )
+    parser.add_argument(
+        "--learners", type=whole(0, 1000), default=0, metavar="N", help="processes that learn (default: this one)"
+    )
+    parser.add_argument("--threads", type=THREADS, default=1, metavar="N", help="threads of each process (default 1)")
     parser.add_argument("--address", metavar="HOST:PORT", help="cluster to connect to; 'auto' for this node's own")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
-    parser.add_argument("--minutes", type=float, default=float("inf"), metavar="M", help="stop after so long")
+    parser.add_argument("--minutes", type=above_zero, default=float("inf"), metavar="M", help="stop after so long")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
     args = parser.parse_args(argv)
     kwargs = {"num_threads": args.threads} | ({"transmission": args.transmission} if args.transmission else {})
-    try:
-        path = config_file(args.env)
-        s = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
-        one = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # says in one line what is wrong, and fills the cache
-        ray.init(address=args.address, log_to_driver=False, include_dashboard=False)
-        algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **kwargs)
-        set_initial_std(algo, s.initial_std)
-        steps = train(algo, s.steps, 60.0 * args.minutes)
-        out = args.out or Path("runs") / f"{path.stem}-rllib"
-        out.mkdir(parents=True, exist_ok=True)
-        algo.save_to_path(str((out / "checkpoint").resolve()))
-        record = _record(one.unwrapped, args.env, kwargs, s, steps)
-        write(to_onnx(actor_of(algo, s.activation), record), record, out / "policy.onnx")
-        algo.stop()
-    except (PolicyError, SettingsError, ValueError, ConnectionError, gymnasium.error.Error) as error:
-        print(f"rllib.py: {error}", file=sys.stderr)
-        return 2
+    return run("rllib.py", lambda: _work(args, kwargs))
+
+
+def _work(args: argparse.Namespace, kwargs: dict[str, Any]) -> int:
+    """Train, write the policy, and say where."""
+    path = config_file(args.env)
+    s = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
+    one = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # says in one line what is wrong, and fills the cache
+    ray.init(address=args.address, log_to_driver=False, include_dashboard=False)
+    algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **kwargs)
+    set_initial_std(algo, s.initial_std)
+    steps = train(algo, s.steps, 60.0 * args.minutes)
+    out = args.out or Path("runs") / f"{path.stem}-rllib"
+    make_folder(out)
+    algo.save_to_path(str((out / "checkpoint").resolve()))
+    record = _record(one.unwrapped, args.env, kwargs, s, steps)
+    write(to_onnx(actor_of(algo, s.activation), record), record, out / "policy.onnx")
+    algo.stop()
     print(out / "policy.onnx")
     return 0
 

@@ -13,15 +13,15 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import torch
+from console import EPISODES, SEED, Parser, run
 from evaluate import evaluate, report
 from export import to_onnx, write
 from rsl_rl.runners import OnPolicyRunner
+from run_folder import make_folder
 from settings import Settings, config_file, load_settings
 
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
@@ -95,34 +95,37 @@ def record_of(envs: RslRlVecEnv, env_id: str, env_kwargs: dict[str, Any], settin
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(description="Train a policy with rsl_rl's PPO.")
+    parser = Parser(description="Train a policy with rsl_rl's PPO.")
     parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
     parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
     parser.add_argument("--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda for networks and physics on a GPU (default cpu)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rsl_rl")
-    parser.add_argument("--episodes", type=int, default=256, metavar="N", help="episodes of the evaluation at the end")
+    parser.add_argument(
+        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation at the end"
+    )
     args = parser.parse_args(argv)
     kwargs: dict[str, Any] = {"transmission": args.transmission} if args.transmission else {}
     kwargs |= {"dtype": "float32"} if args.device.startswith("cuda") else {}
     kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
-    try:
-        path = config_file(args.env)
-        settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
-        out = args.out or Path("runs") / f"{path.stem}-rsl_rl"
-        out.mkdir(parents=True, exist_ok=True)
-        envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **kwargs)
-        runner = train(envs, settings, args.seed, out)
-        record = record_of(envs, args.env, kwargs, settings)
-        write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
-        policy = load_policy(out / "policy.onnx")
-        print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))
-    except (ValueError, gymnasium.error.Error) as error:
-        print(f"rsl_rl_ppo.py: {error}", file=sys.stderr)
-        return 2
+    return run("rsl_rl_ppo.py", lambda: _work(args, kwargs))
+
+
+def _work(args: argparse.Namespace, kwargs: dict[str, Any]) -> int:
+    """Train, write the policy, and say where."""
+    path = config_file(args.env)
+    settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
+    out = args.out or Path("runs") / f"{path.stem}-rsl_rl"
+    make_folder(out)
+    envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **kwargs)
+    runner = train(envs, settings, args.seed, out)
+    record = record_of(envs, args.env, kwargs, settings)
+    write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
+    policy = load_policy(out / "policy.onnx")
+    print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))
     print(out / "policy.onnx")
     return 0
 

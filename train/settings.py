@@ -19,6 +19,20 @@ from ce_gym.policies import ACTIVATIONS
 Activation = str
 """One of those with which a policy can be run without its learner."""
 
+LIMITS = {
+    "steps": 1e12, "num_envs": 2**20, "rollout": 10_000, "minibatches": 10_000, "epochs": 1000, "hidden": 2**13,
+    "initial_std": (1e-6, 100), "final_std": (0, 100), "learning_rate": (0, 1), "target_kl": (0, 10), "gamma": (0, 1),
+    "gae_lambda": (0, 1), "clip": (1e-6, 10), "entropy": (0, 10), "final_entropy": (0, 10), "value": (0, 1000),
+    "max_grad_norm": (1e-6, 1e9),
+}  # fmt: skip
+"""The largest of whole numbers, whose smallest is 1; the smallest and largest of other numbers."""
+
+MOST_SAMPLES = 10**8
+"""Steps between two updates, over all environments: more would not fit into memory."""
+
+NETWORK = ("hidden", "activation")
+"""What a policy keeps for life."""
+
 CONFIG_FOLDER = Path(__file__).parent / "config"
 
 
@@ -98,12 +112,12 @@ def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
     """
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        reason = str(error).replace("\n", " ")
+    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
         raise SettingsError(f"{path}: cannot be read as YAML: {reason}") from None
     if not isinstance(data, dict):
         raise SettingsError(f"{path}: expected one `key: value` per line, got {type(data).__name__}")
-    return make_settings(data | dict(_parse_override(text) for text in overrides), source=str(path))
+    return make_settings(data | parsed(overrides), source=str(path))
 
 
 def make_settings(data: Mapping[str, Any], source: str) -> Settings:
@@ -119,7 +133,32 @@ def make_settings(data: Mapping[str, Any], source: str) -> Settings:
     for key in known:
         if key not in data:
             raise SettingsError(f"{source}: {key}: missing; expected {known[key]}")
-    return Settings(**{key: _convert(source, key, data[key], kind) for key, kind in known.items()})
+    result = Settings(**{key: _convert(source, key, data[key], kind) for key, kind in known.items()})
+    _check_samples(source, result)
+    return result
+
+
+def _check_samples(source: str, s: Settings) -> None:
+    """See that every minibatch has two samples, or the spread of its advantages would be 0 / 0."""
+    samples = s.num_envs * s.rollout
+    if samples > MOST_SAMPLES:
+        raise SettingsError(
+            f"{source}: num_envs * rollout: {samples}; expected at most {MOST_SAMPLES} samples between two updates"
+        )
+    size = -(-samples // s.minibatches)
+    if size < 2 or samples % size == 1:
+        raise SettingsError(
+            f"{source}: minibatches: {s.minibatches} of {samples} samples; expected at least 2 samples in each"
+        )
+
+
+def parsed(overrides: Iterable[str]) -> dict[str, Any]:
+    """Return overrides, each `KEY=VALUE`, as plain data.
+
+    Raises:
+        SettingsError: If one is something else.
+    """
+    return dict(_parse_override(text) for text in overrides)
 
 
 def _parse_override(text: str) -> tuple[str, Any]:
@@ -127,36 +166,40 @@ def _parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals:
         raise SettingsError(f"--set {text}: expected KEY=VALUE")
-    return key.strip().replace("-", "_"), yaml.safe_load(value)
+    try:
+        return key.strip().replace("-", "_"), yaml.safe_load(value)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise SettingsError(f"--set {key.strip()}: cannot be read as YAML: {reason}") from None
 
 
 def _convert(source: str, key: str, value: Any, kind: str) -> Any:
     """Convert one value. Numbers may be written 1e-3 or 6e6, which YAML 1.1 reads as text."""
+    wanted = f"one of {', '.join(ACTIVATIONS)}" if kind == "Activation" else "a list of layer sizes"
     try:
         if kind == "int":
+            high: Any = LIMITS[key]
+            wanted = f"a positive whole number, at most {high:g}"
             number = float(value)
-            if number != int(number) or number <= 0:
+            if isinstance(value, bool) or number != int(number) or not 1 <= number <= high:
                 raise ValueError
             return int(number)
         if kind == "float":
+            low, high = LIMITS[key]  # type: ignore[misc]
+            wanted = f"a number from {low:g} to {high:g}"
             number = float(value)
-            if not 0 <= number < float("inf"):
+            if isinstance(value, bool) or not low <= number <= high:
                 raise ValueError
             return number
-        if kind == "Activation":
-            if value not in ACTIVATIONS:
-                raise ValueError
+        if kind == "Activation" and value in ACTIVATIONS:
             return value
+        if kind == "Activation" or not isinstance(value, list | tuple) or len(value) > 100:
+            raise ValueError
         return tuple(_convert(source, key, size, "int") for size in value)
     except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, SettingsError):
             raise
-        wanted = {
-            "int": "a positive whole number",
-            "float": "a number >= 0",
-            "Activation": f"one of {', '.join(ACTIVATIONS)}",
-        }.get(kind, "a list of layer sizes")
-        raise SettingsError(f"{source}: {key}: {value!r}; expected {wanted}") from None
+        raise SettingsError(f"{source}: {key}: {repr(value)[:200]}; expected {wanted}") from None
 
 
 def _snake(name: str) -> str:

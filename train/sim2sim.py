@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from console import add_json_argument, positive, print_result, run
-from evaluate import EVALUATION_SEED, env_kwargs, planar_velocity, tracking
+from console import EPISODES, SEED, Parser, above_zero, add_json_argument, print_result, run
+from evaluate import EVALUATION_SEED, add_env_argument, env_kwargs, load, planar_velocity, tracking
 from numpy.typing import NDArray
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
-from ce_gym.policies import WHERE, Policy, PolicyError, load_policy
+from ce_gym.policies import WHERE, Policy, PolicyError
 
 STEADY = {"push_period": 0.0, "randomise": {}, "latency": (0, 0), "heading": False, "command_period": 1e6}
 """What is left out of the comparison, as MuJoCo knows nothing of it; commands come from here."""
@@ -231,8 +231,8 @@ def _environment(
 ) -> tuple[SB3VecEnv, Any, Course]:
     """An environment just reset, its observations, and what is commanded; the same for every level."""
     clear = {block["name"]: 0.0 for block in record["contract"]["observation"]["blocks"]}
-    kwargs = {**env_kwargs(record, level), **STEADY, "noise": clear}
-    envs = make_sb3_vec_env(record["env"], n, seed, max_episode_steps=10**9, **kwargs)
+    kwargs = {**env_kwargs(record, level), **STEADY, "noise": clear, "max_episode_steps": 10**9}
+    envs = make_sb3_vec_env(record["env"], n, seed, **kwargs)
     obs = envs.reset()
     native: Any = envs.envs.unwrapped
     return envs, obs, course(native.contract(), native.state()["command"], seconds, every, seed)
@@ -255,25 +255,25 @@ def table(result: dict[str, Any]) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         description="Let a policy act in MuJoCo, beside our own simulation. Exit code 0 if it does well enough in "
         "both of MuJoCo's, 1 if not, 2 after a mistake.",
     )
     parser.add_argument("policy", help=WHERE)
-    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="robots (default 50)")
-    parser.add_argument("--seconds", type=float, default=10.0, metavar="T", help="how long they walk (default 10)")
+    parser.add_argument("--episodes", type=EPISODES, default=50, metavar="N", help="robots (default 50)")
+    parser.add_argument("--seconds", type=above_zero, default=10.0, metavar="T", help="how long they walk (default 10)")
     text = "new commands every T seconds (default: one for the whole time)"
-    parser.add_argument("--every", type=float, default=float("inf"), metavar="T", help=text)
-    parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="of starts and commands")
+    parser.add_argument("--every", type=above_zero, default=float("inf"), metavar="T", help=text)
+    parser.add_argument("--seed", type=SEED, default=EVALUATION_SEED, help="of starts and commands")
+    add_env_argument(parser)
     add_json_argument(parser)
     args = parser.parse_args(argv)
-    positive(parser, episodes=args.episodes, seconds=args.seconds, every=args.every)
     return run("sim2sim.py", lambda: _work(args))
 
 
 def _work(args: argparse.Namespace) -> int:
     """Compare, print, and say whether it passed."""
-    policy = load_policy(args.policy)
+    policy = load(args.policy, args.env)
     result = compare(policy, episodes=args.episodes, seconds=args.seconds, every=args.every, seed=args.seed)
     print_result(result, table(result), args.json)
     return 0 if result["passed"] else 1

@@ -15,16 +15,18 @@ import json
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from console import Table, markdown, positive, print_result, run
-from evaluate import EVALUATION_SEED, add_arguments, env_kwargs, evaluate
+from console import SEED, THREADS, Parser, Table, markdown, print_result, run
+from evaluate import EVALUATION_SEED, add_arguments, add_env_argument, env_kwargs, evaluate, load
 from settings import Settings, config_file, load_settings
-from stable_baselines3 import PPO
 
 from ce_gym import usable_cores
 from ce_gym.policies import WHERE, Policy, PolicyError, load_policy, locate_policy
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
 
 LEVELS = ("exact", "coupled", "armature", "none")
 """Transmission levels, from what is kept in full to what is ignored."""
@@ -161,8 +163,8 @@ def _checked(policy: Path, env: str, level: str, seed: int, settings: Settings) 
     return record
 
 
-def judge(policies: Iterable[Path], episodes: int, seed: int) -> dict[str, Any]:
-    """Judge policies of one task on every level.
+def judge(policies: Iterable[Path], episodes: int, seed: int, env: str | None = None) -> dict[str, Any]:
+    """Judge policies of one task on every level, in the environment `env` or that of their records.
 
     Returns:
         env; episodes; policies: file, transmission, seed, steps and results of each; summary, see `summary`.
@@ -172,7 +174,7 @@ def judge(policies: Iterable[Path], episodes: int, seed: int) -> dict[str, Any]:
     """
     judged, names = [], {}
     for path in policies:
-        model = load_policy(path)
+        model = load(path, env)
         record = model.record
         names[_task(record)] = path
         if len(names) > 1:
@@ -205,20 +207,20 @@ def write_report(result: dict[str, Any], folder: Path) -> list[Path]:
 
 def parser() -> argparse.ArgumentParser:
     """The command line of this file."""
-    result = argparse.ArgumentParser(
+    result = Parser(
         description="Judge policies on every transmission level; with --train, train on every level first.",
         epilog="Policies that lie in the folder already are used again, so that a second call only judges.",
     )
     result.add_argument("policies", nargs="*", metavar="POLICY", help=f"{WHERE}; several seeds are put together")
+    add_env_argument(result)
     add_arguments(result)
     result.add_argument("--out", type=Path, metavar="FOLDER", help="write transfer.json, .md and .png there")
     how = result.add_argument_group("training")
     how.add_argument("--train", action="store_true", help="train what is missing of --levels and --seeds, then judge")
-    how.add_argument("--env", metavar="ID", help="environment id, such as ce_gym/MiniCheetahVelocity-v0")
     how.add_argument("--levels", nargs="+", choices=LEVELS, default=LEVELS, metavar="LEVEL", help="default: all four")
-    how.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="N", help="default: 0 1 2")
+    how.add_argument("--seeds", type=SEED, nargs="+", default=[0, 1, 2], metavar="N", help="default: 0 1 2")
     how.add_argument("--steps", metavar="N", help="environment steps of each (default: as in the settings file)")
-    how.add_argument("--threads", type=int, default=0, metavar="N", help="default: all processors")
+    how.add_argument("--threads", type=THREADS, default=0, metavar="N", help="default: all processors")
     how.add_argument(
         "--runs", type=Path, metavar="FOLDER", help="where runs are kept (default: runs/transfer/<settings file>)"
     )
@@ -229,11 +231,10 @@ def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     arguments = parser()
     args = arguments.parse_args(argv)
-    positive(arguments, episodes=args.episodes)
     if args.train == bool(args.policies):
         arguments.error("expected either policies to judge, or --train and --env")
-    if args.train != bool(args.env):
-        arguments.error("--env: expected together with --train")
+    if args.train and not args.env:
+        arguments.error("--env: missing; expected the environment to train in")
     return run("transfer.py", lambda: _work(args))
 
 
@@ -245,7 +246,7 @@ def _work(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print("transfer.py: interrupted; the same command goes on", file=sys.stderr)
         return 130
-    result = judge(policies, args.episodes, args.seed)
+    result = judge(policies, args.episodes, args.seed, args.env)
     out = args.out or (policies[0].parents[2] if args.train else None)
     files = write_report(result, out) if out else []
     print_result(result, "\n".join([table(result["summary"]), *map(str, files)]), args.json)

@@ -197,6 +197,7 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwa
 
     Raises:
         gymnasium.error.Error: If the id is unknown or has no native vector environment.
+        ValueError: If an argument is wrong.
 
     Examples:
         >>> envs = make_sb3_vec_env("ce_gym/MiniCheetahVelocity-v0", num_envs=64)
@@ -208,7 +209,10 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwa
     """
     mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
     options = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
-    envs = SB3VecEnv(gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode=mode, **options))
+    try:
+        envs = SB3VecEnv(gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode=mode, **options))
+    except (TypeError, ImportError) as error:  # an argument or a module that is not there
+        raise ValueError(f"environment {env_id!r}: {error}") from error
     if seed is not None:
         envs.seed(seed)
     return envs

@@ -1,12 +1,14 @@
 """Trained policies: found by name, read without running code that they may carry, run by numpy.
 
-Knows file formats and where shipped policies lie; knows no environments, learners, robots or tasks.
+Knows file formats and where shipped policies lie; knows no learners, robots or tasks.
 """
 
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
+from ce_gym.policies.environments import environment_of
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.files import RECORD_KEY, load_policy, read_actor, write_npz
 from ce_gym.policies.places import WHERE, find_policy, locate_policy, shelf, shipped_policies
+from ce_gym.policies.weights import read_weights
 
 __all__ = [
     "ACTIVATIONS",
@@ -16,10 +18,12 @@ __all__ = [
     "LevelWarning",
     "Policy",
     "PolicyError",
+    "environment_of",
     "find_policy",
     "load_policy",
     "locate_policy",
     "read_actor",
+    "read_weights",
     "shelf",
     "shipped_policies",
     "write_npz",

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.archive import read_json, read_npz
+from ce_gym.policies.environments import shown
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.places import locate_policy
 from ce_gym.policies.weights import read_weights
@@ -36,6 +37,13 @@ REQUIRED: dict[str, type] = {
 """What a record must say."""
 
 KINDS = {str: "text", dict: "a JSON object", int: "a whole number"}
+
+
+CHOSEN = {
+    "act", "autoreset_mode", "env", "env_id", "episodes", "id", "label", "model", "num_envs", "policy", "robots",
+    "script", "seconds", "seed", "vector_kwargs", "vectorization_mode", "wrappers",
+}  # fmt: skip
+"""Arguments that whoever runs a policy chooses, so that its record may not."""
 
 
 def load_policy(path: str | Path, transmission: str | None = None) -> Policy:
@@ -166,6 +174,8 @@ def _checked(record: Any, file: Path) -> dict[str, Any]:
             raise PolicyError(f"{file}: {key}: missing; expected a record written by this version of train/ppo.py")
         if type(record[key]) is not kind:  # a bool is an int
             raise PolicyError(f"{file}: {key}: {_shortened(record[key])}; expected {KINDS[kind]}")
+    if taken := CHOSEN & record["env_kwargs"].keys():
+        raise PolicyError(f"{file}: env_kwargs: {min(taken)}: expected arguments of the environment alone")
     if record["activation"] not in ACTIVATIONS:
         raise PolicyError(
             f"{file}: activation: {_shortened(record['activation'])}; expected one of {', '.join(ACTIVATIONS)}"
@@ -190,6 +200,6 @@ def _one_line(error: Exception) -> str:
 def _shortened(value: Any, text: Callable[[Any], str] = repr) -> str:
     """Return a value as text of at most 200 characters that a terminal shows as they are."""
     try:
-        return "".join(c if c.isprintable() else "?" for c in text(value)[:200])
+        return shown(text(value)[:200])
     except RecursionError:
         return "a deeply nested value"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from demo import main as demo_main
 from demo import parting
-from evaluate import load_learner
+from saved import load_learner
 
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env

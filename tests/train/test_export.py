@@ -9,11 +9,12 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from evaluate import evaluate, load_learner
+from evaluate import evaluate
 from evaluate import main as evaluate_main
 from job import Job
 from point_mass import ID
 from ppo import train
+from saved import load_learner
 from settings import config_file, load_settings
 
 import ce_gym

@@ -14,12 +14,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from callbacks import AdaptiveLearningRate
-from evaluate import evaluate, load_learner
+from evaluate import evaluate
 from evaluate import main as evaluate_main
 from job import Job
 from point_mass import ID
 from ppo import main, train
 from progress import read_curve
+from saved import load_learner
 from settings import config_file, load_settings
 from stable_baselines3 import PPO
 from transfer import LEVELS
@@ -135,20 +136,21 @@ def test_the_deadline_stops_training_and_saves(tmp_path):
     assert result.policy.exists()
 
 
-def test_ctrl_c_saves_a_usable_policy(tmp_path, capsys):
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_a_usable_policy(number, tmp_path, capsys):
+    before = signal.getsignal(number)
 
     def interrupt_once_training_runs() -> None:
-        while signal.getsignal(signal.SIGINT) is before:
+        while signal.getsignal(number) is before:
             time.sleep(0.02)
-        time.sleep(0.5)
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
     threading.Thread(target=interrupt_once_training_runs, daemon=True).start()
     code = main(["--env", ID, "--steps", "1e9", "--out", str(tmp_path), *FAST])
     assert code == 130
     assert "--resume" in capsys.readouterr().out
     assert load_learner(tmp_path / "policy.zip")[0].num_timesteps > 0
+    assert signal.getsignal(number) is before
 
 
 def test_several_seeds_write_several_policies(tmp_path):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from stander import write_small
 
+import ce_gym
 from ce_gym.__main__ import main
 from ce_gym.viewer import Rollout
 
@@ -49,10 +52,50 @@ def test_play_refuses_robots_and_levels_at_once(tmp_path: Path, capsys: pytest.C
     assert "--robots 2: expected 1, or one level" in capsys.readouterr().err
 
 
-def test_unknown_environment_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["play", str(write_small(tmp_path / "policy.npz", env="CartPole-v1"))]) == 2
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        ("CartPole-v1", "environment 'CartPole-v1': "),
+        ("test/Nothing-v0", "environment 'test/Nothing-v0': not registered; expected one of this package's"),
+        ("trap:test/Nothing-v0", "if you trust it, name it yourself: --env trap:test/Nothing-v0"),
+    ],
+)
+def test_unknown_environments_are_one_line(env, words, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["play", str(write_small(tmp_path / "policy.npz", env=env))]) == 2
     error = capsys.readouterr().err
-    assert "environment 'CartPole-v1'; expected one of this package's" in error
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_environments_of_other_modules_are_inspected_and_play(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command line names the module that registers them; without it the policy's file names no known one."""
+    pytest.importorskip("meshcat")
+    robot = ce_gym.load_robot("mini_cheetah").source
+    (tmp_path / "my_dogs.py").write_text(f"import ce_gym\nce_gym.register_robot({robot!r}, name='my_dog')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    write_small(tmp_path / "dog" / "policy.npz", env="ce_gym/MyDogVelocity-v0")
+    try:
+        assert main(["play", "dog"]) == 2
+        assert "not registered" in capsys.readouterr().err
+        named = "my_dogs:ce_gym/MyDogVelocity-v0"
+        assert main(["inspect", named, "--no-timing"]) == 0
+        assert "MyDogVelocity" in capsys.readouterr().out
+        assert main(["play", "dog", "--env", named, "--command", "0.1", "0", "0", "0"]) == 0
+        assert Path("dog.html").exists()
+    finally:
+        sys.modules.pop("my_dogs", None)
+        for name in [name for name in gymnasium.registry if "MyDog" in name]:
+            del gymnasium.registry[name]
+
+
+@pytest.mark.parametrize("name", ["no_module:ce_gym/MyDogVelocity-v0", "ce_gym/NoDogVelocity-v0"])
+def test_inspect_of_nothing_is_one_line(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", name]) == 2
+    error = capsys.readouterr().err
+    assert f"environment '{name}'" in error
     assert error.count("\n") == 1
 
 

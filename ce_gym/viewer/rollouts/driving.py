@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ce_gym.policies import load_policy
+from ce_gym.envs.base import BatchShell
+from ce_gym.policies import environment_of, load_policy
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.rollouts.recording import Act, record_lanes
 from ce_gym.viewer.rollouts.rollout import Rollout
@@ -58,8 +59,13 @@ def drive_many(
     seconds = sum(time for time, _ in script)
     # Commands come from the script: the environment draws no new ones before the end of time.
     options = {**kwargs, "contact_forces": True, "command_period": 1e6}
-    envs = gymnasium.make_vec(env_id, robots, vectorization_mode="vector_entry_point", **options)
     try:
+        envs = gymnasium.make_vec(env_id, robots, vectorization_mode="vector_entry_point", **options)
+    except (TypeError, ValueError, ImportError, gymnasium.error.Error) as error:
+        raise ViewerError(f"environment {env_id!r}: {' '.join(str(error).split())}") from error
+    try:
+        if not isinstance(envs.unwrapped, BatchShell):
+            raise ViewerError(f"environment {env_id!r}: expected one of ce_gym, of its own robots or registered ones")
         period = envs.unwrapped.dt  # type: ignore[attr-defined]
         commands = np.repeat([c for _, c in script], [round(t / period) for t, _ in script], axis=0)
         if script is SHOW:
@@ -71,23 +77,21 @@ def drive_many(
         envs.close()
 
 
-def walk(file: Path, script: Script = SHOW, **options: Any) -> list[Rollout]:
+def walk(file: Path, script: Script = SHOW, *, env: str | None = None, **options: Any) -> list[Rollout]:
     """Run a policy through a list of commands in the environment it was trained in.
 
     Args:
         file: Of the policy.
         script: What to command.
+        env: Id of the environment, if not the one that the policy's record names; see `policies.environment_of`.
         **options: See `drive_many`; anything else replaces what the policy was trained with, such as `transmission`.
 
     Raises:
-        PolicyError: If the file is damaged or no policy.
-        ViewerError: If its environment is unknown.
+        PolicyError: If the file is damaged or no policy, or its environment is not registered.
+        ViewerError: If the environment cannot be made, or is none of ce_gym.
     """
-    from ce_gym import environment_ids
-
     policy = load_policy(file)
     record = policy.record
-    if record["env"] not in environment_ids():
-        raise ViewerError(f"{file}: environment {record['env']!r}; expected one of this package's (see `list`)")
+    env_id = environment_of(record, env)
     kwargs: Mapping[str, Any] = {"robots": 1, "label": file.resolve().parent.name, **record["env_kwargs"], **options}
-    return drive_many(lambda observation: policy.predict(observation)[0], record["env"], script, **kwargs)
+    return drive_many(lambda observation: policy.predict(observation)[0], env_id, script, **kwargs)
