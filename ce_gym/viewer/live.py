@@ -2,12 +2,18 @@
 
 meshcat's own server is not used: it listens on every network interface, runs as another process that outlives its
 window, and takes one blocking message at a time. The page carries the whole animation, so a plain HTTP server inside
-this process does, and there is nothing to leave behind. Knows how to make a page and how to serve it.
+this process does, and there is nothing to leave behind.
+
+Who may look: browsers of this machine that were given the address. It has a random part, so that pages of other sites
+cannot guess it, and requests that came here by another name than the loopback's are refused.
 """
 
 from __future__ import annotations
 
 import contextlib
+import secrets
+import socket
+import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
@@ -19,6 +25,10 @@ from ce_gym.viewer.page.html import page
 from ce_gym.viewer.rollouts.rollout import Rollout
 
 LOOPBACK = "127.0.0.1"
+MOST_CLIENTS = 16  # connections at a time, a thread each; more are closed at once
+PATIENCE = 10.0  # of a connection over which nothing comes or goes [s]
+
+Events = Callable[[], Iterator[bytes]]
 
 
 def show(
@@ -39,54 +49,108 @@ def show(
     Raises:
         ViewerError: meshcat is not installed, or a rollout does not fit its robot.
     """
-    with serve(page(rollouts, **options)) as url, contextlib.suppress(KeyboardInterrupt):
-        print(f"playing at {url} (Ctrl-C to stop)", flush=True)
+    with contextlib.closing(PageServer(page(rollouts, **options))) as server, contextlib.suppress(KeyboardInterrupt):
+        print(f"playing at {server.url} (Ctrl-C to stop)", flush=True)
         if open_browser:
-            webbrowser.open(url, new=2)
+            webbrowser.open(server.url, new=2)
         threading.Event().wait(seconds)
 
 
-@contextlib.contextmanager
-def serve(text: str, events: Callable[[], Iterator[bytes]] | None = None) -> Iterator[str]:
-    """Serve one page at a free loopback port inside the context, which gets its address.
+class PageServer:
+    """Serves one page at a free loopback port until it is closed.
 
     Args:
         text: The page.
-        events: Gives what the page's browsers get as server-sent events from `/events`; none if not given.
+        events: Gives what the page's browsers get as server-sent events from `events`; none if not given.
+
+    Attributes:
+        url: Address of the page.
     """
-    server = ThreadingHTTPServer((LOOPBACK, 0), _handler(text.encode("utf-8"), events))
-    server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
-    thread.start()
-    try:
-        yield f"http://{LOOPBACK}:{server.server_port}/"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+
+    def __init__(self, text: str, events: Events | None = None) -> None:
+        path = f"/{secrets.token_urlsafe(16)}/"
+        self._stop = threading.Event()
+        server = _Server((LOOPBACK, 0), _handler(text.encode("utf-8"), path, events))
+        self.url = f"http://{LOOPBACK}:{server.server_port}{path}"
+        self._thread = threading.Thread(target=_serve, args=(server, self._stop), daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Let the server end soon, and do not wait: for finalizers, which may run in any thread, its own included."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Stop the server and free its port; harmless if done before."""
+        self.stop()
+        self._thread.join()
 
 
-def _handler(body: bytes, events: Callable[[], Iterator[bytes]] | None) -> type[BaseHTTPRequestHandler]:
+def _serve(server: _Server, stop: threading.Event) -> None:
+    """Take connections until told to stop."""
+    with server:
+        while not stop.is_set():
+            server.handle_request()
+
+
+class _Server(ThreadingHTTPServer):
+    """A server whose threads are limited in number, and that says nothing of browsers that leave."""
+
+    daemon_threads = True
+    timeout = 0.05  # between two looks at whether to stop [s]
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._places = threading.BoundedSemaphore(MOST_CLIENTS)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Give a connection a thread, or close it if there are too many."""
+        if not self._places.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve a connection, in its thread."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Be silent about connections that broke; all else is a mistake of ours."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
+
+def _handler(body: bytes, path: str, events: Events | None) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
+        timeout = PATIENCE
+
         def do_GET(self) -> None:
-            if self.path == "/events" and events is not None:
+            port = self.server.server_address[1]
+            if self.headers.get("Host") not in (f"{LOOPBACK}:{port}", f"localhost:{port}"):
+                self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
+            elif self.path == f"{path}events" and events is not None:
                 self._send_events(events())
-                return
-            if self.path != "/":
+            elif self.path == path:
+                self._send_head("text/html; charset=utf-8", len(body))
+                self.wfile.write(body)
+            else:
                 self.send_error(HTTPStatus.NOT_FOUND)
-                return
+
+        def _send_head(self, kind: str, length: int | None = None) -> None:
             self.send_response(HTTPStatus.OK)
-            self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Content-Type", kind)
+            self.send_header("Cache-Control", "no-store")
+            self.send_header("Referrer-Policy", "no-referrer")
+            if length is not None:
+                self.send_header("Content-Length", str(length))
             self.end_headers()
-            self.wfile.write(body)
 
         def _send_events(self, items: Iterator[bytes]) -> None:
-            self.send_response(HTTPStatus.OK)
-            self.send_header("Content-Type", "text/event-stream")
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            with contextlib.closing(items), contextlib.suppress(ConnectionError):  # type: ignore[type-var]
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**16)  # who does not read is seen soon
+            self._send_head("text/event-stream")
+            with contextlib.closing(items):  # type: ignore[type-var]
                 for item in items:
                     self.wfile.write(item)
 

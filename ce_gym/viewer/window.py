@@ -7,12 +7,12 @@ commands, terrain and how to serve a page; knows no environments.
 from __future__ import annotations
 
 import base64
-import contextlib
 import html
 import json
 import string
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.sim.terrain import Terrain
-from ce_gym.viewer.live import serve
+from ce_gym.viewer.live import PageServer
 from ce_gym.viewer.page import three
 from ce_gym.viewer.page.html import meshcat_code, source
 from ce_gym.viewer.page.lights_and_camera import HORIZON, TILE, camera_commands, eye, field_command, stage_commands
@@ -38,7 +38,8 @@ BLOCK = 4.0  # edge of the squares of the world that share a piece of ground tha
 class Window:
     """Shows one robot to every browser that looks.
 
-    The address is printed when the window is first drawn into; a server runs until `close`.
+    The address is printed when the window is first drawn into; a server runs until `close`, or until the window is
+    dropped.
 
     Args:
         model: The robot and its forward kinematics.
@@ -58,39 +59,37 @@ class Window:
         order = list(self._index.values())
         low, high = extent(self._robot, positions[order], rotations[order])
         self._radius, self._terrain = max(float(np.linalg.norm(high - low)) / 2, 0.05), terrain
-        self._block, self._ground, self._grounds = (0, 0), b"", 0  # the piece of ground, as an event, and its number
+        self._block: tuple[int, int] | None = None  # the piece of ground that the page has
         self._middle, self._height = (low + high)[:2] / 2, float(low[2] + high[2]) / 2
         self._text = self._page()
-        self._news = threading.Condition()
-        self._event, self._count, self._watchers, self._closed = b"", 0, 0, False
-        self._due = 0.0
-        self._running = contextlib.ExitStack()
-        self.url: str | None = None
+        self._feed, self._due = Feed(), 0.0
+        self._server: PageServer | None = None
+
+    @property
+    def url(self) -> str | None:
+        """Address of the page, once something has been drawn."""
+        return self._server.url if self._server else None
 
     def draw(self, q: Array) -> None:
         """Show the robot at positions `q`, shape (nq,)."""
-        if self._closed:
+        if self._feed.closed:
             return
-        if self.url is None:
-            self.url = self._running.enter_context(serve(self._text, self._events))
+        if self._server is None:
+            self._server = PageServer(self._text, self._feed.events)
+            weakref.finalize(self, _stop, self._server, self._feed)  # a window that is dropped leaves nothing behind
             print(f"watch at {self.url}", flush=True)
         positions, rotations = (np.asarray(rows[0]) for rows in self._model.body_poses(np.asarray(q, float)[None]))
         event = f"data: {json.dumps(self._moves(positions, rotations))}\n\n".encode()
         self._look_around(self._place(positions))
-        with self._news:
-            self._event, self._count = event, self._count + 1
-            self._news.notify_all()
-            watched = self._watchers > 0
-        if watched:
+        if self._feed.publish(event):
             time.sleep(max(0.0, self._due - time.monotonic()))
         self._due = max(self._due, time.monotonic() - self._period) + self._period
 
     def close(self) -> None:
         """Stop the server and free its port; harmless if done before."""
-        with self._news:
-            self._closed = True
-            self._news.notify_all()
-        self._running.close()
+        self._feed.close()
+        if self._server:
+            self._server.close()
 
     def _page(self) -> str:
         code = meshcat_code()
@@ -128,18 +127,54 @@ class Window:
     def _look_around(self, place: Array) -> None:
         """Let the page have the ground around a place [m], shape (2,), if it is not flat and new to it."""
         row, column = np.floor(place / BLOCK).astype(int).tolist()
-        if self._terrain is None or (self._grounds and self._block == (row, column)):
+        if self._terrain is None or self._block == (row, column):
             return
         block = BLOCK * np.array([[row, column], [row + 1, column + 1]])
         ground = around(self._terrain, block)
         root = self._paths[self._robot.bodies[0].name]
         command = field_command(_FIELD, ground, [root], reach(ground, block))
-        with self._news:
-            self._block, self._grounds = (row, column), self._grounds + 1
-            self._ground = f"event: ground\ndata: {json.dumps(command)}\n\n".encode()
+        self._block = (row, column)
+        self._feed.put_ground(f"event: ground\ndata: {json.dumps(command)}\n\n".encode())
 
-    def _events(self) -> Iterator[bytes]:
-        """Yield the newest poses to one browser until the window is closed."""
+
+def _stop(server: PageServer, feed: Feed) -> None:
+    feed.close()
+    server.stop()
+
+
+class Feed:
+    """What the browsers of a window are sent: the newest poses, and the ground around them. Knows no window.
+
+    Attributes:
+        closed: Whether it has ended.
+    """
+
+    def __init__(self) -> None:
+        self._news = threading.Condition(threading.RLock())  # a finalizer may close it amid a call
+        self._event, self._count, self._watchers = b"", 0, 0
+        self._ground, self._grounds = b"", 0
+        self.closed = False
+
+    def publish(self, event: bytes) -> bool:
+        """Send an event to whoever watches; return whether anybody does."""
+        with self._news:
+            self._event, self._count = event, self._count + 1
+            self._news.notify_all()
+            return self._watchers > 0
+
+    def put_ground(self, event: bytes) -> None:
+        """Send another piece of ground before the next event."""
+        with self._news:
+            self._ground, self._grounds = event, self._grounds + 1
+
+    def close(self) -> None:
+        """End the stream of every browser."""
+        with self._news:
+            self.closed = True
+            self._news.notify_all()
+
+    def events(self) -> Iterator[bytes]:
+        """Yield the newest poses to one browser until the feed is closed."""
         seen = grounds = 0
         with self._news:
             self._watchers += 1
@@ -147,9 +182,9 @@ class Window:
             while True:
                 with self._news:
                     # Without news for a second, an empty line finds out whether the browser is still there.
-                    if not self._closed and self._count == seen:
+                    if not self.closed and self._count == seen:
                         self._news.wait(timeout=1.0)
-                    if self._closed:
+                    if self.closed:
                         return
                     event, seen = (self._event, self._count) if self._count > seen else (b":\n\n", seen)
                     if self._grounds > grounds:

@@ -6,6 +6,7 @@ import json
 import socket
 import subprocess
 import sys
+import urllib.parse
 import urllib.request
 import warnings
 from pathlib import Path
@@ -275,7 +276,7 @@ def test_a_page_gets_every_pose_and_closing_frees_the_port(capsys: pytest.Captur
     env.close()
     with socket.socket() as free:
         free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # past connections may linger; a listener may not
-        free.bind(("127.0.0.1", int(url.rsplit(":")[-1].strip("/"))))
+        free.bind(("127.0.0.1", urllib.parse.urlsplit(url).port))
 
 
 def test_nothing_to_render_without_a_mode():

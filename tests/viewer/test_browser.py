@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from chromium import PROGRAM, Chromium
 from ce_gym import Terrain
 from ce_gym.dynamics import Model
 from ce_gym.viewer import Rollout, write_html
-from ce_gym.viewer.live import serve
+from ce_gym.viewer.live import PageServer
 from ce_gym.viewer.page.html import page
 from ce_gym.viewer.rollouts.ground_patch import around
 
@@ -216,10 +217,10 @@ def test_the_address_says_what_to_show(file: Path) -> None:
 
 
 def test_the_live_page_is_the_same(twins: list[Rollout]) -> None:
-    with serve(page(twins[:1])) as url, Chromium(url, size=(600, 500)) as browser:
+    with closing(PageServer(page(twins[:1]))) as server, Chromium(server.url, size=(600, 500)) as browser:
         browser.until("animator.time > 0.1")
         assert browser.errors == []
-        assert all(asked.startswith((url, "data:")) for asked in browser.requests)
+        assert all(asked.startswith((server.url, "data:")) for asked in browser.requests)
 
 
 @pytest.fixture(scope="module")

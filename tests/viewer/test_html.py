@@ -11,8 +11,10 @@ import struct
 import subprocess
 import sys
 import urllib.error
+import urllib.parse
 import urllib.request
 import zlib
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -121,8 +123,8 @@ def connect(host: str, port: int) -> None:
 
 
 def test_live_page_is_served_on_loopback_only_and_then_gone() -> None:
-    with live.serve("<p>robot</p>") as url:
-        port = int(url.rstrip("/").rsplit(":", 1)[1])
+    with closing(live.PageServer("<p>robot</p>")) as server:
+        url, port = server.url, urllib.parse.urlsplit(server.url).port
         with urllib.request.urlopen(url, timeout=5) as answer:
             assert answer.read() == b"<p>robot</p>"
         with pytest.raises(urllib.error.HTTPError, match="404"):
