@@ -74,8 +74,9 @@ def test_commands_exist(page: str, command: str):
 
 def check_extras(words: list[str]) -> None:
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    (asked,) = re.findall(r"\[([\w,-]+)\]", words[-1])
-    assert set(asked.split(",")) <= set(known)
+    what, extras = re.fullmatch(r"(ce_gym|\.)(?:\[([\w,-]+)\])?", words[-1]).groups()
+    assert words[:2] == ["pip", "install"]
+    assert set(extras.split(",") if extras else ()) <= set(known), what
 
 
 def check_module(module: str, words: list[str]) -> None:

@@ -98,7 +98,7 @@ def test_sdist_has_what_the_readme_names(built: Path):
         names = {name.split("/", 1)[1] for name in archive.getnames()}
     assert {name for name in names if "/" not in name} == {
         ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile", "PKG-INFO", "README.md",
-        "constraints.txt", "pyproject.toml",
+        "SECURITY.md", "constraints.txt", "pyproject.toml",
     }  # fmt: skip
     assert {name.split("/")[0] for name in names if "/" in name} == {
         ".ci", "assets", "ce_gym", "docs", "tests", "train",
