@@ -127,7 +127,8 @@ def _handler(body: bytes, path: str, events: Events | None) -> type[BaseHTTPRequ
         timeout = PATIENCE
 
         def do_GET(self) -> None:
-            port = self.server.server_address[1]
+            server: Any = self.server
+            port = server.server_port
             if self.headers.get("Host") not in (f"{LOOPBACK}:{port}", f"localhost:{port}"):
                 self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             elif self.path == f"{path}events" and events is not None:
