@@ -51,7 +51,7 @@ def as_text(report: SceneReport, times: SceneTimes | None = None) -> str:
     timed = (
         f"ns: one robot, one core, double precision; {BATCH} robots, kernels in turn, medians of {ROUNDS} rounds.",
         "A line is a difference of two kernels, and each can be slower by a fifth in one process than in the next:",
-        "small times are noise. Sub-steps are those of robots settling onto their feet, further attempts included. The",
+        "small times are noise. Sub-steps are those of robots settling onto their feet, with all iterations. The",
         "environment step is timed by itself, under random actions, with its random numbers and the Python call.",
     )
     return "\n".join(

@@ -40,7 +40,7 @@ class SceneTimes:
     """Nanoseconds for one robot on one core, in double precision.
 
     Attributes:
-        sub_step: A sub-step, further attempts included where they were called for.
+        sub_step: A sub-step, further iterations included where they were called for.
         env_step: An environment step as users get it, random actions, everything included.
         added: What an item of the report adds, by its group and name.
     """

@@ -108,4 +108,4 @@ def test_no_robot_exceeds_its_limits_or_stays_below_for_nothing(robot: str, leve
         at_limit += int((np.abs(asked) > limit).sum())
     assert sim.n_diverged == 0
     assert at_limit > 0
-    assert np.mean(wrong) < 0.01  # steps that five attempts were not enough for; most on Tello without rotors
+    assert np.mean(wrong) < 0.01  # steps that five iterations were not enough for; most on Tello without rotors

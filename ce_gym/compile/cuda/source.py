@@ -188,9 +188,9 @@ class _KernelText:
             for c in calls:
                 yield from self._calls([c])
             return
-        asked = "" if first.only_if else "attempt == 0 || "
+        asked = "" if first.only_if else "iteration == 0 || "
         yield "#pragma unroll 1"
-        yield f"for (int attempt = 0; attempt < {len(calls)} && ({asked}{flag}_[0] != 0); ++attempt)"
+        yield f"for (int iteration = 0; iteration < {len(calls)} && ({asked}{flag}_[0] != 0); ++iteration)"
         yield f"    {call}"
 
     def _look_up(self, lookup: Lookup) -> str:
