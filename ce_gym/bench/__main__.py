@@ -1,6 +1,6 @@
 """The command `python -m ce_gym.bench`: lists the benchmarks, or runs one and prints its report.
 
-A benchmark is a module of this package, or the module `benchmark` of a package in it, with
+A benchmark is a module of this package or of a package in it, or the module `benchmark` of such a package, with
 `add_arguments(parser)` and `run(arguments) -> Report`; the first line of its docstring is its entry in the list. Only
 the one that runs is imported.
 """
@@ -30,13 +30,15 @@ def summary(name: str) -> str:
 
 def load(name: str) -> ModuleType:
     """Import a benchmark."""
-    inside = "" if _source(name).stem == name else ".benchmark"
-    return importlib.import_module(f"ce_gym.bench.{name}{inside}")
+    path = _source(name).relative_to(Path(__file__).parent).with_suffix("")
+    return importlib.import_module(".".join(["ce_gym.bench", *path.parts]))
 
 
 def _source(name: str) -> Path:
-    alone = Path(__file__).with_name(f"{name}.py")
-    return alone if alone.exists() else Path(__file__).with_name(name) / "benchmark.py"
+    """Return the file of a benchmark: a module here, the module `benchmark` of a package, or a module in one."""
+    here = Path(__file__).parent
+    candidates = (here / f"{name}.py", here / name / "benchmark.py", *here.glob(f"*/{name}.py"))
+    return next(path for path in candidates if path.exists())
 
 
 def listing() -> str:

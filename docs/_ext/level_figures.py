@@ -11,7 +11,7 @@ from environment_page import percent, table, title
 from robot_page import report_of, shipped
 
 from ce_gym import Model, robots
-from ce_gym.bench.tracking import FREQUENCY, STEP, sinusoid
+from ce_gym.bench.paper.tracking import FREQUENCY, STEP, sinusoid
 from ce_gym.model.mechanism import LEVELS
 
 LEG, JOINT = "mit_humanoid_leg", "knee_link"

@@ -39,7 +39,7 @@ LAYERS = {
     "sim": "tiles devices terrain placement substeps pieces retry kernel_key simulator",
     "envs": "terms task runtime policy_spec base rendering single gpu_vector vector registration custom",
     "viewer": "errors console rollouts page raytrace live window renderers cli",
-    "bench": "measure peers friction instructions tracking soak digests fuzz speed throughput paper accuracy stability"
+    "bench": "measure peers friction instructions soak digests fuzz speed throughput paper accuracy stability"
     " gpu __main__",
 }
 """What a folder consists of, bottom first: a module imports from its own layer and from those below."""

@@ -13,9 +13,9 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby, pairwise
 from pathlib import Path
 
-from ce_gym.bench import tracking
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.paper import counts as paper_counts
+from ce_gym.bench.paper import tracking
 from ce_gym.bench.paper.counts import ChainCount, RobotCount, crossover, increments
 
 LARGEST_SPREAD = 4

@@ -14,7 +14,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from ce_gym.bench import tracking
+from ce_gym.bench.paper import tracking
 from ce_gym.bench.paper.counts import ChainCount, RobotCount, crossover
 from ce_gym.dynamics.model import Model
 from ce_gym.model import load_robot
