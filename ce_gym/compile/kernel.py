@@ -122,14 +122,14 @@ class Kernel:
 
     def _address(self, name: str, array: object, shape: tuple[int, ...], dtype: np.dtype) -> int:
         """Address of an array that is as it should be."""
+        known = self._known.get(name)  # checks and asking numpy take longer, and most arrays come again
+        if known is not None and known[0]() is array and array is not None and array.shape == shape:  # type: ignore[attr-defined]
+            return known[1]
         if not isinstance(array, np.ndarray):
             got = "nothing" if array is None else type(array).__name__
         elif array.shape == shape and array.dtype == dtype and array.flags.c_contiguous:
-            # Asking numpy for an address takes longer than all checks together, and most arrays come again.
-            known = self._known.get(name)
-            if known is None or known[0]() is not array:
-                known = self._known[name] = (weakref.ref(array), array.ctypes.data)
-            return known[1]
+            self._known[name] = (weakref.ref(array), array.ctypes.data)
+            return self._known[name][1]
         else:
             order = "C order" if array.flags.c_contiguous else "not in C order"
             got = f"{array.dtype} {array.shape} {order}"

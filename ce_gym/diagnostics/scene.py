@@ -35,7 +35,7 @@ from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.registry import OWN
 from ce_gym.model.description import Robot
 from ce_gym.model.mechanism import LEVELS
-from ce_gym.sim.simulator import select_contacts
+from ce_gym.sim.kernels import select_contacts
 from ce_gym.sim.substeps import substeps
 
 TERMS = {
@@ -275,7 +275,7 @@ def _once(program: TaskProgram, whole: SubStep) -> Iterator[Item]:
     steps = [(field, term) for field in TERMS for term in getattr(program.task, field)]
     for field, term in (*steps, ("noise and history", "noise and history")):
         known = field in TERMS
-        before, task = assess, with_term(task, field, term, program.task.rewards) if known else program.task
+        before, task = assess, with_term(task, field, term, program.task) if known else program.task
         assess = replace(program, task=task).function("assess")
         if known or assess.n_instructions() != before.n_instructions():
             yield Item(field, term, assess.n_instructions() - before.n_instructions(), assess)
@@ -293,18 +293,20 @@ def _late_actions(program: TaskProgram, whole: SubStep) -> int:
     return total
 
 
-def with_term(task: Task, field: str, term: str, weights: Mapping[str, float]) -> Task:
-    """Return the task with one term more; a reward with its weight, or 1 if it has none."""
+def with_term(task: Task, field: str, term: str, like: Task | None = None) -> Task:
+    """Return the task with one term more, its weight and parameters as in `like`; else with weight 1 and defaults."""
+    given = getattr(like, field, {})
+    own = given[term] if isinstance(given, Mapping) else 1.0 if field == "rewards" else {}
     terms = getattr(task, field)
-    more = {**terms, term: weights.get(term, 1.0)} if field == "rewards" else (*terms, term)
-    return replace(task, **{field: more})
+    old = terms if isinstance(terms, Mapping) else {name: {} for name in terms}
+    return replace(task, **{field: {**old, term: own}})
 
 
 def _terms_left_out(program: TaskProgram) -> Iterator[Item]:
     """What each term and feature that the task does not have would add to what is done once in its step."""
     task, whole = program.task, program.function("assess").n_instructions()
     changes = [
-        (field, term, with_term(task, field, term, {}))
+        (field, term, with_term(task, field, term))
         for field, kind in TERMS.items()
         for term in OWN[kind]
         if field != "critic" and term not in getattr(task, field)

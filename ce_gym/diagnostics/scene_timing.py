@@ -18,8 +18,9 @@ from ce_gym.compile import Buffer, Call, Kernel, Program, Repeat, load_kernel, s
 from ce_gym.diagnostics.scene import SceneReport, SubStep
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
-from ce_gym.envs.runtime.batch import Batch
-from ce_gym.sim.simulator import load_step_kernel
+from ce_gym.envs.runtime.batch import TaskBatch
+from ce_gym.sim.devices import device_named
+from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.substeps import FRAME, HEIGHTS, TIMES
 from ce_gym.sim.tiles import tiles, write_rows
 
@@ -110,7 +111,7 @@ def _work(model: Model, compiled: SubStep | ca.Function) -> Work:
 
 
 def _env_work(report: SceneReport) -> Work:
-    batch = Batch(report.program, BATCH, DTYPE, 1)
+    batch = TaskBatch(report.program, BATCH, DTYPE, device_named("cpu"))
     batch.seed(np.arange(BATCH).astype(np.uint64))
     batch.reset(np.ones(BATCH, bool))
     actions = np.random.default_rng(0).uniform(-1, 1, (BATCH, report.program.n_actions)).astype(np.float32)

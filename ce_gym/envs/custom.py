@@ -1,4 +1,4 @@
-"""Environments of a robot of one's own, under ids of its own. May know descriptions, tasks and Gymnasium's registry.
+"""Environments of a robot of one's own, under ids of its own.
 
     ids = ce_gym.register_robot("my_robot.yaml")
     env = gymnasium.make("ce_gym/MyRobotVelocity-Armature-v0")
@@ -41,6 +41,10 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
         >>> print(ids[0], ids[3])
         ce_gym/MyRobotVelocity-v0 ce_gym/MyRobotVelocity-Armature-v0
     """
+    if not isinstance(path, str | os.PathLike):
+        given = repr(path.name) if isinstance(path, Robot) else repr(path)
+        expected = "the path of a file, which worker processes can read, too"
+        raise bad("register_robot", "path", f"{type(path).__name__} {given}", expected)
     file = Path(path).resolve()
     robot = load_robot(file)
     check_ready(robot)
@@ -85,7 +89,7 @@ def _register(env_id: str, arguments: dict[str, str]) -> None:
     gymnasium.register(
         env_id,
         entry_point="ce_gym.envs.single:LeggedEnv",
-        vector_entry_point="ce_gym.envs.vector:make_vector_env",
+        vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
         max_episode_steps=TASKS[arguments["task"]].episode_length,
         kwargs=arguments,
     )

@@ -1,7 +1,7 @@
 """The contract of a policy: all that somebody must know to run it on another simulator or on a robot.
 
 Plain data, so that it can be written beside a policy or into its file. Nothing is said here that is written elsewhere:
-where the numbers of an observation come from is read off the traced terms. May know programs; no Gymnasium.
+where the numbers of an observation come from is read off the traced terms.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.runtime.program import OBSERVATION_BOUND, TaskProgram
+from ce_gym.envs.runtime.program import TaskProgram
+from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
 
 FORMAT = "ce_gym policy contract, version 1"
 
@@ -100,7 +101,7 @@ def _blocks(program: TaskProgram) -> list[dict[str, Any]]:
     seen = dict(zip(look.name_out(), look.call(list(state.values())), strict=True))
     blocks = []
     for name, size in program.observation_sizes.items():
-        document = inspect.getdoc(program.observation_terms[name]) or ""
+        document = inspect.getdoc(program.observation_terms[name].function) or ""
         noise = {"noise": program.task.noise[name]} if program.task.noise.get(name) else {}
         meaning = " ".join(document.split())
         blocks.append({"name": name, "size": size, "meaning": meaning, **_source(seen[name], state), **noise})

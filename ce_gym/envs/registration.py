@@ -1,4 +1,4 @@
-"""The ids under which environments are found: `ce_gym/<Robot><Task>[-<Level>]-v0`. May know names only."""
+"""The ids under which environments are found: `ce_gym/<Robot><Task>[-<Level>]-v0`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def register_environments() -> None:
             gymnasium.register(
                 name,
                 entry_point="ce_gym.envs.single:LeggedEnv",
-                vector_entry_point="ce_gym.envs.vector:make_vector_env",
+                vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
                 max_episode_steps=TASKS[arguments["task"]].episode_length,
                 kwargs=arguments,
             )

@@ -1,8 +1,7 @@
 """What `render` shows: environments ask for a render mode, the top of the package says where its renderer is.
 
 The rooms that draw lie above this one, so this file does not know them: `use_renderers` is told the name of a module
-that has a function for each render mode, and that module is imported when an environment is made with one. May know
-batches, fields and Gymnasium's logger.
+that has a function for each render mode, and that module is imported when an environment is made with one.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
-from ce_gym.envs.runtime.batch import Batch
+from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.task.terrain_tiles import field_of
 
 RENDER_MODES = ("human", "rgb_array")
@@ -59,7 +58,7 @@ class Screen:
         ViewerError: If what the mode needs is not installed.
     """
 
-    def __init__(self, mode: str | None, batch: Batch, *, width: int, height: int) -> None:
+    def __init__(self, mode: str | None, batch: TaskBatch, *, width: int, height: int) -> None:
         if mode is not None and mode not in RENDER_MODES:
             raise ValueError(f"render_mode={mode!r}; expected one of {', '.join(RENDER_MODES)}, or None")
         for name, value in (("width", width), ("height", height)):

@@ -26,9 +26,11 @@ class Device(Protocol):
 
     Attributes:
         name: "cpu", "cuda", "cuda:1" and so on.
+        fuses: Whether stages that follow each other are one kernel.
     """
 
     name: str
+    fuses: bool
 
     def tiles(self, num_envs: int, size: int, dtype: str) -> Array:
         """Return zeros for `size` values of each robot, as kernels take them."""
@@ -50,6 +52,22 @@ class Device(Protocol):
         """Return values as an array of this device, contiguous; broadcast to `shape`, if one is given."""
         ...
 
+    def zeros(self, shape: tuple[int, ...], dtype: str) -> Array:
+        """Return zeros as a plain array, one robot per row."""
+        ...
+
+    def empty(self, shape: tuple[int, ...], dtype: str) -> Array:
+        """Return a plain array whose values are yet to be written."""
+        ...
+
+    def assign(self, array: Array, rows: Any, mask: Any = None) -> None:
+        """Write rows of a plain array, where `mask` is true."""
+        ...
+
+    def host(self, array: Array) -> NDArray:
+        """Return a plain array in the memory of the CPU, its type kept."""
+        ...
+
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
         """Return the kernel of some stages, see `ce_gym.compile.load_kernel`."""
         ...
@@ -58,7 +76,7 @@ class Device(Protocol):
 class Processor:
     """numpy arrays and the kernels of `ce_gym.compile`."""
 
-    name = "cpu"
+    name, fuses = "cpu", False
     tiles = staticmethod(host_tiles.tiles)
     read = staticmethod(host_tiles.read_rows)
     write = staticmethod(host_tiles.write_rows)
@@ -71,6 +89,22 @@ class Processor:
         """Return values as an array; broadcast to `shape` and contiguous, if one is given."""
         array = np.asarray(values, dtype)
         return np.ascontiguousarray(np.broadcast_to(array, shape)) if shape else array
+
+    def zeros(self, shape: tuple[int, ...], dtype: str) -> NDArray:
+        """Return zeros."""
+        return np.zeros(shape, dtype)
+
+    def empty(self, shape: tuple[int, ...], dtype: str) -> NDArray:
+        """Return an array whose values are yet to be written."""
+        return np.empty(shape, dtype)
+
+    def assign(self, array: Array, rows: Any, mask: Any = None) -> None:
+        """Write rows where `mask` is true."""
+        array[...] = rows if mask is None else np.where(_beside(mask, array.ndim), rows, array)
+
+    def host(self, array: Array) -> NDArray:
+        """Return the array itself."""
+        return array
 
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
         """Return the kernel of one stage."""
@@ -91,6 +125,8 @@ class Cuda:
     Raises:
         CudaUnavailable: If there is no such GPU, or a package is missing; one line.
     """
+
+    fuses = True
 
     def __init__(self, gpu: int = 0) -> None:
         from ce_gym.compile.cuda.gpu import architecture
@@ -136,6 +172,30 @@ class Cuda:
         tensor = torch.as_tensor(values, dtype=getattr(torch, dtype), device=self._place)
         return (tensor.expand(shape) if shape else tensor).contiguous()
 
+    def zeros(self, shape: tuple[int, ...], dtype: str) -> Array:
+        """Return zeros."""
+        import torch
+
+        return torch.zeros(shape, dtype=getattr(torch, dtype), device=self._place)
+
+    def empty(self, shape: tuple[int, ...], dtype: str) -> Array:
+        """Return a tensor whose values are yet to be written."""
+        import torch
+
+        return torch.empty(shape, dtype=getattr(torch, dtype), device=self._place)
+
+    def assign(self, array: Array, rows: Any, mask: Any = None) -> None:
+        """Write rows where `mask` is true."""
+        import torch
+
+        new = torch.as_tensor(rows, dtype=array.dtype, device=array.device)
+        chosen = None if mask is None else torch.as_tensor(mask, dtype=torch.bool, device=array.device)
+        array[...] = new if chosen is None else torch.where(_beside(chosen, array.ndim), new, array)
+
+    def host(self, array: Array) -> NDArray:
+        """Return a copy in the memory of the CPU."""
+        return array.cpu().numpy()
+
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
         """Return the kernel of some stages."""
         from ce_gym.compile.cuda import load_cuda_kernel
@@ -154,6 +214,11 @@ class Emulated(Cuda):
         from ce_gym.compile.cuda import host_kernel
 
         return host_kernel(build, dtype)
+
+
+def _beside(mask: Array, ndim: int) -> Array:
+    """Return a mask of rows with a column for those of an array with two axes."""
+    return mask[:, None] if ndim == 2 else mask
 
 
 def device_named(device: str | Device) -> Device:

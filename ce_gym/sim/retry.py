@@ -39,7 +39,7 @@ class Retry:
         shared: Arrays,
         n_substeps: int,
         section: CriticalSection,
-    ) -> int:
+    ) -> NDArray[np.bool_]:
         """Step again the robots that diverged between `before` and `after`, and write what became of them to `after`.
 
         A robot that no step length saves stays as it is in `after`: frozen and flagged. Robots are stepped alone, so
@@ -55,10 +55,10 @@ class Retry:
             section: The one that this is called in.
 
         Returns:
-            How many robots were stepped again.
+            Which robots were stepped again, shape (num_envs,).
         """
         failed = read_rows(after["diverged"], num_envs)[:, 0] > read_rows(before["diverged"], num_envs)[:, 0]
-        count, parts = int(failed.sum()), 1
+        again, parts = failed.copy(), 1
         for _ in range(self.halvings):
             if not failed.any():
                 break
@@ -75,7 +75,7 @@ class Retry:
                 rows[failed] = read_rows(array, n)
                 write_rows(after[name], rows, chosen)
             failed &= ~chosen
-        return count
+        return again
 
 
 def _rows_as_tiles(array: NDArray, num_envs: int, mask: NDArray[np.bool_]) -> NDArray:

@@ -13,23 +13,27 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.compile import Buffer, CriticalSection, Program
+from ce_gym.compile import CriticalSection
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.normal import NORMAL_LAWS
-from ce_gym.dynamics.forces.parameters import parameter_defaults
+from ce_gym.dynamics.forces.parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.forces.scene import Control, StepOptions, target_names
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import OUTPUTS
-from ce_gym.model import ContactMaterial, Robot
-from ce_gym.sim.devices import Array, Device, Processor, device_named, to_numpy
-from ce_gym.sim.kernel_key import laws_key, model_key
+from ce_gym.model import ContactMaterial
+from ce_gym.sim.batch import Batch, File, Snapshot
+from ce_gym.sim.devices import Array, Device, device_named, to_numpy
+from ce_gym.sim.kernels import load_step_kernel, select_contacts
 from ce_gym.sim.pieces import piece_length, run_substeps
 from ce_gym.sim.placement import Placement
 from ce_gym.sim.retry import Retry
-from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
+from ce_gym.sim.schema import Row, physics_rows
 from ce_gym.sim.terrain import Terrain
+
+COUNTS = (Row("failures", 1, "host", dtype="int64"), Row("retries", 1, "host", dtype="int64"))
+"""How often a robot has diverged and been set anew, and how often it has been stepped again."""
 
 
 class Simulator:
@@ -62,7 +66,6 @@ class Simulator:
 
     Attributes:
         device: Name of the device.
-        n_retried: How many times a robot has been stepped again.
         target_names: What each entry of a target is for: joints, or the motors' rotors and then joints without one.
 
     Raises:
@@ -99,6 +102,7 @@ class Simulator:
         retry: int = 0,
         device: str | Device = "cpu",
     ) -> None:
+        self._made_with = {name: value for name, value in locals().items() if name != "self"}
         _check("num_envs", num_envs, num_envs >= 1, "at least 1")
         _check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
         _check("num_threads", num_threads, num_threads >= 1, "at least 1")
@@ -134,27 +138,19 @@ class Simulator:
             parameters=tuple(parameters),
         )
         self.target_names = target_names(model.mechanism, self.options.control)
-        defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
         self._retry = Retry(
             retry, lambda parts: load_step_kernel(model, replace(self.options, dt=dt / parts), asked, dtype)
         )
-        self.n_retried = self._n_cleared = 0
         self._section = CriticalSection(f"Simulator of {num_envs} {model.robot.name}")
-        self._arrays = {
-            name: self._device.tiles(num_envs, buffer.size, dtype)
-            for name, buffer in self._kernel.buffers.items()
-            if buffer.kind == "tiles"
-        }
+        ground = terrain if self.options.ground == "field" else None
+        rows = [*physics_rows(model, self.options, asked), *COUNTS]
+        self._batch = Batch(rows, num_envs, dtype, self._device, ground)
+        self._arrays = self._batch.arrays
+        defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
         ends = np.cumsum([0, *(len(default) for default in defaults.values())])
         self._columns = {name: slice(*ends[i : i + 2]) for i, name in enumerate(defaults)}
-        if defaults:
-            self._device.write(self._arrays["parameters"], np.concatenate(list(defaults.values())))
-        self._tables: dict[str, Array] = {}
-        if terrain is not None and FRAME in self._arrays:
-            self._tables[HEIGHTS] = self._device.rows(terrain.heights.astype(dtype), dtype)
-            self._device.write(self._arrays[FRAME], [*terrain.origin, terrain.cell])
         self.reset()
 
     def reset(self, mask: ArrayLike | None = None) -> None:
@@ -192,10 +188,10 @@ class Simulator:
         if "dependent" in self._arrays:
             rows["dependent"] = self.model.dependent_guess(rows["q"])
         with self._section:  # all that can be refused has been
-            self._n_cleared += int(self.diverged[slice(None) if chosen is None else chosen].sum())
+            failures = self._batch.rows("failures") + self.diverged
             for name, value in rows.items():
-                whole = np.broadcast_to(value, (self.num_envs, value.shape[-1]))
-                self._device.write(self._arrays[name], whole, chosen)
+                self._batch.write(name, np.broadcast_to(value, (self.num_envs, value.shape[-1])), chosen)
+            self._batch.write("failures", failures, chosen)
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
         """Advance all robots by `n_substeps` sub-steps, or none of them by any.
@@ -228,12 +224,14 @@ class Simulator:
         """Step all robots; the state is as before if that raises, by Ctrl-C in a long call."""
         keep = self._retry.halvings > 0 or n_substeps > piece_length(self.num_envs)
         before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
-        arrays = self._arrays | self._tables | given
+        tables = self._batch.tables
+        arrays = self._arrays | tables | given
         try:
             run_substeps(self._kernel, arrays, self.num_envs, n_substeps, self._section, self.num_threads)
             if self._retry.halvings:
-                again = (self.num_envs, given, self._tables, n_substeps, self._section)
-                self.n_retried += self._retry(before, self._arrays, *again)
+                lanes = {name: array for name, array in before.items() if name in self._kernel.buffers}
+                again = (self.num_envs, given, tables, n_substeps, self._section)
+                self._arrays["retries"] += self._retry(lanes, self._arrays, *again)
         except BaseException:
             for name, array in before.items():
                 self._arrays[name][...] = array
@@ -250,7 +248,7 @@ class Simulator:
             mask: Which robots, bool, shape (num_envs,); all of them if None.
 
         Raises:
-            ValueError: If the parameter was not declared, or a shape is wrong.
+            ValueError: If the parameter was not declared, a shape is wrong, or a number is out of range.
         """
         if name not in self._columns:
             declared = ", ".join(self._columns) or "none"
@@ -259,12 +257,42 @@ class Simulator:
             )
         columns, chosen, new = self._columns[name], self._chosen(mask), to_numpy(value)
         size = columns.stop - columns.start
-        if new.shape not in ((), (size,), (self.num_envs, size)) or not np.isfinite(new).all():
-            raise ValueError(f"{name} has shape {new.shape}; expected ({size},) or ({self.num_envs}, {size}), finite")
+        if new.shape not in ((), (size,), (self.num_envs, size)):
+            raise ValueError(f"{name} has shape {new.shape}; expected ({size},) or ({self.num_envs}, {size})")
+        check_parameter(self.model.robot, name, new)
         with self._section:
-            rows = to_numpy(self._device.read(self._arrays["parameters"], self.num_envs))
+            rows = to_numpy(self._batch.rows("parameters"))
             rows[:, columns] = new
-            self._device.write(self._arrays["parameters"], rows, chosen)
+            self._batch.write("parameters", rows, chosen)
+
+    def snapshot(self, file: File | None = None) -> Snapshot:
+        """Return all that the robots carry, from which `restore` continues bit for bit.
+
+        Args:
+            file: Where to write it besides, as `.npz`.
+
+        Returns:
+            Arrays by name, a row for each robot, copies in the memory of the CPU.
+        """
+        return self._batch.snapshot(file)
+
+    def restore(self, snapshot: Snapshot | File) -> None:
+        """Continue from a snapshot of such a simulator.
+
+        Args:
+            snapshot: What `snapshot` returned, or the name of the file that it wrote.
+
+        Raises:
+            ValueError: If it is of other robots or another scene.
+        """
+        with self._section:
+            self._batch.restore(snapshot)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remade, (self._made_with, self.snapshot())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Simulator:
+        return _remade(self._made_with, self.snapshot())  # models and terrain are never changed
 
     @property
     def q(self) -> Array:
@@ -284,7 +312,12 @@ class Simulator:
     @property
     def n_diverged(self) -> int:
         """How many robots have been frozen so far, those that have been reset since included."""
-        return self._n_cleared + int(self.diverged.sum())
+        return int(self._arrays["failures"].sum()) + int(self.diverged.sum())
+
+    @property
+    def n_retried(self) -> int:
+        """How many times a robot has been stepped again, see `retry`."""
+        return int(self._arrays["retries"].sum())
 
     @property
     def torque(self) -> Array:
@@ -338,55 +371,23 @@ class Simulator:
         """Return the springs' forces on the contacts [N], shape (..., n_contacts): what friction has to go by."""
         stiffness: float | NDArray = self.options.material.stiffness
         if "stiffness" in self._columns:
-            rows = to_numpy(self._device.read(self._arrays["parameters"], self.num_envs))
+            rows = to_numpy(self._batch.rows("parameters"))
             stiffness = rows[:, self._columns["stiffness"]]
         return stiffness * self._placement.depth(q)
 
     def _read(self, name: str) -> Array:
         if name not in self._arrays:
             raise ValueError(f"{name} is not computed; ask for it with Simulator(..., outputs=({name!r},))")
-        return self._device.read(self._arrays[name], self.num_envs)
+        rows = self._batch.rows(name)
+        if name in OUTPUTS:
+            rows[self._batch.rows("diverged")[:, 0] > 0.5] = 0.0
+        return rows
 
 
-def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, ...]:
-    """Return names of contact spheres, in the robot's order.
-
-    Args:
-        robot: The robot.
-        contacts: "all", or names of spheres or groups of spheres, one or several.
-
-    Raises:
-        ValueError: If a name is neither a sphere's nor a group's.
-    """
-    wanted = {contacts} if isinstance(contacts, str) else set(contacts)
-    known = {"all"} | {c.group for c in robot.contacts} | {c.name for c in robot.contacts}
-    for name in sorted(wanted - known):
-        _check("contacts", name, False, f"'all', groups or names among {', '.join(sorted(known - {'all'}))}")
-    return tuple(c.name for c in robot.contacts if wanted & {"all", c.group, c.name})
-
-
-def load_step_kernel(
-    model: Model, options: StepOptions, outputs: tuple[str, ...], dtype: str, device: Device | None = None
-) -> Any:
-    """Compile, or load from the cache, the kernel that repeats a sub-step.
-
-    Args:
-        model: The robot at a transmission level.
-        options: The scene.
-        outputs: What to compute besides the state.
-        dtype: "float64" or "float32".
-        device: Whose kernel; the processor's if None.
-    """
-
-    def build() -> tuple[Program]:
-        sizes, further, steps = substeps(model.mechanism, options, outputs)
-        joints = sizes.pop("target", 0)
-        buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()]
-        buffers += [Buffer("target", joints, "rows_in")] if joints else []
-        return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
-
-    key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r}"
-    return (device or Processor()).kernel(key, build, dtype)
+def _remade(made_with: dict[str, Any], snapshot: Snapshot) -> Simulator:
+    sim = Simulator(**made_with)
+    sim.restore(snapshot)
+    return sim
 
 
 def _choice(argument: str, value: object, choices: tuple[object, ...]) -> None:

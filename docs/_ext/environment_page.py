@@ -10,10 +10,11 @@ from dataclasses import fields
 from typing import Any
 
 from ce_gym.envs.registration import camel_case
-from ce_gym.envs.runtime.program import OBSERVATION_BOUND, TaskProgram
+from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.setup import make_program
+from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
 from ce_gym.envs.task.tasks import Task
-from ce_gym.envs.terms.registry import find_term
+from ce_gym.envs.terms.registry import OWN
 from ce_gym.model.mechanism import LEVELS
 
 GOALS = {
@@ -24,7 +25,7 @@ GOALS = {
 }
 FIRST = {
     "transmission": ('"exact"', '`"exact"`, `"coupled"`, `"armature"` or `"none"`: what is kept of spinning rotors.'),
-    "reward_weights": ("{}", "Weights that replace or add to those below; 0 removes a term."),
+    "rewards": ("{}", "Weights, or weights and parameters, that replace or add to those below; 0 removes a term."),
     "obs_mode": ('"vector"', '`"vector"`, or `"dict"` for `{"policy": ..., "critic": ...}`.'),
     "dtype": ('"float64"', '`"float64"` or `"float32"` for physics.'),
     "num_threads": ("None", "Threads; the number of usable cores if None."),
@@ -186,7 +187,7 @@ def _attributes(thing: Any) -> dict[str, str]:
 
 def _meaning(kind: str, name: str) -> tuple[str, str]:
     """Return the first sentence of a term's docstring, without its units, and those."""
-    function: Callable = find_term(kind, name)
+    function: Callable = OWN[kind][name]
     text = " ".join((inspect.getdoc(function) or "").split("\n\n")[0].split())
     units = re.findall(r"\[([^\]]+)\]", text)
     plain = re.sub(r" ?\[[^\]]+\]", "", re.sub(r", shape \([^)]*\)", "", text))

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from ce_gym.bench.soak import benchmark as soak
-from ce_gym.envs.runtime.batch import Batch
+from ce_gym.envs.runtime.batch import TaskBatch
 
 IDS = ["ce_gym/MiniCheetahVelocity-v0", "ce_gym/MiniCheetahRun-v0"]
 
@@ -28,14 +28,14 @@ def test_a_few_seconds_of_it():
 
 
 def test_it_notices_failures_that_are_not_flagged(monkeypatch: pytest.MonkeyPatch):
-    step = Batch.step
+    step = TaskBatch.step
 
     def silent(self, *given):
         outcome = step(self, *given)
         outcome.diverged[:] = False
         return outcome
 
-    monkeypatch.setattr(Batch, "step", silent)
+    monkeypatch.setattr(TaskBatch, "step", silent)
     report = soak.run(arguments(minutes=0.0, env=IDS[:1]))
     assert [r.met for r in report.requirements][:2] == [False, False]
 

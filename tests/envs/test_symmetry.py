@@ -50,6 +50,11 @@ def test_the_kernel_commutes_with_the_reflection():
     base = np.concatenate([state["q"][:, :3] * [1, -1, 1], state["q"][:, 3:7] * quaternion], axis=1)
     reflected["q"] = np.concatenate([base, symmetry.action(state["q"][:, 7:])], axis=1)
     reflected["v"] = np.concatenate([state["v"][:, :6] * twist, symmetry.action(state["v"][:, 6:])], axis=1)
+    native = envs.unwrapped
+    points, _ = native.model.contact_points(native.model.standing_q, np.zeros(native.model.nv))
+    spheres = points[[native.model.contact_names.index(name) for name in native.contact_names]]
+    partners = np.linalg.norm(spheres[:, None] * [1, -1, 1] - spheres[None], axis=2).argmin(axis=1)
+    reflected["load"] = state["load"][:, partners]
     images.unwrapped.restore(reflected)
     for _ in range(10):
         actions = rng.uniform(-0.5, 0.5, (4, 12)).astype(np.float32)

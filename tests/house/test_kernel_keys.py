@@ -63,7 +63,7 @@ def files(names: tuple[str, ...]) -> set[Path]:
 LLVM = "ce_gym.compile.lowering.tile", "ce_gym.compile.machine_code", "ce_gym.compile.layout"
 CUDA = "ce_gym.compile.cuda.source", "ce_gym.compile.cuda.nvrtc", "ce_gym.compile.layout"
 SIMULATOR = "ce_gym.sim.simulator", "ce_gym.sim.substeps"
-ENVIRONMENT = *SIMULATOR, *(f"ce_gym.envs.runtime.{name}" for name in ("program", "fused_step"))
+ENVIRONMENT = *SIMULATOR, *(f"ce_gym.envs.runtime.{name}" for name in ("program", "stages"))
 TASKS = kernel_key.SOURCES + batch.SOURCES
 
 

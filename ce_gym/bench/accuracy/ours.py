@@ -11,7 +11,7 @@ import numpy as np
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
-from ce_gym.sim.simulator import load_step_kernel
+from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.tiles import tiles, write_rows
 
 

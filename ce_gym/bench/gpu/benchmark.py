@@ -18,7 +18,7 @@ from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.compile.cuda import CudaUnavailable, nvrtc
 from ce_gym.compile.cuda.source import BLOCK, emit_source
 from ce_gym.dynamics.model import Model
-from ce_gym.envs.runtime.fused_step import round_stages
+from ce_gym.envs.runtime.batch import programs
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.model import robots
 from ce_gym.sim import Simulator
@@ -144,7 +144,7 @@ def _resources(robot: str) -> Table:
     for dtype in DTYPES:
         caught = _Stages()
         Simulator(Model(robot), device=caught, dtype=dtype, contacts="foot", outputs=())
-        sources = {"sub-steps": caught.source, "environment step": emit_source(round_stages(program), dtype)}
+        sources = {"sub-steps": caught.source, "environment step": emit_source(programs(program, fused=True), dtype)}
         for name, source in sources.items():
             for arch in ARCHITECTURES:
                 start = time.perf_counter()

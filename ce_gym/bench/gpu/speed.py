@@ -75,16 +75,16 @@ def environment(robot: str, device: Device, sizes: Sequence[int], dtypes: Sequen
     """Return environment steps per second of the velocity task, random actions, resets included."""
     import torch
 
-    from ce_gym.envs.gpu_vector import GpuVectorEnv
+    from ce_gym.envs.vector import LeggedVectorEnv
 
     rates: Rates = {}
     for dtype in dtypes:
         for size in sizes:
-            envs = GpuVectorEnv(size, device, robot=robot, task="velocity", dtype=dtype)
+            envs = LeggedVectorEnv(size, device, robot=robot, task="velocity", dtype=dtype)
             envs.reset(seed=0)
             actions = 2 * torch.rand((4, size, envs.batch.program.n_actions), device=device.name) - 1
 
-            def work(envs: GpuVectorEnv = envs, actions: Any = actions) -> None:
+            def work(envs: LeggedVectorEnv = envs, actions: Any = actions) -> None:
                 for call in range(CALLS):
                     envs.step(actions[call % 4])
 

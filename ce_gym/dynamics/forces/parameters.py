@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.dynamics.algebra.spatial import SX, skew
 from ce_gym.dynamics.forces.contact import Compliance
@@ -76,6 +76,30 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
     if "ratio" in names:
         check_ratios(robot)
     return {name: plain[name] for name in names}
+
+
+def check_parameter(robot: Robot, name: str, values: ArrayLike) -> None:
+    """Check the values of a parameter.
+
+    Args:
+        robot: The robot.
+        name: Of a parameter of it.
+        values: What robots are given, any shape.
+
+    Raises:
+        ValueError: If a value is not finite or out of range; one line.
+    """
+    numbers, kind = np.asarray(values, dtype=float), name.split(":")[0]
+    good, expected = numbers >= 0, "0 or more"
+    if kind in ("gravity", "com_shift"):
+        good, expected = np.isfinite(numbers), "finite numbers"
+    elif kind in ("ratio", "slip_speed"):
+        good, expected = numbers > 0, "more than 0"
+    elif kind == "added_mass":
+        mass = robot.body(name.split(":")[1]).inertial.mass
+        good, expected = numbers > -mass, f"more than -{mass:g} kg, what the body has"
+    if wrong := numbers[~(good & np.isfinite(numbers))].tolist():
+        raise ValueError(f"{name}={wrong[0]:g}; expected {expected}")
 
 
 def figures(robot: Robot, material: ContactMaterial, names: tuple[str, ...], values: SX) -> Figures:

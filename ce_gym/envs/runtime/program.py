@@ -1,41 +1,43 @@
-"""A task on a robot as traced functions, and those as the two programs of an environment.
+"""A task on a robot as the two programs of an environment, and the schema of the state that they share.
 
-    step:   act -> physics sub-steps -> assess      all robots, every control step
-    reset:  begin                                   only tiles with a robot to reset
-
-`assess` is where the task looks at the robot: reward terms, terminations, metrics, the next command, the observation.
-May know dynamics, sim, compile and the term files; no Gymnasium.
+step:   act -> physics sub-steps -> assess      all robots, every control step
+reset:  begin                                   only tiles with a robot to reset
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
 import casadi as ca
 import numpy as np
 
-from ce_gym.compile import Buffer, Call, Program, Step
+from ce_gym.compile import Buffer, Call, Program, Repeat, Step
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
-from ce_gym.dynamics.functions import traced
+from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
+from ce_gym.envs.runtime.stages import OUTCOME, Probe, Stages
 from ce_gym.envs.task.actions import ActionMap
-from ce_gym.envs.task.commands import Commands
-from ce_gym.envs.task.curriculum import Progress
-from ce_gym.envs.task.ground import SEEN, Ground, starting_place
+from ce_gym.envs.task.curriculum import Curriculum
+from ce_gym.envs.task.ground import Ground
 from ce_gym.envs.task.randomisation import Randomised
-from ce_gym.envs.task.sampling import Draws
 from ce_gym.envs.task.tasks import Task
-from ce_gym.envs.terms.context import Snapshot
-from ce_gym.envs.terms.registry import Term, find_term, is_added
-from ce_gym.sim.simulator import select_contacts
+from ce_gym.envs.terms.registry import Term, terms_of
+from ce_gym.sim.kernels import select_contacts
+from ce_gym.sim.schema import Row, physics_rows, state_buffers
 from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
-OBSERVATION_BOUND = 100.0
-"""Observations are clipped here; blocks are of order one, so only a robot about to fail comes near it."""
+HOST_ROWS = (
+    Row("limit", 1, "host", np.inf),
+    Row("keys", 1, "host", dtype="int64"),
+    Row("counters", 1, "host", dtype="int64"),
+    Row("seeded", 1, "host", dtype="bool"),
+    Row("finished", 1, "host", dtype="bool"),
+)
+"""Control steps until time is up; the key of the random stream, its bits, and how often the stream was used; whether it
+has been seeded; whether an episode has ended and the next one has not begun."""
 
 
 @dataclass
@@ -47,6 +49,15 @@ class TaskProgram:
         task: The task.
         contact_forces: Whether to compute contact forces for recording.
 
+    Attributes:
+        curriculum: What robots carry over from one episode to the next.
+        actions: What an action asks for.
+        contacts: Names of the spheres that take part in the physics.
+        randomised: Figures that are drawn for each episode.
+        ground: How the task sees a field; None on flat ground.
+        options: The scene of the sub-steps.
+        reward_terms, termination_terms, metric_terms, observation_terms, critic_terms: Terms by name.
+
     Raises:
         ValueError: If the robot lacks what the task needs, or the task names something that does not exist.
     """
@@ -54,18 +65,28 @@ class TaskProgram:
     model: Model
     task: Task
     contact_forces: bool = False
+    curriculum: Curriculum = field(init=False, repr=False)
+    actions: ActionMap = field(init=False, repr=False)
+    contacts: tuple[str, ...] = field(init=False, repr=False)
+    randomised: Randomised = field(init=False, repr=False)
+    ground: Ground | None = field(init=False, repr=False)
+    options: StepOptions = field(init=False, repr=False)
+    reward_terms: dict[str, Term] = field(init=False, repr=False)
+    termination_terms: dict[str, Term] = field(init=False, repr=False)
+    metric_terms: dict[str, Term] = field(init=False, repr=False)
+    observation_terms: dict[str, Term] = field(init=False, repr=False)
+    critic_terms: dict[str, Term] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         robot, task = self.model.robot, self.task
         if not robot.floating:
             raise ValueError(f"{robot.name} has a fixed base; a task needs a robot with a floating base")
-        self.progress = Progress(task)
-        self.commands = Commands(task, self.progress)
-        self.reward_terms = {name: find_term("reward", name) for name in task.rewards}
-        self.termination_terms = [find_term("termination", name) for name in task.terminations]
-        self.metric_terms = {name: find_term("metric", name) for name in (*task.metrics, *self.progress.metrics)}
-        self.observation_terms = {name: find_term("observation", name) for name in task.observations}
-        self.critic_terms = {name: find_term("observation", name) for name in task.critic}
+        self.curriculum = Curriculum(task)
+        self.reward_terms = terms_of("reward", task.rewards)
+        self.termination_terms = terms_of("termination", task.terminations)
+        self.metric_terms = terms_of("metric", task.metrics) | terms_of("metric", self.curriculum.metrics)
+        self.observation_terms = terms_of("observation", task.observations)
+        self.critic_terms = terms_of("observation", task.critic)
         for name in task.noise:
             if name not in self.observation_terms:
                 raise ValueError(f"noise={name!r}; expected an observation among {', '.join(self.observation_terms)}")
@@ -74,7 +95,7 @@ class TaskProgram:
             raise ValueError(
                 f"latency={task.latency}; expected at most the {task.n_substeps} sub-steps of a control step"
             )
-        self.ground = Ground(self.model.mechanism, self.contacts) if self.progress.on_field else None
+        self.ground = Ground(self.model.mechanism, self.contacts) if self.curriculum.on_field else None
         self.randomised = Randomised(robot, task.randomise)
         self.actions = ActionMap(self.model.mechanism, task)
         self.options = StepOptions(
@@ -87,9 +108,11 @@ class TaskProgram:
             ground="field" if self.ground and self.contacts else "flat",
             parameters=self.randomised.parameters,
         )
-        self.n_joints, self.n_actions = len(robot.independent), len(self.actions.moved)
-        feet = {contact.body for contact in robot.contacts if contact.group == "foot"}
-        self.n_feet = len(feet)
+
+    @property
+    def n_actions(self) -> int:
+        """Length of an action."""
+        return len(self.actions.moved)
 
     @property
     def control_dt(self) -> float:
@@ -97,32 +120,51 @@ class TaskProgram:
         return self.task.dt * self.task.n_substeps
 
     @cached_property
-    def state_sizes(self) -> dict[str, int]:
-        """State buffers of one robot, by name."""
+    def _rows(self) -> dict[str, Row]:
+        """The schema without what terms add to it."""
+        outputs = ("torque", "contact_forces") if self.contact_forces else ("torque",)
+        feet = {contact.body for contact in self.model.robot.contacts if contact.group == "foot"}
         late = self.task.latency[1] > 0
         sizes = {
-            **state_sizes(self.model.mechanism, self.options),
-            "diverged": 1,
-            "torque": self.n_joints,
             "action": self.n_actions,
             "command": 3,
-            "heading": 1 if self.task.heading else 0,
+            "heading": int(self.task.heading),
             "clock": 1,
-            "air_time": self.n_feet,
-            "sums": 1 + len(self.reward_terms) + len(self.metric_terms),
-            "parameters": self.randomised.size,
+            "air_time": len(feet),
+            "sums": len(self.sum_names),
+            "elapsed": 1,
+            "failures": 1,
+            "chosen": 1,
             "draw": self.randomised.n_draws,
-            "delay": 1 if late else 0,
+            "delay": int(late),
             "target": len(self.actions.targets) if late else 0,
-            "contact_forces": 3 * len(self.contacts) if self.contact_forces else 0,
-            **self.progress.sizes,
+            **self.curriculum.sizes,
         }
-        sizes = {name: size for name, size in sizes.items() if size}
-        if self.task.history > 1:
-            sizes["history"] = (self.task.history - 1) * sum(self._block_sizes(self.observation_terms, sizes).values())
-        return sizes
+        physics = physics_rows(self.model, self.options, outputs)
+        rows = [replace(row, writer="task") if row.name == "parameters" else row for row in (*physics, *HOST_ROWS)]
+        rows += [Row(name, size, "task") for name, size in sizes.items() if size]
+        rows += [Row(FRAME, 3, "host")] if self.ground and not self.contacts else []
+        return {row.name: row for row in rows}
 
-    @property
+    @cached_property
+    def probe(self) -> Probe:
+        """What the terms turn out to be when they are traced."""
+        return Stages(self, self._rows).probe()
+
+    @cached_property
+    def schema(self) -> dict[str, Row]:
+        """State of one robot, by name."""
+        rows = [Row("observation", self.observation_size + self.critic_size, "host", dtype="float32")]
+        if self.task.history > 1:
+            rows.append(Row("history", (self.task.history - 1) * sum(self.observation_sizes.values()), "task"))
+        return self._rows | {row.name: row for row in (*self.probe.memories, *rows)}
+
+    @cached_property
+    def state_sizes(self) -> dict[str, int]:
+        """Sizes of the state buffers in the lanes of the kernels, by name."""
+        return {row.name: row.size for row in self.schema.values() if not row.dtype}
+
+    @cached_property
     def sum_names(self) -> list[str]:
         """What `sums` adds up over an episode, in order."""
         return [
@@ -134,19 +176,19 @@ class TaskProgram:
     @cached_property
     def observation_sizes(self) -> dict[str, int]:
         """Length of each block of one observation of the policy, by name, in order."""
-        return self._block_sizes(self.observation_terms, self.state_sizes)
-
-    @cached_property
-    def critic_sizes(self) -> dict[str, int]:
-        """Length of each block of an observation of the critic: the policy's blocks and the privileged ones."""
-        return self._block_sizes(self.observation_terms | self.critic_terms, self.state_sizes)
+        return {name: self.probe.sizes[name] for name in self.observation_terms}
 
     @property
+    def critic_sizes(self) -> dict[str, int]:
+        """Length of each block of an observation of the critic: the policy's blocks and the privileged ones."""
+        return self.probe.sizes
+
+    @cached_property
     def observation_size(self) -> int:
         """Length of the policy's observation, history included."""
         return self.task.history * sum(self.observation_sizes.values())
 
-    @property
+    @cached_property
     def critic_size(self) -> int:
         """Length of the critic's observation; 0 if the task gives it none of its own."""
         return sum(self.critic_sizes.values()) if self.task.critic else 0
@@ -157,237 +199,83 @@ class TaskProgram:
         One observation of the policy, neither noisy nor clipped, and whether the episode ends: for robots that
         something else simulates.
         """
-        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}
-        s = self._snapshot(self._seen(state | {"previous_action": state["action"]}))
-        seen = {name: SX(term(s)) for name, term in self.observation_terms.items()}
-        seen["failed"] = sum([term(s) for term in self.termination_terms], SX(0)) > 0
-        everything = ca.vertcat(*seen.values())
-        return traced("look", {n: x for n, x in state.items() if ca.depends_on(everything, x)}, seen)
+        return Stages(self, self.schema).look()
 
     def terms_function(self, terms: Mapping[str, Term]) -> ca.Function:
         """Return the state buffers that terms look at, and the action before -> their values, one after the other."""
-        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}
-        state["previous_action"] = SX.sym("previous_action", self.n_actions)
-        s = self._snapshot(self._seen(state))
-        values = ca.vertcat(SX(0, 1), *[SX(term(s)) for term in terms.values()])
-        return traced("terms", {n: x for n, x in state.items() if ca.depends_on(values, x)}, {"values": values})
+        return Stages(self, self.schema).values(terms)
 
-    def added_terms(self) -> str:
-        """Return a text that changes with the terms that users have added, for cache keys."""
-        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}
-        s = self._snapshot(self._seen(state | {"previous_action": state["action"]}))
-        kinds = {"reward": self.task.rewards, "observation": (*self.task.observations, *self.task.critic)}
-        kinds |= {"termination": self.task.terminations, "metric": self.task.metrics}
-        added = {name: SX(find_term(k, name)(s)) for k, names in kinds.items() for name in names if is_added(k, name)}
-        return traced("added", state, added).serialize() if added else ""
+    def step_program(self, fused: bool = False) -> Program:
+        """Return act, physics and assess as one program.
 
-    def step_program(self) -> Program:
-        """Return act, physics and assess as one program."""
-        act, (assess, n_draws) = self.actions.act("delay" in self.state_sizes), self._assess()
-        look, seeing = self._look_at_ground()
-        _, scratch, physics = substeps(self.model.mechanism, self.options, self._physics_outputs)
-        buffers = [Buffer(name, size, "tiles") for name, size in self.state_sizes.items()]
-        buffers += [
+        Args:
+            fused: Whether a reset of those who are done follows in the same launch, so that what they leave has to be
+                kept: `final_observation`.
+        """
+        assess, n_draws = Stages(self, self.schema).assess()
+        act, size = self.actions.act("delay" in self.schema), self.observation_size + self.critic_size
+        outputs = tuple(name for name in ("torque", "contact_forces") if name in self.schema)
+        _, scratch, physics = substeps(self.model.mechanism, self.options, outputs)
+        buffers = [
             Buffer("action_in", self.n_actions, "rows_in", "float32"),
             Buffer("clipped", self.n_actions, "scratch"),
             *([Buffer("draws", n_draws, "random")] if n_draws else []),
-            Buffer("observation", self.observation_size + self.critic_size, "rows_out", "float32"),
-            Buffer("outcome", 3 + len(self.reward_terms), "rows_out", "float64"),
+            Buffer("observation", size, "rows_out", "float32"),
+            Buffer("outcome", len(OUTCOME) + len(self.reward_terms), "rows_out", "float64"),
+            Buffer("ended", 1 + len(self.sum_names), "rows_out", "float64"),
             *[buffer for buffer in scratch if buffer.kind != "table"],
-            *seeing,
         ]
-        if "delay" in self.state_sizes:
-            buffers += [Buffer("new_target", len(self.actions.targets), "scratch"), Buffer("waited", 1, "scratch")]
-            calls = (Call(act, ("action_in",), ("clipped", "new_target", "waited")), *self.actions.delayed(physics))
+        targets = len(self.actions.targets)
+        if "delay" in self.schema:
+            buffers += [Buffer("new_target", targets, "scratch"), Buffer("waited", 1, "scratch")]
+            steps = (Call(act, ("action_in",), ("clipped", "new_target", "waited")), *self.actions.delayed(physics))
         else:
-            buffers += [Buffer("target", len(self.actions.targets), "scratch")]
-            calls = (Call(act, ("action_in",), ("clipped", "target")), *physics)
-        steps = (*calls, *look, Call(assess, tuple(assess.name_in()), self._assess_outputs))
-        return Program(f"{self.model.robot.name} {self.model.transmission} environment", tuple(buffers), steps)
+            buffers += [Buffer("target", targets, "scratch")]
+            steps = (Call(act, ("action_in",), ("clipped", "target")), *physics)
+        look, seeing = self._look_at_ground()
+        steps = (*steps, *look, assess)
+        if fused:
+            seen = SX.sym("observation", size)
+            steps = (*steps, Call(ca.Function("keep", [seen], [seen]), ("observation",), ("final_observation",)))
+            buffers.append(Buffer("final_observation", size, "rows_out", "float32"))
+        return self._program("environment", [*buffers, *seeing], steps)
 
     def reset_program(self) -> Program:
         """Return the program that starts new episodes where `chosen` is 1."""
-        begin, n_draws = self._begin()
-        buffers = [Buffer(name, size, "tiles") for name, size in self.state_sizes.items()]
-        buffers += [
-            Buffer("chosen", 1, "tiles"),
-            Buffer("draws", n_draws, "random"),
+        stages = Stages(self, self.schema)
+        begin, n_draws = stages.begin()
+        buffers = [
+            Buffer("first_draws", n_draws, "random"),
             Buffer("observation", self.observation_size + self.critic_size, "rows_out", "float32"),
         ]
-        calls: tuple[Step, ...] = (Call(begin, tuple(begin.name_in()), (*self.state_sizes, "observation")),)
+        steps: tuple[Step, ...] = (begin,)
         if self.ground:
-            place, n_draws = self._place()
+            place, n_draws = stages.place()
             look, seeing = self._look_at_ground()
             buffers += [Buffer("place_draws", n_draws, "random"), *seeing]
-            placed = tuple(name.removesuffix("_next") for name in place.name_out())
-            calls = (Call(place, tuple(place.name_in()), placed), *look, *calls)
-        name = f"{self.model.robot.name} {self.model.transmission} reset"
-        return Program(name, tuple(buffers), calls, skip_unless="chosen")
+            steps = (place, *look, begin)
+        return self._program("reset", buffers, steps, skip_unless="chosen")
+
+    def _program(
+        self, name: str, buffers: list[Buffer], steps: tuple[Step | Repeat, ...], skip_unless: str = ""
+    ) -> Program:
+        """Return a program with those state buffers that it uses."""
+        program = Program(f"{self.model.robot.name} {self.model.transmission} {name}", (), steps, skip_unless)
+        used = {skip_unless, *(name for call in program.calls for name in (*call.inputs, *call.outputs))}
+        own = {buffer.name for buffer in buffers}
+        state = [b for b in state_buffers(self.schema.values()) if b.name in used and b.name not in own]
+        return replace(program, buffers=(*state, *buffers))
 
     def _look_at_ground(self) -> tuple[tuple[Step, ...], list[Buffer]]:
         """What a program has to do, and the buffers that takes, for the task to see the ground; nothing if flat."""
         if not self.ground:
             return (), []
         buffers, look = self.ground.look(self.state_sizes.get("dependent", 0))
-        return look, [Buffer(FRAME, 3, "tiles"), Buffer(HEIGHTS, 0, "table"), *buffers]
+        return look, [Buffer(HEIGHTS, 0, "table"), *buffers]
 
     def function(self, name: Literal["act", "assess", "begin"]) -> ca.Function:
         """Trace what is done once in an environment step, before and after its sub-steps, or in a reset."""
-        late = "delay" in self.state_sizes
-        return {
-            "act": lambda: self.actions.act(late),
-            "assess": lambda: self._assess()[0],
-            "begin": lambda: self._begin()[0],
-        }[name]()
-
-    @property
-    def _physics_outputs(self) -> tuple[str, ...]:
-        return ("torque", "contact_forces") if self.contact_forces else ("torque",)
-
-    @property
-    def _assess_outputs(self) -> tuple[str, ...]:
-        optional = [name for name in ("heading", "history", "walked", "tracked") if name in self.state_sizes]
-        pushed = ["v"] if self.task.push_period else []
-        return ("action", "command", "clock", "air_time", "sums", *optional, *pushed, "observation", "outcome")
-
-    def _snapshot(self, values: dict[str, SX]) -> Snapshot:
-        return Snapshot(self.model.mechanism, values, self.control_dt, self.task.gait_period)
-
-    def _block_sizes(self, terms: dict, sizes: dict[str, int]) -> dict[str, int]:
-        s = self._snapshot(self._seen({name: SX.sym(name, n) for name, n in sizes.items()}))
-        return {name: SX(term(s)).numel() for name, term in terms.items()}
-
-    def _seen(self, state: dict[str, SX]) -> dict[str, SX]:
-        return state | ({"scaled_parameters": 2 * state["draw"] - 1} if "draw" in state else {})
-
-    def _assess(self) -> tuple[ca.Function, int]:
-        """State after the sub-steps -> bookkeeping, observation, outcome [reward, terminated, diverged, terms]."""
-        unused = ("anchor", "parameters", "delay", "target", "contact_forces")
-        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items() if name not in unused}
-        seen_ground = {SEEN: SX.sym(SEEN, self.ground.size)} if self.ground else {}
-        clipped, draws = SX.sym("clipped", self.n_actions), Draws()
-        values = self._seen(state | seen_ground | {"action": clipped, "previous_action": state["action"]})
-        s = self._snapshot(values)
-
-        terms = [self.task.rewards[name] * term(s) * self.control_dt for name, term in self.reward_terms.items()]
-        total = sum(terms, SX(0))
-        reward = ca.fmax(0, total) if self.task.only_positive else total
-        failed = sum([term(s) for term in self.termination_terms], SX(0)) > 0
-        terminated = ca.logic_and(failed, state["diverged"] < 0.5)
-        sums = state["sums"] + ca.vertcat(reward, *terms, *[term(s) for term in self.metric_terms.values()])
-
-        air_time = (
-            ca.if_else(s.foot_contact, 0, state["air_time"] + self.control_dt) if self.n_feet else state["air_time"]
-        )
-        clock = state["clock"] + 1
-        fresh = self.commands.new(draws, state.get("grown"))
-        due = self._every(self.task.command_period, clock)
-        after = {name: ca.if_else(due, fresh[name], state[name]) for name in fresh}
-        v = self._pushed(state["v"], clock, draws) if self.task.push_period else state["v"]
-        after = self.commands.steered(values | {"v": v}, after)
-        seen = values | after | {"air_time": air_time, "clock": clock, "v": v}
-        observation, history = self._observation(seen, state.get("history"), draws)
-        outputs = {"action_next": clipped, "command_next": after["command"], "clock_next": clock}
-        outputs |= {"air_time_next": air_time, "sums_next": sums}
-        outputs |= {"heading_next": after["heading"]} if "heading" in after else {}
-        outputs |= {"history_next": history} if "history" in state else {}
-        outputs |= {f"{name}_next": value for name, value in self.progress.followed(s, state).items()}
-        outputs |= {"v_next": v} if self.task.push_period else {}
-        outputs |= {"observation": observation, "outcome": ca.vertcat(reward, terminated, state["diverged"], *terms)}
-        inputs = {**state, **seen_ground, "clipped": clipped}
-        count = draws.symbols.numel()
-        return traced("assess", inputs | ({"draws": draws.symbols} if count else {}), outputs), count
-
-    def _begin(self) -> tuple[ca.Function, int]:
-        """State, chosen, draws -> state of a new episode where chosen, observation.
-
-        On a field the robots have been placed: their state has where they stand, all but the height of the ground.
-        """
-        state = {name: SX.sym(name, size) for name, size in self.state_sizes.items()}
-        chosen, draws = SX.sym("chosen"), Draws()
-        fresh = {name: SX(size, 1) for name, size in self.state_sizes.items()}
-        seen_ground = {SEEN: SX.sym(SEEN, self.ground.size)} if self.ground else {}
-        if self.ground:
-            lift = self.ground.lift(state["q"], state.get("dependent"), seen_ground[SEEN])
-            fresh["q"], fresh["level"] = SX(state["q"]), state["level"]
-            fresh["q"][2] += lift
-        else:
-            fresh["q"] = self._starting_pose(draws)
-        fresh["v"] = self._starting_velocity(draws)
-        if "dependent" in fresh:
-            fresh["dependent"] = SX(self.model.guess)
-        if "grown" in fresh:
-            fresh["grown"] = self.progress.grown(state)
-        if "draw" in fresh:
-            fresh["draw"] = ca.vertcat(*[draws.unit() for _ in range(self.randomised.n_draws)])
-            fresh["parameters"] = self.randomised.values(fresh["draw"])
-        if "delay" in fresh:
-            low, high = self.task.latency
-            fresh["delay"] = ca.floor(draws.uniform(low, high + 1))
-            fresh["target"] = SX(self.actions.rest)
-        fresh |= self.commands.new(draws, fresh.get("grown"))
-        fresh |= self.commands.steered(fresh, {name: fresh[name] for name in ("command", "heading") if name in fresh})
-        after = {name: ca.if_else(chosen > 0.5, ca.densify(fresh[name]), state[name]) for name in state}
-        seen = self._seen(after | seen_ground | {"previous_action": after["action"]})
-        observation, history = self._observation(seen, None, draws)
-        if "history" in state:
-            after["history"] = ca.if_else(chosen > 0.5, history, state["history"])
-        outputs = {f"{name}_next": value for name, value in after.items()} | {"observation": observation}
-        inputs = {**state, **seen_ground, "chosen": chosen, "draws": draws.symbols}
-        return traced("begin", inputs, outputs), draws.symbols.numel()
-
-    def _place(self) -> tuple[ca.Function, int]:
-        """State, chosen, place_draws -> where chosen, a pose on a tile of the field as if the ground were at 0."""
-        names = [n for n in ("q", "dependent", "level", "walked", "command", "clock") if n in self.state_sizes]
-        state = {name: SX.sym(name, self.state_sizes[name]) for name in names}
-        chosen, draws = SX.sym("chosen"), Draws()
-        level = self.progress.level(state, draws, self.control_dt)
-        place = starting_place(self.progress, level, draws)
-        fresh = {"q": self._starting_pose(draws), "level": level}
-        fresh["q"][:2] = place
-        fresh |= {"dependent": SX(self.model.guess)} if "dependent" in state else {}
-        outputs = {f"{name}_next": ca.if_else(chosen > 0.5, value, state[name]) for name, value in fresh.items()}
-        inputs = {**state, "chosen": chosen, "place_draws": draws.symbols}
-        return traced("place", inputs, outputs), draws.symbols.numel()
-
-    def _starting_pose(self, draws: Draws) -> SX:
-        """Positions near the standing pose, heading anywhere."""
-        standing = self.model.standing_q
-        half_yaw = draws.uniform(-np.pi / 2, np.pi / 2)
-        joints = standing[7:] + draws.symmetric(self.n_joints, self.task.reset_noise["joint_position"])
-        return ca.densify(ca.vertcat(standing[:3], ca.cos(half_yaw), 0, 0, ca.sin(half_yaw), joints))
-
-    def _starting_velocity(self, draws: Draws) -> SX:
-        """Velocities near rest."""
-        noise = self.task.reset_noise
-        base = draws.symmetric(6, noise["base_velocity"])
-        return ca.vertcat(base, draws.symmetric(self.n_joints, noise["joint_velocity"]))
-
-    def _every(self, period: float, clock: SX) -> SX:
-        """1 once in a period [s], else 0."""
-        return ca.fmod(clock, max(round(period / self.control_dt), 1)) < 0.5
-
-    def _pushed(self, v: SX, clock: SX, draws: Draws) -> SX:
-        """Now and then change the horizontal velocity of the base, as seen from it, at a stroke."""
-        push = ca.vertcat(SX(3, 1), draws.symmetric(2, self.task.push_speed), SX(v.numel() - 5, 1))
-        return v + ca.if_else(self._every(self.task.push_period, clock), ca.densify(push), 0)
-
-    def _observation(self, values: dict[str, SX], before: SX | None, draws: Draws) -> tuple[SX, SX]:
-        """The policy's observation, noisy and with its history, then the critic's; and the history to keep."""
-        s = self._snapshot(values)
-        blocks = {name: SX(term(s)) for name, term in self.observation_terms.items()}
-        noisy = [b + draws.symmetric(b.numel(), self.task.noise.get(n, 0.0)) if self.task.noise.get(n) else b
-                 for n, b in blocks.items()]  # fmt: skip
-        now = _clipped(ca.vertcat(*noisy))
-        kept = SX(0, 1)
-        if self.task.history > 1:
-            kept = ca.repmat(now, self.task.history - 1, 1) if before is None else before
-        policy = ca.vertcat(now, kept)
-        critic = SX(0, 1)
-        if self.task.critic:
-            critic = _clipped(ca.vertcat(*blocks.values(), *[SX(term(s)) for term in self.critic_terms.values()]))
-        return ca.vertcat(policy, critic), policy[: kept.numel()]
-
-
-def _clipped(observation: SX) -> SX:
-    return ca.fmax(-OBSERVATION_BOUND, ca.fmin(OBSERVATION_BOUND, observation))
+        if name == "act":
+            return self.actions.act("delay" in self.schema)
+        stages = Stages(self, self.schema)
+        return (stages.assess() if name == "assess" else stages.begin())[0].function

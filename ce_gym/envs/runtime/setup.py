@@ -1,10 +1,11 @@
 """From the arguments of `gymnasium.make` to a batch of environments.
 
-All arguments are JSON-able, so that a spec survives `to_json`. May know programs and batches; no Gymnasium.
+All arguments are JSON-able, so that a spec survives `to_json`.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -12,13 +13,14 @@ from typing import Any, get_args
 
 from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
-from ce_gym.envs.runtime.batch import Batch
+from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
-from ce_gym.envs.task.checks import checked_value, number
+from ce_gym.envs.task.checks import checked_value, merged_rewards
 from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
 from ce_gym.model.mechanism import Level
+from ce_gym.sim.devices import Device, device_named
 
 
 def make_batch(
@@ -28,8 +30,10 @@ def make_batch(
     num_envs: int,
     dtype: str = "float64",
     num_threads: int | None = None,
+    device: str | Device = "cpu",
+    max_episode_steps: float = math.inf,
     **arguments: Any,
-) -> Batch:
+) -> TaskBatch:
     """Build a batch of environments.
 
     Args:
@@ -38,29 +42,21 @@ def make_batch(
         num_envs: Number of environments.
         dtype: "float64" or "float32" for physics.
         num_threads: Threads; the number of usable cores if None.
+        device: "cpu", or "cuda" or "cuda:N" for a GPU.
+        max_episode_steps: Control steps until time is up.
         **arguments: What `make_program` takes besides.
 
     Raises:
-        ValueError: If an argument is not one of the choices.
+        ValueError: If there is no such device, or an argument is not one of the choices.
         RobotError: If the robot file is not valid.
-    """
-    checked_dtype(dtype)
-    for name, value in (("num_envs", num_envs), ("num_threads", num_threads)):
-        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-            raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
-    program = make_program(robot, task, **arguments)
-    return Batch(program, num_envs, dtype, num_threads or usable_cores())
-
-
-def checked_dtype(dtype: str) -> str:
-    """Return the argument `dtype`.
-
-    Raises:
-        ValueError: If it is not one of the choices.
     """
     if dtype not in ("float64", "float32"):
         raise ValueError(f"dtype={dtype!r}; expected 'float64' or 'float32'")
-    return dtype
+    for name, value in (("num_envs", num_envs), ("num_threads", num_threads)):
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+            raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
+    program, threads = make_program(robot, task, **arguments), num_threads or usable_cores()
+    return TaskBatch(program, num_envs, dtype, device_named(device), threads, max_episode_steps)
 
 
 def make_program(
@@ -69,7 +65,8 @@ def make_program(
     *,
     transmission: str = "exact",
     contact_forces: bool = False,
-    reward_weights: Mapping[str, float] | None = None,
+    rewards: Mapping[str, Any] | None = None,
+    reward_weights: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> TaskProgram:
     """Put a task on a robot.
@@ -79,7 +76,9 @@ def make_program(
         task: Name of a task.
         transmission: "exact", "coupled", "armature" or "none".
         contact_forces: Whether contact forces are computed, for recording.
-        reward_weights: Weights that replace or add to those of the task, by the name of the term; 0 removes a term.
+        rewards: What replaces or adds to the rewards of the task, by the name of the term: a weight, 0 to remove it, or
+            a mapping of `weight` and parameters, such as `{"weight": 1.5, "width": 0.25}`.
+        reward_weights: The same, as it used to be called.
         **changes: Attributes of `Task` that replace those of the task, such as command_range, contacts, actions,
             noise, history, latency, randomise, push_period or episode_length.
 
@@ -88,21 +87,25 @@ def make_program(
         RobotError: If the robot file is not valid.
     """
     if not isinstance(robot, str | os.PathLike):
-        raise ValueError(f"robot={robot!r}; expected the name of a robot or a path to a file")
+        given = f"the Robot {robot.name!r}" if isinstance(robot, Robot) else repr(robot)
+        raise ValueError(f"robot={given}; expected the name of a robot or a path to a file")
     if not isinstance(contact_forces, bool):
         raise ValueError(f"contact_forces={contact_forces!r}; expected true or false")
-    if reward_weights is not None and not isinstance(reward_weights, Mapping):
-        raise ValueError(f"reward_weights={reward_weights!r}; expected numbers by the name of a reward term")
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"task={task!r}; expected one of {', '.join(TASKS)}")
     if transmission not in get_args(Level):
         raise ValueError(f"transmission={transmission!r}; expected one of {', '.join(get_args(Level))}")
     model = Model(robot, transmission)
-    figures = changed_task(own_task(model.robot, task), reward_weights or {}, changes)
+    figures = own_task(model.robot, task)
+    for name, given in (("reward_weights", reward_weights), ("rewards", rewards)):
+        figures = replace(figures, rewards=merged_rewards(name, figures.rewards, {} if given is None else given))
+    figures = changed_task(figures, changes)
     if figures.actions.endswith("_pd") and not model.robot.gains.kp:
         file, expected = model.robot.source or model.robot.name, f"gains, because actions={figures.actions!r} need them"
         raise bad(file, "gains.kp", None, expected)
-    return TaskProgram(model, figures, contact_forces)
+    program = TaskProgram(model, figures, contact_forces)
+    program.probe  # noqa: B018  (so that a wrong term is found here)
+    return program
 
 
 def own_task(robot: Robot, task: str) -> Task:
@@ -120,28 +123,26 @@ def own_task(robot: Robot, task: str) -> Task:
     if not isinstance(wanted, str):  # tasks ask for knees, too, but not every robot has some
         own.setdefault("contacts", tuple(group for group in wanted if group in groups))
     try:
-        return changed_task(TASKS[task], dict(own.pop("reward_weights", ())), own)
+        weights = merged_rewards("reward_weights", TASKS[task].rewards, dict(own.pop("reward_weights", ())))
+        return changed_task(replace(TASKS[task], rewards=weights), own)
     except (ValueError, TypeError) as error:
         raise RobotError(f"{file}: tasks.{task}: {error}") from None
 
 
-def changed_task(task: Task, reward_weights: Mapping[str, float], changes: Mapping[str, Any]) -> Task:
+def changed_task(task: Task, changes: Mapping[str, Any]) -> Task:
     """Return a task with some of its figures replaced, checked.
 
     Args:
         task: A task.
-        reward_weights: Weights that replace or add to its own; 0 removes a term.
-        changes: Other attributes of `Task`; lists, as JSON has them, count as tuples, and None as no change.
+        changes: Attributes of `Task` but `rewards`; lists, as JSON has them, count as tuples, and None as no change.
 
     Raises:
         ValueError: One line that names the argument, its value and what was expected.
     """
-    weights = {**task.rewards, **{str(k): number("reward_weights", v) for k, v in reward_weights.items()}}
-    given = {"rewards": {name: weight for name, weight in weights.items() if weight != 0}}
-    known = [f.name for f in fields(Task) if f.name not in ("rewards",)]
+    known, given = [f.name for f in fields(Task) if f.name != "rewards"], {}
     for name, value in changes.items():
         if name not in known:
-            raise ValueError(f"unknown argument {name!r}; expected one of {', '.join(known)}")
+            raise ValueError(f"unknown argument {name!r}; expected one of rewards, {', '.join(known)}")
         if value is not None:
             given[name] = checked_value(name, value, getattr(task, name))
     return replace(task, **given)

@@ -122,7 +122,7 @@ def paired_joints(model: Model) -> SignedPermutation | None:
     names = robot.independent
     axes = np.array([rotations[row[name]] @ bodies[name].axis for name in names])
     origins = np.array([positions[row[name]] for name in names])
-    types = np.array([bodies[name].joint_type for name in names])
+    types = np.array([bodies[name].joint.type for name in names])
     turned = np.where((types == "revolute")[:, None], -axes * REFLECTION, axes * REFLECTION)
     distance = np.linalg.norm((origins * REFLECTION)[:, None] - origins[None], axis=2)
     along = turned @ axes.T

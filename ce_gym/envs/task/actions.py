@@ -1,4 +1,4 @@
-"""What an action asks of joints or motors, as traced functions. May know tasks, compile and dynamics."""
+"""What an action asks of joints or motors, as traced functions."""
 
 from __future__ import annotations
 

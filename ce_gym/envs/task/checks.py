@@ -1,4 +1,4 @@
-"""Checks of the figures of a task that users give as arguments. May know tasks and fields."""
+"""Checks of the figures of a task that users give as arguments."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from ce_gym.envs.task.terrain_tiles import checked_terrain
 CHOICES = {"actions": get_args(Actions), "friction": FRICTION, "motors": MOTORS}
 POSITIVE = ("action_scale", "command_period", "gait_period", "dt")
 COUNTS = ("history", "n_substeps", "episode_length", "max_episode_steps")
+TERMS = ("observations", "terminations", "metrics", "critic")
+HEAVIEST = 1e9
+"""Largest weight of a reward, either way."""
 LARGEST = {"dt": 0.1, "standing_fraction": 1.0}
 
 
@@ -46,6 +49,8 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
     if name == "randomise":
         _check(name, value, isinstance(value, Mapping), "pairs (low, high) by the name of a figure")
         return {str(key): _pair(f"randomise[{key!r}]", pair) for key, pair in value.items()}
+    if name in TERMS:
+        return _terms(name, value)
     if name in COUNTS:
         whole = isinstance(value, int) and not isinstance(value, bool)
         _check(name, value, whole and value >= 1, "a whole number, at least 1")
@@ -60,9 +65,7 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
             _check(name, key, name != "reset_noise" or key in old, f"one of {', '.join(old)}")
         return {**old, **{str(key): float(figure) for key, figure in value.items()}}
     if isinstance(old, tuple):
-        names = _names(name, value)
-        _check(name, value, len(names) > 0 or name != "observations", "at least one name")
-        return names
+        return _names(name, value)
     if name == "command_curriculum":
         _check(name, value, 0 < number(name, value) <= 1, "a share above 0 and up to 1")
     figure, expected = number(name, value), "a positive number" if name in POSITIVE else "0 or more"
@@ -70,6 +73,45 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
     most = LARGEST.get(name, math.inf)
     _check(name, value, figure <= most, f"at most {most:g}")
     return figure
+
+
+def merged_rewards(name: str, old: Mapping[str, Any], given: Any) -> dict[str, Any]:
+    """Return reward terms of a task with some replaced or added, those of weight 0 left out.
+
+    Args:
+        name: Of the argument.
+        old: What the task has, a weight or a mapping of `weight` and parameters by the name of the term.
+        given: What a user gave, likewise; parameters alone leave the weight as it was.
+
+    Raises:
+        ValueError: If it is nothing of the kind.
+    """
+    _check(name, given, isinstance(given, Mapping), "weights, or mappings of weight and parameters, by name")
+    rewards = dict(old)
+    for term, value in given.items():
+        before = old.get(term, {})
+        before = dict(before) if isinstance(before, Mapping) else {"weight": before}
+        new = before | (dict(value) if isinstance(value, Mapping) else {"weight": value})
+        place = f"{name}[{term!r}]"
+        _check(place, value, "weight" in new, "a `weight`, for the task has none")
+        new["weight"] = number(place, new["weight"])
+        _check(place, value, abs(new["weight"]) <= HEAVIEST, f"a weight from -{HEAVIEST:g} to {HEAVIEST:g}")
+        rewards[str(term)] = new if len(new) > 1 else new["weight"]
+        if new["weight"] == 0:
+            del rewards[str(term)]
+    return rewards
+
+
+def _terms(name: str, value: Any) -> Any:
+    """Return names of terms, or parameters of terms by name."""
+    if isinstance(value, Mapping):
+        terms: Any = {str(key): {} if own is None else own for key, own in value.items()}
+        for key, own in terms.items():
+            _check(f"{name}[{key!r}]", own, isinstance(own, Mapping), "parameters by name")
+    else:
+        terms = _names(name, value)
+    _check(name, value, len(terms) > 0 or name != "observations", "at least one name")
+    return terms
 
 
 def number(name: str, value: Any) -> float:

@@ -1,4 +1,4 @@
-"""What a task commands: velocities, and headings to turn to. May know tasks, draws and progress."""
+"""What a task commands: velocities, and headings to turn to."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.task.curriculum import Progress
+from ce_gym.envs.task.curriculum import Curriculum
 from ce_gym.envs.task.sampling import Draws
 from ce_gym.envs.task.tasks import Task
 
@@ -19,17 +19,17 @@ class Commands:
 
     Args:
         task: The task.
-        progress: Its curricula.
+        curriculum: Its curricula.
     """
 
-    def __init__(self, task: Task, progress: Progress) -> None:
-        self.task, self.progress = task, progress
+    def __init__(self, task: Task, curriculum: Curriculum) -> None:
+        self.task, self.curriculum = task, curriculum
 
     def new(self, draws: Draws, grown: SX | None) -> dict[str, SX]:
         """Return a command within the range that the robot has come to, or to stand still; and a heading."""
         standing = draws.unit() < self.task.standing_fraction
         moving = draws.within(self.task.command_range)
-        moving = moving if grown is None else self.progress.share(grown) * moving
+        moving = moving if grown is None else self.curriculum.share(grown) * moving
         command = {"command": ca.if_else(standing, 0, moving)}
         return command | ({"heading": draws.uniform(-np.pi, np.pi)} if self.task.heading else {})
 

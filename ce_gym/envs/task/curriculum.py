@@ -1,7 +1,7 @@
 """Curricula: what a robot carries over from one episode to the next, and how it is judged.
 
-Every robot has its own progress, in its lane of the kernel's state, so that it depends on its seed and its actions and
-on nothing else. Seeding an environment begins from the start. May know tasks, draws and snapshots.
+Every robot has its own level, in its lane of the kernel's state, so that it depends on its seed and its actions and on
+nothing else. Seeding an environment begins from the start.
 
     terrain     up a level if it walked half a tile along its commands, down if not half of what it was asked
     commands    a wider range if its mean tracking was above 80 %, a narrower one below 40 %
@@ -18,7 +18,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.task.sampling import Draws
 from ce_gym.envs.task.tasks import Task
-from ce_gym.envs.terms.context import Snapshot
+from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.rewards import track_linear_velocity
 
 WIDER = 0.1
@@ -27,7 +27,7 @@ WELL, BADLY = 0.8, 0.4
 """Mean tracking from which on the range grows, and below which it shrinks."""
 
 
-class Progress:
+class Curriculum:
     """The curricula of a task.
 
     Args:
@@ -52,7 +52,7 @@ class Progress:
         """Metrics that tell how far robots have come."""
         return ("terrain_level",) * self.on_field + ("times_grown",) * self.widening
 
-    def followed(self, s: Snapshot, state: dict[str, SX]) -> dict[str, SX]:
+    def followed(self, s: TermContext, state: dict[str, SX]) -> dict[str, SX]:
         """Return what a control step adds to the account of an episode, by name of the state."""
         after = {}
         if self.climbing:

@@ -1,19 +1,24 @@
 """How a task sees the ground of a field, and puts robots on it: traced functions around a look-up.
 
 Of a field the task knows what is under the base and under every contact sphere of the robot, looked up once in a
-control step, after the physics. May know kinematics, progress, compile and the sub-steps.
+control step, after the physics.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
 
 from ce_gym.compile import Buffer, Call, Lookup, Step
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.ground import above, lift
+from ce_gym.dynamics.forces.parameters import figures
+from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.recursion.kinematics import constant, outward_velocity_pass
-from ce_gym.envs.task.curriculum import Progress
+from ce_gym.envs.task.curriculum import Curriculum
 from ce_gym.envs.task.sampling import Draws
 from ce_gym.envs.task.terrain_tiles import PLATFORM
 from ce_gym.model.mechanism import Mechanism
@@ -43,7 +48,7 @@ class Ground:
         """
         q = SX.sym("q", len(self.mechanism.robot.independent) + 7)
         given = {"q": q} | ({"dependent": SX.sym("dependent", dependent)} if dependent else {})
-        at = ca.horzcat(q[:2], self._centres(given)[:2, :])
+        at = ca.horzcat(q[:2], sphere_centres(self.mechanism, given)[:2, :])
         places = traced("seen_places", given, {"seen_places": ca.vec(at)})
         buffers = [Buffer("seen_places", 2 * self.size // 3, "scratch"), Buffer(SEEN, self.size, "scratch")]
         call = Call(places, tuple(given), ("seen_places",))
@@ -58,26 +63,45 @@ class Ground:
             seen: The buffer `SEEN`.
         """
         spheres = self.mechanism.robot.contacts
-        centres = self._centres({"q": q} | ({} if dependent is None else {"dependent": dependent}))
+        centres = sphere_centres(self.mechanism, {"q": q} | ({} if dependent is None else {"dependent": dependent}))
         chosen = [i for i, sphere in enumerate(spheres) if sphere.name in self.contacts]
-        needed = []
-        for i in chosen:
-            height, slope = seen[3 * i + 3], seen[3 * i + 4 : 3 * i + 6]
-            z, radius = centres[2, i], spheres[i].radius
-            needed.append(ca.fmin(z, radius) * ca.sqrt(1 + ca.sumsqr(slope)) - (z - height))
+        under, z = ca.reshape(seen[3:], 3, -1), centres[2, :]
+        needed = [lift(ca.fmin(z[i], spheres[i].radius), z[i], *ca.vertsplit(under[:, i])) for i in chosen]
         return ca.mmax(ca.vertcat(*needed)) if needed else seen[0]
 
-    def _centres(self, given: dict[str, SX]) -> SX:
-        q, n = given["q"], len(self.mechanism.robot.independent)
-        bodies = outward_velocity_pass(self.mechanism, q, SX(n + 6, 1), given.get("dependent")).bodies
-        spheres = self.mechanism.robot.contacts
-        points = [bodies[s.body].point_position(constant(np.array(s.position))) for s in spheres]
-        return ca.horzcat(SX(3, 0), *points)
+
+def sphere_centres(mechanism: Mechanism, state: Mapping[str, SX]) -> SX:
+    """Return where the contact spheres of a robot are [m], shape (3, n_spheres); `dependent` is used if it is there."""
+    q, spheres = state["q"], mechanism.robot.contacts
+    at_rest = SX(len(mechanism.robot.independent) + 6, 1)
+    bodies = outward_velocity_pass(mechanism, q, at_rest, state.get("dependent")).bodies
+    points = [bodies[s.body].point_position(constant(np.array(s.position))) for s in spheres]
+    return ca.horzcat(SX(3, 0), *points)
 
 
-def starting_place(progress: Progress, level: SX, draws: Draws) -> SX:
+def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str, SX], seen: SX | None) -> SX:
+    """Return the springs' forces on the contacts [N], shape (n_contacts,): what friction has to go by at first.
+
+    Args:
+        mechanism: The robot.
+        options: Its scene.
+        state: Of it, with the parameters that are declared.
+        seen: The buffer `SEEN`; None on flat ground.
+    """
+    parameters = state.get("parameters", SX(0, 1))
+    stiffness = figures(mechanism.robot, options.material, options.parameters, parameters).compliance.stiffness
+    centres, load = sphere_centres(mechanism, state), []
+    for i, sphere in enumerate(mechanism.robot.contacts):
+        if sphere.name in options.contacts:
+            ground = SX(3, 1) if seen is None else seen[3 * i + 3 : 3 * i + 6]
+            depth = sphere.radius - above(centres[2, i], *ca.vertsplit(ground))
+            load.append(stiffness * ca.fmax(depth, 0))
+    return ca.vertcat(*load)
+
+
+def starting_place(curriculum: Curriculum, level: SX, draws: Draws) -> SX:
     """Return where an episode begins, x and y [m]: about the middle of a tile of a level, in any column."""
-    terrain = progress.task.terrain
+    terrain = curriculum.task.terrain
     column = ca.floor(draws.uniform(0, terrain["columns"]))
     middle = terrain["size"] * (ca.vertcat(level, column) + 0.5)
     return middle + draws.symmetric(2, PLATFORM / 2)

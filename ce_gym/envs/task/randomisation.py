@@ -1,13 +1,14 @@
-"""Physical figures that are drawn anew for each episode. May know parameters of the dynamics and descriptions."""
+"""Physical figures that are drawn anew for each episode."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 import casadi as ca
+import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.parameters import parameter_defaults
+from ce_gym.dynamics.forces.parameters import check_parameter, parameter_defaults
 from ce_gym.envs.task.tasks import RANDOMISED, Range
 from ce_gym.model.description import Robot
 
@@ -39,12 +40,16 @@ class Randomised:
                 raise ValueError(f"randomise={name!r}; expected one of {', '.join(RANDOMISED)}")
             if not low <= high:
                 raise ValueError(f"randomise[{name!r}]=({low}, {high}); expected low <= high")
-            if low < 0 and name.split(":")[0] not in ("added_mass", "com_shift"):
-                raise ValueError(f"randomise[{name!r}]=({low}, {high}); expected 0 or more")
             names.append(f"{name}:{base}" if name in ("added_mass", "com_shift") else name)
         self.parameters = tuple(names)
         self._ranges = tuple(ranges.values())
         self._defaults = list(parameter_defaults(robot, robot.material, self.parameters).values())
+        for given, name, bounds, default in zip(ranges, names, self._ranges, self._defaults, strict=True):
+            try:
+                check_parameter(robot, name, np.outer(bounds, default) if name in FACTORS else bounds)
+            except ValueError as problem:
+                expected = str(problem).split("; ")[-1]
+                raise ValueError(f"randomise[{given!r}]=({bounds[0]}, {bounds[1]}); {expected}") from None
         self.size = self.n_draws = sum(len(default) for default in self._defaults)
 
     def values(self, draw: SX) -> SX:

@@ -1,7 +1,7 @@
 """Named use of a vector of uniform random numbers while a function is traced.
 
 The kernel fills a buffer with uniform numbers from a counter-based stream; a traced function consumes them one after
-the other and afterwards knows how many it needed. May know CasADi.
+the other and afterwards knows how many it needed.
 """
 
 from __future__ import annotations

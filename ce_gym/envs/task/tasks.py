@@ -2,7 +2,7 @@
 
 A task names functions of rewards.py, observations.py, terminations.py and metrics.py; it works for every robot whose
 description has what those functions ask for. Change one with `dataclasses.replace` or through the arguments of
-`gymnasium.make`. May know nothing but names.
+`gymnasium.make`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 Range = tuple[float, float]
+Terms = tuple[str, ...] | Mapping[str, Mapping[str, Any]]
+"""Names of terms, or their parameters by name."""
 Actions = Literal["joint_pd", "joint_torque", "motor_pd", "motor_torque"]
 
 
@@ -21,9 +23,9 @@ class Task:
     """What a robot is asked to do.
 
     Attributes:
-        rewards: Weight of each reward term, by the name of its function; the reward is the weighted sum times the
-            control step.
-        observations: Observation blocks, in order.
+        rewards: Weight of each reward term, or a mapping of `weight` and parameters, by the name of its function; the
+            reward is the weighted sum times the control step.
+        observations: Observation blocks, in order: names, or parameters by name. So are the following three.
         terminations: Conditions that end an episode as a failure.
         metrics: Figures averaged over each episode.
         critic: Blocks that the critic sees besides the policy's, without noise, if observations come as a dictionary.
@@ -60,11 +62,11 @@ class Task:
             and base velocities [rad/s and m/s].
     """
 
-    rewards: Mapping[str, float]
-    observations: tuple[str, ...]
-    terminations: tuple[str, ...]
-    metrics: tuple[str, ...]
-    critic: tuple[str, ...] = ()
+    rewards: Mapping[str, float | Mapping[str, Any]]
+    observations: Terms
+    terminations: Terms
+    metrics: Terms
+    critic: Terms = ()
     noise: Mapping[str, float] = field(default_factory=dict)
     history: int = 1
     actions: Actions = "joint_pd"

@@ -2,7 +2,7 @@
 
 Robots start in the middle of a tile. On slopes and stairs that is the top of a pyramid or the bottom of a pit, by turns
 from column to column, so that they walk down or up whatever their heading is; tiles meet at height 0. The lowest level
-is flat, the highest has the figure that the task says. May know terrain and numpy.
+is flat, the highest has the figure that the task says.
 """
 
 from __future__ import annotations

@@ -1,33 +1,41 @@
 """What a reward, observation or termination may ask about one robot at the end of a control step, as SX.
 
-A term is a free function of a `Snapshot`. Everything here is traced when it is asked for and costs nothing otherwise.
-May know kinematics and mechanisms; no tasks.
+A term is a free function of a `TermContext`. What is here is traced when it is asked for and costs nothing otherwise.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.ground import above as over_ground
 from ce_gym.dynamics.functions import spanning_coordinates
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
 
 
-class Snapshot:
+class TermContext:
     """One robot at the end of a control step.
 
     Args:
         mechanism: The robot at a transmission level.
         values: Expressions of the state buffers, by name: q, v, command, action, previous_action, torque,
-            air_time, clock, load, scaled_parameters; and seen_ground, height and slopes of the ground under the base
-            and each contact sphere, shape (3 (1 + n_spheres),), if it is not flat.
+            air_time, clock, load, scaled_parameters; what terms remember; and seen_ground, height and slopes of the
+            ground under the base and each contact sphere, shape (3 (1 + n_spheres),), if it is not flat.
         control_dt: Length of a control step [s].
         gait_period: Time of one cycle of the gait's clock [s].
+
+    Attributes:
+        term: Kind and name of the term that is being traced, for what it remembers.
+        remembered: What terms have recalled, by name of the state.
+        resets: With what that begins, a number or shape (size,).
+        kept: What terms have kept, likewise.
     """
 
     def __init__(
@@ -35,10 +43,44 @@ class Snapshot:
     ) -> None:
         self.mechanism, self.control_dt, self._values = mechanism, control_dt, values
         self._gait_period = gait_period
+        self.term = ""
+        self.remembered: dict[str, SX] = {}
+        self.resets: dict[str, ArrayLike] = {}
+        self.kept: dict[str, SX] = {}
         robot = mechanism.robot
         self._n_joints = len(robot.independent)
         pose = dict(robot.pose.joints)
         self.standing_joints = np.array([pose.get(name, 0.0) for name in robot.independent])
+
+    def recall(self, name: str, size: int = 1, reset: ArrayLike = 0.0) -> SX:
+        """Return what this term kept in the control step before, shape (size,): memory of its own, one of each robot.
+
+        Args:
+            name: Of the memory, a word.
+            size: How many numbers it has.
+            reset: With what an episode begins, a number or shape (size,).
+        """
+        key = self._key(name)
+        if key not in self.remembered:
+            self.remembered[key] = self._values[key] if key in self._values else SX.sym(key, size)
+            self.resets[key] = reset
+        return self.remembered[key]
+
+    def _key(self, name: str) -> str:
+        return f"{self.term}_{name}".replace("__", "_")  # CasADi's rule for names
+
+    def keep(self, name: str, value: SX) -> None:
+        """Keep something for the next control step, see `recall`.
+
+        Raises:
+            ValueError: If nothing of that name and size has been recalled.
+        """
+        key = self._key(name)
+        size = self.remembered[key].numel() if key in self.remembered else 0
+        if SX(value).numel() != size:
+            expected = f"recall({name!r}, size={SX(value).numel()}) before"
+            raise ValueError(f"{self.term}: keep({name!r}) of {SX(value).numel()} numbers; expected {expected}")
+        self.kept[key] = ca.densify(ca.vec(SX(value)))
 
     @property
     def q(self) -> SX:
@@ -73,12 +115,13 @@ class Snapshot:
     @property
     def air_time(self) -> SX:
         """How long each foot had been in the air up to the previous control step [s], shape (n_feet,)."""
+        self._feet  # noqa: B018  (says so if there are none)
         return self._values["air_time"]
 
     @property
     def load(self) -> SX:
         """Normal force on each contact in the last sub-step [N], shape (n_contacts,)."""
-        return self._values["load"]
+        return self._values.get("load", SX(0, 1))
 
     @property
     def scaled_parameters(self) -> SX:
@@ -154,8 +197,7 @@ class Snapshot:
                 centre = constant(np.array(sphere.position))
                 velocity, above = body.R @ body.point_velocity(centre), body.point_position(centre)[2]
                 if self._ground.numel():
-                    height, slope = self._ground[3 * i + 3], self._ground[3 * i + 4 : 3 * i + 6]
-                    above = (above - height) / ca.sqrt(1 + ca.sumsqr(slope))
+                    above = over_ground(above, *ca.vertsplit(self._ground[3 * i + 3 : 3 * i + 6]))
                 points.append((sphere.body, above - sphere.radius, velocity))
         return points
 
@@ -169,6 +211,8 @@ class Snapshot:
         feet: dict[str, list[tuple[SX, SX]]] = {}
         for body, height, velocity in self.lowest_points("foot"):
             feet.setdefault(body, []).append((height, velocity))
+        if not feet:
+            raise ValueError(f"{self.term}: {self.mechanism.robot.name} has no contact spheres of group 'foot'")
         return feet
 
     @cached_property
@@ -201,3 +245,10 @@ class Snapshot:
     def commanded_to_move(self) -> SX:
         """1 if the command asks for motion, else 0."""
         return ca.sumsqr(self.command) > 0.01
+
+
+def __getattr__(name: str) -> type:
+    if name == "Snapshot":
+        warnings.warn("Snapshot is called TermContext now", DeprecationWarning, stacklevel=2)
+        return TermContext
+    raise AttributeError(name)

@@ -1,7 +1,6 @@
-"""Observation blocks: free functions of a `Snapshot` that return a vector of order one.
+"""Observation blocks: free functions of a `TermContext` that return a vector of order one.
 
-Scales are those of legged_gym's velocity task, so that policies of similar make see similar numbers. May know
-snapshots.
+Scales are those of legged_gym's velocity task, so that policies of similar make see similar numbers.
 """
 
 from __future__ import annotations
@@ -10,76 +9,76 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.terms.context import Snapshot
+from ce_gym.envs.terms.context import TermContext
 
 
-def base_linear_velocity(s: Snapshot) -> SX:
-    """Base frame, times 2 [m/s], shape (3,)."""
-    return 2.0 * s.base_linear_velocity
+def base_linear_velocity(s: TermContext, scale: float = 2.0) -> SX:
+    """Base frame, times `scale`, 2 [m/s], shape (3,)."""
+    return scale * s.base_linear_velocity
 
 
-def base_angular_velocity(s: Snapshot) -> SX:
-    """Base frame, times 0.25 [rad/s], shape (3,)."""
-    return 0.25 * s.base_angular_velocity
+def base_angular_velocity(s: TermContext, scale: float = 0.25) -> SX:
+    """Base frame, times `scale`, 0.25 [rad/s], shape (3,)."""
+    return scale * s.base_angular_velocity
 
 
-def projected_gravity(s: Snapshot) -> SX:
+def projected_gravity(s: TermContext) -> SX:
     """Direction of gravity in the base frame, shape (3,); (0, 0, -1) if upright."""
     return -s.up
 
 
-def velocity_command(s: Snapshot) -> SX:
+def velocity_command(s: TermContext) -> SX:
     """Commanded forward and sideways velocity times 2 [m/s] and yaw rate times 0.25 [rad/s], shape (3,)."""
     return s.command * np.array([2.0, 2.0, 0.25])
 
 
-def joint_positions(s: Snapshot) -> SX:
+def joint_positions(s: TermContext) -> SX:
     """Distance from the standing pose [rad], shape (n_joints,)."""
     return s.joint_positions - s.standing_joints
 
 
-def joint_velocities(s: Snapshot) -> SX:
-    """Times 0.05 [rad/s], shape (n_joints,)."""
-    return 0.05 * s.joint_velocities
+def joint_velocities(s: TermContext, scale: float = 0.05) -> SX:
+    """Times `scale`, 0.05 [rad/s], shape (n_joints,)."""
+    return scale * s.joint_velocities
 
 
-def last_action(s: Snapshot) -> SX:
+def last_action(s: TermContext) -> SX:
     """The action just carried out, shape (n_joints,)."""
     return s.action
 
 
-def feet_in_contact(s: Snapshot) -> SX:
+def feet_in_contact(s: TermContext) -> SX:
     """Whether each foot is on the ground, 0 or 1, shape (n_feet,)."""
     return ca.vertcat(s.foot_contact)
 
 
-def gait_phase(s: Snapshot) -> SX:
+def gait_phase(s: TermContext) -> SX:
     """Sine and cosine of the gait's clock, shape (2,)."""
     return ca.vertcat(ca.sin(s.phase), ca.cos(s.phase))
 
 
-def base_height(s: Snapshot) -> SX:
+def base_height(s: TermContext) -> SX:
     """Height of the base above its standing height [m], shape (1,)."""
     return s.base_height - s.mechanism.robot.pose.height
 
 
-def torques(s: Snapshot) -> SX:
+def torques(s: TermContext) -> SX:
     """Motor torques as shares of the joints' largest [-], shape (n_joints,)."""
     limits = [s.mechanism.robot.body(name).joint.torque for name in s.mechanism.robot.independent]
     return s.torque / np.array([limit if np.isfinite(limit) else 100.0 for limit in limits])
 
 
-def contact_forces(s: Snapshot) -> SX:
+def contact_forces(s: TermContext) -> SX:
     """Normal forces on the contacts over the robot's weight [-], shape (n_contacts,)."""
     weight = -s.mechanism.robot.gravity[2] * s.mechanism.robot.total_mass
     return s.load / (weight if weight > 0 else 1.0)
 
 
-def rotor_speeds(s: Snapshot) -> SX:
+def rotor_speeds(s: TermContext) -> SX:
     """Speeds of the rotors over 100 rad/s, shape (n_rotors,)."""
     return ca.vertcat(SX(0, 1), *[0.01 * speed for speed in s.rotor_velocities])
 
 
-def parameters(s: Snapshot) -> SX:
+def parameters(s: TermContext) -> SX:
     """The randomised figures of the episode, each scaled to [-1, 1] over its range, shape (n,)."""
     return s.scaled_parameters

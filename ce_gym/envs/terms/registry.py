@@ -1,30 +1,31 @@
-"""Finding terms by name: the package's own and those a user adds.
+"""Finding terms by name, the package's own and those a user adds, and tracing them with clear errors.
 
-    @ce_gym.reward
-    def near_the_origin(s):
-        return -(s.q[0] ** 2 + s.q[1] ** 2)
+@ce_gym.reward
+def near_the_origin(s, width=1.0):
+return -(s.q[0] ** 2 + s.q[1] ** 2) / width**2
 
-    gymnasium.make("ce_gym/MiniCheetahVelocity-v0", reward_weights={"near_the_origin": 0.5})
-
-May know the term files and snapshots.
+gymnasium.make("ce_gym/MiniCheetahVelocity-v0", rewards={"near_the_origin": {"weight": 0.5, "width": 2.0}})
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+import math
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.terms import metrics, observations, rewards, terminations
-from ce_gym.envs.terms.context import Snapshot
+from ce_gym.envs.terms.context import TermContext
 
-Term = Callable[[Snapshot], SX]
+Function = Callable[..., SX]
 _F = TypeVar("_F", bound=Callable)
 
 
-def _functions_of(module: ModuleType) -> dict[str, Term]:
+def _functions_of(module: ModuleType) -> dict[str, Function]:
     return {
         name: function
         for name, function in inspect.getmembers(module, inspect.isfunction)
@@ -32,57 +33,140 @@ def _functions_of(module: ModuleType) -> dict[str, Term]:
     }
 
 
-OWN: dict[str, dict[str, Term]] = {
+OWN: dict[str, dict[str, Function]] = {
     "reward": _functions_of(rewards),
     "observation": _functions_of(observations),
     "termination": _functions_of(terminations),
     "metric": _functions_of(metrics),
 }
-_added: dict[str, dict[str, Term]] = {kind: {} for kind in OWN}
+_added: dict[str, dict[str, Function]] = {kind: {} for kind in OWN}
 
 
-def find_term(kind: str, name: str) -> Term:
-    """Return a term.
+@dataclass(frozen=True)
+class Term:
+    """A term of a task.
+
+    Attributes:
+        kind: "reward", "observation", "termination" or "metric".
+        name: Of the function.
+        function: A function of a `TermContext` and of parameters with defaults.
+        parameters: Those that differ from the defaults.
+        weight: Of a reward.
+    """
+
+    kind: str
+    name: str
+    function: Function
+    parameters: Mapping[str, Any]
+    weight: float = 1.0
+
+    @property
+    def added(self) -> bool:
+        """Whether it comes from a user."""
+        return self.name in _added[self.kind]
+
+    def __call__(self, s: TermContext) -> SX:
+        """Trace the term.
+
+        Raises:
+            ValueError: If it cannot be traced; one line.
+        """
+        s.term = f"{self.kind}_{self.name}"
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", category=FutureWarning)  # CasADi's, of numpy's functions
+                value = self.function(s, **self.parameters)
+            if value is None:
+                raise TypeError("returns None; expected a CasADi expression")
+            return SX(value)
+        except (RuntimeError, NotImplementedError, TypeError) as error:
+            raise ValueError(f"{self.kind} term {self.name!r}: {_advice(error)}") from error
+
+    def number(self, s: TermContext) -> SX:
+        """Trace a term that is one number.
+
+        Raises:
+            ValueError: If it is another shape.
+        """
+        value = self(s)
+        if value.numel() != 1:
+            expected = "expected one number, for instance ca.sumsqr(...) or ca.sum1(...)"
+            raise ValueError(f"{self.kind} term {self.name!r} has shape {value.shape}; {expected}")
+        return value
+
+
+def _advice(error: Exception) -> str:
+    """Return what to do about an error of CasADi's, or the first line of the error."""
+    if "truth value" in str(error):
+        return "a condition on a traced value (Python's if, and, or, min, max); expected ca.if_else, ca.fmin, ca.fmax"
+    text = str(error).strip().splitlines() or [type(error).__name__]
+    if isinstance(error, TypeError):
+        return text[0]
+    return f"{text[-1]}; expected arithmetic of CasADi expressions (ca.sqrt, ca.if_else, ca.dot, ...)"
+
+
+def terms_of(kind: str, given: Mapping[str, Any] | Iterable[str]) -> dict[str, Term]:
+    """Return the terms that a task names.
 
     Args:
         kind: "reward", "observation", "termination" or "metric".
-        name: Of the function.
+        given: Names; or parameters by name, for a reward its weight or parameters that `weight` is one of.
 
     Raises:
-        ValueError: If there is none; names those there are.
+        ValueError: If there is no such term or parameter; names those there are.
     """
+    return {name: _term(kind, name, given[name] if isinstance(given, Mapping) else {}) for name in given}
+
+
+def _term(kind: str, name: str, given: Any) -> Term:
     known = OWN[kind] | _added[kind]
     if name not in known:
         raise ValueError(f"no {kind} term {name!r}; expected one of {', '.join(sorted(known))}")
-    return known[name]
+    parameters = dict(given) if isinstance(given, Mapping) else {"weight": given}
+    weight = parameters.pop("weight", 1.0) if kind == "reward" else 1.0
+    defaults = parameters_of(known[name])
+    for key, value in parameters.items():
+        if key not in defaults:
+            expected = f"one of {', '.join(defaults)}" if defaults else "none"
+            raise ValueError(f"{kind} term {name!r}: parameter {key!r}; expected {expected}")
+        if _is_number(defaults[key]) and not _is_number(value):
+            raise ValueError(f"{kind} term {name!r}: {key}={value!r}; expected a finite number")
+    return Term(kind, name, known[name], parameters, weight)
 
 
-def is_added(kind: str, name: str) -> bool:
-    """Whether a term comes from a user."""
-    return name in _added[kind]
+def parameters_of(function: Function) -> dict[str, Any]:
+    """Return the parameters of a term and their defaults."""
+    _, *others = inspect.signature(function).parameters.values()
+    return {parameter.name: parameter.default for parameter in others}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def reward(function: _F) -> _F:
-    """Add a reward term under the function's name: a function of a `Snapshot` that returns one number.
+    """Add a reward term under the function's name: a function of a `TermContext` that returns one number.
+
+    Further arguments, with defaults, are parameters that a task can set; see `TermContext.recall` for memory.
 
     Raises:
-        ValueError: If the package has a term of this name.
+        ValueError: If the package has a term of this name, or a parameter has no default.
     """
     return _add("reward", function)
 
 
 def observation(function: _F) -> _F:
-    """Add an observation block under the function's name: a function of a `Snapshot` that returns a vector."""
+    """Add an observation block under the function's name: a function of a `TermContext` that returns a vector."""
     return _add("observation", function)
 
 
 def termination(function: _F) -> _F:
-    """Add a condition that ends an episode: a function of a `Snapshot` that returns 0 or 1."""
+    """Add a condition that ends an episode: a function of a `TermContext` that returns 0 or 1."""
     return _add("termination", function)
 
 
 def metric(function: _F) -> _F:
-    """Add a figure to report under the function's name: a function of a `Snapshot` that returns one number."""
+    """Add a figure to report under the function's name: a function of a `TermContext` that returns one number."""
     return _add("metric", function)
 
 
@@ -90,5 +174,8 @@ def _add(kind: str, function: _F) -> _F:
     name = function.__name__
     if name in OWN[kind]:
         raise ValueError(f"{kind} term {name!r}: the package has one of this name; give yours another")
+    for parameter, default in parameters_of(function).items():
+        if default is inspect.Parameter.empty:
+            raise ValueError(f"{kind} term {name!r}: parameter {parameter!r} has no default; expected one")
     _added[kind][name] = function
     return function

@@ -1,7 +1,7 @@
-"""Reward terms: free functions of a `Snapshot` that return one number, to be weighted by a task.
+"""Reward terms: free functions of a `TermContext` that return one number, to be weighted by a task.
 
 Names and forms follow the widely used legged_gym velocity task (Rudin et al. 2022), so that scales carry over. A term
-is a rate: a task multiplies it by its weight and by the control step. May know snapshots; no robots, no weights.
+is a rate: a task multiplies it by its weight and by the control step.
 """
 
 from __future__ import annotations
@@ -10,110 +10,107 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.terms.context import Snapshot
-
-TRACKING_WIDTH = 0.25
-"""Squared error at which a tracking reward has fallen to 1/e [(m/s)^2 or (rad/s)^2]."""
+from ce_gym.envs.terms.context import TermContext
 
 
-def track_linear_velocity(s: Snapshot) -> SX:
-    """Follow the commanded horizontal velocity; 1 if exact."""
-    return ca.exp(-ca.sumsqr(s.command[:2] - s.base_linear_velocity[:2]) / TRACKING_WIDTH)
+def track_linear_velocity(s: TermContext, width: float = 0.25) -> SX:
+    """Follow the commanded horizontal velocity; 1 if exact, 1/e where the squared error is `width` [(m/s)^2]."""
+    return ca.exp(-ca.sumsqr(s.command[:2] - s.base_linear_velocity[:2]) / width)
 
 
-def track_angular_velocity(s: Snapshot) -> SX:
-    """Follow the commanded yaw rate; 1 if exact."""
-    return ca.exp(-((s.command[2] - s.base_angular_velocity[2]) ** 2) / TRACKING_WIDTH)
+def track_angular_velocity(s: TermContext, width: float = 0.25) -> SX:
+    """Follow the commanded yaw rate; 1 if exact, 1/e where the squared error is `width` [(rad/s)^2]."""
+    return ca.exp(-((s.command[2] - s.base_angular_velocity[2]) ** 2) / width)
 
 
-def linear_velocity_z(s: Snapshot) -> SX:
+def linear_velocity_z(s: TermContext) -> SX:
     """Vertical speed of the base, squared [(m/s)^2]."""
     return s.base_linear_velocity[2] ** 2
 
 
-def angular_velocity_xy(s: Snapshot) -> SX:
+def angular_velocity_xy(s: TermContext) -> SX:
     """Roll and pitch rates, squared [(rad/s)^2]."""
     return ca.sumsqr(s.base_angular_velocity[:2])
 
 
-def orientation(s: Snapshot) -> SX:
+def orientation(s: TermContext) -> SX:
     """How far the base leans, squared sine of the angle to upright."""
     return ca.sumsqr(s.up[:2])
 
 
-def base_height(s: Snapshot) -> SX:
+def base_height(s: TermContext) -> SX:
     """Distance of the base from its standing height, squared [m^2]."""
     return (s.base_height - s.mechanism.robot.pose.height) ** 2
 
 
-def torques(s: Snapshot) -> SX:
+def torques(s: TermContext) -> SX:
     """Motor torques at the joints, squared [(N m)^2]."""
     return ca.sumsqr(s.torque)
 
 
-def power(s: Snapshot) -> SX:
+def power(s: TermContext) -> SX:
     """Mechanical power of the motors, positive and negative both counted [W]."""
     return ca.sum1(ca.fabs(s.torque * s.joint_velocities))
 
 
-def action_rate(s: Snapshot) -> SX:
+def action_rate(s: TermContext) -> SX:
     """Change of the action since the last control step, squared."""
     return ca.sumsqr(s.action - s.previous_action)
 
 
-def pose(s: Snapshot) -> SX:
+def pose(s: TermContext) -> SX:
     """Distance of the joints from the standing pose, squared [rad^2]."""
     return ca.sumsqr(s.joint_positions - s.standing_joints)
 
 
-def stand_still(s: Snapshot) -> SX:
+def stand_still(s: TermContext) -> SX:
     """Distance of the joints from the standing pose while no motion is commanded [rad]."""
     return ca.if_else(s.commanded_to_move, 0, ca.sum1(ca.fabs(s.joint_positions - s.standing_joints)))
 
 
-def feet_air_time(s: Snapshot) -> SX:
-    """At each touchdown, how long the foot was in the air beyond 0.1 s, while motion is commanded [s]."""
-    gained = ca.dot(s.air_time - 0.1, s.landed) / s.control_dt  # an event, not a rate: the step cancels
+def feet_air_time(s: TermContext, least: float = 0.1) -> SX:
+    """At each touchdown, how long the foot was in the air beyond `least` [s], while motion is commanded [s]."""
+    gained = ca.dot(s.air_time - least, s.landed) / s.control_dt  # an event, not a rate: the step cancels
     return ca.if_else(s.commanded_to_move, gained, 0)
 
 
-def knee_contact(s: Snapshot) -> SX:
+def knee_contact(s: TermContext) -> SX:
     """Number of knees on the ground."""
     return ca.sum1(s.touching("knee"))
 
 
-def joint_limits(s: Snapshot) -> SX:
-    """How far joints are beyond 90 % of their range [rad]."""
+def joint_limits(s: TermContext, margin: float = 0.05) -> SX:
+    """How far joints are nearer to an end of their range than `margin` of its length [rad]."""
     total = SX(0)
     for i, name in enumerate(s.mechanism.robot.independent):
         low, high = s.mechanism.robot.body(name).joint.position
         if np.isfinite(high - low):
-            margin = 0.05 * (high - low)
-            total += ca.fmax(0, low + margin - s.joint_positions[i]) + ca.fmax(0, s.joint_positions[i] - high + margin)
+            near = margin * (high - low)
+            total += ca.fmax(0, low + near - s.joint_positions[i]) + ca.fmax(0, s.joint_positions[i] - high + near)
     return total
 
 
-def alive(s: Snapshot) -> SX:
+def alive(s: TermContext) -> SX:
     """1 as long as the episode goes on."""
     return SX(1)
 
 
-def survive(s: Snapshot) -> SX:
+def survive(s: TermContext) -> SX:
     """1 as long as the episode goes on, under the name of Gymnasium's MuJoCo environments."""
     return SX(1)
 
 
-def forward(s: Snapshot) -> SX:
+def forward(s: TermContext) -> SX:
     """Forward speed of the base in its own heading [m/s]."""
     return s.base_linear_velocity[0]
 
 
-def ctrl(s: Snapshot) -> SX:
+def ctrl(s: TermContext) -> SX:
     """Size of the action, squared."""
     return ca.sumsqr(s.action)
 
 
-def gait(s: Snapshot) -> SX:
+def gait(s: TermContext) -> SX:
     """How many feet are on the ground and off it when the gait's clock wants them, minus those that are not.
 
     Feet take turns: the first half of the cycle belongs to every second one. While no motion is commanded all stand.
@@ -123,23 +120,23 @@ def gait(s: Snapshot) -> SX:
     return ca.sum1(1 - 2 * ca.fabs(wanted - s.foot_contact))
 
 
-def foot_slip(s: Snapshot) -> SX:
+def foot_slip(s: TermContext) -> SX:
     """Horizontal speeds of feet on the ground, squared [(m/s)^2]."""
     return ca.dot(s.foot_contact, ca.sum1(s.foot_velocities[:2, :] ** 2).T)
 
 
-def foot_clearance(s: Snapshot) -> SX:
-    """How far feet in the air are below 8 cm, times how fast they move, while motion is commanded [m^2/s]."""
-    low = ca.fmax(0, 0.08 - s.foot_heights) ** 2
+def foot_clearance(s: TermContext, height: float = 0.08) -> SX:
+    """How far feet in the air are below `height` [m], squared, times how fast they move, while motion is commanded."""
+    low = ca.fmax(0, height - s.foot_heights) ** 2
     speed = ca.sqrt(ca.sum1(s.foot_velocities[:2, :] ** 2).T + 1e-6)
     return ca.if_else(s.commanded_to_move, ca.sum1(low * speed), 0)
 
 
-def height(s: Snapshot) -> SX:
+def height(s: TermContext) -> SX:
     """How far the base is above its standing height, during the second half of the gait's clock [m]."""
     return ca.if_else(ca.sin(s.phase) < 0, ca.fmax(0, s.base_height - s.mechanism.robot.pose.height), 0)
 
 
-def flight(s: Snapshot) -> SX:
+def flight(s: TermContext) -> SX:
     """1 if no foot is on the ground."""
     return ca.sum1(s.foot_contact) < 0.5

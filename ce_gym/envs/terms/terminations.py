@@ -1,4 +1,4 @@
-"""Conditions that end an episode as a failure: functions of a `Snapshot` that return 0 or 1. May know snapshots."""
+"""Conditions that end an episode as a failure: functions of a `TermContext` that return 0 or 1."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import math
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.terms.context import Snapshot
+from ce_gym.envs.terms.context import TermContext
 
 
-def torso_contact(s: Snapshot) -> SX:
+def torso_contact(s: TermContext) -> SX:
     """Any torso sphere touches the ground."""
     return ca.sum1(s.touching("torso")) > 0
 
 
-def fallen(s: Snapshot) -> SX:
-    """The base is lower than 60 % of its standing height."""
-    return s.base_height < 0.6 * s.mechanism.robot.pose.height
+def fallen(s: TermContext, share: float = 0.6) -> SX:
+    """The base is lower than a `share` of its standing height."""
+    return s.base_height < share * s.mechanism.robot.pose.height
 
 
-def tilt(s: Snapshot) -> SX:
-    """The base leans by more than 70 degrees."""
-    return s.up[2] < math.cos(math.radians(70))
+def tilt(s: TermContext, angle: float = math.radians(70)) -> SX:
+    """The base leans by more than an `angle` [rad], 70 degrees."""
+    return s.up[2] < math.cos(angle)

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.envs.base import BatchShell
-from ce_gym.envs.single import recorded_state
+from ce_gym.envs.base import BaseEnv, recorded_state
 from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.model import Robot, robots
 from ce_gym.sim.terrain import Terrain
@@ -84,7 +83,7 @@ def record_lanes(
         ViewerError: It is no environment of ce_gym, or there is no such lane.
     """
     native = env.unwrapped
-    if not isinstance(native, BatchShell):
+    if not isinstance(native, BaseEnv):
         raise ViewerError(f"cannot record {type(native).__name__}: expected an environment of ce_gym")
     batch = native.batch
     for lane in lanes:
@@ -113,7 +112,7 @@ def record_lanes(
     return [recorder.rollout() for recorder in recorders.values()]
 
 
-def _recorder(native: BatchShell, field: Terrain | None, label: str, info: Mapping[str, str]) -> Recorder:
+def _recorder(native: BaseEnv, field: Terrain | None, label: str, info: Mapping[str, str]) -> Recorder:
     model = native.batch.program.model
     names = ("reward", *(f"reward: {name}" for name in native.batch.program.reward_terms))
     return Recorder(

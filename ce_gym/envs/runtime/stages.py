@@ -1,0 +1,242 @@
+"""What an environment does around the sub-steps, as traced functions of the state in the schema.
+
+assess   after a control step: reward terms, terminations, metrics, the next command, the observation
+place    before a reset on a field: where the robot stands
+begin    a reset: the state of a new episode, its first observation
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.compile import Call
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.functions import traced
+from ce_gym.envs.task.commands import Commands
+from ce_gym.envs.task.ground import SEEN, resting_load, starting_place
+from ce_gym.envs.task.sampling import Draws
+from ce_gym.envs.terms.context import TermContext
+from ce_gym.envs.terms.registry import Term
+from ce_gym.sim.schema import Row
+from ce_gym.sim.substeps import FRAME
+
+if TYPE_CHECKING:
+    from ce_gym.envs.runtime.program import TaskProgram
+
+OBSERVATION_BOUND = 100.0
+"""Observations are clipped here; blocks are of order one, so only a robot about to fail comes near it."""
+OUTCOME = ("reward", "terminated", "truncated", "diverged", "done")
+"""Columns of the rows `outcome`; the weighted reward terms follow."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What the terms of a task turn out to be.
+
+    Attributes:
+        sizes: Length of each observation block, by name; the policy's first.
+        memories: Rows of what terms remember.
+        added: A text that changes with terms that users have added, for cache keys.
+    """
+
+    sizes: dict[str, int]
+    memories: tuple[Row, ...]
+    added: str
+
+
+class Stages:
+    """Traces the stages of a task on a robot.
+
+    Args:
+        program: The task on the robot.
+        schema: The state.
+    """
+
+    def __init__(self, program: TaskProgram, schema: Mapping[str, Row]) -> None:
+        self.program, self.task, self.model = program, program.task, program.model
+        self.schema = {row.name: row for row in schema.values() if not row.dtype and row.name != FRAME}
+        self.commands = Commands(self.task, program.curriculum)
+        self.state = {name: SX.sym(name, row.size) for name, row in self.schema.items()}
+        self.seen_ground = {SEEN: SX.sym(SEEN, program.ground.size)} if program.ground else {}
+
+    def probe(self) -> Probe:
+        """Trace every term once."""
+        p, s = self.program, self._context(self.state | {"previous_action": self.state["action"]})
+        for term in (*p.reward_terms.values(), *p.termination_terms.values(), *p.metric_terms.values()):
+            term.number(s)
+        blocks = {name: term(s) for name, term in (p.observation_terms | p.critic_terms).items()}
+        kinds = (p.reward_terms, p.termination_terms, p.metric_terms, p.observation_terms, p.critic_terms)
+        added = [term for terms in kinds for term in terms.values() if term.added]
+        values = {f"x{i}": term(s) for i, term in enumerate(added)} | {f"k_{n}": x for n, x in s.kept.items()}
+        inputs = self.state | self.seen_ground | s.remembered
+        rows = tuple(Row(name, x.numel(), "term", s.resets[name]) for name, x in s.remembered.items())
+        text = f"{traced('added', inputs, values).serialize()} {rows!r}" if added else ""
+        return Probe({name: block.numel() for name, block in blocks.items()}, rows, text)
+
+    def look(self) -> ca.Function:
+        """Trace one observation of the policy, neither noisy nor clipped, and `failed`; of what they look at."""
+        s = self._context(self.state | {"previous_action": self.state["action"]})
+        seen = {name: term(s) for name, term in self.program.observation_terms.items()}
+        seen["failed"] = self._failed(s)
+        return traced("look", _used(self.state, seen), seen)
+
+    def values(self, terms: Mapping[str, Term]) -> ca.Function:
+        """Trace terms alone, one after the other; of the state and the action before."""
+        state = self.state | {"previous_action": SX.sym("previous_action", self.program.n_actions)}
+        s = self._context(state)
+        values = {"values": ca.vertcat(SX(0, 1), *[term(s) for term in terms.values()])}
+        return traced("terms", _used(state, values), values)
+
+    def assess(self) -> tuple[Call, int]:
+        """Trace what follows the sub-steps; return the call and how many random numbers it takes."""
+        p, task, state, draws = self.program, self.task, self.state, Draws()
+        clipped = SX.sym("clipped", p.n_actions)
+        values = state | self.seen_ground | {"action": clipped, "previous_action": state["action"]}
+        s = self._context(values)
+        terms = [term.weight * term.number(s) * p.control_dt for term in p.reward_terms.values()]
+        total = sum(terms, SX(0))
+        reward = ca.fmax(0, total) if task.only_positive else total
+        diverged = state["diverged"] > 0.5
+        terminated = ca.logic_and(self._failed(s), ca.logic_not(diverged))
+        after = {"action": clipped, "elapsed": state["elapsed"] + 1, "clock": state["clock"] + 1}
+        after["sums"] = state["sums"] + ca.vertcat(reward, *terms, *[m.number(s) for m in p.metric_terms.values()])
+        after["failures"] = state["failures"] + diverged
+        if "air_time" in state:
+            after["air_time"] = ca.if_else(s.foot_contact, 0, state["air_time"] + p.control_dt)
+        after |= p.curriculum.followed(s, state) | s.kept
+
+        fresh = self.commands.new(draws, state.get("grown"))
+        due = self._every(task.command_period, after["clock"])
+        commanded = {name: ca.if_else(due, fresh[name], state[name]) for name in fresh}
+        if task.push_period:
+            after["v"] = self._pushed(state["v"], after["clock"], draws)
+        after |= self.commands.steered(values | after, commanded)
+        seen = self._context(values | after)
+        observation, history = self._observation(seen, state.get("history"), draws)
+        after |= seen.kept | ({"history": history} if "history" in state else {})
+
+        truncated = ca.logic_or(after["elapsed"] >= state["limit"], diverged)
+        after["chosen"] = done = ca.logic_or(terminated, truncated)
+        outcome = ca.vertcat(reward, terminated, truncated, diverged, done, *terms)
+        # mask NaN and Inf of robots that have diverged
+        outcome = ca.if_else(ca.logic_or(ca.logic_not(diverged), ca.fabs(outcome) < ca.inf), outcome, 0)
+        sums = ca.if_else(ca.logic_and(done, ca.fabs(after["sums"]) < ca.inf), after["sums"], 0)
+        ended = ca.vertcat(ca.if_else(done, after["elapsed"], 0), sums)
+        outputs = after | {"observation": observation, "outcome": outcome, "ended": ended}
+        given = state | self.seen_ground | {"clipped": clipped, "draws": draws.symbols}
+        return _call("assess", given, outputs), draws.symbols.numel()
+
+    def begin(self) -> tuple[Call, int]:
+        """Trace a reset where `chosen`; return the call and how many random numbers it takes.
+
+        On a field the robots have been placed: their state has where they stand, all but the height of the ground.
+        """
+        p, draws = self.program, Draws()
+        state = {name: x for name, x in self.state.items() if self.schema[name].writer != "host" and name != "chosen"}
+        fresh = {name: SX(np.broadcast_to(self.schema[name].reset, x.shape[0])) for name, x in state.items()}
+        fresh |= {name: state[name] for name in ("failures", "level") if name in state}
+        ground = self.seen_ground.get(SEEN)
+        if p.ground and ground is not None:
+            fresh["q"] = SX(state["q"])
+            fresh["q"][2] += p.ground.lift(state["q"], state.get("dependent"), ground)
+        else:
+            fresh["q"] = self._starting_pose(draws)
+        fresh["v"] = self._starting_velocity(draws)
+        if "grown" in fresh:
+            fresh["grown"] = p.curriculum.grown(state)
+        if "draw" in fresh:
+            fresh["draw"] = ca.vertcat(*[draws.unit() for _ in range(p.randomised.n_draws)])
+            fresh["parameters"] = p.randomised.values(fresh["draw"])
+        if "delay" in fresh:
+            low, high = self.task.latency
+            fresh["delay"] = ca.floor(draws.uniform(low, high + 1))
+            fresh["target"] = SX(p.actions.rest)
+        if "load" in fresh:
+            fresh["load"] = resting_load(self.model.mechanism, p.options, fresh, ground)
+        fresh |= self.commands.new(draws, fresh.get("grown"))
+        fresh |= self.commands.steered(fresh, {name: fresh[name] for name in ("command", "heading") if name in fresh})
+        chosen = self.state["chosen"] > 0.5
+        after = {name: ca.if_else(chosen, ca.densify(fresh[name]), x) for name, x in state.items()}
+        s = self._context(self.state | after | self.seen_ground | {"previous_action": after["action"]})
+        observation, history = self._observation(s, None, draws)
+        later = s.kept | ({"history": history} if "history" in state else {})
+        after |= {name: ca.if_else(chosen, value, state[name]) for name, value in later.items()}
+        given = self.state | self.seen_ground | {"first_draws": draws.symbols}
+        return _call("begin", given, after | {"observation": observation}), draws.symbols.numel()
+
+    def place(self) -> tuple[Call, int]:
+        """Trace how those who are `chosen` take a pose on a tile of the field as if the ground were at 0."""
+        state, draws, curriculum = self.state, Draws(), self.program.curriculum
+        level = curriculum.level(state, draws, self.program.control_dt)
+        place = starting_place(curriculum, level, draws)
+        fresh = {"q": self._starting_pose(draws), "level": level}
+        fresh["q"][:2] = place
+        fresh |= {"dependent": SX(self.model.guess)} if "dependent" in state else {}
+        after = {name: ca.if_else(state["chosen"] > 0.5, value, state[name]) for name, value in fresh.items()}
+        return _call("place", state | {"place_draws": draws.symbols}, after), draws.symbols.numel()
+
+    def _context(self, values: Mapping[str, SX]) -> TermContext:
+        values = dict(values) | ({"scaled_parameters": 2 * values["draw"] - 1} if "draw" in values else {})
+        return TermContext(self.model.mechanism, values, self.program.control_dt, self.task.gait_period)
+
+    def _failed(self, s: TermContext) -> SX:
+        return sum([term.number(s) for term in self.program.termination_terms.values()], SX(0)) > 0
+
+    def _starting_pose(self, draws: Draws) -> SX:
+        """Positions near the standing pose, heading anywhere."""
+        standing = self.model.standing_q
+        half_yaw = draws.uniform(-np.pi / 2, np.pi / 2)
+        noise = draws.symmetric(len(standing) - 7, self.task.reset_noise["joint_position"])
+        heading = ca.vertcat(ca.cos(half_yaw), 0, 0, ca.sin(half_yaw))
+        return ca.densify(ca.vertcat(standing[:3], heading, standing[7:] + noise))
+
+    def _starting_velocity(self, draws: Draws) -> SX:
+        """Velocities near rest."""
+        noise = self.task.reset_noise
+        base = draws.symmetric(6, noise["base_velocity"])
+        return ca.vertcat(base, draws.symmetric(self.model.nv - 6, noise["joint_velocity"]))
+
+    def _every(self, period: float, clock: SX) -> SX:
+        """1 once in a period [s], else 0."""
+        return ca.fmod(clock, max(round(period / self.program.control_dt), 1)) < 0.5
+
+    def _pushed(self, v: SX, clock: SX, draws: Draws) -> SX:
+        """Now and then change the horizontal velocity of the base, as seen from it, at a stroke."""
+        push = ca.vertcat(SX(3, 1), draws.symmetric(2, self.task.push_speed), SX(v.numel() - 5, 1))
+        return v + ca.if_else(self._every(self.task.push_period, clock), ca.densify(push), 0)
+
+    def _observation(self, s: TermContext, before: SX | None, draws: Draws) -> tuple[SX, SX]:
+        """The policy's observation, noisy and with its history, then the critic's; and the history to keep."""
+        task, p = self.task, self.program
+        blocks = {name: term(s) for name, term in p.observation_terms.items()}
+        noisy = [b + draws.symmetric(b.numel(), task.noise[n]) if task.noise.get(n) else b for n, b in blocks.items()]
+        now = _clipped(ca.vertcat(*noisy))
+        kept = SX(0, 1)
+        if task.history > 1:
+            kept = ca.repmat(now, task.history - 1, 1) if before is None else before
+        policy = ca.vertcat(now, kept)
+        critic = SX(0, 1)
+        if task.critic:
+            critic = _clipped(ca.vertcat(*blocks.values(), *[term(s) for term in p.critic_terms.values()]))
+        return ca.vertcat(policy, critic), policy[: kept.numel()]
+
+
+def _call(name: str, given: Mapping[str, SX], after: Mapping[str, SX]) -> Call:
+    """Trace a function of those buffers among `given` that `after`, the buffers that it writes, depends on."""
+    used = _used(given, after)
+    results = {f"{buffer}_next" if buffer in used else buffer: value for buffer, value in after.items()}
+    return Call(traced(name, used, results), tuple(used), tuple(after))
+
+
+def _used(given: Mapping[str, SX], after: Mapping[str, SX]) -> dict[str, SX]:
+    everything = ca.vertcat(*[ca.vec(value) for value in after.values()])
+    return {name: x for name, x in given.items() if x.numel() and ca.depends_on(everything, x)}
+
+
+def _clipped(observation: SX) -> SX:
+    return ca.fmax(-OBSERVATION_BOUND, ca.fmin(OBSERVATION_BOUND, observation))

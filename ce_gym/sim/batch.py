@@ -1,0 +1,124 @@
+"""`Batch`: the state of many robots on a device, made from a schema, and the kernels that work on it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.sim.devices import Array, Device
+from ce_gym.sim.schema import Row
+from ce_gym.sim.substeps import FRAME, HEIGHTS
+from ce_gym.sim.terrain import Terrain
+
+File = str | os.PathLike[str]
+Snapshot = Mapping[str, NDArray]
+"""The state of a batch: rows of robots by name, copies in the memory of the CPU."""
+
+
+class Batch:
+    """Many robots with state, tables that they share, and a device.
+
+    Args:
+        rows: The schema of their state.
+        num_envs: Number of robots.
+        dtype: "float64" or "float32" for the lanes.
+        device: Where they live.
+        terrain: The ground, if it is a field.
+        num_threads: Threads that the robots are split over.
+
+    Attributes:
+        schema: Rows by name.
+        arrays: What kernels and the host work on, by name of the row.
+        tables: Arrays that all robots have in common.
+    """
+
+    def __init__(
+        self,
+        rows: Iterable[Row],
+        num_envs: int,
+        dtype: str,
+        device: Device,
+        terrain: Terrain | None = None,
+        num_threads: int = 1,
+    ) -> None:
+        self.schema = {row.name: row for row in rows}
+        self.num_envs, self.dtype, self.place, self.num_threads = num_envs, dtype, device, num_threads
+        self.arrays = {name: self._array(row) for name, row in self.schema.items()}
+        self.tables: dict[str, Array] = {}
+        if terrain is not None:
+            self.tables[HEIGHTS] = device.rows(terrain.heights.astype(dtype), dtype)
+            self.write(FRAME, [*terrain.origin, terrain.cell])
+        for name, row in self.schema.items():
+            if np.any(row.reset):
+                self.write(name, row.reset)
+
+    def _array(self, row: Row) -> Array:
+        if not row.dtype:
+            return self.place.tiles(self.num_envs, row.size, self.dtype)
+        shape = (self.num_envs, row.size) if row.size > 1 else (self.num_envs,)
+        return self.place.zeros(shape, row.dtype)
+
+    def rows(self, name: str) -> Array:
+        """Return a copy of a state buffer, one robot per row; KeyError if there is none."""
+        array = self.arrays[name]
+        return self.place.copy(array) if self.schema[name].dtype else self.place.read(array, self.num_envs)
+
+    def write(self, name: str, values: Any, mask: Any = None) -> None:
+        """Overwrite a state buffer.
+
+        Args:
+            name: Of the buffer.
+            values: Shape (num_envs, size) or what broadcasts to it; (num_envs,) for a plain buffer of size 1.
+            mask: Which robots, bool, shape (num_envs,); all of them if None.
+        """
+        array = self.arrays[name]
+        if self.schema[name].dtype:
+            self.place.assign(array, values, mask)
+        else:
+            self.place.write(array, values, mask)
+
+    def snapshot(self, file: File | None = None) -> Snapshot:
+        """Return the state by name, shape (num_envs, size) or (num_envs,); write it to a file, too, if one is given."""
+        state = {name: self.place.host(self.rows(name)) for name in self.schema}
+        if file is not None:
+            with Path(file).open("wb") as stream:  # numpy would add a suffix to a name
+                np.savez(stream, **state)  # pyright: ignore[reportArgumentType]
+        return state
+
+    def restore(self, snapshot: Snapshot | File) -> None:
+        """Continue from a snapshot, or from a file with one.
+
+        Raises:
+            ValueError: If it is not one of such a batch; nothing is changed then.
+        """
+        state = snapshot if isinstance(snapshot, Mapping) else load_snapshot(snapshot)
+        expected = self.snapshot()
+        for name in sorted(expected.keys() ^ state.keys()):
+            there = "missing" if name in expected else "not part of this state"
+            raise ValueError(f"snapshot: {name!r} is {there}; expected one of the same robot, scene and task")
+        for name, rows in expected.items():
+            got = np.asarray(state[name])
+            if (got.shape, got.dtype) != (rows.shape, rows.dtype):
+                wanted = f"{rows.dtype} {rows.shape}"
+                raise ValueError(f"snapshot: {name!r} is {got.dtype} {got.shape}; expected {wanted}")
+        for name in expected:
+            self.write(name, state[name])
+
+
+def load_snapshot(file: File) -> Snapshot:
+    """Read a snapshot from a file; no code in it is run.
+
+    Raises:
+        ValueError: If it is not such a file; one line.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, BadZipFile) as problem:
+        raise ValueError(f"snapshot {os.fspath(file)!r}: {problem}; expected a file that `snapshot` wrote") from None

@@ -1,0 +1,56 @@
+"""The kernel that repeats the sub-steps of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ce_gym.compile import Buffer, Program
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.model import Model
+from ce_gym.model import Robot
+from ce_gym.sim.devices import Device, Processor
+from ce_gym.sim.kernel_key import laws_key, model_key
+from ce_gym.sim.substeps import substeps
+
+
+def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, ...]:
+    """Return names of contact spheres, in the robot's order.
+
+    Args:
+        robot: The robot.
+        contacts: "all", or names of spheres or groups of spheres, one or several.
+
+    Raises:
+        ValueError: If a name is neither a sphere's nor a group's.
+    """
+    wanted = {contacts} if isinstance(contacts, str) else set(contacts)
+    known = {"all"} | {c.group for c in robot.contacts} | {c.name for c in robot.contacts}
+    for name in sorted(wanted - known):
+        expected = f"'all', groups or names among {', '.join(sorted(known - {'all'}))}"
+        raise ValueError(f"contacts={name!r}; expected {expected}")
+    return tuple(c.name for c in robot.contacts if wanted & {"all", c.group, c.name})
+
+
+def load_step_kernel(
+    model: Model, options: StepOptions, outputs: tuple[str, ...], dtype: str, device: Device | None = None
+) -> Any:
+    """Compile, or load from the cache, the kernel that repeats a sub-step.
+
+    Args:
+        model: The robot at a transmission level.
+        options: The scene.
+        outputs: What to compute besides the state.
+        dtype: "float64" or "float32".
+        device: Whose kernel; the CPU's if None.
+    """
+
+    def build() -> tuple[Program]:
+        sizes, further, steps = substeps(model.mechanism, options, outputs)
+        joints = sizes.pop("target", 0)
+        buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()]
+        buffers += [Buffer("target", joints, "rows_in")] if joints else []
+        return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
+
+    key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r}"
+    return (device or Processor()).kernel(key, build, dtype)

@@ -1,0 +1,68 @@
+"""What a robot of a batch carries from call to call: a schema with one row for each state buffer.
+
+Arrays on a device, the buffers of kernels, resets, snapshots and copies are made from the rows and from nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ce_gym.compile import Buffer
+from ce_gym.dynamics.forces.parameters import parameter_defaults
+from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
+from ce_gym.dynamics.model import Model
+from ce_gym.sim.substeps import FRAME
+
+Writer = Literal["physics", "task", "term", "host"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One state buffer.
+
+    Attributes:
+        name: Of the buffer.
+        size: Numbers that one robot has there.
+        writer: Who changes it: "physics" (the sub-steps), "task" (what an environment does around them), "term" (a
+            reward, observation, termination or metric with memory) or "host" (Python only; no reset touches it).
+        reset: With what a robot begins, a number or shape (size,).
+        dtype: Of a plain array, shape (num_envs,) or (num_envs, size); "" for one in the lanes of the kernels.
+    """
+
+    name: str
+    size: int
+    writer: Writer
+    reset: ArrayLike = 0.0
+    dtype: str = ""
+
+
+def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str]) -> list[Row]:
+    """Return the rows of what the sub-steps of a scene read and write.
+
+    Args:
+        model: The robot at a transmission level.
+        options: The scene.
+        outputs: What is computed besides the state.
+    """
+    joints, contacts, motors = len(model.joint_links), len(options.contacts), len(model.robot.motors)
+    start = {"q": model.standing_q, "dependent": model.guess}
+    sizes = state_sizes(model.mechanism, options)
+    rows = [Row(name, size, "physics", start.get(name, 0.0)) for name, size in sizes.items()]
+    rows.append(Row("diverged", 1, "physics"))
+    lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts, "motor_speed": motors}
+    rows += [Row(name, size, "physics") for name in outputs if (size := lengths.get(name, 1))]
+    if options.parameters:
+        defaults = parameter_defaults(model.robot, options.material, options.parameters)
+        values = np.concatenate(list(defaults.values()))
+        rows.append(Row("parameters", len(values), "host", values))
+    return rows + ([Row(FRAME, 3, "host")] if options.ground == "field" else [])
+
+
+def state_buffers(rows: Iterable[Row]) -> list[Buffer]:
+    """Return the buffers of a kernel that rows in its lanes are."""
+    return [Buffer(row.name, row.size, "tiles") for row in rows if not row.dtype]

@@ -1,0 +1,153 @@
+"""State that is saved, copied and pickled goes on bit for bit; a schema that fits the kernels."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ce_gym import Model, Simulator, Terrain
+from ce_gym.sim.schema import physics_rows
+from ce_gym.sim.substeps import substeps
+
+READ = ("q", "v", "torque", "contact_forces")
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return Model("mini_cheetah")
+
+
+@pytest.fixture(scope="module")
+def sim(model: Model) -> Simulator:
+    """Robots under way, one of them frozen; with parameters, and on a field."""
+    sim = Simulator(model, 11, terrain=Terrain.rough(0, 0.02), parameters=("friction", "kp"), retry=1)
+    sim.set_parameter("friction", np.linspace(0.4, 0.9, 11)[:, None])
+    v = np.random.default_rng(0).normal(0, 0.5, (11, model.nv))
+    v[4] = 1e8
+    sim.set_state(sim.q, v)
+    sim.step(model.standing_q[7:], 7)
+    assert sim.diverged.tolist() == [i == 4 for i in range(11)]
+    return sim
+
+
+def goes_on_like(one: Simulator, other: Simulator) -> None:
+    """Both step on alike; the count of failures and what was set are the same too."""
+    target = one.model.standing_q[7:] + 0.1
+    for each in (one, other):
+        each.step(target, 5)
+    for name in READ:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    assert (one.n_diverged, one.n_retried) == (other.n_diverged, other.n_retried)
+    for each in (one, other):
+        each.reset(each.diverged)
+    assert one.n_diverged == other.n_diverged == 1
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.deepcopy, copy.copy, lambda sim: pickle.loads(pickle.dumps(sim))],
+    ids=["deepcopy", "copy", "pickle"],
+)
+def test_a_copy_goes_on_by_itself(sim: Simulator, copied):
+    original = copy.deepcopy(sim)
+    goes_on_like(original, copied(sim))
+
+
+def test_a_snapshot_is_continued(sim: Simulator, model: Model, tmp_path: Path):
+    snapshot = sim.snapshot(tmp_path / "state")
+    kept = {name: rows.copy() for name, rows in snapshot.items()}
+    expected = copy.deepcopy(sim)
+    other, third = copy.deepcopy(sim), copy.deepcopy(sim)
+    for each in (other, third):
+        each.step(model.standing_q[7:] - 0.3, 9)
+        each.set_parameter("friction", 0.1)
+        each.reset()
+    other.restore(snapshot)
+    third.restore(tmp_path / "state")
+    goes_on_like(copy.deepcopy(expected), third)
+    goes_on_like(expected, other)
+    for name, rows in snapshot.items():
+        np.testing.assert_array_equal(rows, kept[name], err_msg=name)
+
+
+def test_what_is_no_snapshot_of_it_is_refused(sim: Simulator, model: Model, tmp_path: Path):
+    plain = Simulator(model, 11)
+    before = plain.snapshot()
+    with pytest.raises(ValueError, match=r"snapshot: 'frame' is not part of this state; expected one of the same"):
+        plain.restore(sim.snapshot())
+    with pytest.raises(ValueError, match=r"snapshot: 'q' is float64 \(11, 18\); expected float64 \(11, 19\)"):
+        plain.restore({**before, "q": before["q"][:, 1:]})
+    with pytest.raises(ValueError, match=r"snapshot: 'failures' is missing"):
+        plain.restore({name: rows for name, rows in before.items() if name != "failures"})
+    for name, content in {"text": b"walk", "empty": b"", "cut": b"PK\x03\x04"}.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=r"expected a file that `snapshot` wrote") as caught:
+            plain.restore(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    np.savez(tmp_path / "objects.npz", q=np.array([print], dtype=object))
+    with pytest.raises(ValueError, match=r"allow_pickle"):
+        plain.restore(tmp_path / "objects.npz")
+    for name, rows in plain.snapshot().items():
+        np.testing.assert_array_equal(rows, before[name], err_msg=name)
+
+
+@pytest.mark.parametrize("robot", ["mini_cheetah", "tello", "six_bar", "mit_humanoid_leg"])
+def test_the_schema_is_what_the_kernel_has(robot: str):
+    """Every state buffer of a compiled program is in the schema, with its size, and vice versa."""
+    sim = Simulator(Model(robot), outputs=("torque", "power", "contact_forces", "motor_speed", "energy"), retry=0)
+    lanes = {row.name: row.size for row in sim._batch.schema.values() if not row.dtype}
+    assert lanes == {name: b.size for name, b in sim._kernel.buffers.items() if b.kind == "tiles"}
+
+
+def test_the_schema_is_what_the_sub_steps_need(sim: Simulator, model: Model):
+    """Likewise with parameters, on a field, with an error estimate, before anything is compiled."""
+    outputs = ("torque", "error")
+    sizes, *_ = substeps(model.mechanism, sim.options, outputs)
+    rows = {row.name: row.size for row in physics_rows(model, sim.options, outputs)}
+    assert rows == {name: size for name, size in sizes.items() if name != "target"}
+
+
+def test_a_diverged_robot_reports_numbers(model: Model):
+    sim = Simulator(model, 3, outputs=("torque", "contact_forces", "power", "energy"))
+    v = np.zeros((3, model.nv))
+    v[1] = 1e30
+    sim.set_state(sim.q, v)
+    sim.step(model.standing_q[7:])
+    assert sim.diverged.tolist() == [False, True, False]
+    for name in ("torque", "contact_forces", "power", "energy"):
+        told = getattr(sim, name)
+        assert not told[1].any(), f"{name} of a frozen robot is 0"
+        assert told[0].any(), name
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("friction", -0.1, "friction=-0.1; expected 0 or more"),
+        ("stiffness", -1.0, "stiffness=-1; expected 0 or more"),
+        ("ratio", 0.0, "ratio=0; expected more than 0"),
+        ("slip_speed", 0.0, "slip_speed=0; expected more than 0"),
+        ("kp", np.r_[np.ones(11), -2.0], "kp=-2; expected 0 or more"),
+        (
+            "added_mass:Floating Base",
+            -50.0,
+            "added_mass:Floating Base=-50; expected more than -3.3 kg, what the body has",
+        ),
+        ("gravity", [0.0, 0.0, np.nan], "gravity=nan; expected finite numbers"),
+    ],
+)
+def test_parameters_have_ranges(model: Model, name: str, value, expected: str):
+    sim = Simulator(
+        model,
+        2,
+        parameters=("friction", "stiffness", "ratio", "slip_speed", "kp", "added_mass:Floating Base", "gravity"),
+    )
+    before = sim.snapshot()["parameters"]
+    with pytest.raises(ValueError, match="expected") as caught:
+        sim.set_parameter(name, value)
+    assert str(caught.value) == expected
+    np.testing.assert_array_equal(sim.snapshot()["parameters"], before)
