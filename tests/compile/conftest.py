@@ -5,7 +5,6 @@ import os
 
 import numpy as np
 import pytest
-import torch
 
 from ce_gym.compile import Buffer, Call, Program, load_kernel
 from ce_gym.compile.cuda import host_kernel
@@ -42,6 +41,7 @@ def run_llvm(program, arrays, n, dtype):
 
 def run_cuda(program, arrays, n, dtype):
     """The emitted CUDA C, run by the processor."""
+    torch = pytest.importorskip("torch")
     kernel = host_kernel(lambda: (program,), dtype)
     kernel({name: torch.from_numpy(array) for name, array in arrays.items()}, n)
 
