@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ce_gym.envs.base import BatchShell
+from ce_gym.envs.base import BaseEnv
 from ce_gym.policies import environment_of, load_policy
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.rollouts.recording import Act, record_lanes
@@ -64,7 +64,7 @@ def drive_many(
     except (TypeError, ValueError, ImportError, gymnasium.error.Error) as error:
         raise ViewerError(f"environment {env_id!r}: {' '.join(str(error).split())}") from error
     try:
-        if not isinstance(envs.unwrapped, BatchShell):
+        if not isinstance(envs.unwrapped, BaseEnv):
             raise ViewerError(f"environment {env_id!r}: expected one of ce_gym, of its own robots or registered ones")
         period = envs.unwrapped.dt  # type: ignore[attr-defined]
         commands = np.repeat([c for _, c in script], [round(t / period) for t, _ in script], axis=0)
