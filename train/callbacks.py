@@ -1,7 +1,4 @@
-"""What happens beside learning, as callbacks of Stable-Baselines3: each does one thing, by way of progress.py.
-
-Knows the learner; knows nothing of robots or tasks.
-"""
+"""What happens beside learning, as callbacks of Stable-Baselines3: each does one thing, by way of progress.py."""
 
 from __future__ import annotations
 

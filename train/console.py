@@ -1,7 +1,4 @@
-"""What the judging programs have in common on the command line: results as text and JSON, errors in one line.
-
-Knows nothing of policies, environments or robots.
-"""
+"""What the judging programs have in common on the command line: results as text and JSON, errors in one line."""
 
 from __future__ import annotations
 

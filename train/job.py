@@ -1,7 +1,6 @@
 """Training runs, whoever learns: what the command line asks for, what is written beside a policy, what is said.
 
-A learner is a program that has `train(job) -> Trained`; `main` here does all else. Knows settings and policies, no
-learner; no robots, no tasks.
+A learner is a program that has `train(job) -> Trained`; `main` here does all else.
 """
 
 from __future__ import annotations

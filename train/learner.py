@@ -1,9 +1,9 @@
 """PPO whose updates run on several threads, each on its own share of a minibatch.
 
-Stable-Baselines3 leaves threads to torch, which splits every single matrix product and waits after each; on networks
-of this size that gains a third, and loses nearly everything as soon as another program wants a core. Here a thread
+Stable-Baselines3 leaves threads to torch, which splits every single matrix product and waits after each; on networks of
+this size that gains a third, and loses nearly everything as soon as another program wants a core. Here a thread
 computes the gradient of its share from beginning to end, and the shares are added in a fixed order: one meeting per
-minibatch, and the same result bit for bit on any number of threads. Knows Stable-Baselines3; no robots, no tasks.
+minibatch, and the same result bit for bit on any number of threads.
 """
 
 from __future__ import annotations

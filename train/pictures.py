@@ -1,4 +1,4 @@
-"""Pictures of what was judged: errors and falls from level to level, and how learning went. Knows matplotlib."""
+"""Pictures of what was judged: errors and falls from level to level, and how learning went."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What happens beside learning, whoever learns: the curve, the progress bar, schedules, stopping in good order.
-
-Knows the `episode` entries that environments report; knows no learner, no robots, no tasks.
-"""
+"""What happens beside learning, whoever learns: the curve, the progress bar, schedules, stopping in good order."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The folder of a training run: files are whole or not there, and a full disk does not end training.
-
-Knows files only.
-"""
+"""The folder of a training run: files are whole or not there, and a full disk does not end training."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """PPO settings: what they are, and how they are read from a YAML file and the command line.
 
-One file per robot and task lies in `config/`, found by the name of the environment. A file is complete: every
-setting is in it, none is inherited. Knows nothing of learners, environments or robots.
+One file per robot and task lies in `config/`, found by the name of the environment. A file is complete: every setting
+is in it, none is inherited.
 """
 
 from __future__ import annotations

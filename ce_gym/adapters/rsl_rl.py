@@ -1,8 +1,7 @@
 """rsl_rl's `VecEnv` over a native Gymnasium `VectorEnv`: arrays shown as tensors, without copies; a GPU's stay there.
 
 rsl_rl (5.x, https://github.com/leggedrobotics/rsl_rl) never resets environments; it wants observations as groups in a
-`TensorDict`, time-outs apart from failures, and the end of an episode to be followed at once by the next. Knows the two
-contracts; knows nothing of robots, tasks or physics.
+`TensorDict`, time-outs apart from failures, and the end of an episode to be followed at once by the next.
 """
 
 from __future__ import annotations

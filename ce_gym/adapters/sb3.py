@@ -1,8 +1,8 @@
 """Stable-Baselines3's `VecEnv` over a native Gymnasium `VectorEnv`, without processes and without copies.
 
-Stable-Baselines3 wants one information dictionary per environment and step. Building thousands of them costs more
-than the physics, so every running environment shares one empty dictionary, and only those whose episode has just
-ended get one of their own. Knows the two contracts; knows nothing of robots, tasks or physics.
+Stable-Baselines3 wants one information dictionary per environment and step. Building thousands of them costs more than
+the physics, so every running environment shares one empty dictionary, and only those whose episode has just ended get
+one of their own.
 """
 
 from __future__ import annotations

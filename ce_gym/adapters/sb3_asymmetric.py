@@ -4,8 +4,7 @@
     model = PPO(AsymmetricPolicy, envs)
 
 A critic is needed in simulation only, so it may be shown what no sensor of the robot measures (Pinto et al. 2017,
-arXiv:1710.06542). Knows Stable-Baselines3's policies and the two keys of a dictionary of observations; knows nothing
-of robots, tasks or physics.
+arXiv:1710.06542).
 """
 
 from __future__ import annotations

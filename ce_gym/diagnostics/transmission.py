@@ -1,8 +1,7 @@
 """What the transmissions of a robot are, and what each transmission level loses of them, in figures.
 
 Everything comes from the public quantities of `Model`: the constraint Jacobian `G` from spanning velocities, the
-reflected inertia `G_r^T J G_r` from it, and the price of a level from its accelerations beside the exact ones. May know
-models and descriptions; `report_text` turns a report into words.
+reflected inertia `G_r^T J G_r` from it, and the price of a level from its accelerations beside the exact ones.
 """
 
 from __future__ import annotations

@@ -11,8 +11,6 @@ The Jacobians of forward dynamics follow from those of inverse dynamics,
 which takes a third of the instructions of differentiating the articulated-body recursion.
 
 Source: Carpentier, Mansard, "Analytical Derivatives of Rigid Body Dynamics Algorithms", RSS 2018.
-
-May know the quantities, parameters and spatial algebra.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The quantities of a mechanism on numpy arrays, and their derivatives.
 
 Every quantity is traced once, on first use, into a CasADi function, and evaluated on arrays with any leading batch
-shape. May know the algorithms of this room and mechanisms; no compilation.
+shape.
 """
 
 from __future__ import annotations

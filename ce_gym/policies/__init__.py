@@ -1,7 +1,4 @@
-"""Trained policies: found by name, read without running code that they may carry, run by numpy.
-
-Knows file formats and where shipped policies lie; knows no learners, robots or tasks.
-"""
+"""Trained policies: found by name, read without running code that they may carry, run by numpy."""
 
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.environments import environment_of

@@ -1,4 +1,4 @@
-"""The network that acts: linear layers with an activation in between, run by numpy. Knows no files."""
+"""The network that acts: linear layers with an activation in between, run by numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zip files from strangers, read within a limit on memory and without unpickling. Knows zip, npz and JSON.
+"""Zip files from strangers, read within a limit on memory and without unpickling.
 
 What a header says about sizes is not believed: a member is never unpacked beyond its stated size, that size is checked
 before anything is allocated, and an array must fill its member exactly.

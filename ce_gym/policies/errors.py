@@ -1,4 +1,4 @@
-"""What is said of policies that cannot be used, or are used elsewhere than they were trained. Knows nothing else."""
+"""What is said of policies that cannot be used, or are used elsewhere than they were trained."""
 
 from __future__ import annotations
 

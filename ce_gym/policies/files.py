@@ -6,7 +6,7 @@
 | `policy.npz`  | weights of the actor and the record, nothing else; a tenth of the zip: policies are shipped so     |
 | `policy.onnx` | as train/export.py writes it, the record in its metadata; needs onnxruntime                        |
 
-All but ONNX are read within a limit on memory. Knows formats; where files lie is the business of places.py.
+All but ONNX are read within a limit on memory.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
     rollout.save("walk.npz")
     write_html(Rollout.load("walk.npz"), "walk.html")
 
-Knows models, environments and rollouts; knows nothing of learning. meshcat is needed only when something is drawn.
+meshcat is needed only when something is drawn.
 """
 
 from __future__ import annotations

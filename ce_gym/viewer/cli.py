@@ -1,4 +1,4 @@
-"""`python -m ce_gym view` and `play`: their arguments, and what they do with them. Knows the viewer's functions."""
+"""`python -m ce_gym view` and `play`: their arguments, and what they do with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the commands of the package speak: help that reads well, mistakes in one line. Knows no command."""
+"""How the commands of the package speak: help that reads well, mistakes in one line."""
 
 from __future__ import annotations
 

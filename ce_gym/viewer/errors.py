@@ -1,4 +1,4 @@
-"""What the viewer says when it cannot show something. Knows nothing else."""
+"""What the viewer says when it cannot show something."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The renderers of environments, a function for each render mode. Knows pictures and windows; imports either lately."""
+"""The renderers of environments, a function for each render mode."""
 
 from __future__ import annotations
 

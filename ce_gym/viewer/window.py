@@ -1,7 +1,6 @@
 """A live window: meshcat's page at this machine's loopback, to which poses are sent as they come.
 
-Nothing is opened and nothing waits: where no browser looks, drawing costs next to nothing. Knows posed models, scene
-commands, terrain and how to serve a page; knows no environments.
+Nothing is opened and nothing waits: where no browser looks, drawing costs next to nothing.
 """
 
 from __future__ import annotations

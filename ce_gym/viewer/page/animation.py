@@ -1,4 +1,4 @@
-"""Animation tracks: poses and scales over time, packed for meshcat's page. Knows no robots, no rollouts."""
+"""Animation tracks: poses and scales over time, packed for meshcat's page."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Arrows: contact forces at the contacts, commanded and real speed above the base.
 
-An arrow is one unit long along z and is stretched by its scale track. Knows actors (posed rollouts) and three.js
-commands.
+An arrow is one unit long along z and is stretched by its scale track.
 """
 
 from __future__ import annotations

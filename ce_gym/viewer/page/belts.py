@@ -4,7 +4,7 @@ A robot file says how fast a rotor turns with which joints, not by what. Where a
 a pulley is wide, something flexible must run between them, and it is drawn: two strands, tangents to pulleys of one
 size, and a pulley that turns on each joint's axis. A belt that goes on to a further joint runs over a pulley that is
 free on the axis between, so that its rotor turns equally far with every joint on the way; a rotor that turns otherwise,
-or with a joint that no belt could reach, is part of a differential, and nothing is drawn. Knows the robot description.
+or with a joint that no belt could reach, is part of a differential, and nothing is drawn.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What the page plots beside the scene, and how close each joint is to its torque limit.
-
-Knows actors (posed rollouts); knows no page.
-"""
+"""What the page plots beside the scene, and how close each joint is to its torque limit."""
 
 from __future__ import annotations
 

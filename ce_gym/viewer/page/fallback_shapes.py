@@ -1,4 +1,4 @@
-"""Shapes for bodies that have none: stick figures of whole robots, discs of rotors. Knows the robot description."""
+"""Shapes for bodies that have none: stick figures of whole robots, discs of rotors."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Rollouts -> one HTML file that plays them: no server, no network, nothing beside it.
-
-Knows the scene's commands and where meshcat keeps its page's code; meshcat itself is not even imported.
-"""
+"""Rollouts -> one HTML file that plays them: no server, no network, nothing beside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What surrounds the robot: ground, sky, lights and camera. Knows three.js commands and terrain; knows no robots."""
+"""What surrounds the robot: ground, sky, lights and camera."""
 
 from __future__ import annotations
 

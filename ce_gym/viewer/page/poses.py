@@ -1,7 +1,4 @@
-"""An actor: one rollout with the world poses of its robot's bodies at the frames to show.
-
-Knows rollouts and posed models; knows no scene around them.
-"""
+"""An actor: one rollout with the world poses of its robot's bodies at the frames to show."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A robot as scene nodes: one nested group for each body, its shapes inside.
 
-Groups nest as bodies do, so that a revolute joint moves its group by a rotation alone: animations stay small and
-links do not shrink between frames. Knows the robot description and three.js commands; knows no rollouts.
+Groups nest as bodies do, so that a revolute joint moves its group by a rotation alone: animations stay small and links
+do not shrink between frames.
 """
 
 from __future__ import annotations

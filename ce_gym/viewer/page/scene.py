@@ -1,8 +1,7 @@
 """Rollouts -> the commands of one meshcat scene: robots, arrows, stage and the animation that moves them.
 
 Robots stand side by side, many of them in a square, or on top of each other as ghosts. The world moves under the camera
-so that the first thing to leave the picture is the ground, not the robot. Knows rollouts and posed models; knows no
-files, no servers.
+so that the first thing to leave the picture is the ground, not the robot.
 """
 
 from __future__ import annotations

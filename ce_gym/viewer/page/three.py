@@ -1,9 +1,9 @@
 """The few three.js objects and meshcat commands that a scene is made of, as plain dictionaries.
 
-meshcat's browser page takes commands (`set_object`, `set_property`, `set_animation`) packed with MessagePack.
-Building them here, instead of through meshcat's Python classes, needs no server, gives identical bytes for identical
-scenes, and reaches what those classes lack (capsules, lights with shadows, packed animation tracks). The formats are
-those of three.js r132, which meshcat 0.3.2 carries, and of meshcat's `commands.py`. Knows no robots.
+meshcat's browser page takes commands (`set_object`, `set_property`, `set_animation`) packed with MessagePack. Building
+them here, instead of through meshcat's Python classes, needs no server, gives identical bytes for identical scenes, and
+reaches what those classes lack (capsules, lights with shadows, packed animation tracks). The formats are those of
+three.js r132, which meshcat 0.3.2 carries, and of meshcat's `commands.py`.
 """
 
 from __future__ import annotations

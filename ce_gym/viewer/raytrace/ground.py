@@ -1,7 +1,4 @@
-"""The ground of pictures where it is not flat: what rays meet on the surface of a height field.
-
-Knows terrain and rays; knows no robots and no cameras.
-"""
+"""The ground of pictures where it is not flat: what rays meet on the surface of a height field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robot's scene commands as triangles: what a ray tracer needs of `three.mesh`. Knows three.js commands only."""
+"""The robot's scene commands as triangles: what a ray tracer needs of `three.mesh`."""
 
 from __future__ import annotations
 

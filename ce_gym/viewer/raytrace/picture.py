@@ -1,7 +1,7 @@
 """Pictures of a robot as arrays, traced on the processor: no display, no OpenGL, nothing but pip packages.
 
 Embree finds what each ray meets; flat ground and the sky need no tracing. A picture depends on the pose alone, not on
-what was drawn before. Knows posed models, terrain and scene commands; knows no rollouts, no environments.
+what was drawn before.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Rays and triangles: the few calls of embreex, the binding to Embree that trimesh keeps. Knows arrays only."""
+"""Rays and triangles: the few calls of embreex, the binding to Embree that trimesh keeps."""
 
 from __future__ import annotations
 

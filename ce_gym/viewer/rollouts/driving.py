@@ -1,7 +1,4 @@
-"""What policies do, recorded: a policy drives robots through a list of commands.
-
-Knows environments by their ids, and recording.
-"""
+"""What policies do, recorded: a policy drives robots through a list of commands."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The ground around a robot, where it is not flat: a piece of a height field, small enough to be kept and drawn.
-
-Knows terrain and numpy; knows no rollouts and no way of drawing.
-"""
+"""The ground around a robot, where it is not flat: a piece of a height field, small enough to be kept and drawn."""
 
 from __future__ import annotations
 

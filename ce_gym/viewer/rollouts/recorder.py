@@ -1,4 +1,4 @@
-"""Collects the frames of a rollout. Knows rollouts and terrain; knows nothing of what runs meanwhile."""
+"""Collects the frames of a rollout."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0", contact_forces=True)
     rollout = record(env, lambda observation: env.action_space.sample(), seconds=5.0)
 
-Knows environments and recorders; knows nothing of policies.
+What acts, a policy or any function of the observation, is an argument.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Recorded rollouts: what a robot did, frame by frame, as one small file.
 
-A rollout names its robot and holds arrays; poses of bodies are computed from it when it is shown. Knows numpy,
-files and terrain; knows no dynamics and no way of drawing.
+A rollout names its robot and holds arrays; poses of bodies are computed from it when it is shown.
 """
 
 from __future__ import annotations
