@@ -4,7 +4,7 @@
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0")
 
 `load_robot` reads a robot, `Model` is its dynamics at a transmission level, `Simulator` steps thousands of copies,
-`Terrain` is ground for it that is not flat.
+`StepDerivatives` differentiates their steps, `Terrain` is ground for it that is not flat.
 """
 
 from ce_gym.compile.system import usable_cores
@@ -16,6 +16,7 @@ from ce_gym.envs.rendering import use_renderers
 from ce_gym.envs.terms.registry import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
 from ce_gym.policies import LevelWarning, Policy, PolicyError, load_policy, shipped_policies
+from ce_gym.sim.derivatives import StepDerivatives
 from ce_gym.sim.simulator import Simulator
 from ce_gym.sim.terrain import Terrain
 
@@ -31,6 +32,7 @@ __all__ = [
     "Robot",
     "RobotError",
     "Simulator",
+    "StepDerivatives",
     "Terrain",
     "environment_ids",
     "load_policy",

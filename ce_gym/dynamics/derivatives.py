@@ -25,6 +25,9 @@ from ce_gym.dynamics.forces.parameters import parameter_defaults, with_parameter
 from ce_gym.dynamics.functions import FUNCTIONS, traced
 from ce_gym.model.mechanism import Mechanism
 
+PLAIN_FIGURES, BODY_FIGURES = ("gravity", "rotor_inertia", "ratio"), ("added_mass", "com_shift")
+"""Parameters that are figures of the mechanism, not of a scene: of the whole, and of each link."""
+
 
 def tangent_basis(q: SX, floating: bool) -> SX:
     """Return how positions (nq,) change with their tangent, shape (nq, nv)."""
@@ -80,13 +83,16 @@ def make_quantity(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> Quan
         raise ValueError(f"derivatives of {name!r}; expected one of {', '.join(FUNCTIONS)}")
     plain = FUNCTIONS[name](mechanism).name_in()
     figures = tuple(x for x in wrt if x not in plain or x == "guess")
-    try:
-        defaults = parameter_defaults(mechanism.robot, mechanism.robot.material, figures)
-    except ValueError as error:
-        inputs = ", ".join(x for x in plain if x != "guess")
-        raise ValueError(
-            f"derivatives of {name} with respect to {figures[0]!r}; expected {inputs} or {error}"
-        ) from None
+    bodies = [body.name for body in mechanism.robot.bodies if body.kind == "link"]
+    known = {*PLAIN_FIGURES, *(f"{figure}:{body}" for figure in BODY_FIGURES for body in bodies)}
+    for x in figures:
+        if x not in known:
+            inputs = [x for x in plain if x != "guess"]
+            expected = ", ".join([*inputs, *PLAIN_FIGURES, *(f"{figure}:BODY" for figure in BODY_FIGURES)])
+            raise ValueError(
+                f"derivatives of {name} with respect to {x!r}; expected some of {expected}, BODY being a link"
+            )
+    defaults = parameter_defaults(mechanism.robot, mechanism.robot.material, figures)
     symbols = {x: SX.sym("figure", len(value)) for x, value in defaults.items()}
     named = with_parameters(mechanism, figures, ca.vertcat(*symbols.values())) if figures else mechanism
     function = FUNCTIONS[name](named)

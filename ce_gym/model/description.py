@@ -252,7 +252,7 @@ class Robot:
 
     @property
     def base_nq(self) -> int:
-        """Number of position coordinates of the base: position and quaternion if it is floating, or none."""
+        """Number of position coordinates of the base, 7 if it is floating (position and quaternion) or none."""
         return 7 if self.floating else 0
 
     @property

@@ -1,0 +1,89 @@
+"""The reverse mode of a time step, iteration by iteration, as traced functions.
+
+A step with an active set is made of iterations on the same state, each from the iterate that the one before left. Its
+gradient is chained through all of them: the last one that was needed hands what it is owed to the state and to its
+iterate, that to the iteration before, and so on. Decisions (touching, sticking, slipping, a limit that acts) are
+differentiated as decided. A diverged robot's gradient is zero.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.derivatives import tangent_basis
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.functions import traced
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.step import iterate_size, iterations_needed
+from ce_gym.dynamics.stepping.trace import iteration_function, step_function
+from ce_gym.model.mechanism import Mechanism
+
+
+def iterations_of(mechanism: Mechanism, options: StepOptions) -> int:
+    """Return in how many iterations a step is differentiated: 1 where it is differentiated as one expression."""
+    plan = METHODS[options.method]
+    alone = plan.single and plan.stages[0].length == 1 and iterate_size(mechanism, options) > 0
+    return 1 + min(plan.stages[0].iterations, iterations_needed(mechanism, options)) if alone else 1
+
+
+def primal_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+    """Trace what is differentiated: an iteration of the step, or the step itself if that is one expression."""
+    whole = iterations_of(mechanism, options) == 1
+    return step_function(mechanism, options) if whole else iteration_function(mechanism, options)
+
+
+def adjoint_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+    """Trace the reverse mode of one iteration.
+
+    Returns:
+        Function (*inputs of `primal_function`, `w_{part}` of the state after the step, `sums`, `pending`, `active`,
+        `owed`) -> (`sums`, `pending`, `owed`). `w_q` and the gradient to `q` are in the tangent space of positions.
+        `sums` stacks the gradients to the state, the target and the parameters; `pending` is 1 until the iteration that
+        ended the step has been met; where `active` is 0 nothing changes; `owed` is the gradient to the iterate, if
+        there is one.
+    """
+    primal, floating = primal_function(mechanism, options), mechanism.robot.floating
+    inputs = {name: SX.sym(name, primal.numel_in(i)) for i, name in enumerate(primal.name_in())}
+    after = dict(zip(primal.name_out(), primal.call(list(inputs.values())), strict=True))
+    weights = {
+        f"w_{name}": SX.sym(f"w_{name}", size - (1 if name == "q" and floating else 0))
+        for name, size in state_parts(primal).items()
+    }
+    pending, active = SX.sym("pending"), SX.sym("active")
+    last = ca.logic_and(pending, active)
+    seeds = [ca.if_else(last, _ambient(name, after, weights[f"w_{name}"], floating), 0) for name in state_parts(primal)]
+    results = [after[f"{name}_next"] for name in state_parts(primal)]
+    owed = SX.sym("owed", inputs["iterate"].numel() if "iterate" in inputs else 0)
+    if owed.numel():
+        seeds.append(owed)
+        results.append(after["iterate_next"])
+    to = [name for name in ("target", "parameters") if name in inputs]
+    wrt = [*state_parts(primal), *to, *(["iterate"] if owed.numel() else [])]
+    gradient = ca.jtimes(ca.vertcat(*results), ca.vertcat(*[inputs[x] for x in wrt]), ca.vertcat(*seeds), True)
+    ends = [sum(inputs[x].numel() for x in wrt[:i]) for i in range(len(wrt) + 1)]
+    parts = dict(zip(wrt, ca.vertsplit(gradient, ends), strict=True))
+    parts["q"] = tangent_basis(inputs["q"], floating).T @ parts["q"]
+    back = parts.pop("iterate", SX(0, 1))
+    whole = ca.vertcat(*parts.values())
+    sums = SX.sym("sums", whole.numel())
+    counts = ca.logic_and(active, after["diverged_next"] < 0.5)
+    left = {"sums_next": sums + ca.if_else(counts, whole, 0), "pending_next": ca.if_else(active, 0, pending)}
+    left |= {"owed_next": ca.if_else(counts, back, 0)} if owed.numel() else {}
+    given = weights | {"sums": sums, "pending": pending, "active": active}
+    return traced("adjoint", inputs | given | ({"owed": owed} if owed.numel() else {}), left)
+
+
+def state_parts(primal: ca.Function) -> dict[str, int]:
+    """Return the sizes of the parts of a state, `diverged` left out."""
+    others = ("diverged_next", "iterate_next")
+    names = [name.removesuffix("_next") for name in primal.name_out() if name.endswith("_next") and name not in others]
+    return {name: primal.numel_in(name) for name in names}
+
+
+def _ambient(name: str, after: dict[str, SX], weights: SX, floating: bool) -> SX:
+    """Return weights of coordinates that give the same for every motion as weights of their tangent."""
+    if name != "q" or not floating:
+        return weights
+    scale = ca.vertcat(4 * SX.ones(3), SX.ones(weights.numel() - 3))  # a rotation moves the quaternion by half of it
+    return tangent_basis(after["q_next"], floating) @ (scale * weights)

@@ -1,0 +1,244 @@
+"""`StepDerivatives`: gradients through the steps of a simulator, and their linearisation.
+
+One kernel makes the reverse mode of one sub-step: it repeats the iterations that the step needed and goes back through
+them. May know the simulator and compile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ce_gym.compile import Buffer, Call, Program, aligned_zeros, load_kernel
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
+from ce_gym.sim.kernel_key import model_key
+from ce_gym.sim.simulator import Simulator
+
+
+@dataclass
+class Record:
+    """One sub-step: the state before it, the target, and the positions and velocities after it."""
+
+    arrays: dict[str, NDArray]
+    target: NDArray
+    after: tuple[NDArray, NDArray]
+
+
+class StepDerivatives:
+    """Derivatives of the steps of a simulator, in reverse mode.
+
+    Positions are differentiated in their tangent space: a rotation of the base, a translation of it, both in base axes,
+    then the joints. What was decided in a step (touching, sticking, slipping, a limit that acts) is differentiated as
+    decided, through all iterations of the step.
+
+    Args:
+        simulator: Whose steps; on the CPU, on flat ground and without retries.
+
+    Attributes:
+        state_sizes: Of the tangent of each part of a state.
+        n_recorded: How many sub-steps have been recorded.
+
+    Raises:
+        ValueError: If the simulator's steps cannot be differentiated.
+
+    Examples:
+        >>> model = ce_gym.Model("planar_leg_linkage")
+        >>> sim = ce_gym.Simulator(model, num_envs=4)
+        >>> derivatives = ce_gym.StepDerivatives(sim)
+        >>> A, B = derivatives.linearize(model.standing_q)
+        >>> print(A.shape, B.shape)
+        (4, 4, 4) (4, 4, 2)
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        for unfit, why in (
+            (simulator.device != "cpu", f"on device {simulator.device!r}; expected 'cpu'"),
+            (simulator.terrain is not None, "on terrain; expected flat ground"),
+            (simulator._retry.halvings > 0, "with retries; expected retry=0"),
+        ):
+            if unfit:
+                raise ValueError(f"derivatives of a simulator {why}")
+        self.simulator, self._records = simulator, list[Record]()
+        primal = primal_function(simulator.model.mechanism, simulator.options)
+        floating = simulator.model.robot.floating
+        self._parts = state_parts(primal)
+        self.state_sizes = {n: size - (1 if n == "q" and floating else 0) for n, size in self._parts.items()}
+        others = {n: primal.numel_in(n) for n in ("target", "parameters") if n in primal.name_in()}
+        ends = np.cumsum([0, *self.state_sizes.values(), *others.values()])
+        names = [*self.state_sizes, *others]
+        self._columns = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(names)}
+        self._kernel = load_gradient_kernel(simulator.model, simulator.options, simulator.dtype)
+
+    @property
+    def n_recorded(self) -> int:
+        """See above."""
+        return len(self._records)
+
+    def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
+        """Step the simulator, and record: the state before each sub-step is kept."""
+        for _ in range(n_substeps):
+            before = {name: _aligned_copy(self.simulator._arrays[name]) for name in self._kept}
+            self.simulator.step(target, 1)
+            rows = self._target(target)
+            self._records.append(Record(before, rows, (self.simulator.q, self.simulator.v)))
+
+    def backward(self, weights: Mapping[str, ArrayLike]) -> tuple[dict[str, NDArray], list[NDArray], NDArray]:
+        """Go back through all recorded sub-steps, and forget them.
+
+        A robot that was reset or set in between, or diverged, passes nothing on to what was before.
+
+        Args:
+            weights: Gradient of something with respect to parts of the last state, shape (num_envs, size), see
+                `state_sizes`; those left out are zero.
+
+        Returns:
+            Its gradient with respect to the first state, by part; to the target of each sub-step, first to last,
+            (num_envs, n_targets) each; and to the declared parameters, (num_envs, n), in the order of declaration.
+        """
+        now = self._weights(weights)
+        targets, parameters = [], np.zeros((self.simulator.num_envs, 0))
+        later: Record | None = None
+        for record in reversed(self._records):
+            if later is not None:
+                now = {name: self._unless_set(record, later, value) for name, value in now.items()}
+            found = self._gradient(record.arrays, record.target, now)
+            now = {name: found[name] for name in self.state_sizes}
+            targets.append(found.get("target", np.zeros((self.simulator.num_envs, 0))))
+            if "parameters" in found:
+                parameters = found["parameters"] + (parameters if parameters.size else 0)
+            later = record
+        self._records.clear()
+        return now, targets[::-1], parameters
+
+    def gradient(self, target: ArrayLike, weights: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
+        """Return the gradient of one sub-step from the present state, which stays as it is.
+
+        Args:
+            target: As for `Simulator.step`.
+            weights: Gradient of something with respect to parts of the state after it, as for `backward`.
+
+        Returns:
+            Its gradient with respect to each part of the state before, to "target" and to "parameters", if there are
+            any, shape (num_envs, size) each.
+        """
+        return self._gradient(self.simulator._arrays, self._target(target), self._weights(weights))
+
+    def linearize(self, target: ArrayLike) -> tuple[NDArray, NDArray]:
+        """Return how one sub-step from the present state depends on that state and on the target.
+
+        Args:
+            target: As for `Simulator.step`.
+
+        Returns:
+            `A`, shape (num_envs, 2 nv, 2 nv), and `B`, shape (num_envs, 2 nv, n_targets), of the state [q; v] in the
+            tangent space of positions.
+        """
+        nv, n = self.simulator.model.nv, self.simulator.num_envs
+        A = np.zeros((n, 2 * nv, 2 * nv))
+        B = np.zeros((n, 2 * nv, len(self.simulator.target_names)))
+        for row in range(2 * nv):
+            one = np.broadcast_to(np.eye(nv)[row % nv], (n, nv))
+            found = self.gradient(target, {"q" if row < nv else "v": one})
+            A[:, row] = np.hstack([found["q"], found["v"]])
+            if "target" in found:
+                B[:, row] = found["target"]
+        return A, B
+
+    @property
+    def _kept(self) -> list[str]:
+        return [name for name in self._kernel.buffers if name in self.simulator._arrays]
+
+    def _target(self, target: ArrayLike) -> NDArray:
+        shape = (self.simulator.num_envs, len(self.simulator.target_names))
+        rows = np.asarray(target, self.simulator.dtype)
+        if rows.shape not in (shape, shape[1:]):
+            raise ValueError(f"target has shape {rows.shape}; expected {shape[1:]} or {shape}")
+        return np.ascontiguousarray(np.broadcast_to(rows, shape))
+
+    def _weights(self, weights: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
+        if unknown := set(weights) - set(self.state_sizes):
+            raise ValueError(f"weights of {min(unknown)!r}; expected some of {', '.join(self.state_sizes)}")
+        rows = {name: np.zeros((self.simulator.num_envs, size)) for name, size in self.state_sizes.items()}
+        for name, value in weights.items():
+            if np.shape(value) != rows[name].shape:
+                raise ValueError(f"weights of {name!r} have shape {np.shape(value)}; expected {rows[name].shape}")
+            rows[name] = np.array(value, float)
+        return rows
+
+    def _gradient(
+        self, arrays: Mapping[str, NDArray], target: NDArray, weights: Mapping[str, NDArray]
+    ) -> dict[str, NDArray]:
+        simulator = self.simulator
+        sums = np.zeros((simulator.num_envs, max(end.stop for end in self._columns.values())))
+        given = {f"w_{name}": np.ascontiguousarray(value) for name, value in weights.items()}
+        every = {**arrays, **given, "target": target, "sums": sums}
+        self._kernel(every, simulator.num_envs, num_threads=simulator.num_threads)
+        return {name: sums[:, columns] for name, columns in self._columns.items()}
+
+    def _unless_set(self, record: Record, later: Record, value: NDArray) -> NDArray:
+        """Return zeros for the robots that did not begin a sub-step where the one before had left them."""
+        read = self.simulator._device.read
+        began = [read(later.arrays[name], self.simulator.num_envs) for name in ("q", "v")]
+        same = np.logical_and(*[(a == b).all(axis=1) for a, b in zip(began, record.after, strict=True)])
+        return np.where(same[:, None], value, 0.0)
+
+
+def _aligned_copy(array: NDArray) -> NDArray:
+    copy = aligned_zeros(array.shape, array.dtype.name)
+    copy[...] = array
+    return copy
+
+
+def load_gradient_kernel(model: Model, options: StepOptions, dtype: str) -> Any:
+    """Compile, or load from the cache, the kernel of the reverse mode of one sub-step."""
+
+    def build() -> Program:
+        return gradient_program(model, options)
+
+    return load_kernel(f"step gradient {model_key(model)} {options!r}", build, dtype)
+
+
+def gradient_program(model: Model, options: StepOptions) -> Program:
+    """Return the program: the iterations of the step, then back through those that were needed."""
+    primal, adjoint = (make(model.mechanism, options) for make in (primal_function, adjoint_function))
+    n = iterations_of(model.mechanism, options)
+    parts = state_parts(primal)
+    scratch = {f"iterate{k}": primal.numel_in("iterate") for k in range(n)} if n > 1 else {}
+    scratch |= {f"active{k}": 1 for k in range(n)} | {"pending": 1}
+    if n > 1:
+        scratch |= {"owed": adjoint.numel_in("owed"), "tried_diverged": 1}
+        scratch |= {f"tried_{name}": size for name, size in parts.items()}
+    buffers = [Buffer(name, primal.numel_in(name), "tiles") for name in (*parts, "diverged")]
+    if "parameters" in primal.name_in():
+        buffers.append(Buffer("parameters", primal.numel_in("parameters"), "tiles"))
+    if "target" in primal.name_in():
+        buffers.append(Buffer("target", primal.numel_in("target"), "rows_in"))
+    buffers += [Buffer(f"w_{name}", adjoint.numel_in(f"w_{name}"), "rows_in", "float64") for name in parts]
+    buffers.append(Buffer("sums", adjoint.numel_in("sums"), "rows_out", "float64"))
+    buffers += [Buffer(name, size, "scratch") for name, size in scratch.items()]
+    begin = {name: size for name, size in scratch.items() if not name.startswith("tried_")}
+    values = [
+        SX.ones(size) if name in ("active0", "pending") else SX(ca.DM.zeros(size)) for name, size in begin.items()
+    ]
+    zeros = ca.Function("begin", [], [*values, SX(ca.DM.zeros(adjoint.numel_in("sums")))])
+    steps = [Call(zeros, (), (*begin, "sums"))]
+    for k in range(n - 1):
+        given = tuple(f"iterate{k}" if name == "iterate" else name for name in primal.name_in())
+        here = {"iterate_next": f"iterate{k + 1}", "unconverged": f"active{k + 1}"}
+        left = tuple(here.get(name, f"tried_{name.removesuffix('_next')}") for name in primal.name_out())
+        steps.append(Call(primal, given, left, only_if=f"active{k}"))
+    for k in reversed(range(n)):
+        here = {"iterate": f"iterate{k}", "active": f"active{k}"}
+        left = tuple(name.removesuffix("_next") for name in adjoint.name_out())
+        steps.append(
+            Call(adjoint, tuple(here.get(name, name) for name in adjoint.name_in()), left, only_if=f"active{k}")
+        )
+    return Program(f"{model.robot.name} {model.transmission} step gradient", tuple(buffers), tuple(steps))

@@ -1,0 +1,182 @@
+"""Gradients through steps against central differences of the steps themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ce_gym import Model, Simulator, StepDerivatives, Terrain
+from ce_gym.sim.tiles import read_rows, write_rows
+
+STEP = 1e-6
+
+
+def moved(q: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    """Positions of a floating base moved along their tangent, to second order; in numbers, quaternion by quaternion."""
+    w, u = q[:, 3], q[:, 4:7]
+    d = tangent[:, :3] / 2
+    p = tangent[:, 3:6]
+    turned = p + 2 * np.cross(u, np.cross(u, p) + w[:, None] * p)
+    quat = np.hstack([(w - (u * d).sum(1))[:, None], u + w[:, None] * d + np.cross(u, d)])
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    return np.hstack([q[:, :3] + turned, quat, q[:, 7:] + tangent[:, 6:]])
+
+
+def apart(q: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The tangent from one position to a close one, floating base."""
+    w, u = q[:, 3], q[:, 4:7]
+    ow, ou = other[:, 3], other[:, 4:7]
+    turn = 2 * (w[:, None] * ou - ow[:, None] * u - np.cross(u, ou))
+    p = other[:, :3] - q[:, :3]
+    back = p + 2 * np.cross(-u, np.cross(-u, p) + w[:, None] * p)
+    return np.hstack([turn, back, other[:, 7:] - q[:, 7:]])
+
+
+class Differences:
+    """Central differences of steps with everything that a robot carries."""
+
+    def __init__(self, sim: Simulator, target: np.ndarray, n_substeps: int = 1) -> None:
+        self.sim, self.target, self.n = sim, target, n_substeps
+        self.start = {name: array.copy() for name, array in sim._arrays.items()}
+        self.center = self.after("", 0, 0.0)
+
+    def after(self, part: str, column: int, amount: float) -> tuple[np.ndarray, np.ndarray]:
+        sim, target = self.sim, np.array(np.broadcast_to(self.target, (self.sim.num_envs, self.target.shape[-1])))
+        for name, array in self.start.items():
+            sim._arrays[name][...] = array
+        if part == "target":
+            target[:, column] += amount
+        elif part == "q" and sim.model.robot.floating:
+            tangent = np.zeros((sim.num_envs, sim.model.nv))
+            tangent[:, column] = amount
+            write_rows(sim._arrays["q"], moved(sim.q, tangent))
+        elif part:
+            rows = read_rows(sim._arrays[part], sim.num_envs)
+            rows[:, column] += amount
+            write_rows(sim._arrays[part], rows)
+        sim.step(target, self.n)
+        return sim.q, sim.v
+
+    def column(self, part: str, column: int) -> np.ndarray:
+        (q1, v1), (q2, v2) = self.after(part, column, -STEP), self.after(part, column, STEP)
+        dq = apart(q1, q2) if self.sim.model.robot.floating else q2 - q1
+        return np.hstack([dq, v2 - v1]) / (2 * STEP)
+
+    def restore(self) -> None:
+        for name, array in self.start.items():
+            self.sim._arrays[name][...] = array
+
+
+def quadruped(n: int = 24, **options) -> tuple[Simulator, np.ndarray]:
+    """Robots that stand, slide, and fly, some time after a drop, and targets that not all motors can follow."""
+    model = Model("mini_cheetah")
+    sim = Simulator(model, n, contacts="foot", outputs=(), **options)
+    rng = np.random.default_rng(5)
+    q = np.tile(model.standing_q, (n, 1)) + rng.normal(0, 0.05, (n, model.nq)) * (np.arange(model.nq) > 6)
+    q[:, 2] += np.linspace(-0.01, 0.2, n)
+    v = rng.normal(0, 0.5, (n, model.nv))
+    sim.set_state(q, v)
+    target = model.standing_q[7:] + rng.normal(0, 0.3, (n, 12))
+    sim.step(target, 4)
+    return sim, target
+
+
+def errors(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Largest error of each robot, relative to its largest entry."""
+    rows = tuple(range(1, ours.ndim))
+    return np.abs(ours - theirs).max(rows) / np.abs(theirs).max(rows)
+
+
+def test_linearize_a_fixed_leg():
+    model = Model("planar_leg_linkage")
+    sim, rng = Simulator(model, 5), np.random.default_rng(0)
+    sim.set_state(model.standing_q + rng.normal(0, 0.1, (5, 2)), rng.normal(0, 1, (5, 2)))
+    A, B = StepDerivatives(sim).linearize(model.standing_q)
+    differences = Differences(sim, model.standing_q)
+    theirs = [differences.column(part, i) for part in ("q", "v", "target") for i in range(2)]
+    assert errors(np.concatenate([A, B], axis=2), np.stack(theirs, axis=2)).max() < 1e-8
+
+
+def test_linearize_a_quadruped_through_contact_and_all_iterations():
+    sim, target = quadruped()
+    A, B = StepDerivatives(sim).linearize(target)
+    differences = Differences(sim, target)
+    theirs = [differences.column(part, i) for part, n in (("q", 18), ("v", 18), ("target", 12)) for i in range(n)]
+    assert errors(np.concatenate([A, B], axis=2), np.stack(theirs, axis=2)).max() < 1e-6
+
+
+def test_backward_through_steps_in_contact():
+    sim, target = quadruped()
+    derivatives, rng = StepDerivatives(sim), np.random.default_rng(1)
+    weights = {name: rng.normal(size=(sim.num_envs, 18)) for name in ("q", "v")}
+    differences = Differences(sim, target, n_substeps=5)
+    both = np.hstack([weights["q"], weights["v"]])
+    theirs = {
+        (part, i): (differences.column(part, i) * both).sum(1)
+        for part, n in (("q", 18), ("v", 18), ("load", 4), ("target", 12))
+        for i in range(n)
+    }
+    differences.restore()
+    derivatives.step(target, 5)
+    assert derivatives.n_recorded == 5
+    np.testing.assert_array_equal(sim.q, differences.center[0])
+    state, targets, _ = derivatives.backward(weights)
+    ours = state | {"target": sum(targets)}
+    for part, n in (("q", 18), ("v", 18), ("target", 12)):
+        expected = np.stack([theirs[part, i] for i in range(n)], axis=1)
+        assert errors(ours[part], expected).max() < 1e-5, part
+    carried = read_rows(differences.start["load"], sim.num_envs) > 1.0  # a load of zero is where its effect has a kink
+    assert carried.sum() > 4
+    expected = np.stack([theirs["load", i] for i in range(4)], axis=1)
+    assert np.abs(ours["load"] - expected)[carried].max() < 1e-5 * np.abs(expected[carried]).max()
+
+
+def test_resets_and_diverged_robots_pass_nothing_on():
+    model = Model("planar_leg_linkage")
+    sim = Simulator(model, 3)
+    derivatives = StepDerivatives(sim)
+    derivatives.step(model.standing_q)
+    sim.set_state(model.standing_q + 0.1, np.zeros(2), np.array([True, False, False]))
+    sim._arrays["diverged"][0, 0, 1] = 1.0
+    derivatives.step(model.standing_q)
+    state, targets, _ = derivatives.backward({"q": np.ones((3, 2))})
+    assert not state["q"][:2].any()
+    assert state["q"][2].all()
+    assert not targets[0][:2].any()
+    assert targets[1][0].all()
+    assert not targets[1][1].any()
+
+
+def test_gradient_to_parameters():
+    model = Model("planar_leg_linkage")
+    sim = Simulator(model, 2, parameters=("kp", "kd"))
+    target = model.standing_q + 0.02
+    derivatives = StepDerivatives(sim)
+    derivatives.step(target, 3)
+    _, _, ours = derivatives.backward({"v": np.ones((2, 2))})
+    default = read_rows(sim._arrays["parameters"], 2)[0]
+
+    def after(values: np.ndarray) -> float:
+        sim.set_parameter("kp", values[:2])
+        sim.set_parameter("kd", values[2:])
+        sim.reset()
+        sim.step(target, 3)
+        return float(sim.v[0].sum())
+
+    for i, size in enumerate(1e-4 * default):
+        change = np.eye(4)[i] * size
+        expected = (after(default + change) - after(default - change)) / (2 * size)
+        assert abs(ours[0, i] - expected) < 1e-6 * abs(expected)
+
+
+def test_what_cannot_be_differentiated_is_said():
+    model = Model("planar_leg_linkage")
+    with pytest.raises(ValueError, match="with retries; expected retry=0"):
+        StepDerivatives(Simulator(model, retry=2))
+    with pytest.raises(ValueError, match="on terrain; expected flat ground"):
+        StepDerivatives(Simulator(model, terrain=Terrain(np.zeros((4, 4)), 0.1)))
+    derivatives = StepDerivatives(Simulator(model))
+    with pytest.raises(ValueError, match="weights of 'height'; expected some of q, v"):
+        derivatives.backward({"height": np.zeros(1)})
+    with pytest.raises(ValueError, match=r"weights of 'q' have shape \(2,\); expected \(1, 2\)"):
+        derivatives.backward({"q": np.zeros(2)})
