@@ -67,7 +67,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--minutes", type=above_zero, default=4.0, metavar="M", help="longest time to train (default 4)"
     )
-    parser.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all processors")
+    parser.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all CPUs")
     parser.add_argument(
         "--episodes", type=EPISODES, default=256, metavar="N", help="episodes to judge it by (default 256)"
     )

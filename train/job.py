@@ -207,7 +207,7 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument(
         "--minutes", type=above_zero, default=float("inf"), metavar="M", help="stop after so long at the latest"
     )
-    how.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all processors")
+    how.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all CPUs")
     where = result.add_argument_group("where to")
     where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")
     where.add_argument("--no-tensorboard", dest="tensorboard", action="store_false", help="write no TensorBoard logs")

@@ -220,7 +220,7 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument("--levels", nargs="+", choices=LEVELS, default=LEVELS, metavar="LEVEL", help="default: all four")
     how.add_argument("--seeds", type=SEED, nargs="+", default=[0, 1, 2], metavar="N", help="default: 0 1 2")
     how.add_argument("--steps", metavar="N", help="environment steps of each (default: as in the settings file)")
-    how.add_argument("--threads", type=THREADS, default=0, metavar="N", help="default: all processors")
+    how.add_argument("--threads", type=THREADS, default=0, metavar="N", help="default: all CPUs")
     how.add_argument(
         "--runs", type=Path, metavar="FOLDER", help="where runs are kept (default: runs/transfer/<settings file>)"
     )

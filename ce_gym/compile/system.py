@@ -1,6 +1,6 @@
-"""What operating systems do not have in common: users, usable cores, memory of a process, names of processors, forks.
+"""What operating systems do not have in common: users, usable cores, memory of a process, names of CPUs, forks.
 
-The only file that may call what some system lacks. Knows Python's library only.
+The only file that may call what some system lacks.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 CPUINFO, STATUS = Path("/proc/cpuinfo"), Path("/proc/self/status")
-"""Where Linux tells about the processor and about this process."""
+"""Where Linux tells about the CPU and about this process."""
 
 
 def _nothing() -> None:
@@ -34,7 +34,7 @@ def usable_cores() -> int:
 
 
 def processor() -> str:
-    """Return the model name of the processor, or its architecture where the system does not tell."""
+    """Return the model name of the CPU, or its architecture where the system does not tell."""
     return _fields(CPUINFO).get("model name") or platform.processor() or platform.machine()
 
 

@@ -2,8 +2,8 @@
 
 Everything is a difference of traced functions. A sub-step is built up in layers, each with one feature more; a layer
 costs what its function takes beyond the one before, so that the layers add up to the whole. A feature that is left out
-would cost what the whole takes with it beyond what it takes without. An instruction is one scalar operation of a
-CasADi function for one robot. May know programs, models and traces; `scene_timing` compiles, `scene_text` writes.
+would cost what the whole takes with it beyond what it takes without. An instruction is one scalar operation of a CasADi
+function for one robot.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A scene report in words: `scene_report(env_id)`. Knows reports and times, not how they are worked out."""
+"""A scene report in words: `scene_report(env_id)`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """How long the lines of a scene report take: each is compiled as a kernel of its own, and all are timed in turn.
 
 A line is the difference of two kernels, round by round, so that a change of the machine's pace meets both; the figure
-is the median over rounds. May know reports, kernels and the simulator's arrays.
+is the median over rounds.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def _function_kernel(function: ca.Function) -> Kernel:
 
 
 def _clocked(work: Callable[[], object], units: int) -> float:
-    """Return the processor time of one unit of work on this thread [ns]."""
+    """Return the CPU time of one unit of work on this thread [ns]."""
     start = time.thread_time_ns()
     work()
     return (time.thread_time_ns() - start) / units

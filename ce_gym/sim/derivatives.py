@@ -1,7 +1,7 @@
 """`StepDerivatives`: gradients through the steps of a simulator, and their linearisation.
 
 One kernel makes the reverse mode of one sub-step: it repeats the iterations that the step needed and goes back through
-them. May know the simulator and compile.
+them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Where robots live: numpy arrays and the processor's kernels, or torch tensors and a GPU's.
+"""Where robots live: numpy arrays and the CPU's kernels, or torch tensors and a GPU's.
 
 A device makes, reads and writes the state arrays of `ce_gym.sim.tiles` and loads the kernels that work on them; whoever
 holds robots asks it and does not mind which it is. A GPU's arrays are one tile with a lane for each robot. torch is
-imported when a GPU is asked for. May know `compile`.
+imported when a GPU is asked for.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ce_gym.compile import Program, load_kernel
 from ce_gym.sim import tiles as host_tiles
 
 Array = Any
-"""A numpy array on the processor, a torch tensor on a GPU."""
+"""A numpy array on the CPU, a torch tensor on a GPU."""
 Build = Callable[[], Sequence[Program]]
 
 
@@ -73,7 +73,7 @@ class Device(Protocol):
         ...
 
 
-class Processor:
+class Cpu:
     """numpy arrays and the kernels of `ce_gym.compile`."""
 
     name, fuses = "cpu", False
@@ -210,7 +210,7 @@ class Emulated(Cuda):
         self.name, self._place = "emulated cuda", "cpu"
 
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
-        """Return the kernel of some stages, run by the processor."""
+        """Return the kernel of some stages, run by the CPU."""
         from ce_gym.compile.cuda import host_kernel
 
         return host_kernel(build, dtype)
@@ -233,7 +233,7 @@ def device_named(device: str | Device) -> Device:
     if not isinstance(device, str):
         return device
     if device == "cpu":
-        return Processor()
+        return Cpu()
     kind, _, number = device.partition(":")
     if kind != "cuda" or not (number.isdecimal() or (number == "" and ":" not in device)):
         raise ValueError(f"device={device!r}; expected 'cpu', 'cuda' or 'cuda:N'")
@@ -241,5 +241,5 @@ def device_named(device: str | Device) -> Device:
 
 
 def to_numpy(values: Any) -> NDArray:
-    """Return numbers from anywhere as float64 in the processor's memory."""
+    """Return numbers from anywhere as float64 in the CPU's memory."""
     return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=float)

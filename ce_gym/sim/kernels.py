@@ -9,7 +9,7 @@ from ce_gym.compile import Buffer, Program
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Robot
-from ce_gym.sim.devices import Device, Processor
+from ce_gym.sim.devices import Cpu, Device
 from ce_gym.sim.kernel_key import laws_key, model_key
 from ce_gym.sim.substeps import substeps
 
@@ -53,4 +53,4 @@ def load_step_kernel(
         return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
 
     key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r}"
-    return (device or Processor()).kernel(key, build, dtype)
+    return (device or Cpu()).kernel(key, build, dtype)

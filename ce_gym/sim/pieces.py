@@ -1,4 +1,4 @@
-"""Sub-steps made in pieces, between which a long call answers Ctrl-C. May know compile."""
+"""Sub-steps made in pieces, between which a long call answers Ctrl-C."""
 
 from __future__ import annotations
 

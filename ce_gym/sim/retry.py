@@ -1,7 +1,4 @@
-"""Stepping robots that have diverged again, from where they were, with smaller steps.
-
-Knows arrays of tiles and kernels; neither robots nor physics.
-"""
+"""Stepping robots that have diverged again, from where they were, with smaller steps."""
 
 from __future__ import annotations
 

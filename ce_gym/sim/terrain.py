@@ -1,4 +1,4 @@
-"""`Terrain`: ground that is not flat, as a grid of heights with a smooth surface over it. Knows numpy only."""
+"""`Terrain`: ground that is not flat, as a grid of heights with a smooth surface over it."""
 
 from __future__ import annotations
 

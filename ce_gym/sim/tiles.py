@@ -1,7 +1,7 @@
 """State arrays of many robots in the layout of the kernels, and their conversion to and from plain rows.
 
 A tile holds as many robots as a vector register has lanes: arrays are (n_tiles, size, lanes). Robots beyond `num_envs`
-in the last tile are padding; they hold copies of valid states so that nothing in them can go wrong. May know `compile`.
+in the last tile are padding; they hold copies of valid states so that nothing in them can go wrong.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> Report:
     picture = accuracy_plots.draw(measured, out)
     report = Report("accuracy", tables, [requirement(m) for m in measured])
     report.remarks.append(
-        "Time: processor time of one core for one robot and one simulated second, best of the rounds; both sides take "
+        "Time: CPU time of one core for one robot and one simulated second, best of the rounds; both sides take "
         "turns. Smooth scenes: error against the truth; ours at the exact level, MuJoCo at any. Contact: every code "
         "against its own limit, so MuJoCo may leave out the rotors. No entry: not reached at any step tried."
     )

@@ -1,7 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """Pinocchio as a peer: the tree of a robot with armature, and its loops as constraints.
 
-Knows Pinocchio's Python API (https://github.com/stack-of-tasks/pinocchio), which has traps: joints not numbered depth
+Pinocchio's Python API (https://github.com/stack-of-tasks/pinocchio) has traps: joints not numbered depth
 first make `crba` wrong without a word; `lcaba` ends the process unless `computeJointMinimalOrdering` was called before;
 constraints go in vectors of Pinocchio's own; `aba` knows no tied joints. Pinocchio's base velocity is [linear,
 angular], its quaternion (x, y, z, w); ours are the other way round. (Compiled modules carry no types, hence the line

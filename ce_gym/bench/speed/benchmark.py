@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> Report:
     markdown = "\n\n".join(table.as_markdown() for table in report.tables)
     (arguments.out / "speed.md").write_text(markdown + "\n", encoding="utf-8")
     report.remarks.append(
-        "Time on one core is processor time of one thread, on all cores elapsed time. MuJoCo: mujoco.rollout, no "
+        "Time on one core is CPU time of one thread, on all cores elapsed time. MuJoCo: mujoco.rollout, no "
         "visual geoms, dense Jacobian, pyramidal cones, islands off, no sensors, energy or callbacks; in the first "
         "table the fastest of the settings tried with which it stands, in the others Euler with Newton 4/4, whether it "
         "stands or not. ce_gym: Simulator.step, Python call and copy of targets included. Pinocchio: called from a "

@@ -52,7 +52,7 @@ class CudaKernel:
             repeats: a number for each of `self.repeats`.
             keys: int64, the bits of the unsigned keys, shape (num_envs,), if random numbers are drawn.
             counters: int64, shape (num_envs,), likewise; counted up.
-            num_threads: of no consequence here; processor's kernels have it.
+            num_threads: of no consequence here; CPU's kernels have it.
 
         Raises:
             ValueError: one line naming the kernel, the array and what was expected.

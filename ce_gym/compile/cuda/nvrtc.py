@@ -37,7 +37,7 @@ class Usage:
     spill_loads: int
 
     def occupancy(self, arch: str, block: int) -> float:
-        """Return the share of a multiprocessor's warps that its registers can serve, as blocks of `block` threads."""
+        """Return the share of a multiCPU's warps that its registers can serve, as blocks of `block` threads."""
         most = WARPS[arch.removeprefix("sm_").rstrip("a")]
         per_warp = -(-32 * self.registers // 256) * 256  # registers are given to warps in units of 256
         blocks = (REGISTERS // per_warp) // (block // 32)

@@ -1,4 +1,4 @@
-"""Pictures of a robot as arrays, traced on the processor: no display, no OpenGL, nothing but pip packages.
+"""Pictures of a robot as arrays, traced on the CPU: no display, no OpenGL, nothing but pip packages.
 
 Embree finds what each ray meets; flat ground and the sky need no tracing. A picture depends on the pose alone, not on
 what was drawn before.
