@@ -67,18 +67,25 @@ def command(record: dict[str, Any]) -> str:
 
     Raises:
         PolicyError: If none can: the policy goes on from another one, or its environment has arguments that
-            `train/ppo.py` does not take.
+            the learner does not take.
     """
     if record["resumed_from"]:
         raise PolicyError(f"resumed from {record['resumed_from']}; expected a run from the beginning")
-    words = ["python", "train/ppo.py", "--env", record["env"], "--seed", str(record["seed"])]
+    words = [
+        "python",
+        f"train/{record.get('learner', 'ppo')}.py",
+        "--env",
+        record["env"],
+        "--seed",
+        str(record["seed"]),
+    ]
     kwargs = dict(record["env_kwargs"])
     if level := kwargs.pop("transmission", None):
         words += ["--transmission", level]
     if "critic" in kwargs and kwargs.pop("obs_mode", None) == "dict":
         words += ["--critic", *kwargs.pop("critic")]
     if kwargs:
-        raise PolicyError(f"env_kwargs: {', '.join(kwargs)}; expected none that train/ppo.py does not take")
+        raise PolicyError(f"env_kwargs: {', '.join(kwargs)}; expected none that the learner does not take")
     usual = json.loads(json.dumps(load_settings(config_file(record["env"])).as_dict()))
     chosen = record["settings"] | {"steps": min(record["settings"]["steps"], record["steps"])}  # a deadline may end it
     changed = {key: value for key, value in chosen.items() if value != usual[key]}
@@ -197,7 +204,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(
         description="Judge the policy of a training run and write its card, its learning curve and policy.npz."
     )
-    parser.add_argument("run", help="folder of train/ppo.py, or the policy.zip in it")
+    parser.add_argument("run", help="folder of a training run, or the policy in it")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--out", type=Path, metavar="FOLDER", help="where to write (default: the run's folder)")
     where.add_argument("--ship", action="store_true", help="write to assets/policies/<robot>_<task>_<level>")

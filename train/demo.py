@@ -15,7 +15,6 @@ import numpy as np
 from console import EPISODES, SEED, THREADS, Parser, above_zero, run
 from evaluate import EVALUATION_SEED, report
 from job import Job, Trained
-from ppo import train
 from settings import config_file, load_settings
 from transfer import summary, table, transfer
 
@@ -28,7 +27,9 @@ ENV = "ce_gym/MiniCheetahVelocity-v0"
 
 def obtain_policy(args: argparse.Namespace) -> Path:
     """Train a policy, or take the one in the output folder, and say which."""
-    policy = args.out / "policy.zip"
+    from fast_ppo import train  # says what is missing where its extra is not installed
+
+    policy = args.out / "policy.npz"
     resume = None
     if policy.exists() and not args.fresh:
         record = load_policy(policy).record

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from demo import main as demo_main
 from demo import parting
-from saved import load_learner
 
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
+from ce_gym.policies import load_policy
 from ce_gym.viewer import Rollout
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
@@ -70,7 +70,7 @@ def test_the_rollout_has_states_forces_and_commands(demo):
 def test_fresh_trains_again(demo, capsys):
     assert demo_main([*QUICK, "--fresh", "--seed", "4", "--out", str(demo)]) == 0
     assert "Training from nothing" in capsys.readouterr().out
-    assert load_learner(demo / "policy.zip")[1]["seed"] == 4
+    assert load_policy(demo / "policy.npz").record["seed"] == 4
 
 
 def test_the_adapter_hands_on_what_the_robot_environment_says():

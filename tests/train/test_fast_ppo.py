@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -10,10 +11,11 @@ import warnings
 
 import numpy as np
 import pytest
+from card import command
 from evaluate import evaluate
 from evaluate import main as evaluate_main
 from fast_ppo import FastPPO, main, train
-from job import Job
+from job import Job, jobs, parser
 from point_mass import ID
 from ppo import train as reference_train
 from progress import read_curve
@@ -66,6 +68,15 @@ def test_the_record_has_the_keys_of_the_reference(trained, tmp_path):
     assert trained.record["finished"]
     log = (trained.policy.parent / "progress.csv").read_text().splitlines()[0].split(",")
     assert {"reward/speed", "metrics/velocity_error", "rollout/ep_rew_mean", "train/approx_kl"} <= set(log)
+
+
+def test_the_command_on_its_card_repeats_it(trained):
+    record = load_policy(trained.policy).record
+    words = shlex.split(command(record))
+    assert words[:2] == ["python", "train/fast_ppo.py"]
+    (again,) = jobs(parser().parse_args(words[2:]), folder="-fast")
+    assert json.loads(json.dumps(again.settings.as_dict())) == record["settings"]
+    assert again.out.name.endswith("-fast")
 
 
 def test_checkpoints_are_policies(trained):
