@@ -126,8 +126,10 @@ def _inspect_environment(args: argparse.Namespace) -> int:
         if module:
             importlib.import_module(module)  # registers it, as in `gymnasium.make`
         print(scene_report(name, timing=not args.no_timing))
-    except (ImportError, ValueError) as error:
+    except ImportError as error:
         raise RobotError(f"environment {args.name!r}: {error}") from error
+    except ValueError as error:  # names what is wrong
+        raise RobotError(str(error)) from error
     return 0
 
 

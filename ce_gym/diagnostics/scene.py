@@ -295,8 +295,8 @@ def _late_actions(program: TaskProgram, whole: SubStep) -> int:
 
 def with_term(task: Task, field: str, term: str, like: Task | None = None) -> Task:
     """Return the task with one term more, its weight and parameters as in `like`; else with weight 1 and defaults."""
-    given = getattr(like, field, {})
-    own = given[term] if isinstance(given, Mapping) else 1.0 if field == "rewards" else {}
+    given, default = getattr(like, field, ()), 1.0 if field == "rewards" else {}
+    own = given.get(term, default) if isinstance(given, Mapping) else default
     terms = getattr(task, field)
     old = terms if isinstance(terms, Mapping) else {name: {} for name in terms}
     return replace(task, **{field: {**old, term: own}})

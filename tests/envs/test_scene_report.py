@@ -166,16 +166,22 @@ def test_text_holds_the_figures(report: SceneReport):
     assert max(map(len, text.splitlines())) <= 120
 
 
-def test_command(capsys, monkeypatch):
+def test_command(monkeypatch):
     asked = []
     monkeypatch.setattr("ce_gym.diagnostics.scene_text.scene_report", lambda *a, **k: asked.append((a, k)) or "report")
     assert main(["inspect", ENVIRONMENT, "--no-timing"]) == 0
-    assert asked == [((ENVIRONMENT,), {"timing": False})]
-    assert main(["inspect", "ce_gym/NoSuchRobot-v0"]) == 2
+    assert main(["inspect", f"ce_gym:{ENVIRONMENT}", "--no-timing"]) == 0
+    assert asked == 2 * [((ENVIRONMENT,), {"timing": False})]
+
+
+@pytest.mark.parametrize("name", ["ce_gym/NoSuchRobot-v0", "no_such_module:Walk-v0", "ce_gym:NoSuchRobot-v0"])
+def test_command_refuses_what_is_not_there(name: str, capsys):
+    assert main(["inspect", name]) == 2
     error = capsys.readouterr().err
-    assert "ce_gym/NoSuchRobot-v0" in error
-    assert ENVIRONMENT in error
-    assert error.count("\n") == 1
+    assert error.startswith("ce_gym: environment ")
+    module, _, env_id = name.rpartition(":")
+    assert (module if module == "no_such_module" else f"{env_id!r} is not registered; `python -m ce_gym list`") in error
+    assert error.count("environment ") == error.count("\n") == 1
 
 
 def test_only_environments_of_this_package():
