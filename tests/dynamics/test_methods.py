@@ -53,6 +53,19 @@ def run(method: str, dt: float, time: float = 0.4) -> tuple[np.ndarray, np.ndarr
     return end["q_next"].full()[:, -1], end["v_next"].full()[:, -1]
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_length_that_is_an_input_makes_the_same_step(method: str):
+    """Stages of length 0 too: they divide by no symbol that happens to be 0."""
+    mechanism, options = Model(swinging_robot()).mechanism, StepOptions(0.01, "torque", method=method)
+    fixed, free = step_function(mechanism, options), step_function(mechanism, replace(options, dt=None))
+    given = {"q": ca.DM([0, 0, 0, 0.8, 0, 0.6, 0, 0.3, -0.4]), "v": ca.DM([1, -2, 3, 0.5, 0.2, -0.1, 2, -3])}
+    given |= {"diverged": 0.0, "target": ca.DM([0.3, -0.2])}
+    expected, found = fixed(**given), free(**given, dt=0.01)
+    assert not expected["diverged_next"]
+    for name in ("q_next", "v_next", "diverged_next"):
+        np.testing.assert_allclose(found[name].full(), expected[name].full(), rtol=1e-12, atol=1e-14)
+
+
 @pytest.fixture(scope="module")
 def exact() -> tuple[np.ndarray, np.ndarray]:
     return run("rk8", 0.4 / 128)

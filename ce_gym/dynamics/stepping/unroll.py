@@ -48,7 +48,8 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
             start = parts[stage.start].state if stage.start else before
         if parts and stage.start:  # the ground is known as it is around the start of the step
             scene = looked_up_from(scene, parts[plan.stages[0].name].solved.kinematics)
-        parts[stage.name] = iterated(scene, start, target, stage.length * dt, stage.iterations)
+        length = stage.length * dt if stage.length else 0.0  # a number also where dt is a symbol, see `solve`
+        parts[stage.name] = iterated(scene, start, target, length, stage.iterations)
     first = parts[plan.stages[0].name]
     if isinstance(plan.end, Rates):
         after = replace(_moved(plan.end, before, list(parts.values()), dt, floating), load=first.state.load)
