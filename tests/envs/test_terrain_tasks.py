@@ -59,12 +59,17 @@ def test_a_field_is_flat_first_and_as_asked_last(kind: str):
 
 
 def test_flat_ground_costs_nothing():
-    """As counted before there was terrain; whoever makes it cheaper may lower them."""
+    """Nothing of a field is there, and the counts are no higher; whoever makes it cheaper may lower them.
+
+    Before there was terrain `assess` took 799 and `begin` 734. Since then 161 came for the end of an episode (length,
+    failures, time limit, sums, masks of NaN), which another function of 211 or the host had to do; and 134 for how an
+    episode begins, 126 of them for the springs' forces on the contacts. None of it depends on the terrain.
+    """
     program = make_program("mini_cheetah", "velocity")
     counted = {name: program.function(name).n_instructions() for name in ("act", "assess", "begin")}
     assert counted["act"] <= 85
-    assert counted["assess"] <= 799
-    assert counted["begin"] <= 734
+    assert counted["assess"] <= 960
+    assert counted["begin"] <= 868
     for kernel in (program.step_program(), program.reset_program()):
         assert not [buffer for buffer in kernel.buffers if buffer.kind == "table"]
     assert len(program.reset_program().calls) == 1
