@@ -148,14 +148,7 @@ class BaseEnv(EzPickle):
 
     @cached_property
     def symmetry(self) -> Symmetry | None:
-        """The left-right reflection of observations and actions, None if the robot or its task has none.
-
-        Examples:
-            >>> symmetry = gymnasium.make("ce_gym/MiniCheetahVelocity-v0").unwrapped.symmetry
-            >>> observation = np.arange(48.0)
-            >>> print(symmetry.observation(observation)[:3], symmetry.action.index)
-            [ 0. -1.  2.] [ 3  4  5  0  1  2  9 10 11  6  7  8]
-        """
+        """The left-right reflection of observations and actions, None if the robot or its task has none."""
         return left_right(self.batch.program)
 
     @cached_property

@@ -114,7 +114,7 @@ class Vectors:
         robot = self.robot
         if any(not hasattr(tie, "coefficients") for tie in robot.constraints):
             free, tied = (tuple((j, angles[j]) for j in angles if (j in robot.independent) == f) for f in (True, False))
-            robot = replace(robot, pose=Pose(joints=free), assembly=tied)
+            robot = replace(without_limits(robot), pose=Pose(joints=free), assembly=tied)
         self.models.append(Model(robot, eliminate_rotors=self.eliminate))
         assert self._fits(self.models[-1], state, angles), f"{self.name}: state {state} is not on any branch"
         return self.models[-1]
@@ -141,3 +141,9 @@ class Vectors:
         columns = [*range(base), *(base + model.spanning_names.index(joint) for joint in self.joints)]
         mine = [*range(base), *(base + model.spanning_names.index(joint) for joint in self.independent)]
         return Group(model, states, q, v, G[:, mine], g[:, mine], columns)
+
+
+def without_limits(robot: Robot) -> Robot:
+    """Return a robot that may stand in any state of a file, which come from all round the circle."""
+    free = [replace(body, joint=replace(body.joint, position=(-np.inf, np.inf))) for body in robot.bodies]
+    return replace(robot, bodies=tuple(free))

@@ -76,7 +76,7 @@ def test_a_run_of_another_kind_is_not_overwritten(runs, trainings, capsys):
     assert not trainings
 
 
-@pytest.mark.parametrize("argv", [[], ["--train"], ["some", "--train", "--env", ID], ["some", "--env", ID]])
+@pytest.mark.parametrize("argv", [[], ["--train"], ["some", "--train", "--env", ID]])
 def test_bad_command_lines_are_refused(argv):
     with pytest.raises(SystemExit) as caught:
         main(argv)

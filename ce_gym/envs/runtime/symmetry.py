@@ -79,6 +79,14 @@ def left_right(program: TaskProgram) -> Symmetry | None:
 
     There is none if a joint has no partner, if the dynamics differ by more than 5 % from those of the reflection, if
     the task rewards one side more than the other, or if actions are those of motors.
+
+    Examples:
+        As `symmetry` of environments has it:
+
+        >>> symmetry = gymnasium.make("ce_gym/MiniCheetahVelocity-v0").unwrapped.symmetry
+        >>> observation = np.arange(48.0)
+        >>> print(symmetry.observation(observation)[:3], symmetry.action.index)
+        [ 0. -1.  2.] [ 3  4  5  0  1  2  9 10 11  6  7  8]
     """
     joints = paired_joints(program.model)
     if joints is None or program.actions.control not in ("position", "torque"):
