@@ -33,11 +33,7 @@ def vector(mode: str = "SameStep", **options) -> Any:
 
 def seen(env: Any) -> dict[str, bytes]:
     """All that later steps depend on, and counts."""
-    batch = env.batch
-    state = {name: batch.rows(name) for name in batch.program.state_sizes}
-    state |= {"counters": batch._counters, "keys": batch.keys, "diverged": np.array(env.n_diverged)}
-    names = ("_elapsed", "_finished", "_observation")
-    state |= {name: getattr(env, name) for name in names if hasattr(env, name)}
+    state = {**env.snapshot(), "generator": np.array(str(env.np_random.bit_generator.state))}
     return {name: values.tobytes() for name, values in state.items()}
 
 
@@ -110,6 +106,7 @@ def test_a_second_thread_is_refused(make, call, monkeypatch: pytest.MonkeyPatch)
         errors.append(str(caught.value))
 
     def watched(*arguments, **options):
+        env.batch._step = kernel  # what is not refused ends, too
         thread = threading.Thread(target=other)
         thread.start()
         thread.join()

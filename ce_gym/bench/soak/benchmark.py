@@ -108,7 +108,7 @@ def soak(env_id: str, steps: int, rng: np.random.Generator, account: Account) ->
         account.spoilt += int(victims.sum())
         diverged += int(infos["diverged"].sum())
         length[over] = 0
-    account.diverged += envs.n_diverged
+    account.diverged += diverged
     if envs.n_diverged != diverged:
         account.complaints.append(f"{env_id}: n_diverged is {envs.n_diverged} after {diverged} flags")
     envs.close()
