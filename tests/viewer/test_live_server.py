@@ -6,6 +6,7 @@ import gc
 import http.client
 import socket
 import threading
+import time
 import urllib.parse
 import weakref
 from collections.abc import Iterator
@@ -92,6 +93,8 @@ def test_browsers_that_leave_are_not_mentioned(capfd: pytest.CaptureFixture[str]
         feed.publish(b"data: 2\n\n")
         feed.close()
         for thread in threads:
+            while thread.ident is None:  # listed, but not started yet
+                time.sleep(0.001)
             thread.join()
     assert capfd.readouterr().err == ""
     assert len(left) == 3
