@@ -1,7 +1,7 @@
 """Train a policy with PPO in seconds: collection and learning as compiled loops over plain arrays.
 
-The same algorithm, arguments and settings files as train/ppo.py, which is the reference; a sixth of the processor time
-for learning. Writes `policy.npz` (weights and record), `policy.json` (the record), `policy.learner.npz` (what going on
+The same algorithm, arguments and settings files as train/ppo.py, which is the reference; about a quarter of its CPU
+time. Writes `policy.npz` (weights and record), `policy.json` (the record), `policy.learner.npz` (what going on
 needs; arrays and JSON, nothing that could run), `progress.csv`, `curve.csv` and `checkpoints/`. On one machine a seed
 gives the same bits on any number of threads, and so does training that was interrupted and resumed. Uses public names
 of ce_gym only, and no name of a robot or task.
