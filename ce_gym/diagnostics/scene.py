@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import gymnasium
@@ -253,13 +253,13 @@ def _with_joints(robot: Robot, **figures: Any) -> Robot:
 def _parts_of_dynamics(step: SubStep) -> tuple[ca.Function, ca.Function]:
     """Trace what the kinematics leave for the recursions, and the accelerations."""
     mechanism, options = step.model.mechanism, step.options
-    assert options.dt is not None, "an environment's step has a length"
-    state, target = symbolic_state(mechanism, options), SX.sym("target", len(mechanism.robot.independent))
-    solved = solve(make_scene(mechanism, options, SX(0, 1), SX(3, 0)), state, target, options.dt, SX(6, 0))
+    state, dt = symbolic_state(mechanism, options), cast(Any, SX.sym("dt"))
+    target = SX.sym("target", len(mechanism.robot.independent))
+    solved = solve(make_scene(mechanism, options, SX(0, 1), SX(3, 0)), state, target, dt, SX(6, 0))
     found = [x for body in solved.kinematics.bodies.values() for x in (body.X.E, body.X.p, body.c, body.v[:3])]
     found += [x for c in solved.kinematics.coordinates if c is not None for x in (c.G, c.g)]
     results = {f"x{i}": ca.vec(x) for i, x in enumerate(found)}
-    inputs = dict(state.items()) | ({"target": target} if target.numel() else {})
+    inputs = dict(state.items()) | {"dt": dt} | ({"target": target} if target.numel() else {})
     return traced("kinematics", inputs, results), traced("acceleration", inputs, {"vdot": solved.vdot})
 
 

@@ -21,7 +21,7 @@ from ce_gym.dynamics.model import Model
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.sim.devices import device_named
 from ce_gym.sim.kernels import load_step_kernel
-from ce_gym.sim.substeps import FRAME, HEIGHTS, TIMES
+from ce_gym.sim.substeps import DT, FRAME, HEIGHTS, TIMES
 from ce_gym.sim.tiles import tiles, write_rows
 
 BATCH = 512
@@ -92,6 +92,7 @@ def _work(model: Model, compiled: SubStep | ca.Function) -> Work:
         "v": np.random.default_rng(0).normal(0, 0.1, (BATCH, model.nv)),
         "dependent": model.guess,
         "parameters": np.concatenate([np.zeros(0), *defaults.values()]),
+        DT: 0.005,
         FRAME: np.array([-4.0, -4.0, 0.5]),
     }
     start = {name: tiles(BATCH, b.size, DTYPE) for name, b in kernel.buffers.items() if b.kind == "tiles"}

@@ -85,7 +85,7 @@ class Batch:
 
     def snapshot(self, file: File | None = None) -> Snapshot:
         """Return the state by name, shape (num_envs, size) or (num_envs,); write it to a file, too, if one is given."""
-        state = {name: self.place.host(self.rows(name)) for name in self.schema}
+        state = {name: self.place.host(self.rows(name)) for name, row in self.schema.items() if row.writer != "scene"}
         if file is not None:
             with Path(file).open("wb") as stream:  # numpy would add a suffix to a name
                 np.savez(stream, **state)  # pyright: ignore[reportArgumentType]

@@ -21,6 +21,7 @@ from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
 from ce_gym.sim.kernel_key import model_key
 from ce_gym.sim.simulator import Simulator
+from ce_gym.sim.substeps import DT
 
 
 @dataclass
@@ -216,7 +217,7 @@ def gradient_program(model: Model, options: StepOptions) -> Program:
     if n > 1:
         scratch |= {"owed": adjoint.numel_in("owed"), "tried_diverged": 1}
         scratch |= {f"tried_{name}": size for name, size in parts.items()}
-    buffers = [Buffer(name, primal.numel_in(name), "tiles") for name in (*parts, "diverged")]
+    buffers = [Buffer(name, primal.numel_in(name), "tiles") for name in (*parts, "diverged", DT)]
     if "parameters" in primal.name_in():
         buffers.append(Buffer("parameters", primal.numel_in("parameters"), "tiles"))
     if "target" in primal.name_in():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ce_gym.compile import CriticalSection, Kernel
 from ce_gym.sim.pieces import run_substeps
+from ce_gym.sim.substeps import DT
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
 Arrays = Mapping[str, NDArray]
@@ -21,11 +22,11 @@ class Retry:
 
     Attributes:
         halvings: How often the step is halved before a robot is given up.
-        kernel: Returns the kernel that makes steps of the original length divided by its argument.
+        kernel: That makes the steps.
     """
 
     halvings: int
-    kernel: Callable[[int], Kernel]
+    kernel: Kernel
 
     def __call__(
         self,
@@ -63,11 +64,14 @@ class Retry:
             alone = {name: _rows_as_tiles(array, num_envs, failed) for name, array in before.items()}
             given = {name: np.ascontiguousarray(rows[failed]) for name, rows in inputs.items()}
             n = int(failed.sum())
-            run_substeps(self.kernel(parts), alone | given | dict(shared), n, parts * n_substeps, section)
+            alone[DT] /= parts
+            run_substeps(self.kernel, alone | given | dict(shared), n, parts * n_substeps, section)
             saved = read_rows(alone["diverged"], n)[:, 0] < 0.5
             chosen = failed.copy()
             chosen[failed] = saved
             for name, array in alone.items():
+                if name == DT:
+                    continue
                 rows = np.zeros((num_envs, array.shape[1]), array.dtype)
                 rows[failed] = read_rows(array, n)
                 write_rows(after[name], rows, chosen)

@@ -16,9 +16,9 @@ from ce_gym.compile import Buffer
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
 from ce_gym.dynamics.model import Model
-from ce_gym.sim.substeps import FRAME
+from ce_gym.sim.substeps import DT, FRAME
 
-Writer = Literal["physics", "task", "term", "host"]
+Writer = Literal["physics", "task", "term", "host", "scene"]
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class Row:
         name: Of the buffer.
         size: Numbers that one robot has there.
         writer: Who changes it: "physics" (the sub-steps), "task" (what an environment does around them), "term" (a
-            reward, observation, termination or metric with memory) or "host" (Python only; no reset touches it).
+            reward, observation, termination or metric with memory), "host" (Python only; no reset touches it) or
+            "scene" (nobody: how it is stepped, and no part of a snapshot).
         reset: With what a robot begins, a number or shape (size,).
         dtype: Of a plain array, shape (num_envs,) or (num_envs, size); "" for one in the lanes of the kernels.
     """
@@ -41,13 +42,14 @@ class Row:
     dtype: str = ""
 
 
-def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str]) -> list[Row]:
+def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str], dt: float) -> list[Row]:
     """Return the rows of what the sub-steps of a scene read and write.
 
     Args:
         model: The robot at a transmission level.
         options: The scene.
         outputs: What is computed besides the state.
+        dt: Length of a sub-step [s].
     """
     joints, contacts, motors = len(model.joint_links), len(options.contacts), len(model.robot.motors)
     start = {"q": model.standing_q, "dependent": model.guess}
@@ -60,6 +62,7 @@ def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str]) -> 
         defaults = parameter_defaults(model.robot, options.material, options.parameters)
         values = np.concatenate(list(defaults.values()))
         rows.append(Row("parameters", len(values), "host", values))
+    rows.append(Row(DT, 1, "scene", dt))
     return rows + ([Row(FRAME, 3, "host")] if options.ground == "field" else [])
 
 

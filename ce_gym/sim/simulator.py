@@ -7,7 +7,6 @@ machine code comes from `ce_gym.compile`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -126,7 +125,6 @@ class Simulator:
         self.contact_names = select_contacts(model.robot, contacts)
         self._placement = Placement(model, self.contact_names, terrain)
         self.options = StepOptions(
-            dt=dt,
             control=control,  # type: ignore[arg-type]
             contacts=self.contact_names,
             material=material or model.robot.material,
@@ -140,12 +138,10 @@ class Simulator:
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
-        self._retry = Retry(
-            retry, lambda parts: load_step_kernel(model, replace(self.options, dt=dt / parts), asked, dtype)
-        )
+        self._retry = Retry(retry, self._kernel)
         self._section = CriticalSection(f"Simulator of {num_envs} {model.robot.name}")
         ground = terrain if self.options.ground == "field" else None
-        rows = [*physics_rows(model, self.options, asked), *COUNTS]
+        rows = [*physics_rows(model, self.options, asked, dt), *COUNTS]
         self._batch = Batch(rows, num_envs, dtype, self._device, ground)
         self._arrays = self._batch.arrays
         defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)

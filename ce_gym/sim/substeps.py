@@ -20,6 +20,8 @@ from ce_gym.model.mechanism import Mechanism
 
 TIMES = "n_substeps"
 """Name of the run-time integer that says how many sub-steps to make."""
+DT = "dt"
+"""Name of the buffer with the length of a sub-step of each robot [s]."""
 HEIGHTS = "heights"
 """Name of the table of heights of the ground, on a field."""
 FRAME = "frame"
@@ -32,10 +34,11 @@ def substeps(
     """Return how to advance a robot `n_substeps` times, as a part of a program.
 
     Returns:
-        Sizes of the buffers that the program must have: state, `diverged`, what `step_function` is given, `FRAME` on a
-        field, and outputs; further buffers, for scratch and on a field the table `HEIGHTS`; and the steps. An output
-        that is empty for this robot is left out.
+        Sizes of the buffers that the program must have: state, `diverged`, what `step_function` is given, `DT` among
+        it, `FRAME` on a field, and outputs; further buffers, for scratch and on a field the table `HEIGHTS`; and the
+        steps. An output that is empty for this robot is left out.
     """
+    options = replace(options, dt=None)
     plan, most = METHODS[options.method], iterations_needed(mechanism, options)
     staged = any(min(stage.iterations, most) for stage in plan.stages)
     function = (iteration_function if staged else step_function)(mechanism, options, outputs)
@@ -85,11 +88,11 @@ def _staged(mechanism: Mechanism, options: StepOptions, plan: Plan, outputs: dic
     """
     alone = plan.single and plan.stages[0].length == 1
     asked = tuple(name for name in outputs if plan.single or name != "error")
-    iteration = iteration_function(mechanism, options if alone else replace(options, dt=None), asked)
+    iteration = iteration_function(mechanism, options, asked)
     combine = combination_function(mechanism, options, {} if plan.single else outputs)
     state = tuple(name.removesuffix("_next") for name in combine.name_out() if name.endswith("_next"))
     most = iterations_needed(mechanism, options)
-    lengths, zeros = _lengths(options, plan), _zeros(iteration.numel_in("iterate"))
+    lengths, zeros = _lengths(plan), _zeros(iteration.numel_in("iterate"))
     sizes = {name: iteration.numel_in(name) for name in state}
     sizes |= {} if plan.single else {name: iteration.numel_out(name) for name in asked}
     buffers = {f"{stage.name}_{name}": size for stage in plan.stages for name, size in sizes.items()}
@@ -103,7 +106,7 @@ def _staged(mechanism: Mechanism, options: StepOptions, plan: Plan, outputs: dic
         if "ground" in iteration.name_in() and stage.start != ground_at:
             each += _look_up(mechanism, options, start)[1]
             ground_at = stage.start
-        here = {name: f"{start}{name}" for name in state} | {"dt": "dt" if alone else f"{stage.name}_dt"}
+        here = {name: f"{start}{name}" for name in state} | {DT: DT if alone else f"{stage.name}_dt"}
         given = tuple(here.get(name, name) for name in iteration.name_in())
         told = asked if plan.single else tuple(f"{stage.name}_{name}" for name in asked)
         left = (*(f"{stage.name}_{name}" for name in state), "iterate", "unconverged", *told)
@@ -111,7 +114,7 @@ def _staged(mechanism: Mechanism, options: StepOptions, plan: Plan, outputs: dic
         each += [Call(iteration, given, left, only_if="unconverged")] * min(stage.iterations, most)
     written = tuple(name.removesuffix("_next") for name in combine.name_out())
     each.append(Call(combine, tuple(combine.name_in()), written))
-    before = () if alone else (Call(lengths, tuple(lengths.name_in()), tuple(lengths.name_out())),)
+    before = () if alone else (Call(lengths, (DT,), tuple(lengths.name_out())),)
     return [Buffer(name, size, "scratch") for name, size in buffers.items()], before, tuple(each)
 
 
@@ -119,8 +122,7 @@ def _zeros(size: int) -> ca.Function:
     return ca.Function("zeros", [], [SX(ca.DM.zeros(size))])
 
 
-def _lengths(options: StepOptions, plan: Plan) -> ca.Function:
+def _lengths(plan: Plan) -> ca.Function:
     """Return the function that gives the length of each stage [s]."""
-    dt = SX.sym("dt") if options.dt is None else SX(options.dt)
-    lengths = {f"{stage.name}_dt": stage.length * dt for stage in plan.stages}
-    return traced("lengths", {"dt": dt} if options.dt is None else {}, lengths)
+    dt = SX.sym(DT)
+    return traced("lengths", {DT: dt}, {f"{stage.name}_dt": stage.length * dt for stage in plan.stages})

@@ -161,9 +161,9 @@ def test_robots_that_are_stepped_again_are_taken_back_too(model: Model, monkeypa
     before, load = seen(sim), sim._retry.kernel
     monkeypatch.setattr(pieces, "LONGEST", 5 * pieces.FEWEST)
 
-    def kernel(parts):
+    def kernel(*given, **more):
         signal.raise_signal(signal.SIGINT)
-        return load(parts)
+        load(*given, **more)
 
     object.__setattr__(sim._retry, "kernel", kernel)
     with pytest.raises(KeyboardInterrupt):

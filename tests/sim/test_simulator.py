@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,7 +42,7 @@ def test_kernel_follows_the_traced_step(level: str, method: str, start):
     model = Model("mini_cheetah", level)
     outputs = ("torque", "contact_forces", "motor_speed", *(["error"] if method == "extrapolated" else []))
     sim = run(model, start, method=method, outputs=outputs)
-    function = step_function(model.mechanism, sim.options, outputs)
+    function = step_function(model.mechanism, replace(sim.options, dt=sim.dt), outputs)
     q, v, target = start
     for i in (0, 7, 39):
         n = len(sim.contact_names)

@@ -107,7 +107,7 @@ def test_the_schema_is_what_the_sub_steps_need(sim: Simulator, model: Model):
     """Likewise with parameters, on a field, with an error estimate, before anything is compiled."""
     outputs = ("torque", "error")
     sizes, *_ = substeps(model.mechanism, sim.options, outputs)
-    rows = {row.name: row.size for row in physics_rows(model, sim.options, outputs)}
+    rows = {row.name: row.size for row in physics_rows(model, sim.options, outputs, sim.dt)}
     assert rows == {name: size for name, size in sizes.items() if name != "target"}
 
 

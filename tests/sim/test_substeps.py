@@ -59,13 +59,14 @@ def test_kernel_and_expression_are_one_step(method: str):
     q, v, target = start()
     sim = Simulator(model, len(q), dt, method=method, motors="limited", outputs=outputs)
     sim.set_state(q, v)
-    function, names = step_function(model.mechanism, sim.options, outputs), ("q", "v", "load", "anchor", "diverged")
+    function = step_function(model.mechanism, sim.options, outputs)
+    names = ("q", "v", "load", "anchor", "diverged")
     names = tuple(name for name in names if name in function.name_in())
     state = {name: sim._read(name) for name in names}
     for _ in range(12):
         sim.step(target)
         for i in range(len(q)):
-            result = function(target=target[i], **{name: state[name][i] for name in names})
+            result = function(target=target[i], dt=dt, **{name: state[name][i] for name in names})
             result = {name: value.full().ravel() for name, value in result.items()}
             for name in names:
                 np.testing.assert_allclose(sim._read(name)[i], result[f"{name}_next"], rtol=1e-8, atol=1e-8)

@@ -114,7 +114,7 @@ def run(terrain: Terrain | None, state, rows=slice(None), n_substeps: int = 10, 
 def test_flat_scenes_pay_nothing():
     """Without terrain there is not one instruction, buffer or look-up more."""
     options = Simulator(CHEETAH).options
-    plain = StepOptions(options.dt, contacts=options.contacts, material=options.material)
+    plain = StepOptions(contacts=options.contacts, material=options.material)
     counts = [iteration_function(CHEETAH.mechanism, o).n_instructions() for o in (options, plain)]
     assert counts[0] == counts[1]
     assert iteration_function(CHEETAH.mechanism, replace(options, ground="field")).n_instructions() > counts[0]
@@ -136,7 +136,7 @@ def test_the_kernel_sees_the_surface(dtype: str):
     terrain = Terrain.rough(1, 0.05, cell=0.2, size=4.0)
     q, v, target = state = start(20, terrain)
     sim = run(terrain, state, n_substeps=1, dtype=dtype)
-    function = step_function(CHEETAH.mechanism, sim.options)
+    function = step_function(CHEETAH.mechanism, replace(sim.options, dt=sim.dt))
     centres, _ = CHEETAH.contact_points(q, v)
     radius = np.array([sphere.radius for sphere in CHEETAH.robot.contacts])[:, None]
     under = terrain.at(centres[..., 0], centres[..., 1])

@@ -1,8 +1,4 @@
-"""Our side of the accuracy benchmark: the simulator's own kernel, with the length of the step as an input.
-
-One kernel then serves every point of a curve; the code is the one that `Simulator` runs, but for constants that depend
-on the step and can no longer be folded.
-"""
+"""Our side of the accuracy benchmark: the simulator's own kernel, of which one serves every point of a curve."""
 
 from __future__ import annotations
 
@@ -30,7 +26,6 @@ class Ours:
         self.scene, self.num_envs = scene, num_envs
         self.model = Model(scene.robot, transmission=level)
         options = StepOptions(
-            dt=None,
             control=scene.control,
             contacts=self.model.contact_names,
             material=scene.robot.material,

@@ -20,7 +20,7 @@ class StepOptions:
     """What a scene consists of and how it is stepped.
 
     Attributes:
-        dt: Length of the step [s]; None makes it an input of the traced step.
+        dt: Length of the step [s], a constant of the traced step; None makes it an input, which kernels have.
         control: "position" for joint targets [rad or m] through the robot's gains, "torque" for joint torques;
             "motor_position" and "motor_torque" for angles and torques of the motors' rotors instead.
         contacts: Names of the contact spheres that can touch the ground.
@@ -33,7 +33,7 @@ class StepOptions:
         parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
     """
 
-    dt: float | None
+    dt: float | None = None
     control: Control = "position"
     contacts: tuple[str, ...] = ()
     material: ContactMaterial = field(default_factory=ContactMaterial)

@@ -43,8 +43,8 @@ class TurningDamping:
 
     def on(self, D: SX, rows: list[int], w: SX) -> tuple[SX, SX]:
         """Return the addition to a cluster's inertia `D`, and the force, given the turning of its carrier [rad/s]."""
-        share = TURNING_DAMPING * (self.dt**2 * ca.sumsqr(w)) ** 2
-        return share * D, -share / self.dt * (D @ self.v[rows])
+        rate = TURNING_DAMPING * self.dt**3 * ca.sumsqr(w) ** 2
+        return rate * self.dt * D, -rate * (D @ self.v[rows])
 
 
 def frozen_inertia(mechanism: Mechanism) -> SX:

@@ -99,7 +99,6 @@ class TaskProgram:
         self.randomised = Randomised(robot, task.randomise)
         self.actions = ActionMap(self.model.mechanism, task)
         self.options = StepOptions(
-            dt=task.dt,
             control=self.actions.control,
             contacts=self.contacts,
             material=robot.material,
@@ -140,7 +139,7 @@ class TaskProgram:
             "target": len(self.actions.targets) if late else 0,
             **self.curriculum.sizes,
         }
-        physics = physics_rows(self.model, self.options, outputs)
+        physics = physics_rows(self.model, self.options, outputs, self.task.dt)
         rows = [replace(row, writer="task") if row.name == "parameters" else row for row in (*physics, *HOST_ROWS)]
         rows += [Row(name, size, "task") for name, size in sizes.items() if size]
         rows += [Row(FRAME, 3, "host")] if self.ground and not self.contacts else []
