@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 from ce_gym.viewer.cli import add_play_command, add_view_command
 from ce_gym.viewer.console import Parser, examples, print_anything
+from ce_gym.viewer.live.command import add_live_command
 
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
 
@@ -23,6 +24,7 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
   python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
   python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
   python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
+  python -m ce_gym live POLICY           drive, push and throw it in a browser
   python -m ce_gym view walk.npz         show recorded rollouts, several side by side or as ghosts
   python -m ce_gym bench                 benchmarks
 
@@ -88,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     inspect.set_defaults(run=_inspect)
     add_play_command(commands)
     add_view_command(commands)
+    add_live_command(commands)
     commands.add_parser("bench", help="benchmarks; without a name, the list of them")
     return parser
 

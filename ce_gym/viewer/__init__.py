@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ce_gym.viewer.errors import ViewerError
-    from ce_gym.viewer.live import show
     from ce_gym.viewer.page.html import write_html
     from ce_gym.viewer.rollouts.driving import SHOW, Script, drive, drive_many, walk
     from ce_gym.viewer.rollouts.recorder import Recorder
     from ce_gym.viewer.rollouts.recording import record, record_lanes
     from ce_gym.viewer.rollouts.rollout import Rollout, RolloutError
+    from ce_gym.viewer.server import show
 
 __all__ = [
     "SHOW",
@@ -50,7 +50,7 @@ _HOMES = {
     "Rollout": "rollouts.rollout",
     "RolloutError": "rollouts.rollout",
     "ViewerError": "errors",
-    "show": "live",
+    "show": "server",
     "write_html": "page.html",
 }
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ce_gym.policies import WHERE, find_policy, locate_policy
-from ce_gym.viewer.console import examples
+from ce_gym.viewer.console import examples, has_display
 
 if TYPE_CHECKING:
     from ce_gym.viewer.rollouts.rollout import Rollout
@@ -166,10 +164,3 @@ def _present(rollouts: Sequence[Rollout], args: argparse.Namespace, default: Pat
     if may_open:
         webbrowser.open(path.resolve().as_uri(), new=2)
     return 0
-
-
-def has_display() -> bool:
-    """Return whether a browser could open a window here."""
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

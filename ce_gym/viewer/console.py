@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import sys
 from typing import Any, NoReturn
 
@@ -30,3 +31,10 @@ def print_anything() -> None:
 def examples(*lines: str) -> str:
     """Return an epilog with commands to try."""
     return "\n".join(["examples:", *(f"  python -m ce_gym {line}" for line in lines)])
+
+
+def has_display() -> bool:
+    """Return whether a browser could open a window here."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -39,7 +39,7 @@ LAYERS = {
     "sim": "tiles devices terrain placement substeps kernel_key kernels schema batch pieces retry simulator"
     " derivatives",
     "envs": "terms task runtime policy_spec base rendering single vector registration custom",
-    "viewer": "errors console rollouts page raytrace live window renderers cli",
+    "viewer": "errors console rollouts page raytrace server feed window renderers live cli",
     "bench": "measure peers friction instructions soak digests fuzz speed throughput paper accuracy stability"
     " gpu __main__",
 }

@@ -106,7 +106,15 @@ class Chromium:
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         """Press the mouse at one place of the window, move it to another and let go [pixels]."""
         for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
-            self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+            self.mouse(kind, x, y)
+
+    def mouse(self, kind: str, x: float, y: float) -> None:
+        """Press, move or let go the left button of the mouse at a place of the window [pixels]."""
+        self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def key(self, kind: str, character: str) -> None:
+        """Press a key ("keyDown") or let it go ("keyUp")."""
+        self._call("Input.dispatchKeyEvent", type=kind, key=character)
 
     def picture(self, path: Path) -> Path:
         """Write what the page shows as a PNG file and return its path."""

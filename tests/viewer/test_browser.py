@@ -13,9 +13,9 @@ from chromium import PROGRAM, Chromium
 from ce_gym import Terrain
 from ce_gym.dynamics import Model
 from ce_gym.viewer import Rollout, write_html
-from ce_gym.viewer.live import PageServer
 from ce_gym.viewer.page.html import page
 from ce_gym.viewer.rollouts.ground_patch import around
+from ce_gym.viewer.server import PageServer
 
 pytest.importorskip("meshcat")
 Image = pytest.importorskip("PIL.Image")

@@ -16,8 +16,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ce_gym.viewer.live import MOST_CLIENTS, PageServer
-from ce_gym.viewer.window import Feed
+from ce_gym.viewer.feed import Feed
+from ce_gym.viewer.server import MOST_CLIENTS, PageServer
 
 
 @pytest.fixture

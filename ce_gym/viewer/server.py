@@ -1,4 +1,4 @@
-"""Live playback: the page of a rollout served on this machine's loopback for as long as the call lasts.
+"""Pages served on this machine's loopback for as long as a call lasts.
 
 meshcat's own server is not used: it listens on every network interface, runs as another process that outlives its
 window, and takes one blocking message at a time. The page carries the whole animation, so a plain HTTP server inside
@@ -27,8 +27,10 @@ from ce_gym.viewer.rollouts.rollout import Rollout
 LOOPBACK = "127.0.0.1"
 MOST_CLIENTS = 16  # connections at a time, a thread each; more are closed at once
 PATIENCE = 10.0  # of a connection over which nothing comes or goes [s]
+MOST_BYTES = 1 << 14  # of a message from a page
 
 Events = Callable[[], Iterator[bytes]]
+Receive = Callable[[bytes], None]
 
 
 def show(
@@ -62,15 +64,17 @@ class PageServer:
     Args:
         text: The page.
         events: Gives what the page's browsers get as server-sent events from `events`; none if not given.
+        receive: Is given what browsers post to `messages`, in a thread of theirs; raises ValueError for what makes no
+            sense. None if not given.
 
     Attributes:
         url: Address of the page.
     """
 
-    def __init__(self, text: str, events: Events | None = None) -> None:
+    def __init__(self, text: str, events: Events | None = None, receive: Receive | None = None) -> None:
         path = f"/{secrets.token_urlsafe(16)}/"
         self._stop = threading.Event()
-        server = _Server((LOOPBACK, 0), _handler(text.encode("utf-8"), path, events))
+        server = _Server((LOOPBACK, 0), _handler(text.encode("utf-8"), path, events, receive))
         self.url = f"http://{LOOPBACK}:{server.server_port}{path}"
         self._thread = threading.Thread(target=_serve, args=(server, self._stop), daemon=True)
         self._thread.start()
@@ -122,14 +126,13 @@ class _Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-def _handler(body: bytes, path: str, events: Events | None) -> type[BaseHTTPRequestHandler]:
+def _handler(body: bytes, path: str, events: Events | None, receive: Receive | None) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"  # who posts often keeps the connection
         timeout = PATIENCE
 
         def do_GET(self) -> None:
-            server: Any = self.server
-            port = server.server_port
-            if self.headers.get("Host") not in (f"{LOOPBACK}:{port}", f"localhost:{port}"):
+            if not self._is_for_us():
                 self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             elif self.path == f"{path}events" and events is not None:
                 self._send_events(events())
@@ -139,17 +142,42 @@ def _handler(body: bytes, path: str, events: Events | None) -> type[BaseHTTPRequ
             else:
                 self.send_error(HTTPStatus.NOT_FOUND)
 
+        def do_POST(self) -> None:
+            length = self.headers.get("Content-Length", "")
+            if not self._is_for_us():
+                self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
+            elif self.path != f"{path}messages" or receive is None:
+                self.send_error(HTTPStatus.NOT_FOUND)
+            elif not length.isdecimal() or int(length) > MOST_BYTES:
+                self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+            else:
+                try:
+                    receive(self.rfile.read(int(length)))
+                except ValueError as problem:
+                    self.send_error(HTTPStatus.BAD_REQUEST, explain=" ".join(str(problem).split()))
+                    return
+                self.send_response(HTTPStatus.NO_CONTENT)
+                self.end_headers()
+
+        def _is_for_us(self) -> bool:
+            server: Any = self.server
+            port = server.server_port
+            return self.headers.get("Host") in (f"{LOOPBACK}:{port}", f"localhost:{port}")
+
         def _send_head(self, kind: str, length: int | None = None) -> None:
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", kind)
             self.send_header("Cache-Control", "no-store")
             self.send_header("Referrer-Policy", "no-referrer")
-            if length is not None:
+            if length is None:  # it ends with its connection
+                self.send_header("Connection", "close")
+            else:
                 self.send_header("Content-Length", str(length))
             self.end_headers()
 
         def _send_events(self, items: Iterator[bytes]) -> None:
             self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**16)  # who does not read is seen soon
+            self.close_connection = True
             self._send_head("text/event-stream")
             with contextlib.closing(items):  # type: ignore[type-var]
                 for item in items:

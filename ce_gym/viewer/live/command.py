@@ -1,0 +1,68 @@
+"""`python -m ce_gym live`: drive, push and throw a robot in a browser."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import threading
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+from ce_gym.policies import WHERE
+from ce_gym.viewer.console import examples, has_display
+
+
+def add_live_command(subparsers: Any) -> None:
+    """Add `live` to the subcommands of an argument parser."""
+    parser = subparsers.add_parser(
+        "live",
+        help="drive, push and throw a robot in a browser",
+        description="Let a robot walk in a browser on this machine, in real time, until Ctrl-C: drive it by keys, "
+        "stick or\ngamepad, pull it with the mouse, change ground, friction, load, transmission level and policy while "
+        "it runs.",
+        epilog=examples(
+            "live mini_cheetah_velocity",
+            "live mit_humanoid_velocity --ghost armature",
+            "live my_module:ce_gym/MyRobotVelocity-v0",
+        ),
+    )
+    parser.add_argument("name", metavar="NAME", help=f"{WHERE}; or the id of an environment, whose pose is held")
+    parser.add_argument("--env", metavar="ID", default="", help="environment to act in (default: as trained)")
+    parser.add_argument("--transmission", metavar="LEVEL", default="", help="level to begin with (default: as trained)")
+    parser.add_argument("--ghost", metavar="LEVEL", default="", help="level of a ghost beside it (default: none)")
+    parser.add_argument("--terrain", metavar="KIND", default="", help="ground to begin with (default: as trained)")
+    parser.add_argument("--folder", type=Path, default=Path(), help="where recordings are written (default: here)")
+    parser.add_argument(
+        "--open", action=argparse.BooleanOptionalAction, default=True, help="open a browser, if there is one"
+    )
+    parser.set_defaults(run=live)
+
+
+def live(args: argparse.Namespace) -> int:
+    """Run `live`; return its exit code."""
+    from ce_gym.viewer.live.setup import named
+    from ce_gym.viewer.page.html import meshcat_code
+
+    meshcat_code()  # a missing meshcat is told before all else
+    setup = named(args.name, args.env, transmission=args.transmission, ghost=args.ghost, terrain=args.terrain)
+    with contextlib.suppress(KeyboardInterrupt), serving(setup, args.folder) as url:
+        print(f"live at {url} (Ctrl-C to stop)", flush=True)
+        if args.open and has_display():
+            webbrowser.open(url, new=2)
+        threading.Event().wait()
+    return 0
+
+
+@contextlib.contextmanager
+def serving(setup: Any, folder: Path) -> Any:
+    """Run a setup and serve its page; yield the address."""
+    from ce_gym.viewer.live.page import live_page
+    from ce_gym.viewer.live.stage import Stage
+    from ce_gym.viewer.server import PageServer
+
+    with contextlib.closing(Stage(setup, folder)) as stage:
+        server = PageServer(live_page(stage), stage.feed.events, stage.receive)
+        with contextlib.closing(server):
+            stage.start()
+            yield server.url

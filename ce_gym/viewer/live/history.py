@@ -1,0 +1,82 @@
+"""The last seconds of a session: moments to look back at and to continue from."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """All robots at one time.
+
+    Attributes:
+        time: Since the session began [s].
+        poses: Positions of each robot, shape (nq,) each.
+        snapshots: What each continues from, bit for bit.
+    """
+
+    time: float
+    poses: tuple[Array, ...]
+    snapshots: tuple[Any, ...]
+
+
+class History:
+    """Keeps moments of the last `seconds`, oldest first."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._moments: deque[Moment] = deque()
+
+    def add(self, moment: Moment) -> None:
+        """Append the newest moment and forget those that are too old."""
+        self._moments.append(moment)
+        while self._moments[0].time < moment.time - self._seconds:
+            self._moments.popleft()
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._moments.clear()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Times of the oldest and the newest moment [s]."""
+        return self._moments[0].time, self._moments[-1].time
+
+    def around(self, time: float) -> tuple[Moment, Moment]:
+        """Return the moments before and after a time, the same one twice at an end."""
+        after = min(bisect_left(self._moments, time, key=lambda moment: moment.time), len(self._moments) - 1)
+        before = after if self._moments[after].time <= time else max(after - 1, 0)
+        return self._moments[before], self._moments[after]
+
+    def return_to(self, time: float) -> Moment:
+        """Forget what came after a time; return the last moment that is left, the oldest one at least."""
+        while len(self._moments) > 1 and self._moments[-1].time > time + 1e-9:
+            self._moments.pop()
+        return self._moments[-1]
+
+
+def between(before: Moment, after: Moment, time: float) -> tuple[Array, ...]:
+    """Return positions of the robots at a time between two moments, linear but for the length of quaternions.
+
+    The robots' bases are free: `q = [position (3), quaternion (4), joints]`.
+    """
+    length = after.time - before.time
+    share = 0.0 if length <= 0 else float(np.clip((time - before.time) / length, 0.0, 1.0))
+    return tuple(_blend(a, b, share) for a, b in zip(before.poses, after.poses, strict=True))
+
+
+def _blend(a: Array, b: Array, share: float) -> Array:
+    toward = b.copy()
+    if a[3:7] @ b[3:7] < 0:  # the same orientation
+        toward[3:7] *= -1
+    blended = (1 - share) * a + share * toward
+    blended[3:7] /= np.linalg.norm(blended[3:7])
+    return blended

@@ -1,0 +1,52 @@
+"""The text of a live page."""
+
+from __future__ import annotations
+
+import html
+import json
+import string
+from pathlib import Path
+
+from ce_gym.viewer.live.robot import RANGES
+from ce_gym.viewer.live.setup import GROUNDS, LEVELS
+from ce_gym.viewer.live.stage import Stage
+from ce_gym.viewer.page import three
+from ce_gym.viewer.page.html import meshcat_code, source
+from ce_gym.viewer.page.lights_and_camera import HORIZON
+
+_HERE = Path(__file__).parent
+
+
+def live_page(stage: Stage, title: str | None = None) -> str:
+    """Return the page of a stage.
+
+    Args:
+        stage: What runs.
+        title: Heading; the robot's name by default.
+
+    Raises:
+        ViewerError: meshcat is not installed.
+    """
+    scene = stage.scene
+    return string.Template((_HERE / "live.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(title or scene.robot.name),
+        meshcat=meshcat_code(),
+        ground=source("ground.js"),
+        live=(_HERE / "live.js").read_text(encoding="utf-8"),
+        commands=json.dumps(scene.commands()),
+        offer=json.dumps(_offer(stage)).replace("<", "\\u003c"),  # a name must not end the script
+        horizon=three.hex_color(HORIZON),
+    )
+
+
+def _offer(stage: Stage) -> dict[str, object]:
+    policies = [(name, Path(name).stem if Path(name).suffix else name) for name in stage.offered]
+    levels = [(name, name) for name in LEVELS]
+    choices = {
+        "policy": [*policies, ("", "none: hold the pose")],
+        "transmission": levels,
+        "ghost": [("", "none"), *levels],
+        "terrain": [(name, name) for name in GROUNDS],
+    }
+    bodies = {path: name for name, path in stage.scene.paths[0].items()}
+    return {"choices": choices, "figures": RANGES, "bodies": bodies}

@@ -1,0 +1,57 @@
+"""What a session records: a rollout of each robot, written as files and as one page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.viewer.live.robot import LiveRobot
+from ce_gym.viewer.page.html import write_html
+from ce_gym.viewer.rollouts.recorder import Recorder
+from ce_gym.viewer.rollouts.recording import reference
+
+Array = NDArray[np.float64]
+
+
+class LiveRecording:
+    """Collects frames of some robots from now on."""
+
+    def __init__(self, robots: Sequence[LiveRobot]) -> None:
+        self._dt = robots[0].dt
+        self._recorders = [
+            Recorder(
+                reference(robot.model.robot),
+                robot.model.transmission,
+                robot.dt,
+                label=robot.model.transmission,
+                terrain=robot.terrain,
+            )
+            for robot in robots
+        ]
+
+    def add(self, frames: Sequence[Mapping[str, Array]]) -> None:
+        """Append what `LiveRobot.frame` returns of each robot."""
+        for recorder, frame in zip(self._recorders, frames, strict=True):
+            time = len(recorder) * self._dt
+            recorder.add(time, frame["q"], frame["v"], command=frame["command"], torque=frame["torque"])
+
+    def write(self, folder: Path) -> Path | None:
+        """Write the rollouts and their page, and return the page; None if nothing was recorded."""
+        if not len(self._recorders[0]):
+            return None
+        page = _unused(folder)
+        rollouts = [recorder.rollout() for recorder in self._recorders]
+        for rollout in rollouts:
+            rollout.save(page.with_name(f"{page.stem}_{rollout.transmission}.npz"))
+        return write_html(rollouts, page, spacing=0.0)
+
+
+def _unused(folder: Path) -> Path:
+    """Return the name of a page that does not exist yet."""
+    number = 1
+    while (page := folder / f"live_{number}.html").exists():
+        number += 1
+    return page

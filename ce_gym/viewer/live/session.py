@@ -1,0 +1,193 @@
+"""A session: what a live page shows and what it may ask for. Knows no clock, no thread and no browser.
+
+Robots are stepped as time is given to the session: the one that is driven, and its ghost, which gets the same commands
+and the same pushes on another transmission level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ce_gym.viewer.live.history import History, Moment, between
+from ce_gym.viewer.live.pull import pulled
+from ce_gym.viewer.live.recording import LiveRecording
+from ce_gym.viewer.live.robot import LiveRobot
+
+Array = NDArray[np.float64]
+
+REMEMBERED = 30.0  # so far back can be gone [s]
+THROW = (0.0, 0.0, 2.5)  # change of velocity [m/s]
+DROP = 0.5  # how far it is lifted [m]
+
+
+class Session:
+    """Robots under one command.
+
+    Args:
+        robots: The one that is driven, then its ghost if there is one.
+
+    Attributes:
+        robots: The same.
+        command: Forward [m/s], sideways [m/s], yaw rate [rad/s].
+        paused: Whether time stands still.
+        speed: Seconds of simulation in a second.
+        time: That is shown [s].
+    """
+
+    def __init__(self, robots: list[LiveRobot]) -> None:
+        self.command, self.paused, self.speed, self.time = np.zeros(3), False, 1.0, 0.0
+        self._drag: tuple[str, Array, Array] | None = None
+        self.recording: LiveRecording | None = None
+        self.take(robots)
+
+    def take(self, robots: list[LiveRobot]) -> None:
+        """Go on with other robots, from where they are."""
+        self.robots, self.dt = robots, robots[0].dt
+        self._steps = 0
+        self._start = self.time
+        self._history = History(REMEMBERED)
+        self.recording = None
+        self._remember()
+
+    # Time.
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass in which nothing else is asked for [s]."""
+        if self.paused:
+            return
+        self.time += seconds * self.speed
+        while self._simulated < self.time:
+            self._step()
+
+    def step_once(self) -> None:
+        """Let one control step pass and stand still."""
+        self.pause(True)
+        self._continue_here()
+        self._step()
+        self.time = self._simulated
+
+    def pause(self, on: bool) -> None:
+        """Stop time, or let it go on from what is shown."""
+        if not on and self.paused:
+            self._continue_here()
+        self.paused = on
+
+    def look_back(self, seconds: float) -> None:
+        """Show what was some time before the newest moment, at rest [s]."""
+        self.paused = True
+        first, last = self._history.span
+        self.time = float(np.clip(last - seconds, first, last))
+
+    @property
+    def past(self) -> tuple[float, float]:
+        """How far back can be gone and how far back it is that is shown [s]."""
+        first, last = self._history.span
+        return last - first, max(last - self.time, 0.0)
+
+    @property
+    def _simulated(self) -> float:
+        return self._start + self._steps * self.dt
+
+    def _continue_here(self) -> None:
+        """Go back to the moment that is shown, if it is not the newest."""
+        moment = self._history.return_to(self.time)
+        if moment.time < self._simulated - self.dt / 2:
+            for robot, snapshot in zip(self.robots, moment.snapshots, strict=True):
+                robot.restore(snapshot)
+            self._start, self._steps, self.recording = moment.time, 0, None
+        self.time = self._simulated
+
+    def _step(self) -> None:
+        self._pull()
+        for robot in self.robots:
+            robot.step(self.command)
+        self._steps += 1
+        self._remember()
+        if self.recording:
+            self.recording.add([robot.frame() for robot in self.robots])
+
+    def _remember(self) -> None:
+        poses = tuple(robot.state()[0] for robot in self.robots)
+        self._history.add(Moment(self._simulated, poses, tuple(robot.snapshot() for robot in self.robots)))
+
+    def poses(self) -> tuple[Array, ...]:
+        """Return positions of the robots as they are shown, shape (nq,) each; at most one control step old."""
+        shown = self.time if self.paused else self.time - self.dt
+        return between(*self._history.around(shown), shown)
+
+    # What the robot is told and what is done to it.
+
+    def drive(self, shares: ArrayLike) -> None:
+        """Command shares from -1 to 1 of what the task commands forward, to the left and in turning."""
+        low, high = self.robots[0].command_range.T
+        shares = np.clip(np.asarray(shares, float), -1.0, 1.0)
+        self.command = np.where(shares < 0, -shares * low, shares * high)
+
+    def drag(self, body: str, point: ArrayLike, target: ArrayLike) -> None:
+        """Pull a point of a body, in its frame [m], towards a place in the world [m], until `release`."""
+        self._drag = body, np.asarray(point, float), np.asarray(target, float)
+
+    @property
+    def pulled(self) -> str | None:
+        """The body that is dragged."""
+        return self._drag[0] if self._drag else None
+
+    def release(self) -> None:
+        """Let go."""
+        self._drag = None
+
+    def _pull(self) -> None:
+        """Let the drag act for a control step."""
+        if self._drag:
+            for robot in self.robots:
+                q, v = robot.state()
+                robot.write(q, pulled(robot.model, q, v, self.dt, *self._drag))
+
+    def throw(self) -> None:
+        """Throw the robots into the air."""
+
+        def thrown(robot: LiveRobot, q: Array, v: Array) -> tuple[Array, Array]:
+            base = robot.model.body_poses(q)[1][0]
+            return q, v + np.r_[np.zeros(3), base.T @ THROW, np.zeros(len(v) - 6)]
+
+        self._change(thrown)
+
+    def drop(self) -> None:
+        """Lift the robots and let them fall."""
+        self._change(lambda robot, q, v: (q + np.r_[0.0, 0.0, DROP, np.zeros(len(q) - 3)], 0 * v))
+
+    def align_ghost(self) -> None:
+        """Put the ghost where the robot is."""
+        q, v = self.robots[0].state()
+        for ghost in self.robots[1:]:
+            ghost.write(q, v)
+
+    def reset(self) -> None:
+        """Let all robots stand up where episodes begin, in one place."""
+        for robot in self.robots:
+            robot.reset()
+        self.align_ghost()
+
+    def set_figures(self, figures: Mapping[str, float]) -> None:
+        """Change friction or added mass; see `live.robot.RANGES`."""
+        for robot in self.robots:
+            robot.set_figures(figures)
+
+    def _change(self, change: Callable[[LiveRobot, Array, Array], tuple[Array, Array]]) -> None:
+        for robot in self.robots:
+            robot.write(*change(robot, *robot.state()))
+
+    # What is kept.
+
+    def record(self, on: bool) -> LiveRecording | None:
+        """Begin to record, or end it and return what was recorded."""
+        done, self.recording = self.recording, LiveRecording(self.robots) if on else None
+        return None if on else done
+
+    def close(self) -> None:
+        """Give back what the environments hold."""
+        for robot in self.robots:
+            robot.close()

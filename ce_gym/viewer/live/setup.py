@@ -1,0 +1,92 @@
+"""What a live page shows, in words: which policy, on which levels, on which ground. Makes the robots of a session."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ce_gym.policies import environment_of, find_policy, load_policy, shipped_policies
+from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.live.robot import Act, LiveRobot
+
+LEVELS = ("exact", "coupled", "armature", "none")
+GROUNDS: Mapping[str, Mapping[str, Any]] = {
+    "flat": {"kind": "flat"},
+    **{kind: {"kind": kind, "curriculum": False, "levels": 2} for kind in ("slope", "rough", "stairs")},
+}
+"""Grounds that can be chosen: other than flat, half of their field is level, half has the task's figure."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is shown.
+
+    Attributes:
+        policy: A file, a folder or the name of a shipped policy; "" for none, which holds the standing pose.
+        env_id: Registered environment id; the one that the policy was trained in if "".
+        transmission: Level of the robot; the policy's own if "".
+        ghost: Level of its ghost, "" for no ghost.
+        terrain: Kind of the ground; the policy's own if "".
+        kwargs: Further arguments of the environment.
+
+    Raises:
+        ViewerError: There is neither a policy nor an environment.
+    """
+
+    policy: str = ""
+    env_id: str = ""
+    transmission: str = ""
+    ghost: str = ""
+    terrain: str = ""
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.policy and not self.env_id:
+            raise ViewerError("nothing to show: expected a policy or an environment")
+        for name, known in (("transmission", LEVELS), ("ghost", LEVELS), ("terrain", tuple(GROUNDS))):
+            if getattr(self, name) not in ("", *known):
+                raise ViewerError(f"{name}={getattr(self, name)!r}; expected one of {', '.join(known)}")
+
+    def changed(self, changes: Mapping[str, str]) -> Setup:
+        """Return the setup with some attributes replaced; another policy brings its own environment, none keeps it."""
+        env_id = self._policy()[1] if changes.get("policy") == "" else "" if "policy" in changes else self.env_id
+        return replace(self, **{"env_id": env_id, **changes})
+
+    def robots(self) -> list[LiveRobot]:
+        """Make the robot, and its ghost; compiles what is not in the cache yet.
+
+        Raises:
+            PolicyError: If the policy's file is missing, damaged or of another robot.
+            ViewerError: If the environment cannot be made.
+        """
+        act, env_id, kwargs = self._policy()
+        if self.terrain:
+            kwargs["terrain"] = GROUNDS[self.terrain]
+        levels = [self.transmission or kwargs.get("transmission", LEVELS[0]), *([self.ghost] if self.ghost else [])]
+        return [LiveRobot(env_id, act, **{**kwargs, "transmission": level}) for level in levels]
+
+    def _policy(self) -> tuple[Act | None, str, dict[str, Any]]:
+        if not self.policy:
+            return None, self.env_id, dict(self.kwargs)
+        policy = load_policy(self.policy)
+        env_id = environment_of(policy.record, self.env_id or None)
+        kwargs = {**policy.record["env_kwargs"], **self.kwargs}
+        return (lambda observation: policy.predict(observation)[0]), env_id, kwargs
+
+
+def named(name: str, env_id: str = "", **options: Any) -> Setup:
+    """Return the setup for a name that may be a policy's or an environment's id."""
+    if find_policy(name) is not None or not _looks_like_id(name):
+        return Setup(policy=name, env_id=env_id, **options)
+    return Setup(env_id=env_id or name, **options)
+
+
+def _looks_like_id(name: str) -> bool:
+    return name.rpartition("-v")[2].isdecimal()
+
+
+def policies_for(robot: str, also: Sequence[str] = ()) -> list[str]:
+    """Return the policies that a page offers for a robot: those given, then the shipped ones."""
+    shipped = [name for name in shipped_policies() if name.startswith(f"{robot}_")]
+    return list(dict.fromkeys([*(name for name in also if name), *shipped]))
