@@ -14,6 +14,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from ce_gym.compile import CriticalSection
+from ce_gym.envs.differentiable import DifferentiableEnv
 from ce_gym.envs.policy_spec import contract
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
@@ -150,6 +151,14 @@ class BaseEnv(EzPickle):
     def symmetry(self) -> Symmetry | None:
         """The left-right reflection of observations and actions, None if the robot or its task has none."""
         return left_right(self.batch.program)
+
+    def differentiable(self, largest: float = np.inf) -> DifferentiableEnv:
+        """Return this environment's control steps with gradients; see `DifferentiableEnv`.
+
+        Args:
+            largest: A robot's carried gradient is shortened to this norm between control steps.
+        """
+        return DifferentiableEnv(self, largest)
 
     @cached_property
     def _look(self) -> ca.Function:

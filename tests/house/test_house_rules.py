@@ -38,7 +38,7 @@ LAYERS = {
     "dynamics": "algebra constraints standing recursion forces functions derivatives stepping evaluation model",
     "sim": "tiles devices terrain placement substeps kernel_key kernels schema batch pieces retry simulator"
     " derivatives",
-    "envs": "terms task runtime policy_spec base rendering single vector registration custom",
+    "envs": "terms task runtime policy_spec differentiable base rendering single vector registration custom",
     "viewer": "errors console rollouts page raytrace server feed window renderers live cli",
     "bench": "measure peers friction instructions soak digests fuzz speed throughput paper accuracy stability"
     " gpu __main__",

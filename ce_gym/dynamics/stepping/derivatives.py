@@ -27,14 +27,19 @@ def iterations_of(mechanism: Mechanism, options: StepOptions) -> int:
     return 1 + min(plan.stages[0].iterations, iterations_needed(mechanism, options)) if alone else 1
 
 
-def primal_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+def primal_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
     """Trace what is differentiated: an iteration of the step, or the step itself if that is one expression."""
     whole = iterations_of(mechanism, options) == 1
-    return step_function(mechanism, options) if whole else iteration_function(mechanism, options)
+    return (step_function if whole else iteration_function)(mechanism, options, outputs)
 
 
-def adjoint_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+def adjoint_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
     """Trace the reverse mode of one iteration.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+        outputs: Names among `OUTPUTS` that something depends on besides the state; each has weights `w_{name}`.
 
     Returns:
         Function (*inputs of `primal_function`, `w_{part}` of the state after the step, `sums`, `pending`, `active`,
@@ -43,17 +48,19 @@ def adjoint_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
         ended the step has been met; where `active` is 0 nothing changes; `owed` is the gradient to the iterate, if
         there is one.
     """
-    primal, floating = primal_function(mechanism, options), mechanism.robot.floating
+    primal, floating = primal_function(mechanism, options, outputs), mechanism.robot.floating
     inputs = {name: SX.sym(name, primal.numel_in(i)) for i, name in enumerate(primal.name_in())}
     after = dict(zip(primal.name_out(), primal.call(list(inputs.values())), strict=True))
     weights = {
         f"w_{name}": SX.sym(f"w_{name}", size - (1 if name == "q" and floating else 0))
         for name, size in state_parts(primal).items()
     }
+    weights |= {f"w_{name}": SX.sym(f"w_{name}", primal.numel_out(name)) for name in outputs}
     pending, active = SX.sym("pending"), SX.sym("active")
     last = ca.logic_and(pending, active)
     seeds = [ca.if_else(last, _ambient(name, after, weights[f"w_{name}"], floating), 0) for name in state_parts(primal)]
-    results = [after[f"{name}_next"] for name in state_parts(primal)]
+    seeds += [ca.if_else(last, weights[f"w_{name}"], 0) for name in outputs]
+    results = [*(after[f"{name}_next"] for name in state_parts(primal)), *(after[name] for name in outputs)]
     owed = SX.sym("owed", inputs["iterate"].numel() if "iterate" in inputs else 0)
     if owed.numel():
         seeds.append(owed)

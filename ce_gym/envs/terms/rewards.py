@@ -6,6 +6,8 @@ is a rate: a task multiplies it by its weight and by the control step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
@@ -21,6 +23,16 @@ def track_linear_velocity(s: TermContext, width: float = 0.25) -> SX:
 def track_angular_velocity(s: TermContext, width: float = 0.25) -> SX:
     """Follow the commanded yaw rate; 1 if exact, 1/e where the squared error is `width` [(rad/s)^2]."""
     return ca.exp(-((s.command[2] - s.base_angular_velocity[2]) ** 2) / width)
+
+
+def linear_velocity_error(s: TermContext) -> SX:
+    """Difference to the commanded horizontal velocity, squared [(m/s)^2]."""
+    return ca.sumsqr(s.command[:2] - s.base_linear_velocity[:2])
+
+
+def yaw_rate_error(s: TermContext) -> SX:
+    """Difference to the commanded yaw rate, squared [(rad/s)^2]."""
+    return (s.command[2] - s.base_angular_velocity[2]) ** 2
 
 
 def linear_velocity_z(s: TermContext) -> SX:
@@ -118,6 +130,19 @@ def gait(s: TermContext) -> SX:
     swing = ca.vertcat(*[ca.sin(s.phase + np.pi * i) > 0 for i in range(s.foot_contact.numel())])
     wanted = ca.if_else(s.commanded_to_move, 1 - swing, 1)
     return ca.sum1(1 - 2 * ca.fabs(wanted - s.foot_contact))
+
+
+def swing_height(s: TermContext, height: float = 0.06, offsets: Sequence[float] = (0.0, 0.5)) -> SX:
+    """Distances of feet from the heights that the gait's clock wants, squared [m^2].
+
+    A foot swings during half of the cycle, up to `height` [m] and down again; `offsets` are shares of the cycle by
+    which feet are ahead, the first one again after the last. While no motion is commanded all stand.
+    """
+    total, moving = SX(0), s.commanded_to_move
+    for i in range(s.foot_heights.numel()):
+        lift = ca.fmax(0, ca.sin(s.phase + 2 * np.pi * offsets[i % len(offsets)]))
+        total += (s.foot_heights[i] - ca.if_else(moving, height * lift, 0)) ** 2
+    return total
 
 
 def foot_slip(s: TermContext) -> SX:
