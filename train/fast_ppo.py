@@ -12,6 +12,7 @@ of ce_gym only, and no name of a robot or task.
 
 from __future__ import annotations
 
+import io
 import json
 import time
 import zipfile
@@ -28,6 +29,7 @@ from job import CHECKPOINTS, Job, Trained, make_record
 from job import main as run_jobs
 from numpy.typing import NDArray
 from progress import Curve, Log, ProgressBar, RecentEpisodes, StopInOrder, adapted_rate, geometric, linear, read_curve
+from run_folder import going_on, make_folder, save_somewhere, write_whole
 
 try:
     from loops import adam, advantages_of, drawn
@@ -279,7 +281,7 @@ def train(job: Job) -> Trained:
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
-    job.out.mkdir(parents=True, exist_ok=True)
+    make_folder(job.out)
     options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
     mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
     n = job.settings.num_envs
@@ -314,22 +316,26 @@ def _learn(learner: FastPPO, job: Job) -> Trained:
             bar.advance(learner.steps)
             bar.describe(means, learner.step_seconds, learner.collect_seconds)
             if learner.steps // every > before and learner.steps < s.steps:
-                save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
+                with going_on():
+                    save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
         bar.close()
     written = record(finished=not stop.interrupted)
-    policy = save(learner, written, job.out / "policy")
+    policy = save_somewhere(lambda folder: save(learner, written, folder / "policy"), job.out)
     return Trained(Policy(learner.actor(), written), written, policy, stop.interrupted)
 
 
 def save(learner: FastPPO, record: dict[str, Any], path: Path) -> Path:
-    """Write `path`.npz, .json and .learner.npz, each whole or not at all, and return the path of the policy."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = [path.with_name(f".{path.name}{kind}") for kind in (".learner.npz", ".json", ".npz")]
-    np.savez(fresh[0], allow_pickle=False, **learner.state())
-    fresh[1].write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    write_npz(learner.actor(), record, fresh[2])
-    for file in fresh:
-        file.replace(path.with_name(file.name[1:]))
+    """Write `path`.npz, .json and .learner.npz, all or none, and return the path of the policy.
+
+    Raises:
+        OSError: If they cannot be written.
+    """
+    state, policy = io.BytesIO(), io.BytesIO()
+    np.savez(state, allow_pickle=False, **learner.state())
+    write_npz(learner.actor(), record, policy)
+    text = json.dumps(record, indent=2) + "\n"
+    files = {".learner.npz": state.getvalue(), ".json": text.encode(), ".npz": policy.getvalue()}
+    write_whole({path.with_name(path.name + kind): data for kind, data in files.items()})
     return path.with_name(f"{path.name}.npz")
 
 

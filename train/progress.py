@@ -117,7 +117,8 @@ class Log:
 
     def __init__(self, file: Path) -> None:
         self.file, self.columns = file, []
-        file.write_text("", encoding="utf-8")
+        with going_on():
+            file.write_text("", encoding="utf-8")
 
     def add(self, steps: int, seconds: float, means: dict[str, float], figures: dict[str, float]) -> None:
         """Write one row, from the first episode that ends on."""
@@ -126,7 +127,7 @@ class Log:
         rollout = {"rollout/ep_rew_mean": means["r"], "rollout/ep_len_mean": means["l"]}
         times = {"time/total_timesteps": steps, "time/time_elapsed": round(seconds, 3)}
         row = times | rollout | {key: mean for key, mean in means.items() if key not in ("r", "l")} | figures
-        with self.file.open("a", newline="", encoding="utf-8") as file:
+        with going_on(), self.file.open("a", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             if not self.columns:
                 self.columns = list(row)

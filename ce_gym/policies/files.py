@@ -15,7 +15,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +86,7 @@ def read_actor(path: str | Path) -> tuple[Actor, dict[str, Any]]:
     return actor, record
 
 
-def write_npz(actor: Actor, record: Mapping[str, Any], out: Path) -> None:
+def write_npz(actor: Actor, record: Mapping[str, Any], out: Path | BinaryIO) -> None:
     """Write an actor's weights, float32, and its record, as JSON, into one file that numpy reads without unpickling.
 
     Raises:

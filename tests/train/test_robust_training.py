@@ -14,6 +14,7 @@ import pytest
 import torch
 from card import main as card_main
 from evaluate import main as evaluate_main
+from fast_ppo import train as train_fast
 from job import Job
 from point_mass import ID
 from ppo import main, make_learner, train
@@ -193,30 +194,37 @@ class FullDisk:
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
 
-def test_training_goes_on_if_there_is_no_room_for_a_checkpoint(tmp_path, capsys, monkeypatch):
+both = pytest.mark.parametrize("learn", [train, train_fast], ids=["reference", "fast"])
+
+
+@both
+def test_training_goes_on_if_there_is_no_room_for_a_checkpoint(learn, tmp_path, capsys, monkeypatch):
     FullDisk(monkeypatch, "checkpoints")
-    result = train(job(tmp_path, 2048))
-    assert result.record["steps"] >= 2048
-    load_learner(result.policy)
+    result = learn(job(tmp_path, 2048))
+    assert load_policy(result.policy).record["steps"] >= 2048
     warnings = [line for line in capsys.readouterr().err.splitlines() if "No space left on device" in line]
     assert len(warnings) >= 3
     assert all("training goes on" in line for line in warnings)
     assert not [path for path in (tmp_path / "checkpoints").glob("*") if path.is_file()]
 
 
-def test_a_policy_that_has_no_room_goes_elsewhere(tmp_path, capsys, monkeypatch):
+@both
+def test_a_policy_that_has_no_room_goes_elsewhere(learn, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     FullDisk(monkeypatch, "/run/")
-    result = train(job(tmp_path / "run"))
-    assert load_learner(result.policy)[0].num_timesteps >= 512
+    result = learn(job(tmp_path / "run"))
+    assert load_policy(result.policy).record["steps"] >= 512
     assert result.policy.parent.parent == tmp_path
     assert f"saving to {result.policy.parent}" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-def test_training_goes_on_if_there_is_no_room_for_its_curve(tmp_path, capsys):
-    (tmp_path / "curve.csv").symlink_to("/dev/full")
-    assert train(job(tmp_path, 4096)).policy.exists()
+@pytest.mark.parametrize(
+    ("learn", "file"), [(train, "curve.csv"), (train_fast, "curve.csv"), (train_fast, "progress.csv")]
+)
+def test_training_goes_on_if_there_is_no_room_for_its_curve(learn, file, tmp_path, capsys):
+    (tmp_path / file).symlink_to("/dev/full")
+    assert learn(job(tmp_path, 4096)).policy.exists()
     assert "No space left on device; training goes on" in capsys.readouterr().err
 
 
