@@ -19,35 +19,36 @@ from typing import Any
 
 from console import EPISODES, Parser, Table, add_json_argument, markdown, print_result, run, whole
 from effort import effort
-from evaluate import EVALUATION_SEED, add_env_argument, evaluate
+from evaluate import add_env_argument, evaluate
 from pictures import draw_curve
 from progress import read_curve
 from pushes import direction_name, push_envelope
 from settings import config_file, load_settings
+from suites import judge_suites, level_table, suite_table, weights_seed
 from transfer import LEVELS
 
 from ce_gym.policies import Policy, PolicyError, environment_of, locate_policy, read_actor, shelf, write_npz
 
 
-def judged(policy: Policy, episodes: int, sim2sim_robots: int, seed: int = EVALUATION_SEED) -> dict[str, Any]:
+def judged(policy: Policy, episodes: int, sim2sim_robots: int) -> dict[str, Any]:
     """Judge a policy for its card.
 
     Args:
         policy: With its record.
-        episodes: Episodes on each level.
+        episodes: Episodes on each level, and of each suite.
         sim2sim_robots: Robots in MuJoCo; 0 leaves that out.
-        seed: Of the first episode.
 
     Returns:
-        levels: result of `evaluate` by level; effort and pushes, on the level of training; sim2sim, or sim2sim_missing,
-        one line that says why there is none.
+        seed: of everything, that which the weights give; levels: result of `evaluate` by level; suites, effort and
+        pushes, on the level of training; sim2sim, or sim2sim_missing, one line that says why there is none.
     """
-    record, kwargs = policy.record, policy.record["env_kwargs"]
+    record, kwargs, seed = policy.record, policy.record["env_kwargs"], weights_seed(policy)
     levels = {
         level: evaluate(policy, record["env"], episodes=episodes, seed=seed, **{**kwargs, "transmission": level})
         for level in LEVELS
     }
-    result: dict[str, Any] = {"levels": levels, "effort": effort(policy, seed=seed, **kwargs)}
+    result: dict[str, Any] = {"seed": seed, "levels": levels, "effort": effort(policy, seed=seed, **kwargs)}
+    result["suites"] = judge_suites(policy, episodes, seed, **kwargs)
     result["pushes"] = push_envelope(policy, seed=seed, **kwargs)
     if not sim2sim_robots:
         return result | {"sim2sim_missing": "not asked for"}
@@ -120,7 +121,9 @@ def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, f
         f"# {name}",
         f"{markdown(facts)}\n\n{_how_to_repeat(record)}",
         *(["![Learning curve](curve.png)"] if curve else []),
-        f"## On every transmission level\n\n{_levels(record, result['levels'])}",
+        f"## On every transmission level\n\n{_levels(record, result)}",
+        *_on_terrain(record, result["levels"]),
+        f"## By what is asked for\n\n{suite_table(result['suites'])}\n\nOn the level of training.",
         *([f"## Motors\n\n{_motors(result['effort'])}"] if result["effort"] else []),
         f"## Pushes\n\n{_pushes(result['pushes'])}",
         f"## In MuJoCo\n\n{_sim2sim(result)}",
@@ -136,15 +139,22 @@ def _how_to_repeat(record: dict[str, Any]) -> str:
         return f"No single command repeats it: {error}"
 
 
-def _levels(record: dict[str, Any], levels: dict[str, dict[str, float]]) -> str:
+def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:
     titles = ["judged on", "forward [m/s]", "sideways [m/s]", "yaw rate [rad/s]", "falls", "reward"]
     keys = (("forward_error", ".3f"), ("lateral_error", ".3f"), ("yaw_rate_error", ".3f"), ("falls", ".1%"))
     rows = [titles]
-    for level, figures in levels.items():
+    for level, figures in result["levels"].items():
         own = " (trained)" if level == record["transmission"] else ""
         rows.append([f"`{level}`{own}", *(f"{figures[key]:{form}}" for key, form in (*keys, ("reward", ".2f")))])
     count, length = figures["episodes"], record["contract"]["control_dt"]
-    return f"{markdown(rows)}\n\nMean absolute errors over every step of {count} episodes; a step is {length:g} s."
+    errors = f"Mean absolute errors over every step of {count} episodes of the mean action; a step is {length:g} s."
+    return f"{markdown(rows)}\n\n{errors} Seed {result['seed']}: the first 32 bits of the SHA-256 of the weights."
+
+
+def _on_terrain(record: dict[str, Any], levels: dict[str, dict[str, Any]]) -> list[str]:
+    """The section on the levels of the ground, if it has some."""
+    found = levels.get(record["transmission"], {}).get("levels")
+    return [f"## On every level of the ground\n\n{level_table(found)}"] if found else []
 
 
 def _motors(found: dict[str, Any]) -> str:
@@ -209,7 +219,7 @@ def main(argv: list[str] | None = None) -> int:
     where.add_argument("--out", type=Path, metavar="FOLDER", help="where to write (default: the run's folder)")
     where.add_argument("--ship", action="store_true", help="write to assets/policies/<robot>_<task>_<level>")
     parser.add_argument(
-        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes on each level (default 256)"
+        "--episodes", type=EPISODES, default=2048, metavar="N", help="episodes on each level (default 2048)"
     )
     parser.add_argument(
         "--robots", type=whole(0, 100_000), default=50, metavar="N", help="robots in MuJoCo; 0: none (default 50)"

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 from console import EPISODES, SEED, THREADS, Parser, above_zero, run
-from evaluate import EVALUATION_SEED, report
+from evaluate import report
 from job import Job, Trained
 from settings import config_file, load_settings
+from suites import EVALUATION_SEED
 from transfer import summary, table, transfer
 
 from ce_gym import usable_cores

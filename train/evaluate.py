@@ -1,10 +1,10 @@
 """Judge a trained policy: how well it follows its commands, how often it falls, what it asks of the motors.
 
-Every environment of a batch plays exactly one whole episode, so that short episodes do not count more often than
-long ones. Uses public names of ce_gym only, and no name of a robot or task.
+By the mean action, from a seed that the weights give. Uses public names of ce_gym only, and no name of a robot or
+task.
 
     python train/evaluate.py runs/mini_cheetah_velocity --transmission armature
-    python train/evaluate.py policy.onnx --pushes --json result.json
+    python train/evaluate.py policy.onnx --suites --pushes --json result.json
 """
 
 from __future__ import annotations
@@ -14,19 +14,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from console import EPISODES, SEED, Parser, add_json_argument, print_result, run
+from console import EPISODES, Parser, add_json_argument, print_result, run, whole
 from effort import effort
+from episodes import play
 from pushes import push_envelope, push_table
+from suites import everywhere, judge_suites, level_table, suite_table, weights_seed
 
-from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
+from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.policies import WHERE, Policy, environment_of, load_policy
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
-EVALUATION_SEED = 1_000_000
-"""Far from training seeds, so that a policy is judged on commands and starts it has not met."""
+WEIGHTS_SEED = whole(0, 2**32 - 1)
+"""Reads a seed of judging, which may be as large as 32 bits of a policy's weights."""
 
 
 def load(path: str | Path, env: str | None = None, transmission: str | None = None) -> Policy:
@@ -52,15 +53,17 @@ def env_kwargs(record: dict[str, Any], transmission: str | None = None) -> dict[
 
 
 def evaluate(
-    model: PPO | Policy, env_id: str, *, episodes: int = 256, seed: int = EVALUATION_SEED, **kwargs: Any
-) -> dict[str, float]:
+    model: PPO | Policy, env_id: str, *, episodes: int = 256, seed: int | None = None, **kwargs: Any
+) -> dict[str, Any]:
     """Play one episode in each of `episodes` environments with the policy's mean action.
+
+    Curricula are left out: a robot begins on any level of the ground, and may be given any command.
 
     Args:
         model: The policy.
         env_id: Registered environment id.
         episodes: Number of episodes, played side by side.
-        seed: Of the first environment.
+        seed: Of the first environment; None takes the one that the policy's weights give, see `suites.weights_seed`.
         **kwargs: Given to the environment, such as `transmission`.
 
     Returns:
@@ -68,64 +71,15 @@ def evaluate(
         actual base velocity, in base coordinates, over every step of every episode; velocity_error [m/s]: the same of
         the length of the horizontal difference. falls, timed_out, diverged: fraction of episodes that ended early,
         that lasted to the end, and that were stopped because the state was no longer finite. episode_length [s],
-        reward: means over episodes. episodes: their number. Other entries are means of what the task reports itself.
+        reward: means over episodes. episodes: their number. seed: what was used. levels, where the ground has some:
+        errors, falls and number of episodes of each. Other entries are means of what the task reports itself.
     """
-    envs = make_sb3_vec_env(env_id, episodes, seed, **kwargs)
+    seed = weights_seed(model) if seed is None else seed
+    envs = make_sb3_vec_env(env_id, episodes, seed, **everywhere(env_id, kwargs))
     try:
-        return _play(model, envs)
+        return play(model, envs) | {"seed": seed}
     finally:
         envs.close()
-
-
-def _play(model: PPO | Policy, envs: SB3VecEnv) -> dict[str, float]:
-    """Step until every environment has ended its first episode."""
-    native: Any = envs.envs.unwrapped
-    period = 1.0 / native.metadata["render_fps"]
-    errors, ended = [], {}
-    obs = envs.reset()
-    running = np.ones(envs.num_envs, bool)
-    while running.any():
-        command = native.state()["command"]  # the one the observation shows
-        action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
-        obs, _, dones, infos = envs.step(action)
-        state = native.state()
-        going = running & ~dones  # an environment that is done shows its next episode already
-        errors.append((planar_velocity(state["v"]) - command)[going])
-        ended |= {i: infos[i] for i in np.flatnonzero(running & dones)}
-        running &= ~dones
-    return _summary(np.concatenate(errors), list(ended.values()), period)
-
-
-def planar_velocity(v: np.ndarray) -> np.ndarray:
-    """Forward and lateral speed [m/s] and yaw rate [rad/s] of the base, shape (n, 3); `v` has angular part first."""
-    return np.stack([v[:, 3], v[:, 4], v[:, 2]], axis=1)
-
-
-def tracking(errors: np.ndarray) -> dict[str, float]:
-    """Means of how far velocities (n, 3) are from those commanded, by name; not a number if there are none."""
-    if not len(errors):
-        errors = np.full((1, 3), np.nan)
-    forward, lateral, yaw = np.abs(errors).mean(axis=0).tolist()
-    velocity = float(np.hypot(errors[:, 0], errors[:, 1]).mean())
-    return {"forward_error": forward, "lateral_error": lateral, "yaw_rate_error": yaw, "velocity_error": velocity}
-
-
-def _summary(errors: np.ndarray, ended: list[dict[str, Any]], period: float) -> dict[str, float]:
-    """Means over steps (errors) and over episodes (the rest)."""
-    episodes = [info["episode"] for info in ended]
-    mean = {key: float(np.mean([episode[key] for episode in episodes])) for key in episodes[0] if key != "t"}
-    timed_out = np.array([info["TimeLimit.truncated"] for info in ended])
-    diverged = np.array([info["diverged"] for info in ended])
-    return {
-        **tracking(errors),
-        "falls": float(np.mean(~timed_out & ~diverged)),
-        "timed_out": float(np.mean(timed_out & ~diverged)),
-        "diverged": float(np.mean(diverged)),
-        "episode_length": mean.pop("l") * period,
-        "reward": mean.pop("r"),
-        "episodes": len(ended),
-        **mean,
-    }
 
 
 def report(result: dict[str, Any]) -> str:
@@ -135,7 +89,7 @@ def report(result: dict[str, Any]) -> str:
         ("lateral speed error", f"{result['lateral_error']:.3f} m/s", ""),
         ("yaw rate error", f"{result['yaw_rate_error']:.3f} rad/s", ""),
         ("velocity error", f"{result['velocity_error']:.3f} m/s", "horizontal, mean length"),
-        ("falls", f"{result['falls']:.1%}", f"of {result['episodes']} episodes"),
+        ("falls", f"{result['falls']:.1%}", f"of {result['episodes']} episodes, seed {result['seed']}"),
         ("time-outs", f"{result['timed_out']:.1%}", "on its feet to the end"),
         ("episode length", f"{result['episode_length']:.1f} s", "mean"),
         ("reward per episode", f"{result['reward']:.2f}", ""),
@@ -143,7 +97,12 @@ def report(result: dict[str, Any]) -> str:
     if result["diverged"]:
         rows.append(("diverged", f"{result['diverged']:.1%}", "stopped because numbers went astray"))
     lines = [f"{name:<20} {figure:<12} {note}".rstrip() for name, figure, note in rows + _effort_rows(result)]
-    return "\n".join(lines) + (f"\n\n{push_table(result['pushes'])}" if "pushes" in result else "")
+    tables = [table(result[key]) for key, table in TABLES.items() if key in result]
+    return "\n\n".join(["\n".join(lines), *tables])
+
+
+TABLES = {"levels": level_table, "suites": suite_table, "pushes": push_table}
+"""What is shown below the figures, if it was judged."""
 
 
 def _effort_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -170,12 +129,13 @@ def add_env_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env", metavar="ID", help=text + "the policy's file names is not imported")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser, episodes: int) -> None:
     """Arguments shared by the programs that judge policies, apart from the policies and `--env`."""
     parser.add_argument(
-        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes, side by side (default 256)"
+        "--episodes", type=EPISODES, default=episodes, metavar="N", help=f"episodes, side by side (default {episodes})"
     )
-    parser.add_argument("--seed", type=SEED, default=EVALUATION_SEED, help="seed of the first episode")
+    text = "seed of the first episode (default: the first 32 bits of the SHA-256 of the policy's weights)"
+    parser.add_argument("--seed", type=WEIGHTS_SEED, metavar="N", help=text)
     add_json_argument(parser)
 
 
@@ -190,8 +150,10 @@ def main(argv: list[str] | None = None) -> int:
         "--transmission", metavar="LEVEL", help="exact, coupled, armature or none (default: as trained)"
     )
     parser.add_argument("--pushes", action="store_true", help="also push it, from all sides, harder and harder")
+    text = "also judge it on commands that jump, standing, turning in place, going backwards, and pushed"
+    parser.add_argument("--suites", action="store_true", help=text)
     add_env_argument(parser)
-    add_arguments(parser)
+    add_arguments(parser, episodes=2048)
     args = parser.parse_args(argv)
     return run("evaluate.py", lambda: _judge(args))
 
@@ -201,10 +163,13 @@ def _judge(args: argparse.Namespace) -> int:
     model = load(args.policy, args.env, args.transmission)
     kwargs = env_kwargs(model.record, args.transmission)
     result: dict[str, Any] = evaluate(model, model.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
-    if found := effort(model, episodes=min(args.episodes, 32), seed=args.seed, **kwargs):
+    seed = result["seed"]
+    if found := effort(model, episodes=min(args.episodes, 32), seed=seed, **kwargs):
         result["effort"] = found
+    if args.suites:
+        result["suites"] = judge_suites(model, args.episodes, seed, **kwargs)
     if args.pushes:
-        result["pushes"] = push_envelope(model, seed=args.seed, **kwargs)
+        result["pushes"] = push_envelope(model, seed=seed, **kwargs)
     print_result(result, report(result), args.json)
     return 0
 

@@ -242,6 +242,6 @@ def _train_all(program: str, train: Callable[[Job], Trained], args: argparse.Nam
         if trained.interrupted:
             print(f"interrupted; go on with: python train/{program} --resume {trained.policy}")
             return 130
-        result = evaluate(trained.model, job.env_id, episodes=args.episodes, **job.env_kwargs)
+        result = evaluate(load_policy(trained.policy), job.env_id, episodes=args.episodes, **job.env_kwargs)
         print(report(result), flush=True)
     return 0

@@ -16,9 +16,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from console import EPISODES, SEED, Parser, above_zero, add_json_argument, print_result, run
-from evaluate import EVALUATION_SEED, add_env_argument, env_kwargs, load, planar_velocity, tracking
+from console import EPISODES, Parser, above_zero, add_json_argument, print_result, run
+from episodes import planar_velocity, tracking
+from evaluate import WEIGHTS_SEED, add_env_argument, env_kwargs, load
 from numpy.typing import NDArray
+from suites import weights_seed
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
 from ce_gym.policies import WHERE, Policy, PolicyError
@@ -172,7 +174,7 @@ def compare(
     episodes: int = 50,
     seconds: float = 10.0,
     every: float = float("inf"),
-    seed: int = EVALUATION_SEED,
+    seed: int | None = None,
 ) -> dict[str, Any]:
     """Play the same course with our dynamics, at the level of training and the two of MuJoCo, and with MuJoCo's.
 
@@ -181,7 +183,7 @@ def compare(
         episodes: Robots.
         seconds: How long they walk.
         every: Time between new commands [s]; one for the whole time if longer than that.
-        seed: Of starts and commands.
+        seed: Of starts and commands; None takes the one that the policy's weights give.
 
     Returns:
         simulations: the result of `play` by the name of the simulation; verdict: see `verdicts`; passed: whether all
@@ -193,6 +195,7 @@ def compare(
     import ce_gym.bench.peers.mujoco_twin  # noqa: F401  # where MuJoCo is missing: told before our own simulation, not after
 
     record, results = policy.record, {}
+    seed = weights_seed(policy) if seed is None else seed
     for level in dict.fromkeys((record["transmission"], "exact", "armature")):
         envs, obs, given = _environment(record, level, episodes, seconds, every, seed)
         results[_ours(level)] = play(policy, OurWorld(envs), obs, given)
@@ -264,7 +267,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=above_zero, default=10.0, metavar="T", help="how long they walk (default 10)")
     text = "new commands every T seconds (default: one for the whole time)"
     parser.add_argument("--every", type=above_zero, default=float("inf"), metavar="T", help=text)
-    parser.add_argument("--seed", type=SEED, default=EVALUATION_SEED, help="of starts and commands")
+    text = "of starts and commands (default: the first 32 bits of the SHA-256 of the policy's weights)"
+    parser.add_argument("--seed", type=WEIGHTS_SEED, metavar="N", help=text)
     add_env_argument(parser)
     add_json_argument(parser)
     args = parser.parse_args(argv)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from console import SEED, THREADS, Parser, Table, markdown, print_result, run
-from evaluate import EVALUATION_SEED, add_arguments, add_env_argument, env_kwargs, evaluate, load
+from evaluate import add_arguments, add_env_argument, env_kwargs, evaluate, load
 from settings import Settings, config_file, load_settings
 
 from ce_gym import usable_cores
@@ -52,10 +52,8 @@ Results = dict[str, dict[str, float]]
 """Figures of one policy by the level it was judged on."""
 
 
-def transfer(
-    model: PPO | Policy, record: dict[str, Any], *, episodes: int = 256, seed: int = EVALUATION_SEED
-) -> Results:
-    """Evaluate a policy on every level, with the same seeds, and return the result by level."""
+def transfer(model: PPO | Policy, record: dict[str, Any], *, episodes: int = 256, seed: int | None = None) -> Results:
+    """Evaluate a policy on every level, with the same seeds (see `evaluate`), and return the result by level."""
     return {
         level: evaluate(model, record["env"], episodes=episodes, seed=seed, **env_kwargs(record, level))
         for level in LEVELS
@@ -163,7 +161,7 @@ def _checked(policy: Path, env: str, level: str, seed: int, settings: Settings) 
     return record
 
 
-def judge(policies: Iterable[Path], episodes: int, seed: int, env: str | None = None) -> dict[str, Any]:
+def judge(policies: Iterable[Path], episodes: int, seed: int | None, env: str | None = None) -> dict[str, Any]:
     """Judge policies of one task on every level, in the environment `env` or that of their records.
 
     Returns:
@@ -213,7 +211,7 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("policies", nargs="*", metavar="POLICY", help=f"{WHERE}; several seeds are put together")
     add_env_argument(result)
-    add_arguments(result)
+    add_arguments(result, episodes=256)
     result.add_argument("--out", type=Path, metavar="FOLDER", help="write transfer.json, .md and .png there")
     how = result.add_argument_group("training")
     how.add_argument("--train", action="store_true", help="train what is missing of --levels and --seeds, then judge")

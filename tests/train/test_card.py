@@ -88,10 +88,13 @@ def test_a_card_says_what_was_measured(run):
     simulations = {"ce_gym, exact": figures, "MuJoCo, rotors as bodies": figures | {"falls": 0.02}}
     verdict = {"MuJoCo, rotors as bodies": {"passed": True}}
     sim2sim = {"simulations": simulations, "verdict": verdict}
-    result = {"levels": {"exact": figures}, "effort": {}, "pushes": pushes, "sim2sim": sim2sim}
+    suites = {"standing": figures | {"falls": 0.789}}
+    result = {"seed": 98765, "levels": {"exact": figures}, "effort": {}, "pushes": pushes, "sim2sim": sim2sim}
+    result |= {"suites": suites}
     curve = [{"steps": 1, "seconds": 98.7, "reward": 1.0, "length": 1.0}]
     text = card(record, result, curve, short_name(record))
-    for words in ("0.123", "45.6%", "25%", "2.0%", "passed", "99 s", ROBOT_ENV, "[32, 16]", "curve.png"):
+    measured = ("0.123", "45.6%", "78.9%", "98765", "25%", "2.0%", "passed")
+    for words in (*measured, "99 s", ROBOT_ENV, "[32, 16]", "curve.png"):
         assert words in text, words
     assert "## Motors" not in text
 
