@@ -13,6 +13,7 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 from ce_gym.viewer.cli import add_play_command, add_view_command
 from ce_gym.viewer.console import Parser, examples, print_anything
@@ -21,6 +22,7 @@ from ce_gym.viewer.live.command import add_live_command
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
 
   python -m ce_gym list                  robots, environments and trained policies
+  python -m ce_gym new my_robot.urdf     write the YAML file that a robot of one's own needs, guesses marked
   python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
   python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
   python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
@@ -88,6 +90,18 @@ def _parser() -> argparse.ArgumentParser:
     inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")
     inspect.add_argument("--no-timing", action="store_true", help="environment: count instructions, compile nothing")
     inspect.set_defaults(run=_inspect)
+    new = commands.add_parser(
+        "new",
+        help="start a robot of one's own from its URDF or MJCF file",
+        description="Write a commented YAML file beside a URDF or MJCF file, with feet, a standing pose and gains\n"
+        "guessed and marked, and say how to go on.",
+        epilog=examples("new my_robot.urdf", "new my_robot.xml --out mine.yaml"),
+    )
+    new.add_argument("file", type=Path, metavar="FILE", help="a URDF or MJCF file")
+    new.add_argument(
+        "--out", type=Path, metavar="YAML", help="the file to write; by default beside FILE, ending in .yaml"
+    )
+    new.set_defaults(run=_new)
     add_play_command(commands)
     add_view_command(commands)
     add_live_command(commands)
@@ -97,25 +111,49 @@ def _parser() -> argparse.ArgumentParser:
 
 def _list(args: argparse.Namespace) -> int:
     from ce_gym import environment_ids, shipped_policies
+    from ce_gym.model.formats.motors import motor_table
     from ce_gym.model.listing import robot_table
 
     names = [name for name in environment_ids() if name.count("-") == 1]
     print(f"Robots:\n{robot_table()}\n")
     print("Environments, each also at one level: -Exact (the default), -Coupled, -Armature or -None before -v0:")
     print("\n".join(f"  {name}" for name in names))
+    print(f"\nMotors, for `use` in robot files; figures at the rotor:\n{motor_table()}")
     print("\nPolicies, for `play`:")
     print("\n".join(f"  {name}" for name in shipped_policies()))
+    return 0
+
+
+def _new(args: argparse.Namespace) -> int:
+    from ce_gym.envs.custom import id_stem, missing
+    from ce_gym.export.new_robot import write_new_robot
+
+    path, robot = write_new_robot(args.file, args.out)
+    guesses = path.read_text(encoding="utf-8").count("GUESS") - 1
+    print(f"{path}: {len(robot.independent)} joints, {len(robot.contacts)} contact spheres, {guesses} lines of guesses")
+    for problem in missing(robot):
+        print(f"  missing: {problem}")
+    print(
+        f"Go through the file; then\n  python -m ce_gym inspect {path}\n"
+        "and, to train, with a module that registers it:\n"
+        f"  echo 'import ce_gym; ce_gym.register_robot(\"{path}\")' > my_robots.py\n"
+        f"  PYTHONPATH=. python train/fast_ppo.py --env my_robots:{id_stem(robot)}Velocity-v0"
+    )
     return 0
 
 
 def _inspect(args: argparse.Namespace) -> int:
     from ce_gym.diagnostics.transmission_text import transmission_report
     from ce_gym.dynamics import Model
+    from ce_gym.envs.custom import missing
 
     if re.search(r"-v\d+$", args.name) and not args.name.endswith((".yaml", ".urdf", ".xml")):
         return _inspect_environment(args)
     model = Model(args.name, transmission=args.transmission)
     print(f"{model.describe()}\n", flush=True)
+    problems = missing(model.robot)
+    print("Environments: it has what every task needs\n" if not problems else "Environments lack:")
+    print("".join(f"  {problem}\n" for problem in problems), flush=True)
     print(transmission_report(model, states=0) if args.no_errors else transmission_report(model))
     return 0
 

@@ -17,7 +17,7 @@ import gymnasium
 
 from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import RobotError, bad
 from ce_gym.model.load import load_robot
 from ce_gym.model.mechanism import LEVELS
 
@@ -48,13 +48,11 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
     file = Path(path).resolve()
     robot = load_robot(file)
     check_ready(robot)
-    stem = "".join(word[:1].upper() + word[1:] for word in re.split(r"[\W_]+", name or robot.name))
-    if not stem:
-        raise bad(str(file), "name", name or robot.name, "a name with letters or digits in it")
+    stem = id_stem(robot, name)
     ids = []
     for task in TASKS:
         for level in (None, *LEVELS):
-            env_id = f"ce_gym/{stem}{task.capitalize()}{f'-{level.capitalize()}' if level else ''}-v0"
+            env_id = f"{stem}{task.capitalize()}{f'-{level.capitalize()}' if level else ''}-v0"
             _register(env_id, {"robot": str(file), "task": task, "transmission": level or "exact"})
             ids.append(env_id)
     return tuple(ids)
@@ -66,19 +64,39 @@ def check_ready(robot: Robot) -> None:
     Raises:
         RobotError: It has not; one line that says what to add.
     """
+    for problem in missing(robot):
+        raise problem
+
+
+def missing(robot: Robot) -> list[RobotError]:
+    """Return what a robot lacks for the tasks, each in one line that says what to add."""
     file = robot.source or robot.name
+    found = []
     if not robot.floating:
-        raise bad(file, "base", "fixed", "a floating base, because tasks are about walking")
+        found.append(bad(file, "base", "fixed", "a floating base, because tasks are about walking"))
     if not any(contact.group == "foot" for contact in robot.contacts):
-        raise bad(file, "contacts of group 'foot'", None, "at least one contact sphere in this group")
+        found.append(bad(file, "contacts of group 'foot'", None, "at least one contact sphere in this group"))
     if not robot.independent:
-        raise bad(file, "independent", (), "at least one joint")
-    gains = dict(robot.gains.kp)
-    for joint in robot.independent:
-        if not gains.get(joint):
-            raise bad(file, f"gains.kp.{joint}", gains.get(joint), "a position gain above 0 (actions are targets)")
+        found.append(bad(file, "independent", (), "at least one joint"))
+    for joint, gain in robot.gains.kp:  # without any, actions must be torques
+        if not gain > 0.0:
+            expected = "a position gain above 0 (actions are targets), or none at all"
+            found.append(bad(file, f"gains.kp.{joint}", gain, expected))
     if not robot.pose.height > 0.0:
-        raise bad(file, "pose.height", robot.pose.height, "the height of the standing base above 0 [m]")
+        found.append(bad(file, "pose.height", robot.pose.height, "the height of the standing base above 0 [m]"))
+    return found
+
+
+def id_stem(robot: Robot, name: str | None = None) -> str:
+    """Return what the ids of a robot's environments start with, such as "ce_gym/MyRobot".
+
+    Raises:
+        RobotError: The name has no letters or digits.
+    """
+    stem = "".join(word[:1].upper() + word[1:] for word in re.split(r"[\W_]+", name or robot.name))
+    if not stem:
+        raise bad(robot.source, "name", name or robot.name, "a name with letters or digits in it")
+    return f"ce_gym/{stem}"
 
 
 def _register(env_id: str, arguments: dict[str, str]) -> None:

@@ -7,7 +7,7 @@ import gymnasium
 from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.mechanism import LEVELS
 
-ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1")
+ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1", "go1", "go2", "berkeley_humanoid")
 """Robots that ship with the package and have what the tasks ask for."""
 
 

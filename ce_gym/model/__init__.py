@@ -1,5 +1,6 @@
 """What a robot is, where it is read from, and how its bodies cluster."""
 
+from ce_gym.model.assets import assets_folder, robots
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
 from ce_gym.model.constraint_functions import constraint_function, register_constraint
@@ -18,7 +19,7 @@ from ce_gym.model.description import (
 )
 from ce_gym.model.errors import InertiaWarning, LossyImportWarning, RobotError
 from ce_gym.model.frames import IDENTITY, ZERO, Mat3, Placement, Vec3
-from ce_gym.model.load import assets_folder, load_robot, robots
+from ce_gym.model.load import load_robot
 
 __all__ = [
     "IDENTITY",

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from ce_gym.model.assets import robots
 from ce_gym.model.clusters import cluster_tree
 from ce_gym.model.description import Robot
-from ce_gym.model.load import load_robot, robots
+from ce_gym.model.load import load_robot
 from ce_gym.model.table import Cell, table_text
 
 COLUMNS = ("robot", "base", "bodies", "joints", "rotors", "clusters", "mass [kg]")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from ce_gym.model.assets import assets_folder, robots
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
 from ce_gym.model.formats.mjcf.robot import robot_from_mjcf
@@ -58,23 +59,6 @@ def _from_urdf(path: Path, floating: bool | None) -> Robot:
     if base is None and not graph.is_plus and beside.is_file() and read_yaml(beside).data.get("urdf") == path.name:
         return robot_from_yaml(beside)
     return robot_from_graph(graph, base)
-
-
-def robots() -> list[str]:
-    """Return the names of the robots that come with the package.
-
-    Examples:
-        >>> "mini_cheetah" in ce_gym.robots()
-        True
-    """
-    return sorted(path.stem for path in assets_folder().glob("*/*.yaml") if path.stem == path.parent.name)
-
-
-def assets_folder() -> Path:
-    """Return the folder of robots: inside an installed package, or beside it in a source checkout."""
-    package = Path(__file__).resolve().parents[1]
-    installed = package / "assets"
-    return installed if installed.is_dir() else package.parent / "assets"
 
 
 def _asset(name: str) -> Path:

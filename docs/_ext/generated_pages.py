@@ -25,6 +25,7 @@ from sphinx.application import Sphinx
 from ce_gym import InertiaWarning, Model, load_robot, robots
 from ce_gym.envs.registration import ROBOTS
 from ce_gym.envs.task.tasks import TASKS
+from ce_gym.model.formats.motors import motor_types
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -47,6 +48,7 @@ def write_pages(folder: Path) -> None:
     _write(folder / "training.inc", measured)
     _write(folder / "environments.inc", _environment_list())
     _write(folder / "robots.inc", _robot_list())
+    _write(folder / "motors.inc", _motor_list())
     _write(folder / "own_robot.inc", _own_robot(folder))
     _write(folder / "tracking.inc", level_figures.tracking_figures())
     _write(folder / "levels.inc", level_figures.acceleration_figures())
@@ -77,6 +79,21 @@ def _robot_list() -> str:
     pages = "\n".join(f"generated/robots/{name}" for name in robots())
     columns = ("robot", "base", "independent joints", "rotors", "mass [kg]")
     return f"{table(columns, rows)}\n\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
+
+
+def _motor_list() -> str:
+    """A table of the motor library, figures at the rotor."""
+    rows = [
+        (
+            f"`{m.name}`",
+            f"{m.ratio:.4g}",
+            f"{m.inertia:.4g}",
+            f"{m.torque:.4g}",
+            "" if m.velocity is None else f"{m.velocity:.4g}",
+        )
+        for m in motor_types().values()
+    ]
+    return table(("motor", "ratio", "inertia [kg m^2]", "torque [N m]", "no-load speed [rad/s]"), rows) + "\n"
 
 
 def _own_robot(folder: Path) -> str:

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 TOLERANCE = 1e-9
 LINKAGES = {"crank-rocker": four_bar, "spatial four-bar": spatial_four_bar, "rod leg": rod_leg}
 STATES = 6
+SERIAL = ("go1", "go2", "berkeley_humanoid")  # what Mini Cheetah is, in other figures; MuJoCo checks those
 
 
 class Case:
@@ -44,7 +45,7 @@ class Case:
         return spread
 
 
-@pytest.fixture(scope="module", params=[*robots(), *LINKAGES, "awkward"])
+@pytest.fixture(scope="module", params=[*sorted(set(robots()) - set(SERIAL)), *LINKAGES, "awkward"])
 def case(request: pytest.FixtureRequest, awkward_robot) -> Case:
     if request.param == "awkward":
         return Case(awkward_robot(lopsided=1e-4))

@@ -18,12 +18,17 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 import ce_gym
 
 IDS = sorted(ce_gym.environment_ids())
+ONE_TASK = ("Go1", "Go2", "BerkeleyHumanoid")  # robots that differ from others in their figures alone
 VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
 LEVELS = ("Exact", "Coupled", "Armature", "None")
 CHECKED = [  # every robot, task and level, but not all of their products: each has to be compiled
     env_id
     for env_id in IDS
-    if env_id.startswith("ce_gym/MiniCheetahVelocity") or not env_id.endswith(tuple(f"-{x}-v0" for x in LEVELS))
+    if env_id.startswith("ce_gym/MiniCheetahVelocity")
+    or (
+        not env_id.endswith(tuple(f"-{level}-v0" for level in LEVELS))
+        and (env_id.endswith("Velocity-v0") or not env_id.startswith(tuple(f"ce_gym/{robot}" for robot in ONE_TASK)))
+    )
 ]
 
 

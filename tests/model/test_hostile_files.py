@@ -5,6 +5,7 @@ Files of a format are loaded in one subprocess with limits, as in `test_bad_file
 
 from __future__ import annotations
 
+import math
 import os
 from importlib.util import find_spec
 
@@ -197,12 +198,13 @@ def test_an_mjcf_file_drawn_below_ground_and_beyond_its_limits_is_lifted_and_mov
     ball = '<geom name="g" size=".1"/>'
     knee = body("knee", '<joint name="k" axis="0 1 0" range="-2 -1"/>', '<geom size=".1" pos="0 0 -.3"/>')
     world = '<geom type="plane" size="1 1 1"/>' + body("base", "<freejoint/>", ball, knee.replace("<body", "<body"))
-    robot = load_robot(write(f'<mujoco><compiler angle="radian"/><worldbody>{world}</worldbody></mujoco>'))
-    assert dict(robot.pose.joints) == {"knee": -1.0}
-    assert robot.pose.height == pytest.approx(0.4)
-    assert any("under ground" in note for note in robot.notes)
-    assert any("limits, of knee" in note for note in robot.notes)
-    Model(robot)
+    for key, note in (("", "limits, of knee"), ('<keyframe><key qpos="0 0 0 1 0 0 0 -1"/></keyframe>', "under ground")):
+        text = f'<mujoco><compiler angle="radian"/><worldbody>{world}</worldbody>{key}</mujoco>'
+        robot = load_robot(write(text))
+        assert dict(robot.pose.joints) == {"knee": -1.0}
+        assert robot.pose.height == pytest.approx(0.3 * math.cos(1.0) + 0.1)
+        assert any(note in each for each in robot.notes)
+        Model(robot)
 
 
 def test_too_many_bodies():

@@ -23,7 +23,7 @@ def test_contacts_actuators_pose_and_looks(write):
     text = f"{start}{GEOMS}<actuator>{actuator}</actuator>{key}</mujoco>"
     robot = load_robot(write(text))
     groups = {sphere.name: sphere.group for sphere in robot.contacts}
-    assert groups == {f"hull_corner{i}": "torso" for i in range(1, 9)} | {"shin_top": "knee", "shin_bottom": "foot"}
+    assert groups == {f"hull_corner{i}": "torso" for i in range(1, 9)} | {"shin_top": "limb", "shin_bottom": "foot"}
     toe = next(sphere for sphere in robot.contacts if sphere.name == "shin_bottom")
     assert (toe.body, toe.radius) == ("leg", 0.02)
     np.testing.assert_allclose(toe.position, (0, 0, -0.4), atol=1e-12)
@@ -71,6 +71,55 @@ def test_what_touches_the_ground_is_no_rotor(write):
     assert Model(robot).contact_points([0.1], [2.0])[0].shape == (2, 3)
 
 
+@pytest.mark.parametrize(
+    ("geom", "count", "reach"),
+    [
+        ('type="cylinder" size="0.05 0.2"', 8, 0.2),
+        ('type="ellipsoid" size="0.05 0.06 0.2"', 6, 0.2),
+        ('type="mesh" mesh="wedge"', 4, 0.1),
+    ],
+)
+def test_points_of_geoms_are_on_their_surface(write, geom, count, reach):
+    wedge = '<asset><mesh name="wedge" vertex="0 0 0.1  0.1 0 -0.1  -0.1 0.05 -0.1  -0.1 -0.05 -0.1"/></asset>'
+    leg = f'<body name="leg" pos="0 0 -0.4"><joint axis="0 1 0"/><geom name="g" {geom}/></body>'
+    world = f'<worldbody><body name="b" pos="0 0 1"><freejoint/><geom size="0.1"/>{leg}</body></worldbody>'
+    path = write(f"<mujoco>{wedge}{world}</mujoco>")
+    robot = load_robot(path)
+    spheres = [sphere for sphere in robot.contacts if sphere.body == "leg"]
+    assert len(spheres) == count
+    assert {sphere.radius for sphere in spheres} == {0.0}
+    model = Model(robot)
+    points = model.contact_points(model.standing_q, np.zeros(7))[0][-count:]
+    assert points[:, 2].min() == pytest.approx(0.6 - reach, abs=1e-6)
+    assert {sphere.group for sphere in spheres} == {"foot", "limb"}
+
+
+def test_what_several_limbs_hang_on_is_torso(write):
+    """A chest above a pelvis without geoms: falling on the chest must end an episode."""
+    arms = "".join(
+        f'<body name="{side}" pos="0 {y} 0"><joint axis="0 1 0"/><geom size="0.05" pos="0 0 -0.2"/></body>'
+        for side, y in (("left", 0.2), ("right", -0.2))
+    )
+    chest = f'<body name="chest" pos="0 0 0.3"><joint axis="0 0 1"/><geom size="0.1"/>{arms}</body>'
+    leg = '<body name="leg"><joint axis="0 1 0"/><geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.8"/></body>'
+    inertial = '<inertial pos="0 0 0" mass="5" diaginertia="0.1 0.1 0.1"/>'
+    world = f'<worldbody><body name="pelvis" pos="0 0 1"><freejoint/>{inertial}{chest}{leg}</body></worldbody>'
+    robot = load_robot(write(f"<mujoco>{world}</mujoco>"))
+    groups = {sphere.body: set() for sphere in robot.contacts}
+    for sphere in robot.contacts:
+        groups[sphere.body].add(sphere.group)
+    assert groups == {"chest": {"torso"}, "left": {"limb"}, "right": {"limb"}, "leg": {"limb", "foot"}}
+
+
+def test_a_reference_pose_beyond_its_limits_is_moved_and_stands(write):
+    text = GEOMS.replace('range="-1 2"', 'range="1 2"')
+    start = '<mujoco><compiler angle="radian" autolimits="true"/>'
+    with pytest.warns(LossyImportWarning, match="beyond its limits, of leg"):
+        robot = load_robot(write(f"{start}{text}</mujoco>"))
+    assert robot.pose.joints == (("leg", 1.0),)
+    assert robot.pose.height == pytest.approx(0.4 * np.cos(1.0) + 0.02, abs=1e-9)
+
+
 def test_physics_that_the_file_switches_off(write):
     robot = load_robot(write(f'<mujoco><option><flag gravity="disable" contact="disable"/></option>{GEOMS}</mujoco>'))
     assert robot.gravity == (0.0, 0.0, 0.0)
@@ -93,7 +142,8 @@ def test_physics_that_the_file_switches_off(write):
         (mjcf(CHAIN, actuator='<velocity name="m" joint="a" kv="1"/>'), "velocity actuators"),
         (mjcf(CHAIN, "", '<fixed name="t" stiffness="2"><joint joint="a" coef="1"/></fixed>'), "tendon t"),
         (mjcf(CHAIN + '<geom name="g" type="box" size="1 1 1"/>'), "obstacle g"),
-        (f"<mujoco>{GEOMS.replace('capsule', 'cylinder')}</mujoco>", "contact of geom shin"),
+        (mjcf(CHAIN.replace('name="a"', 'name="a" armature="1"')), "the gear ratio behind the armature of arm"),
+        (mjcf(CHAIN.replace('name="a"', 'name="a" range="1 2"')), "beyond its limits, of arm"),
         (f"<mujoco>{GEOMS.replace(ROUGH, ROUGH.replace('0.6', '0.9'))}</mujoco>", "than 0.9"),
     ],
     ids=lambda value: value[:40] if not value.startswith("<") else "",

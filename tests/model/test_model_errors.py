@@ -55,7 +55,7 @@ YAML_ERRORS = [
     (("base: floating", "base: flying"), ["leg.yaml", "base", "'flying'", "floating, fixed"]),
     (("base: floating", "base: yes"), ["leg.yaml", "base", "True", "text"]),
     (("urdf: leg.urdf", "urdf: log.urdf"), ["log.urdf", "cannot be read", "No such file"]),
-    (("urdf: leg.urdf", "name: leg"), ["leg.yaml", "urdf", "missing", "text"]),
+    (("urdf: leg.urdf", "name: leg"), ["leg.yaml", "urdf", "missing", "what the links are"]),
     (("urdf: leg.urdf", "urdf: leg.urdf\nindependent: [thigh]"), ["leg.yaml", "shank, knee_rotor", "()", "1 of them"]),
     (("urdf: leg.urdf", "urdf: leg.urdf\nindependent: [thigh, shin]"), ["leg.yaml", "independent", "'shin'", "name"]),
     (("urdf: leg.urdf", "urdf: leg.urdf\nindependent: [thigh, [shank]]"), ["leg.yaml", "independent[1]", "text"]),

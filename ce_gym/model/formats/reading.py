@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +169,22 @@ class Section:
     def numbers(self) -> tuple[tuple[str, float], ...]:
         """Return all pairs of a mapping from names to finite numbers."""
         return tuple((key, self.number(key)) for key in self.data)
+
+    def figures(self, names: Collection[str]) -> dict[str, float]:
+        """Return a number for each name in a mapping, in which a key such as "*_hip" stands for all that fit it.
+
+        A name that is written out goes before a pattern, and a pattern before those above it. Keys that are neither a
+        pattern nor one of `names` are kept, for the checks to see.
+        """
+        found: dict[str, float] = {}
+        for key, value in self.numbers():
+            if not set(key) & set("*?["):
+                continue
+            fitting = [name for name in names if fnmatchcase(name, key)]
+            if not fitting:
+                raise unknown(self.file, self.path, key, names, "a pattern that fits a name")
+            found |= dict.fromkeys(fitting, value)
+        return found | {key: value for key, value in self.numbers() if not set(key) & set("*?[")}
 
     def list(self, key: str) -> list[Any]:
         """Return a list, empty if the key is missing."""

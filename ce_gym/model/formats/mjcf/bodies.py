@@ -7,7 +7,7 @@ the file was drawn. Here, a body turns about its own origin and its coordinate i
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from ce_gym.model.description import Body, Inertial, Joint, Shape
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement, rotation
 from ce_gym.model.formats.placement import compose, mat3, merge_inertials, transform_inertial, vec3
+from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.frames import ZERO, Placement, Vec3
 
 _UNLIMITED = (-float("inf"), float("inf"))
@@ -29,11 +30,13 @@ class MjcfTree:
         bodies: Parents before children, a free base first.
         frames: For each of MuJoCo's bodies, the body (None: the world) that carries its frame, and the pose in it.
         moved_by: The body that each of MuJoCo's joints moves, by joint index; joints that are locked have none.
+        fixed: Bodies without a joint that were asked for to be kept apart, by name.
     """
 
     bodies: list[Body] = field(default_factory=list)
     frames: list[tuple[str | None, Placement]] = field(default_factory=lambda: [(None, Placement())])
     moved_by: dict[int, str] = field(default_factory=dict)
+    fixed: dict[str, FixedLink] = field(default_factory=dict)
 
     def fresh(self, name: str) -> str:
         """Return `name`, or `name_2` and so on if a body has it already."""
@@ -48,19 +51,20 @@ class MjcfTree:
         return next(b.parent for b in self.bodies if b.name == body)
 
 
-def read_bodies(source: MjcfSource, locked: Mapping[int, float]) -> MjcfTree:
+def read_bodies(source: MjcfSource, locked: Mapping[int, float], apart: Collection[str] = ()) -> MjcfTree:
     """Read the tree of bodies.
 
     Args:
         source: The compiled file.
         locked: Coordinates [rad or m] of joints that an equality holds still, by joint index: they become welds.
+        apart: Names of bodies to keep apart if they have no joint; others mean nothing.
 
     Raises:
         RobotError: Nothing moves, or a joint has several degrees of freedom and is not that of the base.
     """
     tree, model = MjcfTree(), source.model
     for index in range(1, model.nbody):
-        _add_body(source, tree, index, locked)
+        _add_body(source, tree, index, locked, apart)
     if not tree.bodies:
         raise bad(source.file, "bodies", (), "at least one body that moves")
     _report_forces(source)
@@ -71,7 +75,9 @@ def read_bodies(source: MjcfSource, locked: Mapping[int, float]) -> MjcfTree:
     return tree
 
 
-def _add_body(source: MjcfSource, tree: MjcfTree, index: int, locked: Mapping[int, float]) -> None:
+def _add_body(
+    source: MjcfSource, tree: MjcfTree, index: int, locked: Mapping[int, float], apart: Collection[str]
+) -> None:
     model = source.model
     name = source.name("body", index)
     carrier, pose = tree.frames[model.body_parentid[index]]
@@ -88,17 +94,23 @@ def _add_body(source: MjcfSource, tree: MjcfTree, index: int, locked: Mapping[in
         tree.moved_by[j] = link
         carrier, frame = link, _after(source, j)
     tree.frames.append((carrier, frame))
-    if carrier is not None and model.body_mass[index] > 0.0:
+    if name in apart and not joints:
+        tree.fixed[name] = FixedLink(carrier, frame, _inertial(source, index))
+    elif carrier is not None and model.body_mass[index] > 0.0:
         _join(source, tree, carrier, index, bool(moving))
+
+
+def _inertial(source: MjcfSource, index: int) -> Inertial:
+    """Return the mass properties of one of MuJoCo's bodies in its own frame."""
+    model = source.model
+    axes = rotation(model.body_iquat[index])
+    inertia = axes @ np.diag(model.body_inertia[index]) @ axes.T
+    return Inertial(float(model.body_mass[index]), vec3(model.body_ipos[index]), mat3((inertia + inertia.T) / 2))
 
 
 def _join(source: MjcfSource, tree: MjcfTree, carrier: str, index: int, own: bool) -> None:
     """Give a body's mass and shapes to the link that carries it."""
-    model = source.model
-    axes = rotation(model.body_iquat[index])
-    inertia = axes @ np.diag(model.body_inertia[index]) @ axes.T
-    part = Inertial(float(model.body_mass[index]), vec3(model.body_ipos[index]), mat3((inertia + inertia.T) / 2))
-    part = transform_inertial(tree.frames[index][1], part)
+    part = transform_inertial(tree.frames[index][1], _inertial(source, index))
     at = next(i for i, body in enumerate(tree.bodies) if body.name == carrier)
     body = tree.bodies[at]
     tree.bodies[at] = replace(body, inertial=part if own else merge_inertials([body.inertial, part]))

@@ -1,9 +1,19 @@
 """The geoms of a compiled MJCF file that can touch the ground -> contact spheres.
 
-A sphere is one sphere, a capsule the two at its ends, a box its eight corners. A geom can touch the ground if MuJoCo
-would let it touch one of the geoms that do not move, or, in a file without any, anything at all. The ground is the
-plane z = 0. Groups follow from the reference pose: "torso" is what the base carries, "foot" what is lowest of the
-rest, "knee" what is not.
+| geom      | spheres                                                                                  |
+|-----------|------------------------------------------------------------------------------------------|
+| sphere    | itself                                                                                   |
+| capsule   | the two at its ends                                                                      |
+| box       | points at its eight corners                                                              |
+| cylinder  | points on both rims, four each: up to 0.3 radii short of the rim between them            |
+| ellipsoid | points at the ends of its axes                                                           |
+| mesh      | its vertices that reach furthest along the eight diagonals of its axes                   |
+
+None of them sticks out of its geom. A geom can touch the ground if MuJoCo would let it touch one of the geoms that do
+not move, or, in a file without any, anything at all. The ground is the plane z = 0.
+
+Groups follow from the reference pose: "foot" is what is lowest, the base apart; "torso" is on the base and on bodies
+beyond it that several limbs hang on; "limb" is the rest, which no task simulates unless it is told to.
 """
 
 from __future__ import annotations
@@ -21,6 +31,9 @@ from ce_gym.model.formats.placement import transform_point, vec3
 
 FOOT_BAND = 0.02
 """Spheres whose undersides are this close [m] to the lowest one are feet."""
+
+DIAGONALS = np.array(list(product((1.0, -1.0), repeat=3)))
+CROSS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 _DEFAULT_SOLVER = ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0))  # MuJoCo's solref and solimp
 
@@ -83,26 +96,54 @@ def _spheres(source: MjcfSource, geom: int) -> Iterator[tuple[str, NDArray[np.fl
         for end, side in (("top", 1.0), ("bottom", -1.0)):
             yield f"{name}_{end}", np.array([0.0, 0.0, side * b]), a
     elif kind == kinds.mjGEOM_BOX:
-        for i, signs in enumerate(product((1.0, -1.0), repeat=3)):
-            yield f"{name}_corner{i + 1}", np.array(signs) * (a, b, c), 0.0
+        yield from _points(f"{name}_corner", DIAGONALS * (a, b, c))
+    elif kind == kinds.mjGEOM_CYLINDER:
+        yield from _points(f"{name}_rim", np.array([(x * a, y * a, z * b) for z in (1, -1) for x, y in CROSS]))
+    elif kind == kinds.mjGEOM_ELLIPSOID:
+        yield from _points(f"{name}_end", np.vstack([np.diag((a, b, c)), -np.diag((a, b, c))]))
+    elif kind == kinds.mjGEOM_MESH:
+        mesh = int(source.model.geom_dataid[geom])
+        first, count = int(source.model.mesh_vertadr[mesh]), int(source.model.mesh_vertnum[mesh])
+        vertices = np.array(source.model.mesh_vert[first : first + count], dtype=float)
+        furthest = dict.fromkeys(int(np.argmax(vertices @ diagonal)) for diagonal in DIAGONALS)
+        yield from _points(f"{name}_vertex", vertices[list(furthest)])
     else:
-        source.leave_out("contact of geom {}, which is no sphere, capsule or box", name)
+        source.leave_out("contact of geom {}, which is a height field or signed distance field", name)
+
+
+def _points(name: str, points: NDArray[np.float64]) -> Iterator[tuple[str, NDArray[np.float64], float]]:
+    """Iterate over points as spheres of no radius, numbered."""
+    return ((f"{name}{i + 1}", point, 0.0) for i, point in enumerate(points))
 
 
 def _grouped(spheres: list[ContactSphere], heights: list[float], tree: MjcfTree) -> tuple[ContactSphere, ...]:
     """Name the groups from the heights [m] of the undersides at the reference pose."""
     base = next((body.name for body in tree.bodies if body.joint.type == "free"), None)
     lowest = min((h for sphere, h in zip(spheres, heights, strict=True) if sphere.body != base), default=0.0)
+    trunk = _trunk(spheres, tree, base)
 
     def group(sphere: ContactSphere, height: float) -> str:
-        if sphere.body == base:
-            return "torso"
-        return "foot" if height <= lowest + FOOT_BAND else "knee"
+        if sphere.body != base and height <= lowest + FOOT_BAND:
+            return "foot"
+        return "torso" if sphere.body in trunk else "limb"
 
     return tuple(
         ContactSphere(sphere.name, sphere.body, sphere.position, sphere.radius, group(sphere, height))
         for sphere, height in zip(spheres, heights, strict=True)
     )
+
+
+def _trunk(spheres: list[ContactSphere], tree: MjcfTree, base: str | None) -> set[str]:
+    """Return the base, if it is free, and the bodies on which several limbs with contacts hang."""
+    if base is None:
+        return set()
+    limbs: dict[str, set[str]] = {}
+    for sphere in spheres:
+        body, carrier = sphere.body, tree.parent(sphere.body)
+        while carrier is not None:
+            limbs.setdefault(carrier, set()).add(body)
+            body, carrier = carrier, tree.parent(carrier)
+    return {base} | {carrier for carrier, bodies in limbs.items() if len(bodies) > 1}
 
 
 def _material(source: MjcfSource, touching: list[int], ground: list[int]) -> ContactMaterial:

@@ -16,7 +16,7 @@ sensors and textures act on nothing and are passed over.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.description import Pose, Robot
-from ce_gym.model.errors import LossyImportWarning
+from ce_gym.model.errors import LossyImportWarning, bad, unknown
 from ce_gym.model.formats.mjcf.actuators import read_actuators
 from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, shapes
 from ce_gym.model.formats.mjcf.contacts import read_contacts
@@ -32,7 +32,11 @@ from ce_gym.model.formats.mjcf.equalities import choose_independent, locked_join
 from ce_gym.model.formats.mjcf.rotors import add_rotors
 from ce_gym.model.formats.mjcf.source import MjcfSource, read_mjcf, summary
 from ce_gym.model.formats.placement import vec3
+from ce_gym.model.formats.reading import Section
+from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.rotor_rule import with_rotors
+from ce_gym.model.formats.urdf.tree import Frame
+from ce_gym.model.frames import Placement
 
 Angles = tuple[tuple[str, float], ...]  # pairs (body, joint coordinate [rad or m])
 
@@ -46,7 +50,7 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
     Args:
         path: The file.
         gear_ratios: For joints with armature whose gear ratio is not the `gear` of their actuator: the ratio, by the
-            name of the joint. Only the exact level depends on it, see `rotors.py`.
+            name of the body that the joint moves, or a pattern. Only the exact level depends on it, see `rotors.py`.
 
     Raises:
         RobotError: `mujoco` is missing or refuses the file, or the file describes something that cannot be.
@@ -54,9 +58,28 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
     Warns:
         LossyImportWarning: Something in the file has no counterpart; `Robot.notes` has all of it.
     """
+    robot = read_robot(path, Section(str(path), "gears", dict(gear_ratios or {})))[0]
+    check_robot(robot)
+    return robot
+
+
+def read_robot(
+    path: Path, gears: Section, driven: Collection[str] = (), apart: Collection[str] = ()
+) -> tuple[Robot, dict[str, Frame], Mapping[str, FixedLink]]:
+    """Read an MJCF file that a YAML file may add to; nothing is checked yet.
+
+    Args:
+        path: The file.
+        gears: Gear ratios for `robot_from_mjcf`.
+        driven: Bodies whose joints' rotors come from elsewhere, so that the file's armature there is passed over.
+        apart: Names of bodies to keep apart if no joint moves them, because they are rotors.
+
+    Returns:
+        The robot; the body that carries each of the file's bodies, and the pose in it; the bodies kept apart.
+    """
     source = read_mjcf(path)
     locked = locked_joints(source)
-    tree = read_bodies(source, locked)
+    tree = read_bodies(source, locked, apart)
     constraints = read_constraints(source, tree, locked)
     spinning = [
         body.name for body in with_rotors(tree.bodies, constraints, tree.moved_by.values()) if body.kind == "rotor"
@@ -67,12 +90,13 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
     _add_shapes(source, tree)
     links = {*independent, *(contact.body for contact in contacts)}  # what touches the ground spins outside
     tree.bodies[:] = with_rotors(tree.bodies, constraints, [b for b in tree.moved_by.values() if b not in links])
-    gears = add_rotors(source, tree, gear_ratios or {})
+    ties = add_rotors(source, tree, _ratios(gears, tree, driven), driven)
     pose, assembly = _pose(source, tree, independent, lowest)
+    _report_world(source)
     robot = Robot(
         name=_name(source, path),
         bodies=tuple(tree.bodies),
-        constraints=(*constraints, *gears),
+        constraints=(*constraints, *ties),
         independent=independent,
         contacts=contacts if source.enabled("CONTACT") else (),
         material=material,
@@ -81,12 +105,23 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
         gains=gains,
         gravity=vec3(source.model.opt.gravity) if source.enabled("GRAVITY") else (0.0, 0.0, 0.0),
         source=str(path),
+        notes=tuple(f"left out: {what.format(name)}" for what, name in source.left_out),
     )
-    check_robot(robot)
-    _report_world(source)
     if source.left_out:
-        warnings.warn(f"{path}: left out: {summary(source.left_out)}", LossyImportWarning, stacklevel=3)
-    return replace(robot, notes=tuple(f"left out: {what.format(name)}" for what, name in source.left_out))
+        warnings.warn(f"{path}: left out: {summary(source.left_out)}", LossyImportWarning, stacklevel=4)
+    frames = {source.name("body", i): frame for i, frame in enumerate(tree.frames)}
+    return robot, {**frames, **{body.name: (body.name, Placement()) for body in tree.bodies}}, tree.fixed
+
+
+def _ratios(gears: Section, tree: MjcfTree, driven: Collection[str]) -> dict[str, float]:
+    """Return the gear ratios that the caller gives, by the name of the body that the joint moves."""
+    joints = [body for body in tree.moved_by.values() if body not in driven]
+    for joint, ratio in (ratios := gears.figures(joints)).items():
+        if joint not in joints:
+            raise unknown(gears.file, gears.path, joint, joints, "the name of a joint that no rotor is given for")
+        if ratio == 0.0:
+            raise bad(gears.file, gears.key(joint), ratio, "a number other than 0")
+    return ratios
 
 
 def _name(source: MjcfSource, path: Path) -> str:
@@ -119,7 +154,9 @@ def _pose(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...], lowe
             height = float(qpos[address + 2])
             if not np.allclose(qpos[address + 3 : address + 7], (1, 0, 0, 0), atol=1e-9):
                 source.leave_out("the inclination of the base in the reference pose")
-            if lowest < -DEEPEST:
+            if source.moved:
+                height -= lowest  # feet just touch
+            elif lowest < -DEEPEST:
                 source.leave_out("the height of the base in the reference pose ({} m)", f"{height:g}, under ground")
                 height -= lowest
             continue

@@ -8,27 +8,25 @@ gyroscope. Here every armature becomes a rotor, a thin disc about the joint axis
   joints together; `none` lacks the armature;
 - `exact` adds what MuJoCo leaves out, as far as the file knows the ratio: the `gear` of the joint's actuator, if it is
   not 1, or what the caller says. Where the ratio is not known it is taken as 1e6, the limit in which armature is all
-  there is, and `exact` equals MuJoCo too.
+  there is, and `exact` equals MuJoCo too. That is said in the one warning.
 
-The rotor has no mass, and its inertia at rest is taken out of the body that carries it, where a published inertia has
-it already: total mass and inertia stay those of the file.
+The rotors are thin discs without mass, see `rotor_links.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ce_gym.model.constraints import LinearConstraint
-from ce_gym.model.description import Body, Inertial, Joint
-from ce_gym.model.errors import bad, unknown
+from ce_gym.model.description import Body, Joint
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.equalities import drives_joint, tendon_coefficients
 from ce_gym.model.formats.mjcf.source import MjcfSource
-from ce_gym.model.formats.placement import mat3
-from ce_gym.model.frames import ZERO, Placement
+from ce_gym.model.formats.rotor_links import disc, without_rotors
+from ce_gym.model.frames import Placement
 
 UNKNOWN_RATIO = 1e6
 """Gear ratio in place of one that is not known: the rotor's own inertia is then 1e-12 of the reflected one."""
@@ -51,20 +49,26 @@ class _Armature:
     ratio: float | None
 
 
-def add_rotors(source: MjcfSource, tree: MjcfTree, gear_ratios: Mapping[str, float]) -> tuple[LinearConstraint, ...]:
+def add_rotors(
+    source: MjcfSource, tree: MjcfTree, gear_ratios: Mapping[str, float], driven: Collection[str]
+) -> tuple[LinearConstraint, ...]:
     """Add a rotor to the tree for each armature, and return the gears.
 
     Args:
         source: The compiled file.
         tree: Its bodies; gains the rotors.
-        gear_ratios: Ratios that the file does not know, by the name of the joint.
-
-    Raises:
-        RobotError: A ratio is given for a joint that does not exist, or is 0.
+        gear_ratios: Ratios that the file does not know, by the name of the body that the joint moves.
+        driven: Bodies whose rotors the caller knows: the armature of their joints is passed over.
     """
-    ratios = _known_ratios(source, tree, gear_ratios)
+    ratios = _known_ratios(source, tree) | {j: gear_ratios[b] for j, b in tree.moved_by.items() if b in gear_ratios}
     found = [*_joint_armatures(source, tree, ratios), *_tendon_armatures(source), *_motor_armatures(source)]
     moving = [replace(a, joints={j: x for j, x in a.joints.items() if j in tree.moved_by}) for a in found]
+    moving = [a for a in moving if not {tree.moved_by[j] for j in a.joints} & set(driven)]
+    for armature in moving:
+        if armature.joints and armature.ratio is None:
+            source.leave_out(
+                "the gear ratio behind the armature of {} (`exact` keeps an armature there)", armature.name
+            )
     by_carrier: dict[str | None, list[_Armature]] = {}
     for armature in moving:
         if armature.joints:
@@ -94,14 +98,10 @@ def _take_out(tree: MjcfTree, carrier: str | None, rotors: list[Body]) -> bool:
     if carrier is None:
         return True
     at = next(i for i, body in enumerate(tree.bodies) if body.name == carrier)
-    inertial = tree.bodies[at].inertial
-    rest = np.array(inertial.inertia)
-    for rotor in rotors:
-        axes = np.array(rotor.placement.rotation)
-        rest = rest - axes @ np.array(rotor.inertial.inertia) @ axes.T
-    if np.linalg.eigvalsh(rest)[0] <= 0.0:
+    rest = without_rotors(tree.bodies[at].inertial, rotors)
+    if rest is None:
         return False
-    tree.bodies[at] = replace(tree.bodies[at], inertial=replace(inertial, inertia=mat3((rest + rest.T) / 2)))
+    tree.bodies[at] = replace(tree.bodies[at], inertial=rest)
     return True
 
 
@@ -121,33 +121,23 @@ def _rotor(tree: MjcfTree, carrier: str | None, armature: _Armature) -> Body:
     """Return a rotor on `carrier`: a thin disc without mass, about the joint's axis if one joint drives it."""
     driven = next(body for body in tree.bodies if body.name == tree.moved_by[min(armature.joints)])
     moment = armature.reflected / _ratio(armature) ** 2
-    u = np.array(driven.joint.axis)
-    disc = Inertial(0.0, ZERO, mat3(0.5 * moment * (np.eye(3) + np.outer(u, u))))
     place = driven.placement if driven.parent == carrier else Placement()
     name = tree.fresh(f"{armature.name}_rotor")
-    return Body(name, "rotor", carrier, place, Joint("revolute", driven.joint.axis), disc)
+    return Body(name, "rotor", carrier, place, Joint("revolute", driven.joint.axis), disc(moment, driven.joint.axis))
 
 
 def _ratio(armature: _Armature) -> float:
     return UNKNOWN_RATIO if armature.ratio is None else armature.ratio
 
 
-def _known_ratios(source: MjcfSource, tree: MjcfTree, given: Mapping[str, float]) -> dict[int, float]:
-    """Return gear ratios by joint index: those of single actuators with a gear that is not 1, and those given."""
+def _known_ratios(source: MjcfSource, tree: MjcfTree) -> dict[int, float]:
+    """Return gear ratios by joint index: those of single actuators with a gear that is not 1."""
     model = source.model
-    names = {source.name("joint", j): j for j in tree.moved_by}
     gears: dict[int, list[float]] = {}
     for a in range(model.nu):
         if drives_joint(source, a):
             gears.setdefault(int(model.actuator_trnid[a][0]), []).append(float(model.actuator_gear[a][0]))
-    ratios = {j: gear[0] for j, gear in gears.items() if len(gear) == 1 and abs(gear[0]) not in (0.0, 1.0)}
-    for name, ratio in given.items():
-        if name not in names:
-            raise unknown(source.file, "gear_ratios", name, names, "the name of a joint")
-        if not np.isfinite(ratio) or ratio == 0.0:
-            raise bad(source.file, f"gear_ratios.{name}", ratio, "a finite number other than 0")
-        ratios[names[name]] = float(ratio)
-    return ratios
+    return {j: gear[0] for j, gear in gears.items() if len(gear) == 1 and abs(gear[0]) not in (0.0, 1.0)}
 
 
 def _joint_armatures(source: MjcfSource, tree: MjcfTree, ratios: Mapping[int, float]) -> list[_Armature]:

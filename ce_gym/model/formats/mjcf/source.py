@@ -46,6 +46,7 @@ class MjcfSource:
         model: `MjModel`.
         data: `MjData` at the reference pose: the first keyframe, or all joints at their `ref`.
         left_out: What the robot will lack: a text that completes "... is left out", and the name to put in it.
+        moved: Whether joints were moved to within their limits, so that the height of the base means nothing.
     """
 
     file: str
@@ -53,6 +54,7 @@ class MjcfSource:
     model: Any
     data: Any
     left_out: list[tuple[str, str]] = field(default_factory=list)
+    moved: bool = False
 
     def name(self, kind: str, index: int) -> str:
         """Return the name of element `index` of a kind, such as "body"; one like "body3" if it has none."""
@@ -110,8 +112,24 @@ def read_mjcf(path: Path) -> MjcfSource:
     _check_figures(str(path), model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, source.data, 0)
+    elif not model.neq:  # loops would come apart
+        _move_within_limits(source)
     source.forward()
     return source
+
+
+def _move_within_limits(source: MjcfSource) -> None:
+    """Move joints of a reference pose that nobody chose, all at `ref`, to within their limits."""
+    model, kinds = source.model, source.mujoco.mjtJoint
+    for j in range(model.njnt):
+        if model.jnt_limited[j] and int(model.jnt_type[j]) in (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE)):
+            address = model.jnt_qposadr[j]
+            before = source.data.qpos[address]
+            source.data.qpos[address] = np.clip(before, *model.jnt_range[j])
+            if abs(source.data.qpos[address] - before) > 1e-6:
+                source.moved = True
+                body = source.name("body", model.jnt_bodyid[j])
+                source.leave_out("the angle in the reference pose, beyond its limits, of {}", body)
 
 
 @contextmanager

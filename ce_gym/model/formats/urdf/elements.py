@@ -124,7 +124,7 @@ def axis(file: str, where: str, parent: Element) -> Vec3:
 
 
 def shape(file: str, where: str, visual: Element, colors: dict[str, Color]) -> Shape | None:
-    """Return a <visual> as a primitive; None if it is a mesh."""
+    """Return a <visual> or <collision> as a primitive; None if it is a mesh."""
     geometry = required(file, where, visual, "geometry")
     pose = placement(file, where, visual)
     color = _color(file, where, visual.find("material"), colors)

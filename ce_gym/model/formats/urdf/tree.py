@@ -2,11 +2,13 @@
 
 Links joined by fixed joints become one body that has the name of the link nearest to the root; the names of the
 others stay known as frames. A body has the name of its link, and its joint has the name of its body.
+
+Vendors write rotors as links on fixed joints. Whoever knows that they are rotors names them, and they stay apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,6 +18,7 @@ from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Joint, Shape
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import compose, merge_inertials, transform_inertial
+from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.graph import UrdfGraph, UrdfJoint
 from ce_gym.model.frames import Placement
@@ -36,6 +39,7 @@ class UrdfTree:
         frames: Where every link of the file is, also those that were merged into another.
         constraints: The file's <mimic> joints.
         notes: What was left out.
+        fixed: Links that were asked for to be kept apart, by name.
     """
 
     name: str
@@ -43,15 +47,17 @@ class UrdfTree:
     frames: dict[str, Frame]
     constraints: tuple[LinearConstraint, ...]
     notes: tuple[str, ...]
+    fixed: Mapping[str, FixedLink]
 
 
-def read_urdf(path: Path, base: Base | None = None) -> UrdfTree:
+def read_urdf(path: Path, base: Base | None = None, apart: Collection[str] = ()) -> UrdfTree:
     """Read a URDF file.
 
     Args:
         path: The file.
         base: Whether the root link is a body that moves freely or is fixed to the world. By default the root is fixed
             if it is called "world" or has no mass.
+        apart: Names of links to keep apart if they hang on a fixed joint; others mean nothing.
 
     Raises:
         RobotError: The file is missing, malformed, or describes something that is not a tree of rigid bodies; or it is
@@ -60,25 +66,26 @@ def read_urdf(path: Path, base: Base | None = None) -> UrdfTree:
     graph = UrdfGraph(path)
     if graph.is_plus:
         raise bad(graph.file, "<loop>, <coupling> or independent", "URDF+", "a plain URDF; load the URDF+ file itself")
-    tree = read_tree(graph, base)
+    tree = read_tree(graph, base, apart)
     for body in tree.bodies:
         check_body(body, graph.file)
     return tree
 
 
-def read_tree(graph: UrdfGraph, base: Base | None = None) -> UrdfTree:
+def read_tree(graph: UrdfGraph, base: Base | None = None, apart: Collection[str] = ()) -> UrdfTree:
     """Read the tree of a file that has been parsed; as `read_urdf`, but the figures of bodies are not checked."""
-    return _Reader(graph, base).tree()
+    return _Reader(graph, base, apart).tree()
 
 
 class _Reader:
     """One pass over one file; holds the look-up tables the pass needs."""
 
-    def __init__(self, graph: UrdfGraph, base: Base | None):
+    def __init__(self, graph: UrdfGraph, base: Base | None, apart: Collection[str]):
         self.graph, self.file, self.joints = graph, graph.file, graph.joints
         self.colors = read.colors_of(self.file, graph.robot)
         self.inertials = {name: read.inertial(self.file, f"link {name!r}", link) for name, link in graph.links.items()}
         self.root_is_world = self._root_is_world(base)
+        self.apart = [link for link in graph.order if link in apart and self._is_fixed(link)]
         self.frames = self._frames()
         self.notes: list[str] = []
 
@@ -86,7 +93,8 @@ class _Reader:
         bodies = tuple(self._body(link) for link in self.graph.order if self._moves(link))
         mimics = tuple(self._mimics())
         name = self.graph.robot.get("name") or Path(self.file).stem
-        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes))
+        fixed = {link: self._fixed(link) for link in self.apart}
+        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes), fixed)
 
     def _root_is_world(self, base: Base | None) -> bool:
         floating = [joint for joint in self.joints.values() if joint.type == "floating"]
@@ -118,8 +126,20 @@ class _Reader:
         carrier, pose = frames[joint.parent]
         return carrier, compose(pose, read.placement(self.file, joint.where, joint.element))
 
+    def _is_fixed(self, link: str) -> bool:
+        return link in self.joints and self.joints[link].type == "fixed"
+
+    def _fixed(self, link: str) -> FixedLink:
+        """Return a link that is kept apart, which must carry nothing."""
+        carried = next((joint.child for joint in self.joints.values() if joint.parent == link), None)
+        inertial = self.inertials[link]
+        if carried is not None or inertial is None:
+            value, expected = (carried, "nothing: a rotor carries no link") if carried else (None, "mass and inertia")
+            raise bad(self.file, f"what rotor {link!r} {'carries' if carried else 'has'}", value, expected)
+        return FixedLink(*self.frames[link], inertial, tuple(self._shapes(link, Placement())))
+
     def _body(self, link: str) -> Body:
-        parts = list(self.graph.welded_to(link))
+        parts = [part for part in self.graph.welded_to(link) if part not in self.apart]
         inertials = [
             transform_inertial(self.frames[part][1], inertial) for part in parts if (inertial := self.inertials[part])
         ]
@@ -130,16 +150,20 @@ class _Reader:
         if joint is not None and joint.type != "floating":
             parent, pose = self._attachment(joint, self.frames)
             motion = read.joint(self.file, joint.where, joint.element, joint.type)
-        shapes = tuple(shape for part in parts for shape in self._shapes(part))
+        shapes = tuple(shape for part in parts for shape in self._shapes(part, self.frames[part][1]))
         return Body(link, "link", parent, pose, motion, merge_inertials(inertials), shapes)
 
-    def _shapes(self, link: str) -> Iterator[Shape]:
-        for visual in self.graph.links[link].findall("visual"):
-            shape = read.shape(self.file, f"link {link!r}", visual, self.colors)
-            if shape is None:
-                self.notes.append(f"link {link}: a mesh is not drawn")
-            else:
-                yield replace(shape, placement=compose(self.frames[link][1], shape.placement))
+    def _shapes(self, link: str, frame: Placement) -> Iterator[Shape]:
+        """Iterate over what is drawn of a link: primitives; where all that can be seen is meshes, those that touch."""
+        shapes = {tag: self._shapes_of(link, tag) for tag in ("visual", "collision")}
+        if None in shapes["visual"]:
+            self.notes.append(f"link {link}: a mesh is not drawn")
+        drawn = [shape for shape in shapes["visual"] if shape] or [shape for shape in shapes["collision"] if shape]
+        return (replace(shape, placement=compose(frame, shape.placement)) for shape in drawn)
+
+    def _shapes_of(self, link: str, tag: str) -> list[Shape | None]:
+        elements = self.graph.links[link].findall(tag)
+        return [read.shape(self.file, f"link {link!r}", element, self.colors) for element in elements]
 
     def _mimics(self) -> Iterator[LinearConstraint]:
         """Iterate over `child = multiplier * other + offset`, the URDF way to write a gear."""

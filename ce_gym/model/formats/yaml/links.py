@@ -1,0 +1,70 @@
+"""What a robot's YAML file stands on: a plain URDF (`urdf:`) or an MJCF file (`mjcf:`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import Body, Robot
+from ce_gym.model.errors import bad
+from ce_gym.model.formats.mjcf.robot import read_robot
+from ce_gym.model.formats.reading import Section
+from ce_gym.model.formats.rotor_links import FixedLink
+from ce_gym.model.formats.urdf.tree import Base, Frame, read_urdf
+
+
+@dataclass(frozen=True)
+class Links:
+    """The robot as its links alone say it, and what the YAML file can name in it.
+
+    Attributes:
+        robot: Not checked yet.
+        frames: Body and pose of every frame that can be named, links merged into others included.
+        fixed: Links that no joint moves but that the YAML file calls rotors, by name; no body has their mass.
+    """
+
+    robot: Robot
+    frames: dict[str, Frame]
+    fixed: Mapping[str, FixedLink]
+
+
+def read_links(path: Path, file: Section) -> Links:
+    """Read the URDF or MJCF that a YAML file names.
+
+    Args:
+        path: The YAML file.
+        file: Its content.
+
+    Raises:
+        RobotError: It names none, or both, or one that is wrong.
+    """
+    if ("urdf" in file) == ("mjcf" in file):
+        value = None if "urdf" not in file else "both"
+        raise bad(file.file, "urdf or mjcf", value, "one of them, the file that says what the links are")
+    rotors = file.section("rotors")
+    if "urdf" in file:
+        if "gears" in file:
+            raise bad(file.file, "gears", "given", "none: a URDF has no armature; give `rotors`")
+        base: Base | None = file.text("base", None, choices=("floating", "fixed"))  # type: ignore[assignment]
+        tree = read_urdf(path.parent / file.text("urdf"), base, rotors.data)
+        independent = _not_tied(tree.bodies, tree.constraints)
+        robot = Robot(tree.name, tree.bodies, tree.constraints, independent, notes=tree.notes)
+        return Links(robot, dict(tree.frames), tree.fixed)
+    if "base" in file:
+        raise bad(file.file, "base", file.get("base"), "none, because an MJCF file says itself what its base is")
+    driven = {joint for _, rotor in rotors.sections() for joint in names_in(rotor, "ratios")}
+    robot, frames, fixed = read_robot(path.parent / file.text("mjcf"), file.section("gears"), driven, rotors.data)
+    return Links(robot, frames, fixed)
+
+
+def names_in(section: Section, key: str) -> tuple[str, ...]:
+    """Return the names under a key, which are a list or the keys of a mapping."""
+    return section.texts(key) if isinstance(section.get(key, {}), list) else tuple(section.section(key))
+
+
+def _not_tied(bodies: tuple[Body, ...], constraints: tuple[LinearConstraint, ...]) -> tuple[str, ...]:
+    """Return the joints that no <mimic> solves for."""
+    solved = {constraint.bodies[0] for constraint in constraints}
+    return tuple(body.name for body in bodies if body.joint.type != "free" and body.name not in solved)

@@ -1,0 +1,88 @@
+"""`python -m ce_gym new`: what it guesses of a URDF and of an MJCF file, and that the file it writes is complete."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mjcf_files import GEOMS
+
+from ce_gym.__main__ import main
+from ce_gym.dynamics import Model
+from ce_gym.envs.custom import missing
+from ce_gym.export.new_robot import write_new_robot
+from ce_gym.model import RobotError, load_robot
+
+PUP = Path(__file__).parents[1] / "data" / "own_robot" / "pup.urdf"
+
+
+@pytest.fixture
+def pup(tmp_path):
+    return Path(shutil.copy(PUP, tmp_path))
+
+
+def test_a_urdf_becomes_a_robot_that_tasks_can_use(pup):
+    path, robot = write_new_robot(pup)
+    assert path == pup.with_suffix(".yaml")
+    assert not missing(robot)
+    feet = {c.body: (c.position, c.radius) for c in robot.contacts if c.group == "foot"}
+    assert feet == {f"{leg}_shank": ((0.0, 0.0, -0.16), 0.02) for leg in ("fl", "fr", "hl", "hr")}
+    assert len([c for c in robot.contacts if c.group == "torso"]) == 8
+    angles = dict(robot.pose.joints)
+    assert {angles[f"{leg}_thigh"] for leg in ("fl", "fr", "hl", "hr")} == {0.5}
+    assert {angles[f"{leg}_shank"] for leg in ("fl", "fr", "hl", "hr")} == {-1.0}, "knees bend the way they can"
+    model = Model(robot)
+    points = model.contact_points(model.standing_q, np.zeros(model.nv))[0]
+    lowest = min(z - c.radius for c, z in zip(robot.contacts, points[:, 2], strict=True))
+    assert lowest == pytest.approx(0.0, abs=1e-6)
+    torque = robot.body("fl_thigh").joint.torque
+    assert dict(robot.gains.kp)["fl_thigh"] == pytest.approx(torque / 0.6, rel=0.05)
+    assert dict(robot.gains.kd)["fl_thigh"] == pytest.approx(torque / 0.6 * 0.025, rel=0.1)
+
+
+def test_rotors_are_there_to_be_filled_in(pup):
+    """The template's lines, without their #, are a robot with a rotor at every joint."""
+    path, robot = write_new_robot(pup)
+    assert not list(robot.rotors())
+    text = path.read_text()
+    lines = [line for line in text.splitlines() if line == "# rotors:" or line.startswith("#   ")]
+    assert len(lines) == 1 + len(robot.independent)
+    for line in lines:
+        text = text.replace(line, line.removeprefix("# "), 1)
+    path.write_text(text)
+    assert [rotor.name for rotor in load_robot(path).rotors()] == [f"{joint}_rotor" for joint in robot.independent]
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_an_mjcf_file_keeps_what_it_says(tmp_path):
+    pytest.importorskip("mujoco")
+    actuator = '<actuator><motor joint="hip" ctrlrange="-6 6"/></actuator>'
+    key = '<keyframe><key qpos="0 0 0.6 1 0 0 0 0.25"/></keyframe>'
+    start = '<mujoco model="m"><compiler angle="radian" autolimits="true"/>'
+    (tmp_path / "hopper.xml").write_text(f"{start}{GEOMS}{actuator}{key}</mujoco>")
+    _, robot = write_new_robot(tmp_path / "hopper.xml", tmp_path / "other.yaml")
+    assert robot.contacts == load_robot(tmp_path / "hopper.xml").contacts
+    assert (robot.gains.kp, robot.gains.kd) == ((("leg", 10.0),), (("leg", 0.25),))
+    assert robot.pose.joints == (("leg", 0.25),)
+    assert robot.pose.height == pytest.approx(0.4 * np.cos(0.25) + 0.02, abs=1e-5), "feet just touch"
+
+
+def test_what_it_refuses(pup, tmp_path):
+    write_new_robot(pup)
+    with pytest.raises(RobotError, match=r"pup\.yaml: is there already"):
+        write_new_robot(pup)
+    with pytest.raises(RobotError, match=r"file type '\.yaml': expected a file that ends in \.urdf or \.xml"):
+        write_new_robot(pup.with_suffix(".yaml"), tmp_path / "x.yaml")
+
+
+def test_the_command_says_how_to_go_on(pup, capsys):
+    assert main(["new", str(pup)]) == 0
+    out = capsys.readouterr().out
+    assert "8 joints, 12 contact spheres" in out
+    assert "--env my_robots:ce_gym/PupVelocity-v0" in out
+    assert main(["inspect", str(pup.with_suffix(".yaml")), "--no-errors"]) == 0
+    assert "Environments: it has what every task needs" in capsys.readouterr().out
+    assert main(["inspect", "mit_humanoid_leg", "--no-errors"]) == 0
+    assert "a floating base, because tasks are about walking" in capsys.readouterr().out
