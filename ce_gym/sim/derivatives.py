@@ -8,20 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.compile import Buffer, Call, Program, aligned_zeros, load_kernel
-from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.model import Model
-from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
-from ce_gym.sim.kernel_key import model_key
+from ce_gym.compile import aligned_zeros
+from ce_gym.dynamics.stepping.derivatives import primal_function, state_parts
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.sim.derivative_kernels import load_gradient_kernel, load_linearization_kernel
 from ce_gym.sim.simulator import Simulator
-from ce_gym.sim.substeps import DT
 
 
 @dataclass
@@ -142,6 +139,17 @@ class StepDerivatives:
             `A`, shape (num_envs, 2 nv, 2 nv), and `B`, shape (num_envs, 2 nv, n_targets), of the state [q; v] in the
             tangent space of positions.
         """
+        simulator, nv = self.simulator, self.simulator.model.nv
+        if not METHODS[simulator.options.method].is_euler:
+            return self._linearize_by_rows(target)
+        columns = np.empty((simulator.num_envs, 2 * nv + len(simulator.target_names), 2 * nv))
+        every = {**simulator._arrays, "target": self._target(target), "ends": columns.reshape(simulator.num_envs, -1)}
+        self._forward_kernel(every, simulator.num_envs, num_threads=simulator.num_threads)
+        whole = columns.transpose(0, 2, 1)
+        return whole[:, :, : 2 * nv], whole[:, :, 2 * nv :]
+
+    def _linearize_by_rows(self, target: ArrayLike) -> tuple[NDArray, NDArray]:
+        """Return the same row by row, in reverse mode, for any method."""
         nv, n = self.simulator.model.nv, self.simulator.num_envs
         A = np.zeros((n, 2 * nv, 2 * nv))
         B = np.zeros((n, 2 * nv, len(self.simulator.target_names)))
@@ -152,6 +160,10 @@ class StepDerivatives:
             if "target" in found:
                 B[:, row] = found["target"]
         return A, B
+
+    @cached_property
+    def _forward_kernel(self) -> Any:
+        return load_linearization_kernel(self.simulator.model, self.simulator.options, self.simulator.dtype)
 
     @property
     def _kept(self) -> list[str]:
@@ -196,50 +208,3 @@ def _aligned_copy(array: NDArray) -> NDArray:
     copy = aligned_zeros(array.shape, array.dtype.name)
     copy[...] = array
     return copy
-
-
-def load_gradient_kernel(model: Model, options: StepOptions, dtype: str) -> Any:
-    """Compile, or load from the cache, the kernel of the reverse mode of one sub-step."""
-
-    def build() -> Program:
-        return gradient_program(model, options)
-
-    return load_kernel(f"step gradient {model_key(model)} {options!r}", build, dtype)
-
-
-def gradient_program(model: Model, options: StepOptions) -> Program:
-    """Return the program: the iterations of the step, then back through those that were needed."""
-    primal, adjoint = (make(model.mechanism, options) for make in (primal_function, adjoint_function))
-    n = iterations_of(model.mechanism, options)
-    parts = state_parts(primal)
-    scratch = {f"iterate{k}": primal.numel_in("iterate") for k in range(n)} if n > 1 else {}
-    scratch |= {f"active{k}": 1 for k in range(n)} | {"pending": 1}
-    if n > 1:
-        scratch |= {"owed": adjoint.numel_in("owed"), "tried_diverged": 1}
-        scratch |= {f"tried_{name}": size for name, size in parts.items()}
-    buffers = [Buffer(name, primal.numel_in(name), "tiles") for name in (*parts, "diverged", DT)]
-    if "parameters" in primal.name_in():
-        buffers.append(Buffer("parameters", primal.numel_in("parameters"), "tiles"))
-    if "target" in primal.name_in():
-        buffers.append(Buffer("target", primal.numel_in("target"), "rows_in"))
-    buffers += [Buffer(f"w_{name}", adjoint.numel_in(f"w_{name}"), "rows_in", "float64") for name in parts]
-    buffers.append(Buffer("sums", adjoint.numel_in("sums"), "rows_out", "float64"))
-    buffers += [Buffer(name, size, "scratch") for name, size in scratch.items()]
-    begin = {name: size for name, size in scratch.items() if not name.startswith("tried_")}
-    values = [
-        SX.ones(size) if name in ("active0", "pending") else SX(ca.DM.zeros(size)) for name, size in begin.items()
-    ]
-    zeros = ca.Function("begin", [], [*values, SX(ca.DM.zeros(adjoint.numel_in("sums")))])
-    steps = [Call(zeros, (), (*begin, "sums"))]
-    for k in range(n - 1):
-        given = tuple(f"iterate{k}" if name == "iterate" else name for name in primal.name_in())
-        here = {"iterate_next": f"iterate{k + 1}", "unconverged": f"active{k + 1}"}
-        left = tuple(here.get(name, f"tried_{name.removesuffix('_next')}") for name in primal.name_out())
-        steps.append(Call(primal, given, left, only_if=f"active{k}"))
-    for k in reversed(range(n)):
-        here = {"iterate": f"iterate{k}", "active": f"active{k}"}
-        left = tuple(name.removesuffix("_next") for name in adjoint.name_out())
-        steps.append(
-            Call(adjoint, tuple(here.get(name, name) for name in adjoint.name_in()), left, only_if=f"active{k}")
-        )
-    return Program(f"{model.robot.name} {model.transmission} step gradient", tuple(buffers), tuple(steps))

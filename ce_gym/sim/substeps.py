@@ -86,7 +86,7 @@ def _staged(mechanism: Mechanism, options: StepOptions, plan: Plan, outputs: dic
 
     A tile iterates again only if one of its robots has not converged; the others reproduce their result.
     """
-    alone = plan.single and plan.stages[0].length == 1
+    alone = plan.is_euler
     asked = tuple(name for name in outputs if plan.single or name != "error")
     iteration = iteration_function(mechanism, options, asked)
     combine = combination_function(mechanism, options, {} if plan.single else outputs)

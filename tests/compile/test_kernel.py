@@ -231,3 +231,21 @@ def test_aligned_zeros(dtype):
 def test_other_dtypes_are_refused():
     with pytest.raises(ValueError, match="dtype: 'int32', expected 'float64' or 'float32'"):
         lane_count(np.int32)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("rows", DTYPES)
+def test_many_values_become_rows(dtype, rows):
+    """Whole tiles are transposed block by block, the last block overlapping; the last tile is only partly rows."""
+    size, num_envs = 1003, 37
+    x = ca.SX.sym("x", size)
+    buffers = (Buffer("x", size, "tiles"), Buffer("y", size, "rows_out", rows))
+    call = Call(ca.Function("twice", [x], [2 * x]), ("x",), ("y",))
+    kernel = load_kernel(f"many values {rows}", lambda: Program("many", buffers, (call,)), dtype)
+    values = aligned_zeros((-(-num_envs // kernel.lanes), size, kernel.lanes), dtype)
+    values[:] = np.random.default_rng(0).normal(size=values.shape)
+    found = np.zeros((num_envs + 1, size), rows)
+    kernel({"x": values, "y": found[:num_envs]}, num_envs)
+    expected = 2 * values.transpose(0, 2, 1).reshape(-1, size)[:num_envs]
+    np.testing.assert_array_equal(found[:num_envs], expected.astype(rows))
+    assert not found[num_envs].any()

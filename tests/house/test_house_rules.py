@@ -36,8 +36,8 @@ LAYERS = {
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
     "dynamics": "algebra constraints standing recursion forces functions derivatives stepping evaluation model",
-    "sim": "tiles devices terrain placement substeps kernel_key kernels schema batch pieces retry simulator"
-    " derivatives",
+    "sim": "tiles devices terrain placement substeps kernel_key kernels derivative_kernels schema batch pieces retry"
+    " simulator derivatives",
     "envs": "terms task runtime policy_spec differentiable base rendering single vector registration custom",
     "viewer": "errors console rollouts page raytrace server feed window renderers live cli",
     "bench": "measure peers friction instructions soak digests fuzz speed throughput paper accuracy stability"

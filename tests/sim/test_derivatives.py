@@ -81,6 +81,17 @@ def quadruped(n: int = 24, **options) -> tuple[Simulator, np.ndarray]:
     return sim, target
 
 
+def standing(n: int = 9, **options) -> tuple[Simulator, np.ndarray]:
+    """Robots that all stand and sway, a little different from each other."""
+    model, rng = Model("mini_cheetah"), np.random.default_rng(7)
+    sim = Simulator(model, n, contacts="foot", outputs=("contact_forces",), **options)
+    target = model.standing_q[7:] + rng.normal(0, 0.05, (n, 12))
+    sim.step(target, 100)
+    sim.set_state(sim.q, sim.v + rng.normal(0, 0.02, (n, model.nv)))  # as if it had just been pushed
+    sim.step(target, 10)
+    return sim, target
+
+
 def errors(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """Largest error of each robot, relative to its largest entry."""
     rows = tuple(range(1, ours.ndim))
@@ -103,6 +114,35 @@ def test_linearize_a_quadruped_through_contact_and_all_iterations():
     differences = Differences(sim, target)
     theirs = [differences.column(part, i) for part, n in (("q", 18), ("v", 18), ("target", 12)) for i in range(n)]
     assert errors(np.concatenate([A, B], axis=2), np.stack(theirs, axis=2)).max() < 1e-6
+
+
+def test_linearize_robots_that_stand():
+    sim, target = standing()
+    weight = 9.81 * sim.model.total_mass
+    assert (sim.contact_forces[:, :, 2].sum(1) > 0.5 * weight).all()
+    assert (sim.contact_forces[:, :, 2] > 0.02 * weight).sum(1).min() >= 3
+    A, B = StepDerivatives(sim).linearize(target)
+    differences = Differences(sim, target)
+    theirs = [differences.column(part, i) for part, n in (("q", 18), ("v", 18), ("target", 12)) for i in range(n)]
+    assert errors(np.concatenate([A, B], axis=2), np.stack(theirs, axis=2)).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("robot", "options"),
+    [
+        ("planar_leg_linkage", {"control": "motor_position", "motors": "limited"}),
+        ("planar_leg_linkage", {"control": "torque", "dtype": "float32"}),
+        ("four_bar", {}),
+    ],
+)
+def test_linearize_gives_the_rows_of_the_reverse_mode(robot: str, options: dict):
+    model, rng = Model(robot), np.random.default_rng(2)
+    sim = Simulator(model, 11, **options)
+    sim.set_state(model.standing_q + rng.normal(0, 0.1, (11, model.nq)), rng.normal(0, 3, (11, model.nv)))
+    target = rng.normal(0, 1, (11, len(sim.target_names)))
+    derivatives = StepDerivatives(sim)
+    ours, theirs = (np.dstack(both) for both in (derivatives.linearize(target), derivatives._linearize_by_rows(target)))
+    assert errors(ours, theirs).max() < (1e-4 if sim.dtype == "float32" else 1e-12)
 
 
 def test_backward_through_steps_in_contact():

@@ -18,6 +18,8 @@ from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step
 
 INT = ir.IntType(64)
 FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
+MANY = 512
+"""Values per environment from which on rows are written block by block: so many exceed a level-1 cache."""
 
 
 def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...]) -> None:
@@ -105,11 +107,38 @@ class _TileWork:
 
     def _lanes_to_rows(self, buffer: Buffer) -> None:
         """Copy the lanes of real environments to their rows."""
+        b, lanes = self.builder, INT(self.vectors.lanes)
+        if buffer.size < MANY:
+            self._each_lane_to_its_row(buffer)
+            return
+        with b.if_else(b.icmp_signed("==", self.valid_lanes, lanes)) as (whole, partial):
+            with whole:
+                self._blocks_to_rows(buffer)
+            with partial:
+                self._each_lane_to_its_row(buffer)
+
+    def _each_lane_to_its_row(self, buffer: Buffer) -> None:
+        """Copy values one by one."""
         b = self.builder
         with loop(b, self.valid_lanes, "lane") as lane:
             row = b.add(self.first_env, lane)
             with self._elements(buffer, row, lane) as (row_element, lane_element):
                 b.store(_convert(b, b.load(lane_element), FLOATS[buffer.dtype or self.layout.dtype]), row_element)
+
+    def _blocks_to_rows(self, buffer: Buffer) -> None:
+        """Copy blocks of as many values as there are lanes, transposed; the last one may overlap the one before."""
+        b, v, n = self.builder, self.vectors, self.vectors.lanes
+        row_type = FLOATS[buffer.dtype or self.layout.dtype]
+        rows = b.inttoptr(self._array(buffer), row_type.as_pointer())
+        lanes, last = self.lanes[buffer.name], INT(buffer.size - n)
+        with loop(b, INT(-(-buffer.size // n)), "block") as block:
+            first = self._smaller(b.mul(block, INT(n)), last)
+            start = b.gep(lanes, [first])
+            for lane, vector in enumerate(v.transposed([v.load(start, i) for i in range(n)])):
+                row = b.add(b.mul(b.add(self.first_env, INT(lane)), INT(buffer.size)), first)
+                to = ir.VectorType(row_type, n)
+                place = b.bitcast(b.gep(rows, [row]), to.as_pointer())
+                b.store(_convert(b, vector, to), place, align=8 if row_type == FLOATS["float64"] else 4)
 
     @contextmanager
     def _elements(self, buffer: Buffer, row: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
@@ -191,4 +220,5 @@ def _convert(builder: Builder, value: Value, to: ir.Type) -> Value:
     """A float in the other precision, or as it is."""
     if value.type == to:
         return value
-    return builder.fpext(value, to) if to == FLOATS["float64"] else builder.fptrunc(value, to)
+    wider = getattr(to, "element", to) == FLOATS["float64"]
+    return builder.fpext(value, to) if wider else builder.fptrunc(value, to)

@@ -132,6 +132,24 @@ class VectorBuilder:
         """Write vector `index` of an aligned buffer that starts at `base`."""
         self.builder.store(value, self.element(base, index), align=ALIGNMENT)
 
+    def transposed(self, vectors: list[Value]) -> list[Value]:
+        """Vector i of what is returned holds lane i of each, in their order; as many as there are lanes."""
+        vectors, half = list(vectors), self.lanes // 2
+        while half:
+            upper = [bool(lane & half) for lane in range(self.lanes)]
+            low = [self.lanes + lane - half if up else lane for lane, up in enumerate(upper)]
+            high = [self.lanes + lane if up else lane + half for lane, up in enumerate(upper)]
+            for i in range(self.lanes):
+                if not i & half:
+                    pair = vectors[i], vectors[i + half]
+                    vectors[i], vectors[i + half] = self._shuffled(*pair, low), self._shuffled(*pair, high)
+            half //= 2
+        return vectors
+
+    def _shuffled(self, a: Value, b: Value, places: list[int]) -> Value:
+        mask = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), places)
+        return self.builder.shuffle_vector(a, b, mask)
+
     def element(self, base: Value, index: int) -> Value:
         """Address of vector `index`."""
         return self.builder.gep(base, [ir.Constant(ir.IntType(64), index)], inbounds=True)

@@ -75,6 +75,7 @@ class Articulation:
     Attributes:
         U: Force at the handle for a unit independent acceleration, shape (6, d).
         D: Inertia of the cluster's own motion, shape (d, d).
+        inertia: The same without what acts on its coordinates and without damping, shape (d, d).
         u: Generalised force left after all biases, shape (d,).
         handle_body: The body whose frame is the handle; None if the handle is the output body's frame.
         base: Articulated inertia of a floating base and the force left on it; None for a fixed base.
@@ -82,6 +83,7 @@ class Articulation:
 
     U: dict[int, SX] = field(default_factory=dict)
     D: dict[int, SX] = field(default_factory=dict)
+    inertia: dict[int, SX] = field(default_factory=dict)
     u: dict[int, SX] = field(default_factory=dict)
     handle_body: dict[int, str | None] = field(default_factory=dict)
     base: tuple[SX, SX] | None = None
@@ -127,7 +129,7 @@ def inward_inertia_pass(
             more, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
             D, u = mirrored(D + more), u + drag
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
-        articulation.handle_body[k] = handle.name if handle else None
+        articulation.inertia[k], articulation.handle_body[k] = condensed.D, handle.name if handle else None
         if cluster.output_body is None:
             continue
         solved = solve_positive_definite(D, ca.horzcat(U.T, u))  # D^-1 [U^T, u]

@@ -30,11 +30,7 @@ def inverse_dynamics(mechanism: Mechanism, kinematics: Kinematics, vdot: SX) -> 
         tau, base wrench [moment; force] first, shape (nv,).
     """
     a, qdd = outward_acceleration(mechanism, kinematics, vdot)
-    f = {}
-    for name, body in mechanism.bodies.items():
-        inertia, w = constant(body.inertia), kinematics.bodies[name].v[:3]
-        f[name] = inertia @ a[name] + turning_force(inertia, w)
-    return inward_force_pass(mechanism, kinematics, a, f, qdd)
+    return inward_force_pass(mechanism, kinematics, a, net_forces(mechanism, kinematics, a), qdd)
 
 
 def outward_acceleration(mechanism: Mechanism, kinematics: Kinematics, vdot: SX) -> tuple[dict[str, SX], list[SX]]:
@@ -58,6 +54,15 @@ def outward_acceleration(mechanism: Mechanism, kinematics: Kinematics, vdot: SX)
             from_parent = state.X.motion(a[body.parent] if body.parent is not None else world)
             a[body.name] = from_parent + state.S * qdd[k][coordinates.index[body.name]] + state.c
     return a, qdd
+
+
+def net_forces(mechanism: Mechanism, kinematics: Kinematics, a: dict[str, SX]) -> dict[str, SX]:
+    """Return the force that moves each body, [moment; force], shape (6,), given accelerations minus gravity."""
+    f = {}
+    for name, body in mechanism.bodies.items():
+        inertia, w = constant(body.inertia), kinematics.bodies[name].v[:3]
+        f[name] = inertia @ a[name] + turning_force(inertia, w)
+    return f
 
 
 def inward_force_pass(
@@ -87,11 +92,7 @@ def inward_force_pass(
                         + transverse.couple
                     )
                     f[spin.carrier] += ca.vertcat(couple, SX(3, 1))
-        for body in reversed(mechanism.moving(cluster)):
-            state = kinematics.bodies[body.name]
-            spanning[coordinates.index[body.name]] = state.S.T @ f[body.name]
-            if body.parent is not None:
-                f[body.parent] += state.X.force_to_parent(f[body.name])
+        _to_parents(mechanism, kinematics, k, f, spanning)
         tau[rows] = coordinates.G.T @ spanning
         if mechanism.level in ("coupled", "armature"):
             tau[rows] += _reflected(mechanism, coordinates, k, qdd[k])
@@ -111,3 +112,28 @@ def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qd
         G_r = G[row, :]
         torque += spin.inertia * (ca.vec(G_r) ** 2 * ydd if mechanism.level == "armature" else G_r.T * qdd[row])
     return torque
+
+
+def _to_parents(mechanism: Mechanism, kinematics: Kinematics, k: int, f: dict[str, SX], spanning: SX) -> None:
+    """Carry forces on the bodies of a cluster to their parents, and what the joints on the way feel to `spanning`."""
+    coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
+    for body in reversed(mechanism.moving(mechanism.tree.clusters[k])):
+        state = kinematics.bodies[body.name]
+        spanning[coordinates.index[body.name]] = state.S.T @ f[body.name]
+        if body.parent is not None:
+            f[body.parent] += state.X.force_to_parent(f[body.name])
+
+
+def force_on_coordinates(mechanism: Mechanism, kinematics: Kinematics, f: dict[str, SX]) -> SX:
+    """Take forces on bodies [moment; force], body axes, shape (6,) each, to the coordinates of `v`, shape (nv,)."""
+    tau, f = SX(sum(len(rows) for rows in kinematics.rows), 1), dict(f)
+    for k in mechanism.tree.tip_to_base():
+        cluster, rows = mechanism.tree.clusters[k], kinematics.rows[k]
+        if is_free(mechanism, cluster):
+            tau[rows] = f[cluster.bodies[0]]
+            continue
+        coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
+        spanning = SX(len(coordinates.index), 1)
+        _to_parents(mechanism, kinematics, k, f, spanning)
+        tau[rows] = coordinates.G.T @ spanning
+    return tau

@@ -23,7 +23,7 @@ from ce_gym.model.mechanism import Mechanism
 def iterations_of(mechanism: Mechanism, options: StepOptions) -> int:
     """Return in how many iterations a step is differentiated: 1 where it is differentiated as one expression."""
     plan = METHODS[options.method]
-    alone = plan.single and plan.stages[0].length == 1 and iterate_size(mechanism, options) > 0
+    alone = plan.is_euler and iterate_size(mechanism, options) > 0
     return 1 + min(plan.stages[0].iterations, iterations_needed(mechanism, options)) if alone else 1
 
 

@@ -90,6 +90,11 @@ class Plan:
         return isinstance(self.end, Ends) and len(self.stages) == 1
 
     @property
+    def is_euler(self) -> bool:
+        """Whether that stage is a whole linearly implicit Euler step."""
+        return self.single and self.stages[0].length == 1
+
+    @property
     def estimates(self) -> bool:
         """Whether it estimates its error."""
         return isinstance(self.end, Ends) and bool(self.end.error)

@@ -69,6 +69,43 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
         dt: Length of the step [s].
         iterate: From the iteration before: of each contact, then of the motors, shape (iterate_size,).
     """
+    mechanism, acting = scene.mechanism, acting_forces(scene, state, target, dt, iterate)
+    kinematics, contacts, gravity = acting.kinematics, acting.contacts, acting.gravity
+    external = on_bodies(contacts, gravity)
+    at_once = isinstance(dt, float) and dt == 0  # the acceleration of the moment
+    turning = None if at_once else TurningDamping(state.v, dt)
+    momentum = None if at_once else turning_momentum(mechanism, state.v, dt)
+    articulation = inward_inertia_pass(mechanism, kinematics, acting.joints, external, turning)
+    vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
+    return acting.solved(vdot, a)
+
+
+@dataclass
+class Acting:
+    """What acts on a robot over one step, linear in its acceleration.
+
+    Attributes:
+        kinematics: At the start of the step.
+        contacts: Forces of the contacts of the scene.
+        motors: What the motors deliver to the joints.
+        joints: That and what the joints do by themselves.
+        gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
+    """
+
+    kinematics: Kinematics
+    contacts: list[LinearContact]
+    motors: MotorForce
+    joints: JointTerms
+    gravity: dict[str, SX]
+
+    def solved(self, vdot: SX, a: dict[str, SX]) -> Solved:
+        """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each."""
+        motion = Motion(vdot[vdot.numel() - self.motors.tau.numel() :], a, self.gravity)
+        return Solved(self.kinematics, vdot, motion, self.contacts, self.motors)
+
+
+def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Acting:
+    """Linearise all forces about an iterate; arguments as for `solve`."""
     mechanism, n = scene.mechanism, len(scene.mechanism.robot.independent)
     y, yd = state.q[state.q.shape[0] - n :], state.v[state.v.shape[0] - n :]
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
@@ -80,13 +117,7 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
 
     joints = on_coordinates(mechanism, motors + passive_forces(mechanism.robot, y, yd, dt))
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    external = on_bodies(contacts, gravity)
-    at_once = isinstance(dt, float) and dt == 0  # the acceleration of the moment
-    turning = None if at_once else TurningDamping(state.v, dt)
-    momentum = None if at_once else turning_momentum(mechanism, state.v, dt)
-    articulation = inward_inertia_pass(mechanism, kinematics, joints, external, turning)
-    vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
-    return Solved(kinematics, vdot, Motion(vdot[vdot.numel() - n :], a, gravity), contacts, motors)
+    return Acting(kinematics, contacts, motors, joints, gravity)
 
 
 @dataclass
@@ -116,7 +147,11 @@ class Stepped:
 
 def iteration(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Stepped:
     """Make one iteration of a linearly implicit Euler step; arguments as for `solve`."""
-    solved = solve(scene, state, target, dt, iterate)
+    return stepped(scene, state, solve(scene, state, target, dt, iterate), dt, iterate)
+
+
+def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) -> Stepped:
+    """Return what a step leaves behind whose acceleration is known; arguments as for `solve`."""
     kinematics, motion, motors = solved.kinematics, solved.motion, solved.motors
     q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.floating)
     for row, held in motors.held.items():  # a joint that dry friction holds does not move at all

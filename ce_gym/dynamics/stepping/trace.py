@@ -43,7 +43,7 @@ def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str
         scene has; `given` is `target` if there are joints, `parameters` if any are declared, `ground` on a field, and
         `dt` if the options leave it open.
     """
-    given, plan = _Given(mechanism, options), METHODS[options.method]
+    given, plan = Given(mechanism, options), METHODS[options.method]
     parts = unrolled(plan, given.scene, given.state, given.target, given.dt)
     told = {name: given.output(name, plan.shares(name), parts) for name in outputs}
     return traced("step", given.inputs(), given.guarded(parts[AFTER]) | told)
@@ -56,7 +56,7 @@ def iteration_function(mechanism: Mechanism, options: StepOptions, outputs: tupl
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
         `step_function`; the iterate is zero at first, shape (iterate_size,).
     """
-    given, iterate = _Given(mechanism, options), SX.sym("iterate", iterate_size(mechanism, options))
+    given, iterate = Given(mechanism, options), SX.sym("iterate", iterate_size(mechanism, options))
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
     told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
     left = {"iterate_next": stepped.iterate, "unconverged": stepped.unconverged}
@@ -117,7 +117,7 @@ OUTPUTS = {
 """What a step can report, if asked."""
 
 
-class _Given:
+class Given:
     """Symbols of one robot before a step, and what becomes of them."""
 
     def __init__(self, mechanism: Mechanism, options: StepOptions) -> None:
@@ -132,6 +132,7 @@ class _Given:
         self.scene = make_scene(mechanism, options, self.parameters, self.ground)
 
     def inputs(self) -> dict[str, SX]:
+        """Return the symbols by name, without empty ones."""
         given = {"target": self.target, "parameters": self.parameters, "ground": ca.vec(self.ground)}
         given = {name: value for name, value in given.items() if value.numel()}
         given |= {"dt": self.dt} if isinstance(self.dt, SX) else {}

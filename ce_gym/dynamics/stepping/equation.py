@@ -1,0 +1,246 @@
+"""The equation of motion over one step, and what changes in it along directions: expressions.
+
+What must vanish is inverse dynamics less the forces of motors and joints, and less what contacts do, at a given
+acceleration. Of a contact the derivatives of its force with respect to where it is and how it moves come first, and are
+shared by all directions. The damping of joints on turning bodies contains inertias that clusters have on the way of the
+recursion; how these change is found in reverse mode.
+
+Directions are changes of a part of what a step is given, by its name and place; positions in their tangent space.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from functools import cached_property
+from typing import TypeAlias
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_to_rotation, skew
+from ce_gym.dynamics.derivatives import tangent_basis
+from ce_gym.dynamics.forces.contact import LinearContact
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.recursion.ce_aba import BodyTerms, inward_inertia_pass
+from ce_gym.dynamics.recursion.ce_rnea import force_on_coordinates, inward_force_pass, net_forces, outward_acceleration
+from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, turning_momentum
+from ce_gym.dynamics.stepping.step import acting_forces, iterate_size, on_bodies, stacked, stepped
+from ce_gym.dynamics.stepping.trace import Given
+from ce_gym.model.mechanism import Mechanism
+
+GAIN = 3
+"""Of the iterate of a contact, what its force depends on smoothly: the gain in velocity. The rest only decides."""
+Direction: TypeAlias = tuple[str, int]
+"""A part of what a step is given, and a place in it."""
+
+
+class Equation:
+    """The equation of motion of one robot over one iteration of a step.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+
+    Attributes:
+        given: Symbols of what a step is given.
+        iterate: Symbols of the iterate.
+        vdot: Symbols of the acceleration, shape (nv,).
+        local: Of each contact, what its force depends on, the force (3,), and its derivative with respect to that.
+        forces: Symbols of the forces of contacts, shape (3, n_contacts).
+        slopes: Symbols of those derivatives.
+        inertia: Symbols of the inertias of clusters whose joints are damped, shape (d, d) each.
+        order: Rows of `v`, those of a body before those of what it carries.
+        wrt: What directions are changes of, by name; "gains" are those of velocities in the iteration before.
+    """
+
+    def __init__(self, mechanism: Mechanism, options: StepOptions) -> None:
+        self.given = given = Given(mechanism, options)
+        self.mechanism, self.floating = given.scene.mechanism, mechanism.robot.floating
+        self.iterate = SX.sym("iterate", iterate_size(mechanism, options))
+        self.vdot = SX.sym("vdot", given.state.v.numel())
+        self.acting = acting_forces(given.scene, given.state, given.target, given.dt, self.iterate)
+        self.a, self.qdd = outward_acceleration(self.mechanism, self.acting.kinematics, self.vdot)
+        self.solved = self.acting.solved(self.vdot, self.a)
+        self.local = [self.local_force(contact) for contact in self.acting.contacts]
+        self.forces = SX.sym("forces", 3, len(self.local))
+        self.slopes = [SX.sym("slopes", slope.sparsity()) for _, _, slope in self.local]
+        rows, clusters = self.acting.kinematics.rows, self.mechanism.tree.clusters
+        self.order = [row for k in self.mechanism.tree.base_to_tip() for row in rows[k]]
+        self.turned = {k: rows[k] for k in range(len(clusters)) if clusters[k].output_body is not None}
+        self.inertia = {k: SX.sym("inertia", len(rows), len(rows)) for k, rows in self.turned.items()}
+        gains = stacked([contact.iterate.gain for contact in self.acting.contacts])
+        every = {**dict(given.state.items()), "target": given.target, "gains": gains}
+        self.wrt = {name: value for name, value in every.items() if value.numel()}
+
+    @property
+    def nv(self) -> int:
+        """Number of velocities."""
+        return self.vdot.numel()
+
+    @property
+    def x(self) -> SX:
+        """What directions are changes of, stacked."""
+        return ca.vertcat(*self.wrt.values())
+
+    @property
+    def inputs(self) -> dict[str, SX]:
+        """What an iteration is given, and its acceleration."""
+        return there(self.given.inputs() | {"iterate": self.iterate, "vdot": self.vdot})
+
+    @property
+    def frozen(self) -> dict[str, SX]:
+        """That and what all directions share."""
+        more = {"inertia": self.stacked_inertias(self.inertia), "forces": ca.vec(self.forces)}
+        more |= {"slopes": ca.vertcat(SX(0, 1), *map(packed, self.slopes))}
+        return self.inputs | there(more | {"drift": packed(self.drift)})
+
+    def to_own_axes(self, group: list[Direction], columns: SX) -> SX:
+        """Take columns along positions of the base from the axes of the world to its own."""
+        if self.floating and ("q", 3) in group:
+            columns[:, 3:6] = columns[:, 3:6] @ quaternion_to_rotation(self.wrt["q"][3:7])
+        return columns
+
+    def change(self, seeds: SX) -> SX:
+        """Return what directions change in the equation of motion without contacts, for an unchanged acceleration."""
+        change = ca.jtimes(self._motion, self.x, seeds)
+        damped = [row for rows in self.turned.values() for row in rows]
+        change[damped, :] += self.drift @ seeds
+        return ca.sparsify(change)
+
+    def pressing(self, seeds: SX) -> SX:
+        """Return what they change in what contacts do to it."""
+        x = self.x
+        forces = [slope @ ca.jtimes(at, x, seeds) for slope, (at, _, _) in zip(self.slopes, self.local, strict=True)]
+        return ca.sparsify(ca.jtimes(self._pressed, ca.vertcat(x, ca.vec(self.forces)), ca.vertcat(seeds, *forces)))
+
+    def seeds(self, group: list[Direction]) -> SX:
+        """Return directions as columns; along positions of the base in the axes of the world."""
+        columns = []
+        for name, i in group:
+            parts = {name: SX(value.numel(), 1) for name, value in self.wrt.items()}
+            basis = tangent_basis(self.wrt["q"], self.floating) if name == "q" else SX.eye(parts[name].numel())
+            if self.floating and name == "q":
+                basis[:3, 3:6] = SX.eye(3)
+            parts[name] = basis[:, i]
+            columns.append(ca.vertcat(*parts.values()))
+        return ca.horzcat(*columns)
+
+    def implicit(self) -> SX:
+        """Return how the equation of motion changes with the acceleration, shape (nv, nv)."""
+        whole = ca.jacobian(self._motion, self.vdot)
+        for i, (at, _, slope) in enumerate(self.local):
+            whole += ca.jacobian(self._pressed, self.forces[:, i]) @ slope @ ca.jacobian(at, self.vdot)
+        return ca.substitute(
+            ca.sparsify(whole), self.stacked_inertias(self.inertia), self.stacked_inertias(self.articulated)
+        )
+
+    @cached_property
+    def force_values(self) -> SX:
+        """Forces of contacts at the given acceleration, shape (3, n_contacts)."""
+        return ca.horzcat(SX(3, 0), *[force for _, force, _ in self.local])
+
+    def stacked_inertias(self, inertia: dict[int, SX]) -> SX:
+        """Return inertias of clusters as a column."""
+        return ca.vertcat(SX(0, 1), *[ca.vec(ca.densify(D)) for D in inertia.values()])
+
+    @cached_property
+    def drift(self) -> SX:
+        """Symbol of what `drift_function` returns."""
+        return SX.sym("drift", self.drift_of(self.articulated).sparsity())
+
+    def drift_of(self, articulated: dict[int, SX]) -> SX:
+        """Return how the damping of joints changes because these inertias do, shape (joints, size of `x`)."""
+        x, rows = self.x, []
+        for k, inertia in self.inertia.items():
+            torque = self._damping(k, inertia)
+            for i in range(torque.numel()):
+                weights = ca.jtimes(torque[i], ca.vec(inertia), SX(1), True)
+                rows.append(ca.jtimes(ca.vec(ca.densify(articulated[k])), x, weights, True).T)
+        return ca.sparsify(ca.vertcat(*rows)) if rows else SX(0, x.numel())
+
+    @cached_property
+    def articulated(self) -> dict[int, SX]:
+        """Inertias of clusters on the way of the recursion, without what acts on their joints, shape (d, d) each."""
+        return self.inertias(on_bodies(self.acting.contacts, self.acting.gravity))
+
+    def inertias(self, external: dict[str, BodyTerms]) -> dict[int, SX]:
+        """Return such inertias where something else acts on bodies."""
+        turning = TurningDamping(self.given.state.v, self.given.dt)
+        found = inward_inertia_pass(self.mechanism, self.acting.kinematics, self.acting.joints, external, turning)
+        return {k: found.inertia[k] for k in self.turned}
+
+    def local_force(self, contact: LinearContact) -> tuple[SX, SX, SX]:
+        """Return what the force of a contact depends on; the force (3,); and its derivative with respect to that."""
+        law, touch, iterate = contact.law, contact.law.touch, contact.iterate
+        names = [f.name for f in fields(touch) if f.name not in ("point", "drift") and getattr(touch, f.name).numel()]
+        symbols = {name: SX.sym(name, *getattr(touch, name).shape) for name in names}
+        before, gain = SX.sym("before", GAIN), SX.sym("gain", GAIN)
+        about = LinearContact(replace(law, touch=replace(touch, **symbols)), replace(iterate, gain=before))
+        force, wrt = about.force_after(gain), ca.vertcat(*symbols.values(), before, gain)
+        at = ca.vertcat(*[getattr(touch, name) for name in names], iterate.gain, contact.gain(self.solved.motion))
+        force, slope = ca.substitute([force, ca.jacobian(force, wrt)], [wrt], [at])
+        return at, force, ca.sparsify(slope)
+
+    @cached_property
+    def _motion(self) -> SX:
+        """What the equation of motion lacks without contacts, shape (nv,), given inertias of clusters."""
+        acting, kinematics = self.acting, self.acting.kinematics
+        f = net_forces(self.mechanism, kinematics, self.a)
+        left = inward_force_pass(self.mechanism, kinematics, self.a, f, self.qdd)
+        left += acting.joints.slope @ self.vdot - acting.joints.tau
+        momentum = turning_momentum(self.mechanism, self.given.state.v, self.given.dt)
+        if momentum is not None:
+            left[:3] -= skew(momentum) @ self.vdot[:3]
+        for k, rows in self.turned.items():
+            left[rows] += self._damping(k, self.inertia[k])
+        return left
+
+    @cached_property
+    def _pressed(self) -> SX:
+        """What contacts do to it, shape (nv,), given their forces."""
+        kinematics, still = self.acting.kinematics, SX(6, 1)
+        f = dict.fromkeys(self.mechanism.bodies, still)
+        for i, contact in enumerate(self.acting.contacts):
+            moment = cross(contact.law.touch.point, self.forces[:, i])
+            f[contact.body] = f[contact.body] - ca.vertcat(moment, self.forces[:, i])
+        return force_on_coordinates(self.mechanism, kinematics, f)
+
+    def _damping(self, k: int, inertia: SX) -> SX:
+        """Return the torque that damps the joints of a cluster because its carrier turns, shape (d,)."""
+        carrier, rows = self.mechanism.tree.clusters[k].output_body, self.turned[k]
+        turning = TurningDamping(self.given.state.v, self.given.dt)
+        more, drag = turning.on(inertia, rows, self.acting.kinematics.bodies[carrier].v[:3])  # type: ignore[index]
+        return more @ self.vdot[rows] - drag
+
+    @cached_property
+    def _slope(self) -> SX:
+        return self.tangent_after(ca.jacobian(self.end_values, self.vdot))
+
+    @cached_property
+    def end_values(self) -> SX:
+        """Positions and velocities after the step at the given acceleration."""
+        given = self.given
+        after = stepped(given.scene, given.state, self.solved, given.dt, self.iterate).state
+        return ca.vertcat(after.q, after.v)
+
+    def tangent_after(self, columns: SX) -> SX:
+        """Take changes of positions after the step to their tangent space."""
+        nq = columns.size1() - self.nv
+        tangent = tangent_basis(self.end_values[:nq], self.floating).T
+        if self.floating:  # its rows of rotation have length 1/2
+            tangent[:3, :] *= 4
+        return ca.sparsify(ca.vertcat(tangent @ columns[:nq, :], columns[nq:, :]))
+
+
+def acts(contacts: list[LinearContact]) -> SX:
+    """Return 1 if a contact acts, else 0."""
+    return SX(ca.sum1(ca.vertcat(*[contact.active for contact in contacts])) > 0)
+
+
+def packed(x: SX) -> SX:
+    """Return the entries that are not zero by structure, as a column."""
+    return ca.vertcat(SX(0, 1), *x.nonzeros())  # type: ignore[arg-type]
+
+
+def there(named: dict[str, SX]) -> dict[str, SX]:
+    """Return what is not empty."""
+    return {name: value for name, value in named.items() if value.numel()}

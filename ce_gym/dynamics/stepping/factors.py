@@ -1,0 +1,46 @@
+"""Matrices as sparse as a tree of joints: factors without pivoting, and what is solved with them, in place."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+
+
+def factorised(A: SX, order: list[int]) -> SX:
+    """Factorise a matrix `A = U L`, whose symmetric part is positive definite; tips first nothing is filled in.
+
+    Args:
+        A: Shape (n, n).
+        order: Its rows, those of a body before those of what it carries.
+
+    Returns:
+        Shape (n, n): reciprocals of the pivots on the diagonal, and `U`, whose diagonal is 1, and `L`, whose are those
+        pivots, above and below, in the order.
+    """
+    A = SX(A)
+    for place in reversed(range(len(order))):
+        i, above = order[place], order[:place]
+        A[i, i] = 1 / A[i, i]
+        for j in above:
+            if A.sparsity().has_nz(j, i):
+                A[j, i] = A[j, i] * A[i, i]
+                for k in above:
+                    if A.sparsity().has_nz(i, k):
+                        A[j, k] = A[j, k] - A[j, i] * A[i, k]
+    return A
+
+
+def solved_with(factor: SX, order: list[int], b: SX) -> SX:
+    """Solve `A x = b` for right-hand sides (n, m), given what `factorised` returned."""
+    known, x = factor.sparsity(), [b[i, :] for i in range(b.shape[0])]
+    for place in reversed(range(len(order))):
+        for j in order[:place]:
+            if known.has_nz(j, order[place]):
+                x[j] -= factor[j, order[place]] * x[order[place]]
+    for place, i in enumerate(order):
+        for j in order[:place]:
+            if known.has_nz(i, j):
+                x[i] -= factor[i, j] * x[j]
+        x[i] *= factor[i, i]
+    return ca.vertcat(*x)

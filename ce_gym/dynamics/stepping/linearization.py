@@ -1,0 +1,207 @@
+"""How one iteration of a step depends on the state before it, along many directions, as traced functions.
+
+An iteration finds the acceleration at which the equation of motion `r(x, vdot) = 0` holds: inverse dynamics less the
+forces of contacts, motors and joints. So along a direction `dx`
+
+    dvdot = -A^-1 (dr/dx) dx,    A = dr/dvdot,
+
+and only `r` is differentiated, never the recursion that solves it. `A`, the mass matrix and all that is implicit, is as
+sparse as the tree of joints, and is factorised once, tips first, which fills nothing in. Derivatives of contact forces
+with respect to where contacts are and how they move are shared by all directions. The damping of joints on turning
+bodies contains inertias that clusters have on the way of the recursion; these change as found in reverse mode.
+
+An iteration passes on to the next what velocities gained in it: that is another direction of the next one.
+
+Source: Carpentier, Mansard, "Analytical Derivatives of Rigid Body Dynamics Algorithms", RSS 2018, for inverse dynamics;
+Featherstone 2008, section 6.5, for the factorisation.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
+from ce_gym.dynamics.stepping.equation import Direction, Equation, acts, packed, there
+from ce_gym.dynamics.stepping.factors import factorised, solved_with
+from ce_gym.dynamics.stepping.step import solve, stepped
+
+
+class Linearization(Equation):
+    """The traced functions; their inputs and outputs are buffers by name."""
+
+    @cached_property
+    def groups(self) -> list[list[Direction]]:
+        """Directions, those together that share work."""
+        base = 6 if self.floating else 0
+        groups = [[(name, i) for i in range(base)] for name in ("q", "v") if base]
+        for start in range(base, self.nv, 3):
+            groups.append([(name, i) for name in ("q", "v") for i in range(start, min(start + 3, self.nv))])
+        targets = [("target", i) for i in range(self.given.target.numel())]
+        return groups + ([targets] if targets else [])
+
+    @property
+    def directions(self) -> list[Direction]:
+        """Directions of all groups."""
+        return [direction for group in self.groups for direction in group]
+
+    @cached_property
+    def _slope(self) -> SX:
+        return self.tangent_after(ca.jacobian(self.end_values, self.vdot))
+
+    @cached_property
+    def _factor(self) -> ca.Sparsity:
+        return self.implicit().sparsity()
+
+    def attempt_function(self) -> ca.Function:
+        """Trace an iteration, and of its derivative what all directions share.
+
+        Returns:
+            Function (*state, diverged, *given, iterate) -> (vdot, diverged, iterate, unconverged, factor, inertia,
+            forces, slopes); what is empty is left out here and below.
+        """
+        given = self.given
+        solved = solve(given.scene, given.state, given.target, given.dt, self.iterate)
+        after = stepped(given.scene, given.state, solved, given.dt, self.iterate)
+        forces, *slopes = [self.force_values, *[slope for _, _, slope in self.local]]
+        forces, *slopes = [ca.substitute(x, self.vdot, solved.vdot) for x in (forces, *slopes)]
+        left = {"vdot": solved.vdot, "diverged_next": given.guarded(after)["diverged_next"]}
+        left |= {"iterate_next": after.iterate, "unconverged": after.unconverged} if self.iterate.numel() else {}
+        left |= {
+            "factor": packed(factorised(self.implicit(), self.order)),
+            "inertia": self.stacked_inertias(self.articulated),
+        }
+        left |= {"touching": acts(self.acting.contacts)} if self.local else {}
+        left |= {"forces": ca.vec(forces), "slopes": ca.vertcat(SX(0, 1), *map(packed, slopes))}
+        return traced("attempt", {name: x for name, x in self.inputs.items() if name != "vdot"}, there(left))
+
+    def drift_function(self) -> ca.Function:
+        """Trace how the damping of joints on turning bodies changes because the inertias in it do, without contacts.
+
+        Returns:
+            Function (*inputs) -> drift, the derivative of that torque by itself.
+        """
+        free = ca.project(self.drift_of(self.inertias({})), self.drift.sparsity())
+        return traced("drift", self.inputs, {"drift": packed(free)})
+
+    def pressed_drift_function(self) -> ca.Function:
+        """Trace the same with contacts.
+
+        Returns:
+            Function (*inputs, touching, drift) -> drift, as it was for a robot that nothing touches.
+        """
+        before, touching = packed(self.drift), SX.sym("touching")
+        drift = ca.if_else(touching, packed(self.drift_of(self.articulated)), before)
+        return traced("drift", self.inputs | {"touching": touching, "drift": before}, {"drift_next": drift})
+
+    def change_function(self, group: list[Direction]) -> ca.Function:
+        """Trace how the equation of motion changes along directions, for an unchanged acceleration.
+
+        Returns:
+            Function (*inputs, inertia, forces, slopes, drift) -> a column (nv,) for each direction.
+        """
+        columns = self.to_own_axes(group, self.change(self.seeds(group)))
+        return traced("change", self.frozen, {f"change{i}": columns[:, i] for i in range(len(group))})
+
+    def press_function(self, group: list[Direction]) -> ca.Function | None:
+        """Trace what contacts add to that; to be called if a contact acts.
+
+        Returns:
+            Function (*inputs, forces, slopes, columns of changes) -> the changes with contacts; None if they add none.
+        """
+        columns = self.to_own_axes(group, self.pressing(self.seeds(group)))
+        if not columns.nnz():
+            return None
+        changes = {f"change{i}": SX.sym("change", self.nv) for i in range(len(group))}
+        left = {f"{name}_next": change + columns[:, i] for i, (name, change) in enumerate(changes.items())}
+        return traced("press", self.frozen | changes, left)
+
+    def solve_function(self) -> ca.Function:
+        """Trace how the acceleration changes along one direction.
+
+        Returns:
+            Function (factor, change, active, column) -> column (nv,), as it was where `active` is 0.
+        """
+        change, column, active = SX.sym("change", self.nv), SX.sym("column", self.nv), SX.sym("active")
+        factor = SX.sym("factor", self._factor.nnz())
+        solved = solved_with(SX(self._factor, factor), self.order, -change)
+        given = {"factor": factor, "change": change, "active": active, "column": column}
+        return traced("solve", given, {"column_next": ca.if_else(active, solved, column)})
+
+    def slope_function(self) -> ca.Function:
+        """Trace how the state after the step changes with the acceleration.
+
+        Returns:
+            Function (*inputs) -> slope.
+        """
+        return traced("slope", self.inputs, {"slope": packed(self._slope)})
+
+    def end_function(self) -> ca.Function:
+        """Trace what the change of the acceleration does to the state after the step, along one direction.
+
+        Returns:
+            Function (slope, column) -> that of positions, in their tangent space, and velocities, (2 nv,).
+        """
+        slope, column = SX.sym("slope", self._slope.nnz()), SX.sym("column", self.nv)
+        end = SX(self._slope.sparsity(), slope) @ column
+        return traced("end", {"slope": slope, "column": column}, {"end": end})
+
+    def gather_function(self) -> ca.Function:
+        """Trace the derivative of the step.
+
+        Returns:
+            Function (*inputs, what `end_function` returns for each direction) -> ends, shape (2 nv, directions), in the
+            order of q, v and the target; zeros for a robot that has diverged.
+        """
+        ends = [SX.sym("end", 2 * self.nv) for _ in self.directions]
+        still = [
+            self.to_own_axes(group, ca.jtimes(self.end_values, self.x, self.seeds(group))) for group in self.groups
+        ]
+        whole = self.tangent_after(ca.horzcat(*still)) + ca.horzcat(*ends)
+        places = {name: i for i, name in enumerate(("q", "v", "target"))}
+        order = sorted(range(len(ends)), key=lambda i: (places[self.directions[i][0]], self.directions[i][1]))
+        whole = ca.if_else(self.given.diverged, 0, ca.densify(whole)[:, order])
+        return traced("gather", self.inputs | {f"end{i}": end for i, end in enumerate(ends)}, {"ends": whole})
+
+    def gains_function(self) -> ca.Function:
+        """Trace what an iteration passes on to the next: how the gains in velocity change.
+
+        Returns:
+            Function (*inputs of the one before, slopes, drift) -> (how gains change with accelerations, how the
+            equation of motion changes with gains, and the gains' own change for each direction of the state).
+        """
+        left = {"gained": packed(self._gained), "into": packed(self._into)}
+        for g, group in enumerate(self.groups):
+            direct = self.to_own_axes(group, ca.jtimes(self._gains, self.x, self.seeds(group)))
+            left |= {f"direct{g}_{i}": direct[:, i] for i in range(len(group))}
+        return traced("gains", self.frozen, left)
+
+    def pass_on_function(self) -> ca.Function:
+        """Trace what the iteration before does to the equation of motion along one direction.
+
+        Returns:
+            Function (gained, into, direct, column, change) -> change (nv,), given the column of the one before.
+        """
+        gained, into = SX.sym("gained", self._gained.nnz()), SX.sym("into", self._into.nnz())
+        direct = SX.sym("direct", self._gains.numel())
+        column, change = SX.sym("column", self.nv), SX.sym("change", self.nv)
+        gains = direct + SX(self._gained.sparsity(), gained) @ column
+        given = {"gained": gained, "into": into, "direct": direct, "column": column, "change": change}
+        return traced("pass_on", given, {"change_next": change + SX(self._into.sparsity(), into) @ gains})
+
+    @cached_property
+    def _gains(self) -> SX:
+        return ca.vertcat(*[contact.gain(self.solved.motion) for contact in self.acting.contacts])
+
+    @cached_property
+    def _gained(self) -> SX:
+        return ca.sparsify(ca.jacobian(self._gains, self.vdot))
+
+    @cached_property
+    def _into(self) -> SX:
+        n, m = self.x.numel(), self._gains.numel()
+        seeds = SX(n, m)
+        seeds[n - m :, :] = SX.eye(m)  # gains of the iteration before are the last that directions are changes of
+        return ca.sparsify(self.change(seeds) + self.pressing(seeds))

@@ -1,0 +1,164 @@
+"""The kernels of derivatives of a sub-step: reverse mode, and the Jacobian by columns.
+
+Both repeat the iterations that the step needs. The reverse mode then goes back through them; columns go along with
+them, each iteration taking over what the one before passed on.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+from ce_gym.compile import Buffer, Call, Program, load_kernel
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
+from ce_gym.dynamics.stepping.linearization import Linearization
+from ce_gym.sim.kernel_key import laws_key, model_key
+from ce_gym.sim.substeps import DT
+
+
+def _key(model: Model, options: StepOptions) -> str:
+    return f"{model_key(model)} {options!r} {laws_key(model.mechanism, options)}"
+
+
+def load_gradient_kernel(model: Model, options: StepOptions, dtype: str) -> Any:
+    """Compile, or load from the cache, the kernel of the reverse mode of one sub-step."""
+
+    def build() -> Program:
+        return gradient_program(model, options)
+
+    return load_kernel(f"step gradient {_key(model, options)}", build, dtype)
+
+
+def gradient_program(model: Model, options: StepOptions) -> Program:
+    """Return the program: the iterations of the step, then back through those that were needed."""
+    primal, adjoint = (make(model.mechanism, options) for make in (primal_function, adjoint_function))
+    n = iterations_of(model.mechanism, options)
+    parts = state_parts(primal)
+    scratch = {f"iterate{k}": primal.numel_in("iterate") for k in range(n)} if n > 1 else {}
+    scratch |= {f"active{k}": 1 for k in range(n)} | {"pending": 1}
+    if n > 1:
+        scratch |= {"owed": adjoint.numel_in("owed"), "tried_diverged": 1}
+        scratch |= {f"tried_{name}": size for name, size in parts.items()}
+    buffers = [Buffer(name, primal.numel_in(name), "tiles") for name in (*parts, "diverged", DT)]
+    if "parameters" in primal.name_in():
+        buffers.append(Buffer("parameters", primal.numel_in("parameters"), "tiles"))
+    if "target" in primal.name_in():
+        buffers.append(Buffer("target", primal.numel_in("target"), "rows_in"))
+    buffers += [Buffer(f"w_{name}", adjoint.numel_in(f"w_{name}"), "rows_in", "float64") for name in parts]
+    buffers.append(Buffer("sums", adjoint.numel_in("sums"), "rows_out", "float64"))
+    buffers += [Buffer(name, size, "scratch") for name, size in scratch.items()]
+    begin = {name: size for name, size in scratch.items() if not name.startswith("tried_")}
+    values = [
+        SX.ones(size) if name in ("active0", "pending") else SX(ca.DM.zeros(size)) for name, size in begin.items()
+    ]
+    zeros = ca.Function("begin", [], [*values, SX(ca.DM.zeros(adjoint.numel_in("sums")))])
+    steps = [Call(zeros, (), (*begin, "sums"))]
+    for k in range(n - 1):
+        given = tuple(f"iterate{k}" if name == "iterate" else name for name in primal.name_in())
+        here = {"iterate_next": f"iterate{k + 1}", "unconverged": f"active{k + 1}"}
+        left = tuple(here.get(name, f"tried_{name.removesuffix('_next')}") for name in primal.name_out())
+        steps.append(Call(primal, given, left, only_if=f"active{k}"))
+    for k in reversed(range(n)):
+        here = {"iterate": f"iterate{k}", "active": f"active{k}"}
+        left = tuple(name.removesuffix("_next") for name in adjoint.name_out())
+        steps.append(
+            Call(adjoint, tuple(here.get(name, name) for name in adjoint.name_in()), left, only_if=f"active{k}")
+        )
+    return Program(f"{model.robot.name} {model.transmission} step gradient", tuple(buffers), tuple(steps))
+
+
+def load_linearization_kernel(model: Model, options: StepOptions, dtype: str) -> Any:
+    """Compile, or load from the cache, the kernel of the Jacobian of one sub-step."""
+
+    def build() -> Program:
+        return linearization_program(model, options)
+
+    return load_kernel(f"step linearization {_key(model, options)}", build, dtype)
+
+
+def linearization_program(model: Model, options: StepOptions) -> Program:
+    """Return the program: `ends` becomes the derivatives of [q; v], for each direction of q, v and the target."""
+    linear, n = Linearization(model.mechanism, options), iterations_of(model.mechanism, options)
+    steps, sizes = _Columns(linear, n).steps, {}
+    given = linear.given.inputs()
+    buffers = [Buffer(x, given[x].numel(), "rows_in" if x == "target" else "tiles") for x in given]
+    buffers.append(Buffer("ends", 2 * linear.nv * len(linear.directions), "rows_out", "float64"))
+    for call in steps:  # every other buffer is as large as what is first written to it
+        for i, name in enumerate(call.outputs):
+            sizes.setdefault(name, call.function.numel_out(i))
+    scratch = [Buffer(name, size, "scratch") for name, size in sizes.items() if name != "ends"]
+    return Program(f"{model.robot.name} {model.transmission} step linearization", (*buffers, *scratch), tuple(steps))
+
+
+class _Columns:
+    """The calls of that program: iteration by iteration, and in each direction by direction."""
+
+    def __init__(self, linear: Linearization, n: int) -> None:
+        self.linear, self.chained = linear, n > 1 and bool(linear.local)
+        self.columns = [f"column{i}" for i in range(len(linear.directions))]
+        self.changes = [linear.change_function(group) for group in linear.groups]
+        self.attempt, self.solve = linear.attempt_function(), linear.solve_function()
+        self.drift = [linear.drift_function()] if linear.turned else []
+        self.presses = {g: press for g, group in enumerate(linear.groups) if (press := linear.press_function(group))}
+        self.pressed_drift = [linear.pressed_drift_function()] if linear.local and self.drift else []
+        if self.chained:
+            self.gains, self.pass_on = linear.gains_function(), linear.pass_on_function()
+        sizes = {"iterate": linear.iterate.numel()} | dict.fromkeys(self.columns, linear.nv)
+        sizes |= {f"active{k}": 1 for k in range(1, n)}
+        zeros = {name: SX(ca.DM.zeros(size)) for name, size in sizes.items() if size} | {"active0": SX(1)}
+        self.steps = [Call(ca.Function("begin", [], list(zeros.values())), (), tuple(zeros))]
+        for k in range(n):
+            self.steps += self._iteration(k)
+        self.steps += self._ends()
+
+    def _iteration(self, k: int) -> list[Call]:
+        names = {"active": f"active{k}", "unconverged": f"active{k + 1}"}
+        names |= {"iterate_next": "tried_iterate", "diverged_next": "tried_diverged"}
+        only_if = f"active{k}" if k else ""
+
+        def call(function: ca.Function, **further: str) -> Call:
+            return _call(function, names | further, only_if)
+
+        passes = k > 0 and self.chained
+        steps = [call(_copy(self.linear.iterate.numel()), copied="iterate", original="tried_iterate")] if k else []
+        steps += [call(_copy(self.linear.nv), copied="vdot_before", original="vdot")] if passes else []
+        steps += [call(self.attempt), *map(call, self.drift)]
+        steps += [_call(function, names, "touching") for function in self.pressed_drift]
+        steps += [call(self.gains, vdot="vdot_before")] if passes else []
+        column = iter(self.columns)
+        for g, change in enumerate(self.changes):
+            steps.append(call(change))
+            steps += [_call(self.presses[g], names, "touching")] if g in self.presses else []
+            for i in range(change.n_out()):
+                here = {"column": next(column), "change": f"change{i}"}
+                here |= {f"{name}_next": buffer for name, buffer in here.items()}
+                steps += [call(self.pass_on, direct=f"direct{g}_{i}", **here)] if passes else []
+                steps.append(call(self.solve, **here))
+        nothing = ca.Function("nothing", [], [SX(ca.DM.zeros(1))], [], ["touching"])
+        return steps + ([call(nothing)] if self.presses else [])
+
+    def _ends(self) -> list[Call]:
+        """The columns of the step's derivative from those of its acceleration."""
+        linear, names = self.linear, {"diverged": "tried_diverged"}
+        end, gather = linear.end_function(), linear.gather_function()
+        each = [_call(end, {"column": name, "end": f"end_{name}"}) for name in self.columns]
+        return [
+            _call(linear.slope_function(), names),
+            *each,
+            _call(gather, names | {f"end{i}": f"end_{name}" for i, name in enumerate(self.columns)}),
+        ]
+
+
+def _call(function: ca.Function, names: dict[str, str], only_if: str = "") -> Call:
+    """Return the call of a function with buffers called as what it takes and returns, or as `names` has it."""
+    given = tuple(names.get(name, name) for name in function.name_in())
+    return Call(function, given, tuple(names.get(x, x.removesuffix("_next")) for x in function.name_out()), only_if)
+
+
+def _copy(size: int) -> ca.Function:
+    x = SX.sym("x", size)
+    return ca.Function("copy", [x], [x], ["original"], ["copied"])
