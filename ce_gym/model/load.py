@@ -8,6 +8,7 @@ from pathlib import Path
 from ce_gym.model.assets import assets_folder, robots
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.formats.collections import downloaded, is_in_collection
 from ce_gym.model.formats.mjcf.robot import robot_from_mjcf
 from ce_gym.model.formats.reading import read_yaml
 from ce_gym.model.formats.urdf.graph import UrdfGraph
@@ -19,13 +20,15 @@ from ce_gym.model.formats.yaml.robot import robot_from_yaml
 def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = None) -> Robot:
     """Load a robot.
 
-    - `.yaml`: the project's own format. It names a plain URDF and adds rotors, transmissions, motors, contacts, a pose.
+    - `.yaml`: the project's own format. It names a plain URDF or an MJCF file and adds rotors, transmissions, motors,
+      contacts, a pose.
     - `.urdf`: URDF+ if it has `<loop>`, `<coupling>` or `independent`; a plain URDF otherwise. A YAML file of the same
       name beside a plain URDF is read with it if its key `urdf` names the URDF.
     - `.xml`: MJCF, read through the package `mujoco`.
 
     Args:
-        name_or_path: A name such as "mini_cheetah" (`robots()` lists them), or the path of a file.
+        name_or_path: A name such as "mini_cheetah" (`robots()` lists them), the path of a file, or a robot that an
+            installed package downloads: "menagerie:unitree_go2", "robot_descriptions:go2_description".
         floating: Whether the root link of a URDF or URDF+ moves freely or is fixed to the world. By default a root
             link without mass, or called "world", is fixed. The other formats say it themselves.
 
@@ -38,7 +41,9 @@ def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = 
         27 bodies, 10 of them rotors, 10.4 kg
     """
     path = Path(name_or_path)
-    if isinstance(name_or_path, str) and not path.suffix and len(path.parts) <= 1:
+    if isinstance(name_or_path, str) and is_in_collection(name_or_path):
+        path = downloaded(name_or_path)
+    elif isinstance(name_or_path, str) and not path.suffix and len(path.parts) <= 1:
         path = _asset(name_or_path)
     kind = path.suffix.lower()
     if kind == ".urdf":
