@@ -8,7 +8,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from progress import Curve, ProgressBar, StopInOrder, adapted_rate, episode_means, geometric, linear
+import numpy as np
+from progress import (
+    Curve,
+    ProgressBar,
+    StopInOrder,
+    adapted_rate,
+    episode_means,
+    fall_cost,
+    geometric,
+    linear,
+    spread_episodes,
+)
 from run_folder import going_on
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
@@ -43,6 +54,13 @@ class WriteCurve(_Quiet):
 
     def _on_rollout_end(self) -> None:
         self.curve.add(self.num_timesteps, episode_means(self.model.ep_info_buffer))
+
+
+class SpreadEpisodes(_Quiet):
+    """Lets the first episodes end at different times, see `spread_episodes`."""
+
+    def _on_training_start(self) -> None:
+        spread_episodes(self.training_env.unwrapped.envs.unwrapped, np.random.default_rng(self.model.seed))  # type: ignore[attr-defined]
 
 
 class AdaptiveLearningRate(_Quiet):
@@ -92,6 +110,28 @@ class NoiseSchedule(_Schedule):
     def _set(self, done: float) -> None:
         log_std: Any = self.model.policy.log_std
         log_std.data.fill_(math.log(geometric(self.start, self.end, done)))
+
+
+class FallCost(_Schedule):
+    """Takes the cost of a fall from the reward of the step that ends an episode as a failure.
+
+    Args:
+        most: What a fall costs in the end, see `fall_cost`.
+        steps: Steps in all.
+    """
+
+    def __init__(self, most: float, steps: int) -> None:
+        super().__init__(0.0, most, steps)
+
+    def _set(self, done: float) -> None:
+        self.cost = fall_cost(self.end, done)
+
+    def _on_step(self) -> bool:
+        infos, rewards = self.locals["infos"], self.locals["rewards"]  # of the step just made, not in the buffer yet
+        for i in np.flatnonzero(self.locals["dones"]):
+            if not (infos[i]["TimeLimit.truncated"] or infos[i]["diverged"]):
+                rewards[i] -= self.cost
+        return True
 
 
 class Checkpoints(_Quiet):

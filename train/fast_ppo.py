@@ -28,7 +28,19 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from job import CHECKPOINTS, Job, Trained, make_record
 from job import main as run_jobs
 from numpy.typing import NDArray
-from progress import Curve, Log, ProgressBar, RecentEpisodes, StopInOrder, adapted_rate, geometric, linear, read_curve
+from progress import (
+    Curve,
+    Log,
+    ProgressBar,
+    RecentEpisodes,
+    StopInOrder,
+    adapted_rate,
+    fall_cost,
+    geometric,
+    linear,
+    read_curve,
+    spread_episodes,
+)
 from run_folder import going_on, make_folder, save_somewhere, write_whole
 
 try:
@@ -96,6 +108,7 @@ class FastPPO:
         self.log_probs, self.rewards, self.values, self.advantages = (np.zeros(shape, F) for _ in range(4))
         self.dones = np.zeros(shape, bool)
         self.observed = self._views(envs.reset(seed=job.seed)[0])
+        spread_episodes(envs.unwrapped, self.rng)
 
     def parts(self, vector: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Actor, logarithms of the standard deviations, and critic in a vector of parameters."""
@@ -122,15 +135,15 @@ class FastPPO:
         if s.final_std:
             self.parts(self.theta)[1][:] = np.log(geometric(s.initial_std, s.final_std, done))
         start = time.perf_counter()
-        self.collect()
+        self.collect(fall_cost(s.fall_cost, done))
         self.collect_seconds += time.perf_counter() - start
         figures = self.learn(linear(s.entropy, s.final_entropy, done))
         if s.target_kl:
             self.rate = adapted_rate(self.rate, figures["train/approx_kl"], s.target_kl)
         return figures
 
-    def collect(self) -> None:
-        """Act for one rollout, and estimate the advantages of its actions."""
+    def collect(self, cost: float) -> None:
+        """Act for one rollout, each fall of which costs something, and estimate the advantages of its actions."""
         s = self.settings
         actor, log_std, critic = self.parts(self.theta)
         means, clipped = np.zeros((s.num_envs, self.n_actions), F), np.zeros((s.num_envs, self.n_actions), F)
@@ -145,6 +158,7 @@ class FastPPO:
             observations, self.rewards[t], terminated, truncated, infos = self.envs.step(clipped)
             self.step_seconds += time.perf_counter() - start
             self.observed, self.dones[t] = self._views(observations), terminated | truncated
+            self.rewards[t] -= F(cost) * (terminated & ~truncated)
             if self.dones[t].any():
                 self.episodes.add(self.dones[t], infos)
                 late = np.flatnonzero(truncated & ~terminated)

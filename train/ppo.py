@@ -26,9 +26,11 @@ from callbacks import (
     Checkpoints,
     EntropySchedule,
     EpisodeLog,
+    FallCost,
     Lenient,
     NoiseSchedule,
     ShowProgress,
+    SpreadEpisodes,
     Stop,
     WriteCurve,
 )
@@ -85,9 +87,11 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
             save(model, record(), job.out / "checkpoints" / f"policy_{model.num_timesteps}")
 
     with StopInOrder(job.seconds) as stop:
-        callbacks = [Stop(stop), Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog()]
+        callbacks = [Stop(stop), Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog(), SpreadEpisodes()]
         callbacks += [WriteCurve(job.out / "curve.csv", earlier), ShowProgress(settings.steps)]
         callbacks.append(EntropySchedule(settings.entropy, settings.final_entropy, settings.steps))
+        if settings.fall_cost:
+            callbacks.append(FallCost(settings.fall_cost, settings.steps))
         if settings.final_std:
             callbacks.append(NoiseSchedule(settings.initial_std, settings.final_std, settings.steps))
         if settings.target_kl:

@@ -28,6 +28,16 @@ def episode_means(episodes: Iterable[Mapping[str, float]] | None) -> dict[str, f
     return {key: float(np.mean([episode[key] for episode in recent])) for key in recent[-1] if key != "t"}
 
 
+def spread_episodes(native: Any, rng: np.random.Generator) -> None:
+    """Let the first episodes of environments end at different times, where they can.
+
+    Robots that begin together get new commands in the same step: most rollouts would see none of that, and between two
+    that do a policy would forget how to change its gait.
+    """
+    if hasattr(native, "elapsed_steps"):
+        native.elapsed_steps = rng.integers(0, native.max_episode_steps, native.num_envs)
+
+
 class RecentEpisodes:
     """What the last episodes came to.
 
@@ -159,6 +169,14 @@ def linear(start: float, end: float, done: float) -> float:
 def geometric(start: float, end: float, done: float) -> float:
     """Return a value that changes by the same factor in every step, by the share of training that is done."""
     return float(np.exp(linear(np.log(start), np.log(end), done)))
+
+
+def fall_cost(most: float, done: float) -> float:
+    """Return what a fall costs by the share of training that is done: nothing at first, all of it from 60 % on.
+
+    What has not learned to walk falls whatever it does, and learns to stand still if that is dear.
+    """
+    return most * float(np.clip((done - 0.3) / 0.3, 0.0, 1.0))
 
 
 class StopInOrder:

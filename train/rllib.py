@@ -32,7 +32,7 @@ from ce_gym.policies import Actor
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
-    """Return RLlib's PPO with our settings, but for `final_std` and `final_entropy`: exploration has no schedule here.
+    """Return RLlib's PPO with our settings, except what changes on the way: `final_std`, `final_entropy`, `fall_cost`.
 
     Args:
         env_id: Registered environment id.

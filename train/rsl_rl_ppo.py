@@ -31,8 +31,8 @@ from ce_gym.policies import Actor, load_policy
 def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str, Any]:
     """Return our settings in the form that rsl_rl's runner takes; `groups` are those of the observations.
 
-    The weight of the entropy bonus stays as it is at the start and the noise is learned: rsl_rl has no schedules for
-    them.
+    The weight of the entropy bonus stays as it is at the start, the noise is learned, and falls cost nothing: rsl_rl
+    has no schedules for them.
     """
     network = {"class_name": "MLPModel", "hidden_dims": list(s.hidden), "activation": s.activation.lower()}
     spread = {"class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log"}

@@ -23,6 +23,7 @@ LIMITS = {
     "steps": 1e12, "num_envs": 2**20, "rollout": 10_000, "minibatches": 10_000, "epochs": 1000, "hidden": 2**13,
     "initial_std": (1e-6, 100), "final_std": (0, 100), "learning_rate": (0, 1), "target_kl": (0, 10), "gamma": (0, 1),
     "gae_lambda": (0, 1), "clip": (1e-6, 10), "entropy": (0, 10), "final_entropy": (0, 10), "value": (0, 1000),
+    "fall_cost": (0, 1e6),
     "max_grad_norm": (1e-6, 1e9),
 }  # fmt: skip
 """The largest of whole numbers, whose smallest is 1; the smallest and largest of other numbers."""
@@ -62,6 +63,8 @@ class Settings:
         clip: Clipping range of PPO's probability ratio.
         entropy: Weight of the entropy bonus at the start.
         final_entropy: At the end, linear in between.
+        fall_cost: What an episode that ends as a failure takes from the reward of its last step, in the end; see
+            `progress.fall_cost`. Rewards that are reported are without it.
         value: Weight of the value loss.
         max_grad_norm: Gradients are clipped to this norm.
     """
@@ -82,6 +85,7 @@ class Settings:
     clip: float
     entropy: float
     final_entropy: float
+    fall_cost: float
     value: float
     max_grad_norm: float
 

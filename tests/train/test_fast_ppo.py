@@ -9,8 +9,10 @@ import threading
 import time
 import warnings
 
+import gymnasium
 import numpy as np
 import pytest
+from callbacks import FallCost
 from card import command
 from evaluate import evaluate
 from evaluate import main as evaluate_main
@@ -18,7 +20,7 @@ from fast_ppo import FastPPO, main, train
 from job import Job, jobs, parser
 from point_mass import ID
 from ppo import train as reference_train
-from progress import read_curve
+from progress import fall_cost, read_curve
 from settings import config_file, load_settings
 
 from ce_gym.policies import PolicyError, load_policy
@@ -159,6 +161,49 @@ def test_the_deadline_stops_training_and_saves(tmp_path):
 def test_a_critic_may_see_more(tmp_path):
     result = train(job(tmp_path, 30_000, env_kwargs={"obs_mode": "dict"}))
     assert evaluate(result.model, ID, episodes=16, obs_mode="dict")["forward_error"] < 0.2
+
+
+def test_a_fall_costs_what_it_shall_and_reaching_the_end_of_time_nothing(tmp_path):
+    """Two learners alike but for that: their rewards differ by the cost, where an episode failed, and nowhere else."""
+    wide = job(tmp_path, 30_000, settings=["initial_std=5", "rollout=120"])
+    rewards, fallen = [], []
+    for cost in (0.0, 7.0):
+        envs = gymnasium.make_vec(ID, num_envs=64, vectorization_mode="vector_entry_point")
+        learner, step = FastPPO(envs, wide), envs.step
+
+        def watched(actions, step=step):
+            *seen, terminated, truncated, infos = step(actions)
+            fallen.append(terminated & ~truncated)
+            return *seen, terminated, truncated, infos
+
+        envs.step = watched
+        learner.collect(cost)
+        rewards.append(learner.rewards)
+        assert (learner.dones & ~np.array(fallen[-120:])).any()  # time was up for some
+    fallen = np.array(fallen[:120])
+    assert 5 < fallen.sum() < 500
+    np.testing.assert_allclose(rewards[0] - rewards[1], 7.0 * fallen, atol=1e-5)
+
+
+def test_the_reference_counts_falls_alike():
+    callback = FallCost(4.0, steps=1000)
+    callback.num_timesteps = 450
+    callback._on_rollout_start()
+    ends = [{"TimeLimit.truncated": late, "diverged": lost} for late, lost in [(0, 0), (1, 0), (0, 1), (0, 0)]]
+    callback.locals = {"rewards": np.ones(4), "dones": np.array([1, 1, 1, 0]), "infos": ends}
+    callback._on_step()
+    np.testing.assert_allclose(callback.locals["rewards"], [-1, 1, 1, 1])
+
+
+def test_falls_cost_nothing_at_first():
+    assert [fall_cost(4.0, done) for done in (0.0, 0.3, 0.45, 0.6, 1.0)] == pytest.approx([0, 0, 2, 4, 4])
+
+
+def test_episodes_do_not_all_end_together(tmp_path):
+    envs = gymnasium.make_vec(ID, num_envs=64, vectorization_mode="vector_entry_point")
+    FastPPO(envs, job(tmp_path, 100))
+    assert len(set(envs.unwrapped.elapsed_steps.tolist())) > 20
+    assert 0 <= envs.unwrapped.elapsed_steps.min() <= envs.unwrapped.elapsed_steps.max() < 50
 
 
 def test_the_noise_ends_where_it_shall(tmp_path):
