@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from ce_gym.policies import add_env_arg
 from ce_gym.viewer.cli import add_play_command, add_view_command
 from ce_gym.viewer.console import Parser, examples, print_anything
 from ce_gym.viewer.live.command import add_live_command
@@ -80,13 +81,17 @@ def _parser() -> argparse.ArgumentParser:
         description="Say what a robot is made of and what each transmission level drops, or what a step of an "
         "environment\ncosts, feature by feature.",
         epilog=examples(
-            "inspect mini_cheetah", "inspect my_robot.yaml --no-errors", "inspect ce_gym/TelloVelocity-v0 --no-timing"
+            "inspect mini_cheetah",
+            "inspect my_robot.yaml --no-errors",
+            "inspect ce_gym/TelloVelocity-v0 --no-timing",
+            "inspect ce_gym/TelloVelocity-v0 --no-timing --env-arg terrain=stairs",
         ),
     )
     inspect.add_argument("name", metavar="NAME", help="name of a robot, path of its file, or id of an environment")
     inspect.add_argument(
         "--transmission", default="exact", metavar="LEVEL", help="exact (default), coupled, armature or none"
     )
+    add_env_arg(inspect)
     inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")
     inspect.add_argument("--no-timing", action="store_true", help="environment: count instructions, compile nothing")
     inspect.set_defaults(run=_inspect)
@@ -166,7 +171,7 @@ def _inspect_environment(args: argparse.Namespace) -> int:
     try:
         if module:
             importlib.import_module(module)  # registers it, as in `gymnasium.make`
-        print(scene_report(name, timing=not args.no_timing))
+        print(scene_report(name, timing=not args.no_timing, **dict(args.env_args)))
     except ImportError as error:
         raise RobotError(f"environment {args.name!r}: {error}") from error
     except ValueError as error:  # names what is wrong

@@ -19,7 +19,7 @@ from typing import Any
 
 from console import EPISODES, Parser, Table, add_json_argument, markdown, print_result, run, whole
 from effort import effort
-from evaluate import add_env_argument, evaluate
+from evaluate import evaluate
 from pictures import draw_curve
 from progress import read_curve
 from pushes import direction_name, push_envelope
@@ -27,7 +27,16 @@ from settings import config_file, load_settings
 from suites import judge_suites, level_table, suite_table, weights_seed
 from transfer import LEVELS
 
-from ce_gym.policies import Policy, PolicyError, environment_of, locate_policy, read_actor, shelf, write_npz
+from ce_gym.policies import (
+    Policy,
+    PolicyError,
+    add_env_arguments,
+    environment_of,
+    locate_policy,
+    read_actor,
+    shelf,
+    write_npz,
+)
 
 
 def judged(policy: Policy, episodes: int, sim2sim_robots: int) -> dict[str, Any]:
@@ -67,8 +76,7 @@ def command(record: dict[str, Any]) -> str:
     """Return the command line that repeats a training run.
 
     Raises:
-        PolicyError: If none can: the policy goes on from another one, or its environment has arguments that
-            the learner does not take.
+        PolicyError: If none can, because the policy goes on from another one.
     """
     if record["resumed_from"]:
         raise PolicyError(f"resumed from {record['resumed_from']}; expected a run from the beginning")
@@ -85,8 +93,8 @@ def command(record: dict[str, Any]) -> str:
         words += ["--transmission", level]
     if "critic" in kwargs and kwargs.pop("obs_mode", None) == "dict":
         words += ["--critic", *kwargs.pop("critic")]
-    if kwargs:
-        raise PolicyError(f"env_kwargs: {', '.join(kwargs)}; expected none that the learner does not take")
+    for key, value in kwargs.items():
+        words += ["--env-arg", f"{key}={json.dumps(value)}"]
     usual = json.loads(json.dumps(load_settings(config_file(record["env"])).as_dict()))
     chosen = record["settings"] | {"steps": min(record["settings"]["steps"], record["steps"])}  # a deadline may end it
     changed = {key: value for key, value in chosen.items() if value != usual[key]}
@@ -224,7 +232,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--robots", type=whole(0, 100_000), default=50, metavar="N", help="robots in MuJoCo; 0: none (default 50)"
     )
-    add_env_argument(parser)
+    add_env_arguments(parser)
     add_json_argument(parser)
     args = parser.parse_args(argv)
     return run("card.py", lambda: _work(args))
@@ -237,7 +245,8 @@ def _work(args: argparse.Namespace) -> int:
     record, curve = portable(record), read_curve(source.parent / "curve.csv")
     name = short_name(record)
     out = shelf() / name if args.ship else args.out or source.parent
-    policy = Policy(actor, record | {"env": environment_of(record, args.env)})
+    acted_in = {"env": environment_of(record, args.env), "env_kwargs": {**record["env_kwargs"], **dict(args.env_args)}}
+    policy = Policy(actor, record | acted_in)
     result = judged(policy, args.episodes, args.robots)
     out.mkdir(parents=True, exist_ok=True)
     write_npz(actor, record, out / "policy.npz")

@@ -15,6 +15,9 @@ import gymnasium
 EXTRAS = {"mujoco": "mjcf", "meshcat": "viewer", "onnx": "export", "numba": "fast"}
 """What brings packages that a program needs for a part of its work."""
 
+UNKNOWN_ARGUMENT = "unexpected keyword argument"
+"""What Python says of a mistake in `--env-arg` that an environment does not check itself."""
+
 Table = list[list[str]]
 """Rows of cells, the heading first."""
 
@@ -39,7 +42,9 @@ def run(program: str, work: Callable[[], int]) -> int:
     except MemoryError as error:
         print(f"{program}: not enough memory: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except (ValueError, gymnasium.error.Error) as error:
+    except (ValueError, TypeError, gymnasium.error.Error) as error:
+        if isinstance(error, TypeError) and UNKNOWN_ARGUMENT not in str(error):
+            raise
         print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
 

@@ -15,12 +15,12 @@ import numpy as np
 from console import EPISODES, SEED, THREADS, Parser, above_zero, run
 from evaluate import report
 from job import Job, Trained
-from settings import config_file, load_settings
+from settings import config_file, load_env_args, load_settings
 from suites import EVALUATION_SEED
 from transfer import summary, table, transfer
 
 from ce_gym import usable_cores
-from ce_gym.policies import load_policy
+from ce_gym.policies import add_env_arg, load_policy
 from ce_gym.viewer import Rollout, walk, write_html
 
 ENV = "ce_gym/MiniCheetahVelocity-v0"
@@ -30,18 +30,19 @@ def obtain_policy(args: argparse.Namespace) -> Path:
     """Train a policy, or take the one in the output folder, and say which."""
     from fast_ppo import train  # says what is missing where its extra is not installed
 
-    policy = args.out / "policy.npz"
-    resume = None
+    policy, path = args.out / "policy.npz", config_file(args.env)
+    resume, asked = None, (args.env, {**load_env_args(path), **dict(args.env_args)})
     if policy.exists() and not args.fresh:
         record = load_policy(policy).record
-        if record.get("finished") and record["env"] == args.env:
+        same = (record["env"], record["env_kwargs"]) == asked
+        if record.get("finished") and same:
             print(f"Using the policy trained earlier: {policy}, {record['steps']:,} steps. --fresh trains a new one.")
             return policy
-        resume = policy if record["env"] == args.env else None
+        resume = policy if same else None
     overrides = [f"steps={args.steps}"] if args.steps else []
-    settings = load_settings(config_file(args.env), overrides)
+    settings = load_settings(path, overrides)
     job = Job(
-        args.env, settings, args.out, env_kwargs={}, seed=args.seed, threads=args.threads, resume=resume,
+        args.env, settings, args.out, env_kwargs=asked[1], seed=args.seed, threads=args.threads, resume=resume,
         seconds=60.0 * args.minutes,
     )  # fmt: skip
     begin = f"Going on with {policy}" if resume else "Training from nothing"
@@ -63,6 +64,7 @@ def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(description="Train a robot on exact transmissions, judge it, and show it.")
     parser.add_argument("--env", default=ENV, metavar="ID", help=f"environment id (default {ENV})")
+    add_env_arg(parser)
     parser.add_argument("--fresh", action="store_true", help="train anew even if there is a policy from an earlier run")
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps (default: as in the settings file)")
@@ -75,11 +77,13 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     args = parser.parse_args(argv)
-    return run("demo.py", lambda: show(obtain_policy(args), args.episodes, args.out))
+    return run("demo.py", lambda: show(obtain_policy(args), args.episodes, args.out, args.env))
 
 
-def show(policy: Path, episodes: int, out: Path) -> int:
+def show(policy: Path, episodes: int, out: Path, env: str | None = None) -> int:
     """Print how good a policy is, on every transmission level, and write its rollout; the last line is the page.
+
+    `env` is what the user named: an id `module:id` is not imported because the policy's record has it.
 
     The page also shows, as a ghost, what becomes of the policy without rotors, or of one that was trained on a
     simplified level when nothing is left out.
@@ -91,7 +95,7 @@ def show(policy: Path, episodes: int, out: Path) -> int:
     print(f"\nJudged on {level} transmissions:\n{report(results[level])}")
     print(f"\nThe same policy on every transmission level:\n{table(summary([entry]))}")
     (rollout,), (ghost,) = (
-        walk(policy, seed=EVALUATION_SEED, transmission=shown, label=f"{shown} transmissions, {what}")
+        walk(policy, env=env, seed=EVALUATION_SEED, transmission=shown, label=f"{shown} transmissions, {what}")
         for shown, what in ((level, "as trained"), ("none" if level == "exact" else "exact", "the ghost"))
     )
     page = out / f"{rollout.robot}.html"

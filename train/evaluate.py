@@ -10,6 +10,7 @@ task.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ from pushes import push_envelope, push_table
 from suites import everywhere, judge_suites, level_table, suite_table, weights_seed
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
-from ce_gym.policies import WHERE, Policy, environment_of, load_policy
+from ce_gym.policies import WHERE, Policy, add_env_arguments, environment_of, load_policy
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
@@ -30,20 +31,30 @@ WEIGHTS_SEED = whole(0, 2**32 - 1)
 """Reads a seed of judging, which may be as large as 32 bits of a policy's weights."""
 
 
-def load(path: str | Path, env: str | None = None, transmission: str | None = None) -> Policy:
+def load(
+    path: str | Path,
+    env: str | None = None,
+    transmission: str | None = None,
+    env_args: Iterable[tuple[str, Any]] = (),
+) -> Policy:
     """Read a policy to judge; its record then names the environment to judge it in.
 
     Args:
         path: See `ce_gym.load_policy`.
         env: What the user's command line names; the environment of the record if None.
         transmission: Level that it will run on.
+        env_args: Arguments of the environment that replace those of the record.
 
     Raises:
         PolicyError: If it cannot be used, or its environment is one that the user must name: see
             `ce_gym.policies.environment_of`.
     """
     policy = load_policy(path, transmission)
-    return replace(policy, record=policy.record | {"env": environment_of(policy.record, env)})
+    chosen = {
+        "env": environment_of(policy.record, env),
+        "env_kwargs": {**policy.record["env_kwargs"], **dict(env_args)},
+    }
+    return replace(policy, record=policy.record | chosen)
 
 
 def env_kwargs(record: dict[str, Any], transmission: str | None = None) -> dict[str, Any]:
@@ -121,16 +132,8 @@ def _effort_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     return rows
 
 
-def add_env_argument(parser: argparse.ArgumentParser) -> None:
-    """Add `--env`, for `load`."""
-    text = (
-        "environment to act in, such as my_module:ce_gym/MyRobotVelocity-v0 (default: as trained); a module that only "
-    )
-    parser.add_argument("--env", metavar="ID", help=text + "the policy's file names is not imported")
-
-
 def add_arguments(parser: argparse.ArgumentParser, episodes: int) -> None:
-    """Arguments shared by the programs that judge policies, apart from the policies and `--env`."""
+    """Arguments shared by the programs that judge policies, apart from the policies and their environment."""
     parser.add_argument(
         "--episodes", type=EPISODES, default=episodes, metavar="N", help=f"episodes, side by side (default {episodes})"
     )
@@ -152,7 +155,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--pushes", action="store_true", help="also push it, from all sides, harder and harder")
     text = "also judge it on commands that jump, standing, turning in place, going backwards, and pushed"
     parser.add_argument("--suites", action="store_true", help=text)
-    add_env_argument(parser)
+    add_env_arguments(parser)
     add_arguments(parser, episodes=2048)
     args = parser.parse_args(argv)
     return run("evaluate.py", lambda: _judge(args))
@@ -160,7 +163,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _judge(args: argparse.Namespace) -> int:
     """Do everything that the command line asks for."""
-    model = load(args.policy, args.env, args.transmission)
+    model = load(args.policy, args.env, args.transmission, args.env_args)
     kwargs = env_kwargs(model.record, args.transmission)
     result: dict[str, Any] = evaluate(model, model.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
     seed = result["seed"]

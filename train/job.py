@@ -18,10 +18,10 @@ from typing import Any
 import gymnasium
 from console import EPISODES, SEED, THREADS, Parser, above_zero, run
 from run_folder import make_folder
-from settings import NETWORK, Settings, config_file, load_settings, make_settings, parsed
+from settings import NETWORK, Settings, config_file, load_env_args, load_settings, make_settings, parsed
 
 from ce_gym import usable_cores
-from ce_gym.policies import PolicyError, environment_of, load_policy, locate_policy
+from ce_gym.policies import PolicyError, add_env_arg, environment_of, load_policy, locate_policy
 
 CHECKPOINTS = 10
 """Checkpoints per training run."""
@@ -155,9 +155,8 @@ def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
         )
     else:
         settings = load_settings(path, overrides)
-    kwargs = dict(record.get("env_kwargs", {}))
-    kwargs |= {"transmission": args.transmission} if args.transmission else {}
-    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
+    own = {} if record and not args.config else load_env_args(path)  # a policy keeps those that it was trained with
+    kwargs = {**record.get("env_kwargs", {}), **own, **env_kwargs_of(args)}
     out = args.out or Path("runs") / (
         "-".join([path.stem, *([args.transmission] if args.transmission else [])]) + folder
     )
@@ -178,6 +177,13 @@ def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
     ]
 
 
+def env_kwargs_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The arguments of the environment that a command line names."""
+    kwargs = {"transmission": args.transmission} if args.transmission else {}
+    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
+    return kwargs | dict(args.env_args)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line of every learner."""
     result = Parser(
@@ -190,6 +196,7 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees, such as base_height"
     )
+    add_env_arg(what)
     what.add_argument(
         "--resume",
         type=Path,

@@ -60,8 +60,8 @@ def train(job: Job) -> Trained:
     torch.set_num_threads(1)  # threads belong to the learner and to the kernel, see learner.py
     make_folder(job.out)
     envs = make_sb3_vec_env(
-        job.env_id, job.settings.num_envs, job.seed, num_threads=job.threads, **job.env_kwargs
-    )  # fmt: skip
+        job.env_id, job.settings.num_envs, job.seed, **{"num_threads": job.threads, **job.env_kwargs}
+    )
     try:
         model = make_learner(envs, job)
         return _learn(model, envs, job)

@@ -25,10 +25,10 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from run_folder import make_folder
-from settings import Settings, SettingsError, config_file, load_settings
+from settings import Settings, SettingsError, config_file, load_env_args, load_settings
 
 import ce_gym  # noqa: F401  (registers the environments in this process)
-from ce_gym.policies import Actor
+from ce_gym.policies import Actor, add_env_arg
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
@@ -50,7 +50,7 @@ def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: i
     samples = s.num_envs * s.rollout
     config = (
         PPOConfig()
-        .environment(f"ce_gym:{env_id}", env_config=env_kwargs, disable_env_checking=True)
+        .environment(importable(env_id), env_config=env_kwargs, disable_env_checking=True)
         .env_runners(
             num_env_runners=runners,
             num_envs_per_env_runner=s.num_envs // max(runners, 1),
@@ -85,6 +85,11 @@ def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: i
         .debugging(seed=seed, log_level="ERROR")
     )
     return config.build_algo()
+
+
+def importable(env_id: str) -> str:
+    """An id that any process finds: `module:id`, which imports the module that registers it."""
+    return env_id if ":" in env_id else f"ce_gym:{env_id}"
 
 
 def set_initial_std(algo: Algorithm, std: float) -> None:
@@ -135,6 +140,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(description="Train a policy with RLlib's PPO.")
     parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
     parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
+    add_env_arg(parser)
     parser.add_argument(
         "--env-runners", type=whole(0, 10_000), default=2, metavar="N", help="processes that step (default 2)"
     )
@@ -149,13 +155,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
     args = parser.parse_args(argv)
-    kwargs = {"num_threads": args.threads} | ({"transmission": args.transmission} if args.transmission else {})
-    return run("rllib.py", lambda: _work(args, kwargs))
+    return run("rllib.py", lambda: _work(args))
 
 
-def _work(args: argparse.Namespace, kwargs: dict[str, Any]) -> int:
+def _work(args: argparse.Namespace) -> int:
     """Train, write the policy, and say where."""
     path = config_file(args.env)
+    kwargs = {"transmission": args.transmission} if args.transmission else {}
+    kwargs |= {**load_env_args(path), **dict(args.env_args), "num_threads": args.threads}
     s = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
     one = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # says in one line what is wrong, and fills the cache
     ray.init(address=args.address, log_to_driver=False, include_dashboard=False)

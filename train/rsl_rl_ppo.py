@@ -20,12 +20,13 @@ import torch
 from console import EPISODES, SEED, Parser, run
 from evaluate import evaluate, report
 from export import to_onnx, write
+from job import env_kwargs_of
 from rsl_rl.runners import OnPolicyRunner
 from run_folder import make_folder
-from settings import Settings, config_file, load_settings
+from settings import Settings, config_file, load_env_args, load_settings
 
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
-from ce_gym.policies import Actor, load_policy
+from ce_gym.policies import Actor, add_env_arg, load_policy
 
 
 def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str, Any]:
@@ -99,6 +100,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
     parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
     parser.add_argument("--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees")
+    add_env_arg(parser)
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
@@ -108,15 +110,14 @@ def main(argv: list[str] | None = None) -> int:
         "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation at the end"
     )
     args = parser.parse_args(argv)
-    kwargs: dict[str, Any] = {"transmission": args.transmission} if args.transmission else {}
-    kwargs |= {"dtype": "float32"} if args.device.startswith("cuda") else {}
-    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
-    return run("rsl_rl_ppo.py", lambda: _work(args, kwargs))
+    return run("rsl_rl_ppo.py", lambda: _work(args))
 
 
-def _work(args: argparse.Namespace, kwargs: dict[str, Any]) -> int:
+def _work(args: argparse.Namespace) -> int:
     """Train, write the policy, and say where."""
     path = config_file(args.env)
+    kwargs: dict[str, Any] = {"dtype": "float32"} if args.device.startswith("cuda") else {}
+    kwargs |= load_env_args(path) | env_kwargs_of(args)
     settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
     out = args.out or Path("runs") / f"{path.stem}-rsl_rl"
     make_folder(out)

@@ -12,9 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from ce_gym.policies import ACTIVATIONS
+from ce_gym.policies import ACTIVATIONS, checked_arguments, parse_yaml
 
 Activation = str
 """One of those with which a policy can be run without its learner."""
@@ -30,6 +28,9 @@ LIMITS = {
 
 MOST_SAMPLES = 10**8
 """Steps between two updates, over all environments: more would not fit into memory."""
+
+ENV_ARGS = "env_args"
+"""Key of a settings file under which arguments of the environment stand, by name; the only one that may be missing."""
 
 NETWORK = ("hidden", "activation")
 """What a policy keeps for life."""
@@ -114,14 +115,34 @@ def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
     Raises:
         SettingsError: If the file cannot be read, or a key is missing, unknown or of the wrong kind.
     """
+    data = {key: value for key, value in _read(path).items() if key != ENV_ARGS}
+    return make_settings(data | parsed(overrides), source=str(path))
+
+
+def load_env_args(path: Path) -> dict[str, Any]:
+    """Return the arguments of the environment that a settings file asks for; none if it says nothing of them.
+
+    Raises:
+        SettingsError: If the file cannot be read, or they are no plain data by name.
+    """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
+        return checked_arguments(_read(path).get(ENV_ARGS, {}))
+    except SettingsError:
+        raise
+    except ValueError as error:
+        raise SettingsError(f"{path}: {ENV_ARGS}: {error}") from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return what a settings file says, unchecked."""
+    try:
+        data = parse_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise SettingsError(f"{path}: cannot be read as YAML: {reason}") from None
     if not isinstance(data, dict):
         raise SettingsError(f"{path}: expected one `key: value` per line, got {type(data).__name__}")
-    return make_settings(data | parsed(overrides), source=str(path))
+    return data
 
 
 def make_settings(data: Mapping[str, Any], source: str) -> Settings:
@@ -171,8 +192,8 @@ def _parse_override(text: str) -> tuple[str, Any]:
     if not equals:
         raise SettingsError(f"--set {text}: expected KEY=VALUE")
     try:
-        return key.strip().replace("-", "_"), yaml.safe_load(value)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        return key.strip().replace("-", "_"), parse_yaml(value)
+    except ValueError as error:
         reason = " ".join(str(error).split())[:200]
         raise SettingsError(f"--set {key.strip()}: cannot be read as YAML: {reason}") from None
 

@@ -18,12 +18,12 @@ from typing import Any, Protocol
 import numpy as np
 from console import EPISODES, Parser, above_zero, add_json_argument, print_result, run
 from episodes import planar_velocity, tracking
-from evaluate import WEIGHTS_SEED, add_env_argument, env_kwargs, load
+from evaluate import WEIGHTS_SEED, env_kwargs, load
 from numpy.typing import NDArray
 from suites import weights_seed
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
-from ce_gym.policies import WHERE, Policy, PolicyError
+from ce_gym.policies import WHERE, Policy, PolicyError, add_env_arguments
 
 STEADY = {"push_period": 0.0, "randomise": {}, "latency": (0, 0), "heading": False, "command_period": 1e6}
 """What is left out of the comparison, as MuJoCo knows nothing of it; commands come from here."""
@@ -269,7 +269,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--every", type=above_zero, default=float("inf"), metavar="T", help=text)
     text = "of starts and commands (default: the first 32 bits of the SHA-256 of the policy's weights)"
     parser.add_argument("--seed", type=WEIGHTS_SEED, metavar="N", help=text)
-    add_env_argument(parser)
+    add_env_arguments(parser)
     add_json_argument(parser)
     args = parser.parse_args(argv)
     return run("sim2sim.py", lambda: _work(args))
@@ -277,7 +277,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Compare, print, and say whether it passed."""
-    policy = load(args.policy, args.env)
+    policy = load(args.policy, args.env, env_args=args.env_args)
     result = compare(policy, episodes=args.episodes, seconds=args.seconds, every=args.every, seed=args.seed)
     print_result(result, table(result), args.json)
     return 0 if result["passed"] else 1

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from console import SEED, THREADS, Parser, Table, markdown, print_result, run
-from evaluate import add_arguments, add_env_argument, env_kwargs, evaluate, load
-from settings import Settings, config_file, load_settings
+from evaluate import add_arguments, env_kwargs, evaluate, load
+from settings import Settings, config_file, load_env_args, load_settings
 
 from ce_gym import usable_cores
-from ce_gym.policies import WHERE, Policy, PolicyError, load_policy, locate_policy
+from ce_gym.policies import WHERE, Policy, PolicyError, add_env_arguments, load_policy, locate_policy
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
@@ -125,17 +125,16 @@ def train_missing(args: argparse.Namespace) -> list[Path]:
     path = config_file(args.env)
     settings = load_settings(path, [f"steps={args.steps}"] if args.steps else [])
     folder = args.runs or Path("runs") / "transfer" / path.stem
-    policies = []
+    env_args, policies = {**load_env_args(path), **dict(args.env_args)}, []
     for level in args.levels:
         for seed in args.seeds:
-            out = folder / level / f"seed_{seed}"
+            out, kwargs = folder / level / f"seed_{seed}", {**env_args, "transmission": level}
             policy, resume = out / "policy.zip", None
             if policy.exists():
-                record = _checked(policy, args.env, level, seed, settings)
+                record = _checked(policy, args.env, kwargs, seed, settings)
                 resume = None if record["finished"] else policy
             if not policy.exists() or resume:
                 print(f"training on {level}, seed {seed}, {settings.steps:,} steps -> {out}", file=sys.stderr)
-                kwargs = {"transmission": level}
                 done = train(Job(args.env, settings, out, kwargs, seed, args.threads, resume=resume, tensorboard=False))
                 if done.interrupted:
                     raise KeyboardInterrupt
@@ -143,16 +142,18 @@ def train_missing(args: argparse.Namespace) -> list[Path]:
     return policies
 
 
-def _checked(policy: Path, env: str, level: str, seed: int, settings: Settings) -> dict[str, Any]:
+def _checked(policy: Path, env: str, kwargs: dict[str, Any], seed: int, settings: Settings) -> dict[str, Any]:
     """The record of a policy trained earlier, if it is the one asked for."""
     record = load_policy(policy).record
-    asked = {"env": env, "transmission": level, "seed": seed, "settings": json.loads(json.dumps(settings.as_dict()))}
+    asked = {"env": env, "transmission": kwargs["transmission"], "seed": seed, "env_kwargs": kwargs}
+    asked["settings"] = json.loads(json.dumps(settings.as_dict()))
     for key, value in asked.items():
         if record[key] != value:
             if isinstance(value, dict):
-                key = next(name for name in value if record[key].get(name) != value[name])
+                found = record[key]
+                name = next(name for name in {**value, **found} if found.get(name, value) != value.get(name, found))
                 raise PolicyError(
-                    f"{policy}: trained with {key} = {record['settings'].get(key)}, asked for {value[key]}; "
+                    f"{policy}: trained with {name} = {found.get(name)}, asked for {value.get(name)}; "
                     "expected the same: give another --runs folder"
                 )
             raise PolicyError(
@@ -161,8 +162,14 @@ def _checked(policy: Path, env: str, level: str, seed: int, settings: Settings) 
     return record
 
 
-def judge(policies: Iterable[Path], episodes: int, seed: int | None, env: str | None = None) -> dict[str, Any]:
-    """Judge policies of one task on every level, in the environment `env` or that of their records.
+def judge(
+    policies: Iterable[Path],
+    episodes: int,
+    seed: int | None,
+    env: str | None = None,
+    env_args: Iterable[tuple[str, Any]] = (),
+) -> dict[str, Any]:
+    """Judge policies of one task on every level, in the environment `env` or that of their records; see `load`.
 
     Returns:
         env; episodes; policies: file, transmission, seed, steps and results of each; summary, see `summary`.
@@ -172,7 +179,7 @@ def judge(policies: Iterable[Path], episodes: int, seed: int | None, env: str | 
     """
     judged, names = [], {}
     for path in policies:
-        model = load(path, env)
+        model = load(path, env, env_args=env_args)
         record = model.record
         names[_task(record)] = path
         if len(names) > 1:
@@ -210,7 +217,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="Policies that lie in the folder already are used again, so that a second call only judges.",
     )
     result.add_argument("policies", nargs="*", metavar="POLICY", help=f"{WHERE}; several seeds are put together")
-    add_env_argument(result)
+    add_env_arguments(result)
     add_arguments(result, episodes=256)
     result.add_argument("--out", type=Path, metavar="FOLDER", help="write transfer.json, .md and .png there")
     how = result.add_argument_group("training")
@@ -244,7 +251,7 @@ def _work(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print("transfer.py: interrupted; the same command goes on", file=sys.stderr)
         return 130
-    result = judge(policies, args.episodes, args.seed, args.env)
+    result = judge(policies, args.episodes, args.seed, args.env, args.env_args)
     out = args.out or (policies[0].parents[2] if args.train else None)
     files = write_report(result, out) if out else []
     print_result(result, "\n".join([table(result["summary"]), *map(str, files)]), args.json)

@@ -51,6 +51,10 @@ NO_TERMS: dict[str, Any] = {"rewards": {}, "noise": {}, "history": 1} | {f: () f
 """What makes a task one without terms."""
 
 
+WITHOUT_COST = ("autoreset_mode", "dtype", "max_episode_steps", "num_threads", "obs_mode", "width", "height")
+"""Arguments of environments that a task's program does not depend on."""
+
+
 @dataclass(frozen=True)
 class SubStep:
     """A sub-step that could be compiled.
@@ -145,11 +149,15 @@ def report_scene(env_id: str, **arguments: Any) -> SceneReport:
         **arguments: What `gymnasium.make` would be given besides, see `ce_gym.envs.runtime.setup.make_program`.
 
     Raises:
-        ValueError: If the id is not one of this package's, or an argument is wrong.
+        ValueError: If the id is no registered environment of robots of ours, or an argument is wrong.
     """
-    if env_id not in gymnasium.registry or "transmission" not in gymnasium.spec(env_id).kwargs:
+    spec = gymnasium.registry.get(env_id)
+    if spec is None:
         raise ValueError(f"environment {env_id!r} is not registered; `python -m ce_gym list` shows those that are")
-    program = make_program(**{**gymnasium.spec(env_id).kwargs, **arguments})
+    given = {**spec.kwargs, **arguments}
+    if not {"robot", "task"} <= given.keys():
+        raise ValueError(f"environment {env_id!r}: made with {', '.join(given) or 'nothing'}; expected robot and task")
+    program = make_program(**{name: value for name, value in given.items() if name not in WITHOUT_COST})
     outputs = ("torque", "contact_forces") if program.contact_forces else ("torque",)
     whole = SubStep(program.model, program.options, outputs)
     again = dict.fromkeys(call.function for call in whole.calls if call.only_if)

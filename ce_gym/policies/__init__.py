@@ -1,6 +1,7 @@
 """Trained policies: found by name, read without running code that they may carry, run by numpy."""
 
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
+from ce_gym.policies.arguments import add_env_arg, add_env_arguments, checked_arguments, parse_yaml
 from ce_gym.policies.environments import environment_of
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.files import RECORD_KEY, load_policy, read_actor, write_npz
@@ -15,10 +16,14 @@ __all__ = [
     "LevelWarning",
     "Policy",
     "PolicyError",
+    "add_env_arg",
+    "add_env_arguments",
+    "checked_arguments",
     "environment_of",
     "find_policy",
     "load_policy",
     "locate_policy",
+    "parse_yaml",
     "read_actor",
     "read_weights",
     "shelf",

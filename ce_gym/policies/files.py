@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.archive import read_json, read_npz
+from ce_gym.policies.arguments import CHOSEN
 from ce_gym.policies.environments import shown
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.places import locate_policy
@@ -37,13 +38,6 @@ REQUIRED: dict[str, type] = {
 """What a record must say."""
 
 KINDS = {str: "text", dict: "a JSON object", int: "a whole number"}
-
-
-CHOSEN = {
-    "act", "autoreset_mode", "env", "env_id", "episodes", "id", "label", "model", "num_envs", "policy", "robots",
-    "script", "seconds", "seed", "vector_kwargs", "vectorization_mode", "wrappers",
-}  # fmt: skip
-"""Arguments that whoever runs a policy chooses, so that its record may not."""
 
 
 def load_policy(path: str | Path, transmission: str | None = None) -> Policy:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ce_gym.policies import WHERE, find_policy, locate_policy
+from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy
 from ce_gym.viewer.console import examples, has_display
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def add_view_command(subparsers: Any) -> None:
         "rollouts", nargs="+", type=Path, metavar="ROLLOUT", help=f"a recorded rollout (.npz); or a policy: {WHERE}"
     )
     parser.add_argument("--overlay", action="store_true", help="draw all in one place, all but the first as ghosts")
-    add_env_argument(parser)
+    add_env_arguments(parser)
     _add_page_arguments(parser, "beside the first rollout, here for policies")
     parser.set_defaults(run=view)
 
@@ -72,20 +72,10 @@ def add_play_command(subparsers: Any) -> None:
         help="what to command [m/s, m/s, rad/s], and for how long; may be repeated (default: a short show)",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first robot (default 0)")
-    add_env_argument(parser)
+    add_env_arguments(parser)
     parser.add_argument("--save", type=Path, metavar="FOLDER", help="also keep the rollouts as .npz files there")
     _add_page_arguments(parser, "here, named after the policy's folder")
     parser.set_defaults(run=play)
-
-
-def add_env_argument(parser: argparse.ArgumentParser) -> None:
-    """Add `--env`."""
-    parser.add_argument(
-        "--env",
-        metavar="ID",
-        help="environment to act in, such as my_module:ce_gym/MyRobotVelocity-v0 (default: as trained); a module that "
-        "only the policy's file names is not imported",
-    )
 
 
 def _at_least_one(text: str) -> int:
@@ -115,7 +105,8 @@ def view(args: argparse.Namespace) -> int:
 
     policies = [find_policy(path) for path in args.rollouts]
     rollouts = [
-        walk(p, env=args.env)[0] if p else Rollout.load(path) for p, path in zip(policies, args.rollouts, strict=True)
+        walk(p, env=args.env, **dict(args.env_args))[0] if p else Rollout.load(path)
+        for p, path in zip(policies, args.rollouts, strict=True)
     ]
     beside = args.rollouts[0].with_suffix(".html")
     return _present(rollouts, args, _page_of(policies[0]) if policies[0] else beside, overlay=args.overlay)
@@ -132,7 +123,7 @@ def play(args: argparse.Namespace) -> int:
     if args.robots > 1 and len(args.transmission) > 1:
         raise ViewerError(f"--robots {args.robots}: expected 1, or one level of --transmission")
     script = [(time, (x, y, turn)) for time, x, y, turn in args.command] if args.command else SHOW
-    options = {"robots": args.robots, "seed": args.seed, "env": args.env}
+    options = {**dict(args.env_args), "robots": args.robots, "seed": args.seed, "env": args.env}
     levels = [{"transmission": level, "label": level} for level in args.transmission] or [{}]
     rollouts = [rollout for level in levels for rollout in walk(file, script, **options, **level)]
     if args.robots > 1:

@@ -184,8 +184,16 @@ def test_command_refuses_what_is_not_there(name: str, capsys):
     assert error.count("environment ") == error.count("\n") == 1
 
 
-def test_only_environments_of_this_package():
+def test_only_environments_of_a_robot_and_a_task():
     assert "CartPole-v1" in gymnasium.registry
-    for name in ("CartPole-v1", "ce_gym/NoSuchRobot-v0"):
-        with pytest.raises(ValueError, match=r"is not registered; `python -m ce_gym list`"):
-            ce_gym.scene_report(name)
+    with pytest.raises(ValueError, match=r"'CartPole-v1': made with .*; expected robot and task"):
+        ce_gym.scene_report("CartPole-v1")
+
+
+def test_ids_that_somebody_registered_and_arguments_are_reported(report: SceneReport, monkeypatch):
+    """What an id leaves out is as in the environment; arguments that change no kernel change no figure."""
+    kwargs = {"robot": "mini_cheetah", "task": "velocity", "num_threads": 1}
+    spec = gymnasium.envs.registration.EnvSpec("my/Dog-v0", entry_point="ce_gym.envs.single:LeggedEnv", kwargs=kwargs)
+    monkeypatch.setitem(gymnasium.registry, "my/Dog-v0", spec)
+    assert report_scene("my/Dog-v0", obs_mode="dict").env_step == report.env_step
+    assert main(["inspect", "my/Dog-v0", "--no-timing", "--env-arg", "terain=stairs"]) == 2

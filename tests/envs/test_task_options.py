@@ -155,7 +155,7 @@ def test_headings_are_turned_to():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"colour": 3}, "unknown argument 'colour'"),
+        ({"colour": 3}, "unexpected keyword argument 'colour'"),
         ({"actions": "telepathy"}, "actions='telepathy'; expected 'joint_pd'"),
         ({"history": 0}, "history=0; expected a whole number"),
         ({"latency": (2, 1)}, "latency=.*; expected a pair"),

@@ -61,6 +61,7 @@ def test_the_command_on_the_card_makes_the_same_job(run):
     assert (job.env_id, job.seed, job.resume) == (record["env"], record["seed"], None)
     assert json.loads(json.dumps(job.settings.as_dict())) == record["settings"]
     kwargs = {"transmission": "none", "obs_mode": "dict", "critic": ["contact_forces", "rotor_speeds"]}
+    kwargs |= {"terrain": "stairs", "randomise": {"friction": [0.5, 1.2]}, "heading": True, "dt": 5e-3}
     (job,) = jobs(parser().parse_args(shlex.split(command(record | {"env_kwargs": kwargs}))[2:]))
     assert job.env_kwargs == kwargs
 
@@ -71,13 +72,9 @@ def test_a_run_that_a_deadline_ended_is_repeated_that_long(run):
     assert job.settings.steps == 512
 
 
-@pytest.mark.parametrize(
-    ("change", "words"), [({"resumed_from": "x.zip"}, "resumed from x.zip"), ({"env_kwargs": {"dt": 0.002}}, "dt")]
-)
-def test_what_no_command_repeats_is_said(run, change, words):
-    record = load_policy(run).record | change
-    with pytest.raises(PolicyError, match=words):
-        command(record)
+def test_what_no_command_repeats_is_said(run):
+    with pytest.raises(PolicyError, match=r"resumed from x\.zip"):
+        command(load_policy(run).record | {"resumed_from": "x.zip"})
 
 
 def test_a_card_says_what_was_measured(run):

@@ -23,6 +23,10 @@ from ce_gym.model.mechanism import Level
 from ce_gym.sim.devices import Device, device_named
 
 
+class UnknownArgument(TypeError, ValueError):
+    """An argument that nothing takes: Python's own kind of error, and a ValueError as all mistakes in arguments are."""
+
+
 def make_batch(
     robot: str,
     task: str,
@@ -137,12 +141,13 @@ def changed_task(task: Task, changes: Mapping[str, Any]) -> Task:
         changes: Attributes of `Task` but `rewards`; lists, as JSON has them, count as tuples, and None as no change.
 
     Raises:
+        UnknownArgument: If there is no such attribute.
         ValueError: One line that names the argument, its value and what was expected.
     """
     known, given = [f.name for f in fields(Task) if f.name != "rewards"], {}
     for name, value in changes.items():
         if name not in known:
-            raise ValueError(f"unknown argument {name!r}; expected one of rewards, {', '.join(known)}")
+            raise UnknownArgument(f"unexpected keyword argument {name!r}; expected one of rewards, {', '.join(known)}")
         if value is not None:
             given[name] = checked_value(name, value, getattr(task, name))
     return replace(task, **given)

@@ -70,6 +70,18 @@ def _refused(event: yaml.Event, problem: str) -> yaml.composer.ComposerError:
     return yaml.composer.ComposerError(None, None, problem, event.start_mark)
 
 
+def parse_yaml(text: str) -> Any:
+    """Return what a text of YAML says; JSON is YAML, too.
+
+    Raises:
+        ValueError: It is malformed or too large; one line that says where.
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except Exception as error:  # PyYAML also lets IndexError, AttributeError and others out, as for `!!int ''`
+        raise ValueError(_problem(error)) from None
+
+
 def read_yaml(path: Path) -> Section:
     """Read a YAML file that holds one mapping.
 
@@ -78,9 +90,9 @@ def read_yaml(path: Path) -> Section:
     """
     text = read_text(path, "a YAML file")
     try:
-        data = yaml.load(text, _Loader)
-    except Exception as error:  # PyYAML also lets IndexError, AttributeError and others out, as for `!!int ''`
-        raise RobotError(f"{path}: malformed YAML: expected a mapping ({_problem(error)})") from None
+        data = parse_yaml(text)
+    except ValueError as error:
+        raise RobotError(f"{path}: malformed YAML: expected a mapping ({error})") from None
     if data is None:
         raise RobotError(f"{path}: the file is empty: expected a mapping")
     return Section(str(path), "", data)
