@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.util
 import os
 import re
 import sys
@@ -29,7 +30,7 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
   python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
   python -m ce_gym live POLICY           drive, push and throw it in a browser
   python -m ce_gym view walk.npz         show recorded rollouts, several side by side or as ghosts
-  python -m ce_gym bench                 benchmarks
+  python -m ce_gym bench                 benchmarks, in a clone of the repository
 
 Each has --help. In Python: gymnasium.make("ce_gym:ce_gym/MiniCheetahVelocity-v0")."""
 
@@ -110,7 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     add_play_command(commands)
     add_view_command(commands)
     add_live_command(commands)
-    commands.add_parser("bench", help="benchmarks; without a name, the list of them")
+    commands.add_parser("bench", help="benchmarks, in a clone of the repository; without a name, the list of them")
     return parser
 
 
@@ -180,6 +181,9 @@ def _inspect_environment(args: argparse.Namespace) -> int:
 
 
 def _bench(argv: list[str]) -> int:
+    if importlib.util.find_spec("ce_gym.bench") is None:
+        print("ce_gym: benchmarks are not installed with the package; run them in a clone of it", file=sys.stderr)
+        return 2
     from ce_gym.bench.__main__ import main as bench
 
     return bench(argv)

@@ -90,7 +90,7 @@ class MujocoWorld:
     """
 
     def __init__(self, native: Any, obs: Any, level: str) -> None:
-        from ce_gym.bench.peers.mujoco_twin import MujocoTwin
+        from ce_gym.export.mujoco_twin import MujocoTwin
 
         self.native, self.contract = native, native.contract()
         action = self.contract["action"]
@@ -192,7 +192,7 @@ def compare(
     Raises:
         ModuleNotFoundError: MuJoCo is not installed.
     """
-    import ce_gym.bench.peers.mujoco_twin  # noqa: F401  # where MuJoCo is missing: told before our own simulation, not after
+    import ce_gym.export.mujoco_twin  # noqa: F401  # where MuJoCo is missing: told before our own simulation, not after
 
     record, results = policy.record, {}
     seed = weights_seed(policy) if seed is None else seed

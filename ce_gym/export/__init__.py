@@ -1,1 +1,1 @@
-"""Robots written for other simulators: MJCF."""
+"""Robots for other simulators: written as MJCF, and stepped by MuJoCo."""

@@ -70,7 +70,7 @@ def to_mjcf(
 
     MuJoCo refuses inertias that violate the triangle inequality, and its own `balanceinertia` would replace all three
     moments by their mean. Such an inertia is written with its two smaller principal moments raised equally until the
-    inequality holds; `ce_gym.bench.peers.mujoco.load` puts the published inertia back after compilation.
+    inequality holds; `ce_gym.export.mujoco_model.load` puts the published inertia back after compilation.
 
     Args:
         robot: The robot.

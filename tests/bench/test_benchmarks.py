@@ -80,7 +80,7 @@ def test_ours_stands_like_mujoco():
     from ce_gym.sim import Simulator
 
     robot = speed.bare(load_robot("mini_cheetah"), "foot")
-    settings = mujoco_settings.Settings(0.001, "Euler", solimp=mujoco_settings.STIFF[0])
+    settings = mujoco_settings.Settings(0.001, "Euler", solimp=mujoco_settings.STIFF)
     _, reference = mujoco_settings.watched(robot, "exact", settings, 4)
     ours = stand.watch_ours(Simulator(Model(robot, "exact"), num_envs=4), robot)
     assert ours.like(reference)

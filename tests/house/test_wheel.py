@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
-from pages import ROOT, commands, links
+from pages import ROOT, blocks, commands, links
 
 from ce_gym.viewer import Rollout
 
@@ -79,11 +79,12 @@ def sources(folder: str) -> set[str]:
 
 
 def test_wheel_has_all_code_and_assets_and_is_small(built: Path):
-    """At most 5 MB; robots and trained policies come along."""
+    """At most 5 MB; robots and trained policies come along, benchmarks stay with the repository."""
     wheel = only(built, "*.whl")
     assert wheel.stat().st_size <= 5e6
     names = {name for name in files_of(wheel) if ".dist-info/" not in name}
-    assert names == sources("ce_gym") | {f"ce_gym/{name}" for name in sources("assets")}
+    code = sources("ce_gym") - sources("ce_gym/bench")
+    assert names == code | {f"ce_gym/{name}" for name in sources("assets")}
     for kind in ("mini_cheetah/mini_cheetah.urdf", "policies/mini_cheetah_velocity_exact/policy.npz"):
         assert f"ce_gym/assets/{kind}" in names
 
@@ -111,14 +112,14 @@ def test_sdist_has_what_the_readme_names(built: Path):
         assert sources(folder) <= names
 
 
-def dependencies(of: Distribution, found: dict[str, Distribution] | None = None) -> dict[str, Distribution]:
-    """What a distribution needs without extras, and what that needs, by name."""
+def dependencies(of: Distribution, extra: str = "", found: dict[str, Distribution] | None = None) -> dict:
+    """What a distribution needs with an extra or without, and what that needs, distributions by name."""
     found = {} if found is None else found
     for requirement in map(Requirement, of.requires or ()):
-        wanted = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        wanted = requirement.marker is None or requirement.marker.evaluate({"extra": extra})
         if wanted and requirement.name not in found:
             found[requirement.name] = distribution(requirement.name)
-            dependencies(found[requirement.name], found)
+            dependencies(found[requirement.name], "", found)
     return found
 
 
@@ -159,18 +160,57 @@ def python(built: Path, tmp_path_factory) -> Iterator[Path]:
     assert everything(site / "ce_gym") == before  # an administrator may write where nobody may
 
 
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("home")
+
+
 @pytest.fixture
-def elsewhere(tmp_path: Path) -> dict:
+def elsewhere(home: Path, tmp_path: Path) -> dict:
     """An empty folder and a bare environment to run things in."""
-    return {"cwd": tmp_path, "env": {"PATH": os.defpath, "HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path)}}
+    return {"cwd": tmp_path, "env": {"PATH": os.defpath, "HOME": str(home), "TMPDIR": str(tmp_path)}}
 
 
-def test_the_wheel_steps_an_environment(python: Path, elsewhere: dict):
+def test_the_wheel_steps_an_environment(python: Path, elsewhere: dict, home: Path):
     """With a policy that came along, from another folder; its kernel is kept in the user's cache."""
     package, assets = map(Path, checked([python, "-c", STEP], **elsewhere).splitlines())
     assert package.is_relative_to(python.parents[1])
     assert assets == package.parent / "assets"
-    assert any((elsewhere["cwd"] / "home" / ".cache" / "ce_gym").iterdir())
+    assert any((home / ".cache" / "ce_gym").iterdir())
+
+
+def linked(python: Path, extra: str, folder: Path) -> str:
+    """A folder with links to what an extra asks for."""
+    folder.mkdir()
+    site = only(python.parents[1], "lib/python*/site-packages")
+    for one in dependencies(Distribution.at(only(site, "ce_gym-*.dist-info")), extra).values():
+        link(one, folder)
+    return str(folder)
+
+
+def test_the_wheel_trains(python: Path, elsewhere: dict, tmp_path: Path):
+    """As the page for beginners does it, with what the extra asks for."""
+    pytest.importorskip("stable_baselines3")
+    elsewhere["env"]["PYTHONPATH"] = linked(python, "train", tmp_path / "extra")
+    (code,) = (block.text for block in blocks(ROOT / "docs" / "start.md") if "stable_baselines3" in block.text)
+    steps = checked([python, "-c", f"{code}\nprint(learner.num_timesteps)"], **elsewhere)
+    assert int(steps) == 3072
+    assert (tmp_path / "walk.zip").exists()
+
+
+def test_the_wheel_inspects_and_plays(python: Path, elsewhere: dict, tmp_path: Path):
+    pytest.importorskip("meshcat")
+    assert "FL_knee" in checked([python, "-m", "ce_gym", "inspect", "mini_cheetah", "--no-errors"], **elsewhere)
+    elsewhere["env"]["PYTHONPATH"] = linked(python, "viewer", tmp_path / "extra")
+    show = ["play", "mini_cheetah_velocity", "--command", "0.2", "0.5", "0", "0", "--html", "walk.html"]
+    checked([python, "-m", "ce_gym", *show], **elsewhere)
+    assert "mini_cheetah" in (tmp_path / "walk.html").read_text()
+
+
+def test_benchmarks_are_in_the_repository_only(python: Path, elsewhere: dict):
+    result = run([python, "-m", "ce_gym", "bench", "speed"], **elsewhere)
+    assert result.returncode == 2
+    assert result.stderr == "ce_gym: benchmarks are not installed with the package; run them in a clone of it\n"
 
 
 def test_the_wheel_brings_the_command(python: Path, elsewhere: dict):

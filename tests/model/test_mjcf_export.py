@@ -28,9 +28,10 @@ def random_state(model, rng):
 def test_mujoco_has_the_same_dynamics(name, level):
     pytest.importorskip("mujoco")
     from ce_gym.bench.peers import mujoco as mujoco_peer
+    from ce_gym.export.mujoco_model import load
 
     robot = load_robot(name)
-    model, peer = Model(robot, level), mujoco_peer.load(robot, level)
+    model, peer = Model(robot, level), load(robot, level)
     rng = np.random.default_rng(0)
     for _ in range(3):
         q, v, tau = random_state(model, rng)

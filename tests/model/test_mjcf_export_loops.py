@@ -135,9 +135,9 @@ class Peer:
     def __init__(self, robot: Robot, level: str) -> None:
         import mujoco
 
-        from ce_gym.bench.peers import mujoco as mujoco_peer
+        from ce_gym.export.mujoco_model import load
 
-        self.mujoco, self.model = mujoco, mujoco_peer.load(robot, level)
+        self.mujoco, self.model = mujoco, load(robot, level)
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         self.data, self.floating = mujoco.MjData(self.model), robot.floating
         self.joints = [self.model.joint(i).name for i in range(self.model.njnt)][1 if robot.floating else 0 :]

@@ -15,7 +15,7 @@ from sim2sim import MujocoWorld, OurWorld, course, main, play, table, verdicts
 
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
-from ce_gym.bench.peers.mujoco_twin import MujocoTwin
+from ce_gym.export.mujoco_twin import MujocoTwin
 from ce_gym.policies import Policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
@@ -185,9 +185,7 @@ def test_mistakes_are_one_line(tmp_path, capsys):
 def test_without_mujoco_it_says_what_to_install(monkeypatch, capsys):
     for name in (
         "mujoco",
-        "ce_gym.bench.peers.mujoco_twin",
-        "ce_gym.bench.peers.mujoco",
-        "ce_gym.bench.peers.mujoco_settings",
+        *(f"ce_gym.export.mujoco_{part}" for part in ("batch", "coordinates", "model", "twin")),
     ):
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.setitem(sys.modules, "mujoco", None)

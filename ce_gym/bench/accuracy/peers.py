@@ -14,21 +14,17 @@ import numpy as np
 from mujoco import rollout
 
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
-from ce_gym.bench.peers import mujoco_settings
-from ce_gym.bench.peers.mujoco import STATE
-from ce_gym.bench.peers.mujoco_settings import Settings
 from ce_gym.dynamics.model import Model
-
-STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Impedance of equalities held as stiffly as MuJoCo allows, with a time constant of two steps."""
-
+from ce_gym.export import mujoco_model
+from ce_gym.export.mujoco_batch import STATE
+from ce_gym.export.mujoco_model import STIFF, Settings
 
 mujoco.set_mju_user_warning(lambda _: None)  # it would write to a file; `Peer.diverged` says what matters
 
 
 def compiled(scene: Scene, level: str, stiff: bool = False) -> mujoco.MjModel:
     """Compile a scene for MuJoCo at a transmission level; torques act on the joints directly, without actuators."""
-    model = mujoco_settings.compiled(scene.robot, level, Settings(1e-3, solimp=STIFF if stiff else None))
+    model = mujoco_model.compiled(scene.robot, level, Settings(1e-3, solimp=STIFF if stiff else None))
     if scene.control == "torque":
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     return model

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.peers.mujoco import Batch, Coordinates
+from ce_gym.export.mujoco_batch import Batch
+from ce_gym.export.mujoco_coordinates import Coordinates
 from ce_gym.model import Robot
 from ce_gym.sim import Simulator
 

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 
 from ce_gym.bench.measure.timing import Competitor
-from ce_gym.bench.peers import mujoco as mujoco_peer
 from ce_gym.compile import Buffer, Call, Kernel, Program, aligned_zeros, lane_count, load_kernel, source_fingerprint
 from ce_gym.dynamics.model import Model
+from ce_gym.export import mujoco_model
 from ce_gym.model.description import Robot
 from ce_gym.sim.kernel_key import model_key
 
@@ -64,7 +64,7 @@ def mujoco_forward(robot: Robot, level: str, repeats: int = 256) -> Competitor:
     Raises:
         RobotError: If MJCF cannot say what the robot is at this level.
     """
-    model = mujoco_peer.load(robot, level)
+    model = mujoco_model.load(robot, level)
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT if model.neq else mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     model.opt.disableflags |= off | mujoco.mjtDisableBit.mjDSBL_SENSOR
     data = mujoco.MjData(model)

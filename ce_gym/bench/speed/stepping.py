@@ -13,10 +13,10 @@ import numpy as np
 
 from ce_gym.bench.measure.timing import Competitor
 from ce_gym.bench.peers import stand
-from ce_gym.bench.peers.mujoco import Batch
-from ce_gym.bench.peers.mujoco_settings import STIFF, Settings, compiled
 from ce_gym.compile.lowering.counting import floating_point_operations
 from ce_gym.dynamics.model import Model
+from ce_gym.export.mujoco_batch import Batch
+from ce_gym.export.mujoco_model import STIFF, Settings, compiled
 from ce_gym.model import Robot
 from ce_gym.sim import Simulator
 from ce_gym.sim.substeps import substeps
@@ -63,7 +63,7 @@ def bytes_per_robot(model: Model, dtype: str, dt: float) -> int:
 
 def fast_settings(level: str, dt: float) -> Settings:
     """Return MuJoCo's settings for robots that it is not tuned for one by one: those Mini Cheetah stands with."""
-    return Settings(dt, "Euler", "Newton", 4, 4, STIFF[0] if level == "exact" else None)
+    return Settings(dt, "Euler", "Newton", 4, 4, STIFF if level == "exact" else None)
 
 
 def mujoco_batch(robot: Robot, level: str, num_envs: int, num_threads: int, dt: float) -> Batch:

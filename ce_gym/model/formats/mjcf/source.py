@@ -21,7 +21,7 @@ from ce_gym.model.errors import RobotError, bad, printable
 from ce_gym.model.formats.mjcf.limits import check_file
 from ce_gym.model.formats.placement import exact_right_angles, vec3
 from ce_gym.model.formats.text_file import one_line
-from ce_gym.model.frames import Placement
+from ce_gym.model.frames import Placement, rotation_matrix
 
 MOST_KINDS, MOST_NAMES = 8, 3
 """How many kinds of things, and names of each, a summary of what was left out has."""
@@ -163,11 +163,4 @@ def placement(position: NDArray[np.float64], quaternion: NDArray[np.float64]) ->
 
 def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation matrix, shape (3, 3), of a quaternion (w, x, y, z) of any length but 0."""
-    w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_matrix(np.asarray(quaternion) / np.linalg.norm(quaternion))

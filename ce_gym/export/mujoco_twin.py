@@ -9,9 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.peers.mujoco import Batch, Coordinates
-from ce_gym.bench.peers.mujoco_settings import STIFF, Settings, compiled
-from ce_gym.model import Robot
+from ce_gym.export.mujoco_batch import Batch
+from ce_gym.export.mujoco_coordinates import Coordinates
+from ce_gym.export.mujoco_model import STIFF, Settings, compiled
+from ce_gym.model.description import Robot
+from ce_gym.model.frames import rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -42,7 +44,7 @@ class MujocoTwin:
         if level not in TIMESTEPS:
             raise ValueError(f"level={level!r}; expected one of {', '.join(TIMESTEPS)}")
         self.robot, self.level = robot, level
-        impedance = STIFF[0] if level == "exact" else None
+        impedance = STIFF if level == "exact" else None
         self.model = compiled(robot, level, Settings(TIMESTEPS[level], solimp=impedance))
         self._coordinates = Coordinates.of(self.model, robot)
         self._batch = Batch(self.model, num_envs)
@@ -79,13 +81,5 @@ class MujocoTwin:
         """Return our positions (num_envs, nq) and velocities (num_envs, nv)."""
         qpos, qvel = self._batch.split(self._batch.states)
         q = qpos[:, self._positions]
-        w, x, y, z = q[:, 3:7].T
-        R = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        linear = np.einsum("jin,nj->ni", R, qvel[:, 0:3])  # MuJoCo's is in world axes
+        linear = np.einsum("nji,nj->ni", rotation_matrix(q[:, 3:7]), qvel[:, 0:3])  # MuJoCo's is in world axes
         return q, np.hstack([qvel[:, 3:6], linear, qvel[:, self._velocities]])
