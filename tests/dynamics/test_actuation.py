@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -52,10 +53,14 @@ def stepper(model: Model, dt: float, outputs: tuple[str, ...] = (), **options):
     return step
 
 
+@lru_cache
+def turntable_step(motor: Motor) -> Callable[..., dict[str, np.ndarray]]:
+    return stepper(Model(turntable(motor)), MOMENT, ("torque",), control="torque")
+
+
 def turntable_torque(motor: Motor, speed: float, asked: float) -> float:
     """Joint torque of the turntable at a joint speed [rad/s], for a torque asked at the joint [N m]."""
-    step = stepper(Model(turntable(motor)), MOMENT, ("torque",), control="torque")
-    return step([0.3], [speed], [asked])["torque"][0]
+    return turntable_step(motor)([0.3], [speed], [asked])["torque"][0]
 
 
 def test_torque_limit_is_the_rotor_s():

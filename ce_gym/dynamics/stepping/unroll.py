@@ -75,10 +75,13 @@ def _moved(rates: Rates, before: State, parts: list[Stepped], dt: float, floatin
 
 def iterated(scene: Scene, state: State, target: SX, dt: float, most: int) -> Stepped:
     """Advance one robot by one linearly implicit Euler step with all its iterations, `most` after the first."""
-    stepped = iteration(scene, state, target, dt, first_iterate(scene))
-    for _ in range(min(most, iterations_needed(scene.mechanism, scene.options))):
-        stepped = iteration(scene, state, target, dt, stepped.iterate)
-    return stepped
+    iterate, needed = first_iterate(scene), min(most, iterations_needed(scene.mechanism, scene.options))
+    if needed:  # traced once and put into itself, which is faster than to trace every iteration
+        symbol = SX.sym("iterate", iterate.numel())
+        following = ca.cse(ca.densify(iteration(scene, state, target, dt, symbol).iterate))
+        for _ in range(needed):
+            iterate = ca.substitute(following, symbol, ca.densify(iterate))
+    return iteration(scene, state, target, dt, iterate)
 
 
 def _flat(state: State, floating: bool) -> SX:
