@@ -41,16 +41,17 @@ def substeps(
     options = replace(options, dt=None)
     plan, most = METHODS[options.method], iterations_needed(mechanism, options)
     staged = any(min(stage.iterations, most) for stage in plan.stages)
-    function = (iteration_function if staged else step_function)(mechanism, options, outputs)
-    if empty := [name for name in outputs if not function.numel_out(name)]:
+    asked = tuple(name for name in outputs if not staged or plan.single or name != "error")
+    function = (iteration_function if staged else step_function)(mechanism, options, asked)
+    if empty := [name for name in asked if not function.numel_out(name)]:
         return substeps(mechanism, options, tuple(name for name in outputs if name not in empty))
     sizes = {name: function.numel_in(name) for name in function.name_in() if name != "iterate"}
     state = tuple(name for name in sizes if f"{name}_next" in function.name_out())
-    sizes |= {name: function.numel_out(name) for name in outputs}
+    sizes |= {name: function.numel_out(name) if name in asked else 1 for name in outputs}
     on_field = "ground" in sizes
     buffers, look = _look_up(mechanism, options) if on_field else ([], ())
     if staged:
-        further, before, each = _staged(mechanism, options, plan, {name: sizes[name] for name in outputs})
+        further, before, each = _staged(mechanism, options, function, {name: sizes[name] for name in outputs})
     else:
         further, before, each = [], (), (*look, Call(function, tuple(function.name_in()), (*state, *outputs)))
     if on_field:
@@ -81,14 +82,15 @@ def _look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> tuple[
     return buffers, (*under, *beside)
 
 
-def _staged(mechanism: Mechanism, options: StepOptions, plan: Plan, outputs: dict[str, int]) -> Parts:
+def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, outputs: dict[str, int]) -> Parts:
     """Every stage with the iterations that a tile needs, and the state after the step combined from them.
 
-    A tile iterates again only if one of its robots has not converged; the others reproduce their result.
+    `iteration` is the traced iteration, `outputs` are sizes. A tile iterates again only if one of its robots has not
+    converged; the others reproduce their result.
     """
+    plan = METHODS[options.method]
     alone = plan.is_euler
-    asked = tuple(name for name in outputs if plan.single or name != "error")
-    iteration = iteration_function(mechanism, options, asked)
+    asked = tuple(name for name in outputs if name in iteration.name_out())
     combine = combination_function(mechanism, options, {} if plan.single else outputs)
     state = tuple(name.removesuffix("_next") for name in combine.name_out() if name.endswith("_next"))
     most = iterations_needed(mechanism, options)

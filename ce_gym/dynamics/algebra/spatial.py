@@ -17,7 +17,7 @@ SX = ca.SX
 
 def cross(a: SX, b: SX) -> SX:
     """Return the cross product of two 3-vectors."""
-    return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    return ca.cross(a, b)
 
 
 def skew(x: SX) -> SX:
