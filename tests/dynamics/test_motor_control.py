@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tripod import TRIPOD
 
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.motor_control import standing_motors
-from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.forces.scene import StepOptions, target_names
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model.mechanism import LEVELS
 
@@ -43,14 +44,14 @@ def rotor_angles(model: Model, q) -> np.ndarray:
 @pytest.mark.parametrize("motors", ["ideal", "limited"])
 @pytest.mark.parametrize("level", ["exact", "armature"])
 def test_behind_single_gears_both_controls_are_the_same(level: str, motors: str):
-    """A second of walking in place on the ground, targets beyond what the motors can give included."""
-    model = Model("mini_cheetah", level)
+    """Half a second of waving on the ground, targets beyond what the motors can give included."""
+    model = Model(TRIPOD, level)
     ratio = model.actuator_matrix(model.standing_q)[:, 6:]
     assert (np.count_nonzero(ratio, axis=1) == 1).all()
     for joint, motor in (("position", "motor_position"), ("torque", "motor_torque")):
         sims = [Simulator(model, 3, contacts="foot", control=c, motors=motors) for c in (joint, motor)]
         for k in range(25):
-            target = np.random.default_rng(k).normal(0, 0.6, (3, 12))
+            target = np.random.default_rng(k).normal(0, 0.6, (3, 2))
             if joint == "position":
                 target += model.standing_q[7:]
                 sims[0].step(target, 4)
@@ -70,10 +71,10 @@ def test_motor_torques_reach_the_joints_by_virtual_work(name: str):
         model = Model(name, level)
         q, v = state(model)
         W, limits = model.actuator_matrix(q)[:, 6:], np.array([m.torque for m in model.robot.motors])
-        sim_names = Simulator(model, control="motor_torque", contacts=()).target_names
-        assert sim_names[: len(limits)] == tuple(motor.rotor for motor in model.robot.motors)
+        names = target_names(model.mechanism, "motor_torque")
+        assert names[: len(limits)] == tuple(motor.rotor for motor in model.robot.motors)
         asked = np.random.default_rng(1).uniform(-1.5, 1.5, len(limits)) * limits
-        target = np.zeros(len(sim_names))
+        target = np.zeros(len(names))
         target[: len(limits)] = asked
         got = joint_torque(model, "motor_torque", q, v, target)
         np.testing.assert_allclose(got, W.T @ np.clip(asked, -limits, limits), rtol=1e-9, atol=1e-9)
@@ -103,7 +104,7 @@ def test_motor_position_is_a_loop_of_each_motor(name: str):
 
 def test_joints_without_motors_are_controlled_as_joints():
     model = Model("jvrc1")
-    names = Simulator(model, control="motor_position", contacts=()).target_names
+    names = target_names(model.mechanism, "motor_position")
     free = names[len(model.robot.motors) :]
     assert set(free) == {j for j in model.joint_links if "wrist" in j or "neck" in j}
     q, v = state(model)
@@ -120,7 +121,7 @@ def test_loops_stay_stable_at_coarse_steps():
     model = Model("tello")
     robot = replace(model.robot, gravity=(0.0, 0.0, 0.0))
     model = Model(robot)
-    sim = Simulator(model, control="motor_position", contacts=(), dt=0.01)
+    sim = Simulator(model, control="motor_position", contacts=(), dt=0.01, outputs=("energy",))
     q = model.standing_q.copy()
     q[7:] += np.random.default_rng(0).uniform(-0.1, 0.1, 10)
     sim.set_state(q, np.zeros(model.nv))

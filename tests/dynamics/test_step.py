@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
+from tripod import TRIPOD
 
+from ce_gym import Simulator
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
 from ce_gym.dynamics.stepping.trace import step_function
@@ -15,6 +18,11 @@ from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, 
 from ce_gym.model.mechanism import LEVELS
 
 ALL = "all"
+
+
+@cache
+def cheetah(level: str) -> Model:
+    return Model("mini_cheetah", level)
 
 
 def stepper(model: Model, dt: float = 0.005, **options):
@@ -41,12 +49,13 @@ def stepper(model: Model, dt: float = 0.005, **options):
     return step
 
 
-@pytest.mark.parametrize("bristle", [0.0, 2e4])
-@pytest.mark.parametrize("dissipation", [None, 5.0])
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize(
+    ("level", "dissipation", "bristle"),
+    [*((level, None, 0.0) for level in LEVELS), ("exact", 5.0, 0.0), ("exact", None, 2e4), ("armature", 5.0, 2e4)],
+)
 def test_step_equals_a_dense_solve(level: str, dissipation: float | None, bristle: float):
     """(M + dt J^T C J + slope - dt gyro) vdot = tau - bias + J^T (f0 - dt C drift), put together in numpy."""
-    model, dt = Model("mini_cheetah", level), 0.004
+    model, dt = cheetah(level), 0.004
     material = ContactMaterial(3e4, 0.0 if dissipation else 200.0, 0.7, 0.05, bristle, dissipation)
     rng = np.random.default_rng(5)
     q, v = model.standing_q.copy(), rng.normal(0, 0.3, model.nv)
@@ -88,7 +97,7 @@ def test_step_equals_a_dense_solve(level: str, dissipation: float | None, bristl
 def contact_parts(model: Model, sphere: ContactSphere, q, v, dt: float, material: ContactMaterial, load, anchor):
     """World-frame J, base-frame turning, force at zero acceleration and effective damping of one sphere, by numpy."""
     lowest = sphere_bottom(model, sphere, q)
-    world_point, J = point_jacobian(model, sphere.body, lowest, q)
+    world_point, J = point_jacobian(model, sphere.body, tuple(lowest), tuple(q))
     drift = J[:, 3:6] @ np.cross(v[:3], v[3:6])  # the base keeps its velocity in the world, not in its own axes
     velocity, n = J @ v, np.array([0.0, 0.0, 1.0])
     depth, k, up = -world_point[2], material.stiffness, velocity[2]
@@ -120,7 +129,10 @@ def point_on(model: Model, body: str, point) -> ca.Function:
     return Model(robot, model.transmission).casadi_function("contact_points")
 
 
-def point_jacobian(model: Model, body: str, point, q) -> tuple[np.ndarray, np.ndarray]:
+@cache
+def point_jacobian(
+    model: Model, body: str, point: tuple[float, ...], q: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
     f = point_on(model, body, point)
     columns = [f(q, unit)[1].full().ravel() for unit in np.eye(model.nv)]
     return f(q, np.zeros(model.nv))[0].full().ravel(), np.array(columns).T
@@ -155,44 +167,46 @@ def test_free_flight_is_a_straight_line():
     np.testing.assert_allclose(np.arctan2(relative[1, 0], relative[0, 0]), 7.0 - 2 * np.pi, atol=1e-10)
 
 
+def standing(num_envs: int, dt: float) -> Simulator:
+    """Mini Cheetahs, all of whose spheres may touch; one kernel for any step and stiffness."""
+    material = ContactMaterial(5e4, 500.0, 0.8)
+    model = Model(replace(cheetah("exact").robot, material=material))
+    return Simulator(model, num_envs, dt=dt, contacts=model.contact_names, parameters=("stiffness",))
+
+
 def test_rest_depth_is_weight_over_stiffness():
     """A contact has no bias: the robot rests where the springs carry its weight."""
-    model = Model("mini_cheetah")
-    step = stepper(model, 0.005)
-    q, v, target = model.standing_q.copy(), np.zeros(model.nv), model.standing_q[7:]
-    for _ in range(4000):
-        q, v, _, _, forces = step(q, v, target)
-    forces = forces.reshape(-1, 3)
+    sim = standing(1, 0.005)
+    model = sim.model
+    sim.step(model.standing_q[7:], 4000)
+    forces = sim.contact_forces[0]
     assert forces[:, 2].sum() == pytest.approx(model.total_mass * 9.81, rel=1e-3)
-    centres, _ = model.contact_points(q, v)
+    centres, _ = model.contact_points(sim.q[0], sim.v[0])
     for sphere, centre, force in zip(model.robot.contacts, centres, forces, strict=True):
         depth = max(sphere.radius - centre[2], 0.0)
         assert force[2] == pytest.approx(model.robot.material.stiffness * depth, abs=0.5)
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.002, 0.01])
-@pytest.mark.parametrize("stiffness", [1e4, 1e5, 1e6])
-def test_drop_settles_without_chatter(dt: float, stiffness: float):
-    model = Model("mini_cheetah")
-    step = stepper(model, dt, material=ContactMaterial(stiffness, 500.0, 0.8))
-    q, v, target = model.standing_q.copy(), np.zeros(model.nv), model.standing_q[7:]
+def test_drop_settles_without_chatter(dt: float):
+    """From 10 cm onto ground of three stiffnesses."""
+    sim = standing(3, dt)
+    sim.set_parameter("stiffness", [[1e4], [1e5], [1e6]])
+    q, target = sim.model.standing_q.copy(), sim.model.standing_q[7:]
     q[2] += 0.1
-    for _ in range(round(3.0 / dt)):
-        q, v, diverged, *_ = step(q, v, target)
-    assert np.isfinite(v).all()
-    assert diverged[0] == 0
-    assert np.abs(v[:6]).max() < 0.1
-    speeds = []
+    sim.set_state(q, np.zeros(sim.model.nv))
+    sim.step(target, round(3.0 / dt))
+    assert not sim.diverged.any()
+    assert np.abs(sim.v[:, :6]).max() < 0.1
     for _ in range(20):
-        before = v
-        q, v, *_ = step(q, v, target)
-        speeds.append(np.abs(v - before).max())
-    assert max(speeds) < 2e-2
+        before = sim.v.copy()
+        sim.step(target)
+        assert np.abs(sim.v - before).max() < 2e-2
 
 
 def test_motors_saturate():
-    model = Model("mini_cheetah")
-    step = stepper(model)
+    model = cheetah("exact")
+    step = stepper(model, contacts=())
     *_, torque, _ = step(model.standing_q, np.zeros(model.nv), model.standing_q[7:] + 10.0)
     limits = [model.robot.body(name).joint.torque for name in model.joint_links]
     np.testing.assert_allclose(torque, limits)
@@ -200,7 +214,7 @@ def test_motors_saturate():
 
 def test_joint_stops_hold():
     """Full torque against a stop gets no further than the stop's compliance allows."""
-    model = Model(replace(Model("mini_cheetah").robot, gravity=(0.0, 0.0, 0.0)))
+    model = Model(replace(cheetah("exact").robot, gravity=(0.0, 0.0, 0.0)))
     step = stepper(model, contacts=())
     q, v = model.standing_q.copy(), np.zeros(model.nv)
     for _ in range(400):
@@ -211,10 +225,10 @@ def test_joint_stops_hold():
 
 
 def test_a_bad_number_freezes_the_robot():
-    model = Model("mini_cheetah")
+    model = Model(TRIPOD)
     step = stepper(model)
     v = np.zeros(model.nv)
-    v[8] = np.nan
+    v[7] = np.nan
     q_next, v_next, diverged, *_ = step(model.standing_q, v, model.standing_q[7:])
     assert diverged[0] == 1
     np.testing.assert_array_equal(q_next, model.standing_q)
@@ -224,16 +238,26 @@ def test_a_bad_number_freezes_the_robot():
 
 
 def test_what_is_not_asked_for_costs_nothing():
-    model = Model("mini_cheetah")
-    bare = step_function(model.mechanism, StepOptions(0.005))
-    feet = StepOptions(0.005, contacts=("FL_foot",))
-    assert step_function(model.mechanism, feet).n_instructions() > bare.n_instructions() + 50
-    with_forces = step_function(model.mechanism, feet, ("contact_forces",))
-    assert with_forces.n_instructions() > step_function(model.mechanism, feet).n_instructions()
+    mechanism, one = Model(TRIPOD).mechanism, StepOptions(0.005, contacts=("front",))
+    bare, touching, telling = (
+        step_function(mechanism, options, outputs).n_instructions()
+        for options, outputs in ((StepOptions(0.005), ()), (one, ()), (one, ("contact_forces",)))
+    )
+    assert bare + 50 < touching < telling
 
 
-def test_robot_type(robot: Robot):
-    assert step_function(Model(robot).mechanism, StepOptions(0.001, control="torque")).n_out() == 3
+def test_a_short_step_is_the_acceleration_of_the_moment(robot: Robot):
+    """Without contacts and away from stops, (v_next - v) / dt is what forward dynamics says, joint damping added."""
+    model, dt, rng = Model(robot), 1e-7, np.random.default_rng(3)
+    n = len(robot.independent)
+    step = step_function(model.mechanism, StepOptions(dt, control="torque"))
+    q, v, tau = model.standing_q, rng.normal(0, 0.5, model.nv), rng.normal(0, 1.0, n)
+    after = {name: x.full().ravel() for name, x in step(q=q, v=v, target=tau, diverged=0.0).items()}
+    damping = np.array([robot.body(name).joint.damping for name in robot.independent])
+    expected = model.forward_dynamics(q, v, np.concatenate([np.zeros(model.nv - n), tau - damping * v[-n:]]))
+    np.testing.assert_allclose((after["v_next"] - v) / dt, expected, atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose((after["q_next"] - q)[-n:] / dt, v[-n:], rtol=1e-3, atol=1e-4)
+    assert after["diverged_next"] == 0
 
 
 @pytest.mark.parametrize("speed", [1.0, 4.0])

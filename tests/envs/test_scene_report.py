@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import gymnasium
 import pytest
+from tripod import TRIPOD
 
 import ce_gym
 from ce_gym.__main__ import main
@@ -26,7 +27,7 @@ ENVIRONMENT = "ce_gym/MiniCheetahVelocity-v0"
 
 @pytest.fixture(scope="module")
 def report() -> SceneReport:
-    return report_scene(ENVIRONMENT)
+    return report_scene(ENVIRONMENT, robot=TRIPOD)
 
 
 def always(program: TaskProgram) -> dict[str, int]:
@@ -49,8 +50,8 @@ def test_lines_add_up_to_the_kernel(report: SceneReport):
 def test_lines_add_up_whatever_a_task_asks_for():
     """Late actions, randomised figures, noise, history, pushes, a critic, forces for recording, limited motors."""
     report = report_scene(
-        ENVIRONMENT, latency=(0, 2), randomise={"friction": (0.3, 1.0)}, noise={"joint_positions": 0.1}, history=2,
-        push_period=1.0, heading=True, critic=("feet_in_contact",), contact_forces=True, motors="limited",
+        ENVIRONMENT, robot=TRIPOD, latency=(0, 2), randomise={"friction": (0.3, 1.0)}, noise={"joint_positions": 0.1},
+        history=2, push_period=1.0, heading=True, critic=("feet_in_contact",), contact_forces=True, motors="limited",
         friction="secant",
     )  # fmt: skip
     counts, n = always(report.program), report.program.task.n_substeps
@@ -89,7 +90,7 @@ def test_layers_are_what_is_compiled_in(report: SceneReport):
     ("name", "change"),
     [
         ("parameter 'gravity'", {"parameters": ("gravity",)}),
-        ("parameter 'com_shift:Floating Base'", {"parameters": ("com_shift:Floating Base",)}),
+        ("parameter 'com_shift:plate'", {"parameters": ("com_shift:plate",)}),
         ("motors='limited'", {"motors": "limited"}),
         ("dissipation of the material", {"material": ContactMaterial(dissipation=1.0)}),
     ],
@@ -140,7 +141,7 @@ def test_a_term_costs_what_it_adds_when_it_is_there(report: SceneReport):
 def test_what_is_enabled_is_a_layer_and_no_longer_left_out(report: SceneReport):
     program = report.program
     options = replace(program.options, contacts=(), motors="limited", parameters=("friction", "kp"), method="rk4")
-    whole = SubStep(Model("mini_cheetah", "none"), options, ("torque",))
+    whole = SubStep(Model(TRIPOD, "none"), options, ("torque",))
     running = {name: total for name, total, _ in layers(whole)}
     assert running["outputs"] == step_function(whole.model.mechanism, options, ("torque",)).n_instructions()
     assert running["method"] > 2.5 * running["limited motors"] > 2.5 * running["joint stops"]

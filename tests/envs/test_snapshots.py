@@ -9,16 +9,23 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from tripod import TRIPOD
 
 import ce_gym
 
 ID = "ce_gym/MiniCheetahVelocity-None-v0"
 N = 5
-OPTIONS = {"history": 2, "randomise": {"friction": (0.5, 1.0)}, "push_period": 0.08, "command_curriculum": 0.3}
+OPTIONS = {
+    "robot": TRIPOD,
+    "history": 2,
+    "randomise": {"friction": (0.5, 1.0)},
+    "push_period": 0.08,
+    "command_curriculum": 0.3,
+}
 
 
-def make(mode: str) -> gymnasium.vector.VectorEnv:
-    return gymnasium.make_vec(ID, num_envs=N, autoreset_mode=mode, max_episode_steps=6, num_threads=1, **OPTIONS)
+def make(mode: str, n: int = N) -> gymnasium.vector.VectorEnv:
+    return gymnasium.make_vec(ID, num_envs=n, autoreset_mode=mode, max_episode_steps=6, num_threads=1, **OPTIONS)
 
 
 def under_way(env, steps: int = 8):
@@ -87,7 +94,7 @@ def test_what_was_returned_stays_as_it_was():
 
 
 def test_a_snapshot_of_another_task_is_refused():
-    env, plain = gymnasium.make(ID, **OPTIONS).unwrapped, gymnasium.make(ID).unwrapped
+    env, plain = gymnasium.make(ID, **OPTIONS).unwrapped, gymnasium.make(ID, robot=TRIPOD).unwrapped
     for one in (env, plain):
         one.reset(seed=0)
     with pytest.raises(ValueError, match=r"snapshot: 'draw' is not part of this state; expected one of the same"):
@@ -121,7 +128,7 @@ def test_a_partial_reset_of_new_environments_seeds_each_once():
 
 def test_contacts_start_with_the_springs_force():
     """As in a simulator at the same place: friction has something to go by in the first sub-step."""
-    envs = gymnasium.make_vec(ID, num_envs=N, randomise={"stiffness": (0.5, 2.0)}).unwrapped
+    envs = gymnasium.make_vec(ID, num_envs=N, robot=TRIPOD, randomise={"stiffness": (0.5, 2.0)}).unwrapped
     envs.reset(seed=0)
     state, snapshot = envs.state(), envs.snapshot()
     sim = ce_gym.Simulator(envs.model, N, contacts=envs.contact_names, parameters=("stiffness",))
@@ -154,3 +161,16 @@ def test_dictionaries_of_a_single_environment():
     observation, _ = env.reset(seed=0)
     assert observation in env.observation_space
     assert env.step(actions(1, env)[0])[0] in env.observation_space
+
+
+def test_a_snapshot_that_does_not_fit_changes_nothing():
+    envs, fewer = (make("SameStep", n).unwrapped for n in (5, 3))
+    envs.reset(seed=0)
+    fewer.reset(seed=0)
+    before = envs.snapshot()
+    with pytest.raises(ValueError, match=r"snapshot: .* is float64 \(3, .*\); expected float64 \(5, "):
+        envs.restore(fewer.snapshot())
+    with pytest.raises(ValueError, match="snapshot: 'q' is missing"):
+        envs.restore({name: array for name, array in before.items() if name != "q"})
+    for name, array in envs.snapshot().items():
+        np.testing.assert_array_equal(array, before[name])

@@ -1,0 +1,89 @@
+"""Single and vector environments: the same numbers whatever the batch, arrays that stay as they are, wrappers."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+
+import ce_gym  # noqa: F401 - registers the environments
+
+VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
+
+
+def random_actions(steps: int, n: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, n, 12)).astype(np.float32)
+
+
+def rollout(envs, actions: np.ndarray, seed: int) -> list[np.ndarray]:
+    observation, _ = envs.reset(seed=seed)
+    history = [observation]
+    for action in actions:
+        observation, reward, *_ = envs.step(action)
+        history += [observation, reward]
+    return history
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_same_seed_same_rollout_whatever_the_batch(mode: str):
+    """Batch 1, 7, 1024 and threads 1, 2: bitwise equal, through terminations and resets."""
+    actions = random_actions(80, 1024)
+    whole = rollout(gymnasium.make_vec(VELOCITY, num_envs=1024, num_threads=2, autoreset_mode=mode), actions, seed=10)
+    for n, threads in ((1, 1), (7, 1), (7, 2), (1024, 1)):
+        envs = gymnasium.make_vec(VELOCITY, num_envs=n, num_threads=threads, autoreset_mode=mode)
+        for ours, theirs in zip(rollout(envs, actions[:, :n], seed=10), whole, strict=True):
+            np.testing.assert_array_equal(ours, theirs[:n])
+
+
+def test_single_environment_is_lane_zero():
+    actions = random_actions(300, 5, seed=1)
+    envs = gymnasium.make_vec(VELOCITY, num_envs=5, autoreset_mode="SameStep")
+    vector_observation, _ = envs.reset(seed=20)
+    singles = [gymnasium.make(VELOCITY) for _ in range(5)]
+    for i, env in enumerate(singles):
+        np.testing.assert_array_equal(env.reset(seed=20 + i)[0], vector_observation[i])
+    ended = 0
+    for action in actions:
+        observation, reward, terminated, _, infos = envs.step(action)
+        for i, env in enumerate(singles):
+            ours, r, done, _, _ = env.step(action[i])
+            assert r == reward[i]
+            assert done == terminated[i]
+            if done:
+                ended += 1
+                np.testing.assert_array_equal(ours, infos["final_obs"][i])
+                ours, _ = env.reset()
+            np.testing.assert_array_equal(ours, observation[i])
+    assert ended >= 3
+
+
+def test_fresh_arrays_out_of_every_call():
+    envs = gymnasium.make_vec(VELOCITY, num_envs=4, autoreset_mode="SameStep", max_episode_steps=3)
+    envs.reset(seed=0)
+    kept, copies = [], []
+    for action in random_actions(8, 4):
+        observation, reward, terminated, truncated, infos = envs.step(action)
+        arrays = [
+            observation,
+            reward,
+            terminated,
+            truncated,
+            infos["diverged"],
+            *([infos["final_obs"]] if "final_obs" in infos else []),
+        ]
+        kept += arrays
+        copies += [a.copy() for a in arrays]
+        assert observation.dtype == np.float32
+    for array, copy in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+    assert not any(np.shares_memory(a, b) for i, a in enumerate(kept) for b in kept[:i])
+
+
+def test_stock_vector_wrappers():
+    envs = NormalizeObservation(RecordEpisodeStatistics(gymnasium.make_vec(VELOCITY, num_envs=6, max_episode_steps=4)))
+    envs.reset(seed=0)
+    for action in random_actions(4, 6):
+        observation, *_, infos = envs.step(action)
+    assert infos["episode"]["l"].tolist() == [4] * 6
+    assert np.isfinite(observation).all()
