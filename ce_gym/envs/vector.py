@@ -223,7 +223,8 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
             return place.rows(True, "bool", (n,))
         kind, shape = str(getattr(mask, "dtype", "")), tuple(getattr(mask, "shape", ()))
         if kind.removeprefix("torch.") != "bool" or shape != (n,) or not mask.any():
-            raise ValueError(f"reset_mask={mask!r}; expected a bool array of shape ({n},) with a true entry")
+            given = " ".join(repr(mask).split())
+            raise ValueError(f"reset_mask={given}; expected a bool array of shape ({n},) with a true entry")
         return place.rows(mask, "bool")
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ce_gym.bench import fuzz
+from ce_gym.bench.fuzz import benchmark as fuzz
 
 
 @pytest.mark.skipif(find_spec("mujoco") is None, reason="needs mujoco")

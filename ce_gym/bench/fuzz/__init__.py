@@ -1,0 +1,1 @@
+"""Files and calls at random: what must never break, whatever is tried."""
