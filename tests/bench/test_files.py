@@ -1,0 +1,50 @@
+"""Robot files of others: what the table says of files that agree with their peer, differ from it, or are refused."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ce_gym.bench.peers import files
+
+pytest.importorskip("mujoco")
+pytest.importorskip("pinocchio")
+ROOT = Path(__file__).parents[2]
+LINK = '<inertial pos="0.1 0.02 0" mass="2" fullinertia="0.02 0.03 0.04 0.001 -0.002 0.003"/>'
+MJCF = f"""<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint/>{LINK}
+<body name="leg" quat="1 0.2 0 0.1"><joint name="a" axis="0 1 0" armature="0.1"/><joint name="b" axis="1 0 0"/>{LINK}
+<body name="toe" pos="0 0 -0.4"><joint name="c" type="slide" axis="0 0 1"/>{LINK}</body></body></body></worldbody>
+<keyframe><key qpos="0 0 1 1 0 0 0 0 0 0"/></keyframe></mujoco>"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "hopper.xml").write_text(MJCF)
+    (tmp_path / "balls.xml").write_text(MJCF.replace('type="slide" axis="0 0 1"', 'type="ball"'))
+    (tmp_path / "scene.xml").write_text('<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
+    shutil.copy(ROOT / "tests" / "data" / "own_robot" / "pup.urdf", tmp_path)
+    return tmp_path
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_the_table(folder, monkeypatch):
+    rows = {path.name: files.row(path, folder) for path in files.files(folder)}
+    assert set(rows) == {"hopper.xml", "balls.xml", "pup.urdf"}, "a scene without a robot is no robot"
+    for name, joints in (("hopper.xml", 3), ("pup.urdf", 8)):
+        assert rows[name][1:3] == ("same", joints)
+        assert all(isinstance(x, float) and x <= files.BAR for x in rows[name][4:7])
+    assert rows["balls.xml"][1] == "joint 'c' type is 'ball': expected hinge, slide or free"
+    load = files.load_robot
+
+    def heavier(path):
+        """The same robot with a toe that is a gram heavier."""
+        robot = load(path)
+        *bodies, toe = [body for body in robot.bodies if body.kind == "link"]
+        toe = replace(toe, inertial=replace(toe.inertial, mass=toe.inertial.mass + 1e-3))
+        return replace(robot, bodies=(*bodies, toe, *robot.rotors()))
+
+    monkeypatch.setattr(files, "load_robot", heavier)
+    assert files.row(folder / "hopper.xml", folder)[1] == "DIFFERS"
