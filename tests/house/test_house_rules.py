@@ -39,7 +39,8 @@ LAYERS = {
     "sim": "tiles devices terrain placement substeps kernel_key kernels derivative_kernels schema batch pieces retry"
     " simulator derivatives",
     "envs": "terms task runtime policy_spec differentiable base rendering single vector registration custom",
-    "export": "joint_ties mjcf_text mjcf_equalities mjcf mujoco_model mujoco_coordinates mujoco_batch mujoco_twin",
+    "export": "joint_ties mjcf_text mjcf_equalities mjcf mujoco_model mujoco_coordinates mujoco_batch mujoco_twin"
+    " guesses new_robot",
     "viewer": "errors console rollouts page raytrace server feed window renderers live cli",
     "bench": "measure peers friction instructions soak digests fuzz speed throughput paper accuracy stability"
     " gpu __main__",
