@@ -14,6 +14,7 @@ import argparse
 import json
 import re
 import shlex
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from evaluate import evaluate
 from pictures import draw_curve
 from progress import read_curve
 from pushes import direction_name, push_envelope
-from settings import config_file, load_settings
+from settings import Settings, config_file, load_settings
 from suites import judge_suites, level_table, suite_table, weights_seed
 from transfer import LEVELS
 
@@ -95,11 +96,21 @@ def command(record: dict[str, Any]) -> str:
         words += ["--critic", *kwargs.pop("critic")]
     for key, value in kwargs.items():
         words += ["--env-arg", f"{key}={json.dumps(value)}"]
-    usual = json.loads(json.dumps(load_settings(config_file(record["env"])).as_dict()))
+    kind = _settings_of(record)
+    usual = json.loads(json.dumps(asdict(load_settings(config_file(record["env"], kind.folder), kind=kind))))
     chosen = record["settings"] | {"steps": min(record["settings"]["steps"], record["steps"])}  # a deadline may end it
     changed = {key: value for key, value in chosen.items() if value != usual[key]}
     words += ["--set", *(f"{key}={value}" for key, value in changed.items())] if changed else []
     return shlex.join(words)
+
+
+def _settings_of(record: dict[str, Any]) -> type:
+    """The dataclass of the settings of the learner that a record names."""
+    if record.get("learner") != "shac":
+        return Settings
+    from shac import Settings as Analytic  # says what is missing where its extra is not installed
+
+    return Analytic
 
 
 def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, float]], name: str) -> str:

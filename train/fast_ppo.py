@@ -17,6 +17,7 @@ import json
 import time
 import zipfile
 import zlib
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -121,7 +122,7 @@ class FastPPO:
         for vector, sizes, last in ((actor, self.actor_sizes, 0.01), (critic, self.critic_sizes, 1.0)):
             layers = layers_of(vector, sizes)
             for i, (weight, _) in enumerate(layers):
-                weight[:] = (last if i == len(layers) - 1 else 2**0.5) * _orthogonal(self.rng, weight.shape)
+                weight[:] = (last if i == len(layers) - 1 else 2**0.5) * orthogonal(self.rng, weight.shape)
         log_std[:] = np.log(self.settings.initial_std)
 
     def _views(self, observations: Any) -> list[NDArray[np.float32]]:
@@ -282,7 +283,7 @@ class FastPPO:
             self.episodes.restore(facts["episodes"], state["episodes"])
 
 
-def _orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float32]:
+def orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float32]:
     """A random matrix with orthonormal rows or columns, whichever are fewer."""
     q, r = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))
     q = q * np.sign(np.diag(r))
@@ -295,21 +296,35 @@ def train(job: Job) -> Trained:
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
+    return train_with(FastPPO, job, "fast_ppo")
+
+
+def train_with(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str, **training: Any) -> Trained:
+    """Train with a learner that has the methods of `FastPPO`.
+
+    Args:
+        kind: Makes the learner.
+        job: The training run.
+        name: Of the learner's file.
+        **training: Arguments of the environment beside those of the job, which no policy is judged with.
+
+    Raises:
+        PolicyError: If the policy to resume does not fit the environment or the settings.
+    """
     make_folder(job.out)
     options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
-    mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
-    n = job.settings.num_envs
-    envs = gymnasium.make_vec(job.env_id, num_envs=n, vectorization_mode=mode, **{**options, **job.env_kwargs})
+    mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **training}
+    envs = gymnasium.make_vec(job.env_id, num_envs=job.settings.num_envs, vectorization_mode=mode, **options)
     try:
-        learner = FastPPO(envs, job)
+        learner = kind(envs, job)
         if job.resume:
             resume(learner, job.resume)
-        return _learn(learner, job)
+        return _learn(learner, job, name)
     finally:
         envs.close()
 
 
-def _learn(learner: FastPPO, job: Job) -> Trained:
+def _learn(learner: Any, job: Job, name: str) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
     s, start = job.settings, time.perf_counter()
     curve = Curve(job.out / "curve.csv", _earlier(job.resume), learner.steps)
@@ -318,7 +333,7 @@ def _learn(learner: FastPPO, job: Job) -> Trained:
     def record(finished: bool = False) -> dict[str, Any]:
         seconds = time.perf_counter() - start
         written = make_record(job, learner.envs.unwrapped, learner.steps, seconds, ("numba",))
-        return written | {"learner": "fast_ppo", "finished": finished}
+        return written | {"learner": name, "finished": finished}
 
     every = max(s.steps // CHECKPOINTS, 1)
     with StopInOrder(job.seconds) as stop:
@@ -338,7 +353,7 @@ def _learn(learner: FastPPO, job: Job) -> Trained:
     return Trained(Policy(learner.actor(), written), written, policy, stop.interrupted)
 
 
-def save(learner: FastPPO, record: dict[str, Any], path: Path) -> Path:
+def save(learner: Any, record: dict[str, Any], path: Path) -> Path:
     """Write `path`.npz, .json and .learner.npz, all or none, and return the path of the policy.
 
     Raises:
@@ -353,7 +368,7 @@ def save(learner: FastPPO, record: dict[str, Any], path: Path) -> Path:
     return path.with_name(f"{path.name}.npz")
 
 
-def resume(learner: FastPPO, policy: Path) -> None:
+def resume(learner: Any, policy: Path) -> None:
     """Let a learner go on from a policy.
 
     Raises:
@@ -364,7 +379,7 @@ def resume(learner: FastPPO, policy: Path) -> None:
         with np.load(file, allow_pickle=False) as arrays:
             learner.restore({name: arrays[name] for name in arrays.files})
     except FileNotFoundError:
-        raise PolicyError(f"{file}: no such file; expected what train/fast_ppo.py writes beside a policy") from None
+        raise PolicyError(f"{file}: no such file; expected what its learner writes beside a policy") from None
     except (OSError, LookupError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise PolicyError(f"{file}: cannot be gone on from: {' '.join(str(error).split())[:200]}") from None
 

@@ -10,7 +10,7 @@ import json
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ class Job:
     """
 
     env_id: str
-    settings: Settings
+    settings: Any
     out: Path
     env_kwargs: dict[str, Any]
     seed: int = 0
@@ -95,7 +95,7 @@ def make_record(job: Job, native: Any, steps: int, seconds: float, packages: tup
         "seed": job.seed,
         "resumed_from": str(job.resume) if job.resume else None,
         "training_seconds": round(seconds, 1),
-        "settings": job.settings.as_dict(),
+        "settings": asdict(job.settings),
         "date": time.strftime("%Y-%m-%d"),
         "versions": {name: _version(name) for name in ("ce_gym", "gymnasium", *packages, "numpy")}
         | {"python": platform.python_version()},
@@ -118,7 +118,7 @@ def resumed_record(job: Job) -> dict[str, Any]:
     """
     file: Any = job.resume
     record = load_policy(file).record
-    wanted, found = json.loads(json.dumps(job.settings.as_dict())), _settings_of(record)
+    wanted, found = json.loads(json.dumps(asdict(job.settings))), _settings_of(record)
     for key in NETWORK:
         if found.get(key) != wanted[key]:
             told = f"trained with {found.get(key)}, asked for {wanted[key]}"
@@ -134,8 +134,10 @@ def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
+def jobs(args: argparse.Namespace, folder: str = "", settings: type = Settings) -> list[Job]:
     """The training runs a command line asks for; `folder` ends the names of folders that it does not give.
+
+    `settings` is the learner's dataclass, whose attribute `folder` says where its files lie.
 
     Raises:
         ValueError: If the command line, a settings file or a policy cannot be used.
@@ -148,13 +150,12 @@ def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
     overrides = list(args.set)
     overrides += [f"steps={args.steps}"] if args.steps else []
     overrides += [f"num_envs={args.num_envs}"] if args.num_envs else []
-    path = args.config or config_file(env_id)
+    path = args.config or config_file(env_id, settings.folder)
     if record and not args.config:
-        settings = make_settings(
-            {**load_settings(path).as_dict(), **_settings_of(record), **parsed(overrides)}, source=str(resume)
-        )
+        before = {**asdict(load_settings(path, kind=settings)), **_settings_of(record), **parsed(overrides)}
+        chosen = make_settings(before, str(resume), settings)
     else:
-        settings = load_settings(path, overrides)
+        chosen = load_settings(path, overrides, settings)
     own = {} if record and not args.config else load_env_args(path)  # a policy keeps those that it was trained with
     kwargs = {**record.get("env_kwargs", {}), **own, **env_kwargs_of(args)}
     out = args.out or Path("runs") / (
@@ -164,7 +165,7 @@ def jobs(args: argparse.Namespace, folder: str = "") -> list[Job]:
     return [
         Job(
             env_id=env_id,
-            settings=settings,
+            settings=chosen,
             out=out / f"seed_{seed}" if len(seeds) > 1 else out,
             env_kwargs=kwargs,
             seed=seed,
@@ -224,7 +225,13 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
-def main(program: str, train: Callable[[Job], Trained], argv: list[str] | None = None, folder: str = "") -> int:
+def main(
+    program: str,
+    train: Callable[[Job], Trained],
+    argv: list[str] | None = None,
+    folder: str = "",
+    settings: type = Settings,
+) -> int:
     """Train every seed asked for, evaluate each policy, and say where it lies.
 
     Args:
@@ -232,16 +239,19 @@ def main(program: str, train: Callable[[Job], Trained], argv: list[str] | None =
         train: What learns.
         argv: Arguments of the command line.
         folder: Ends the names of folders, so that policies of different learners do not mix.
+        settings: The learner's dataclass of settings.
     """
     args = parser().parse_args(argv)
-    return run(program, lambda: _train_all(program, train, args, folder))
+    return run(program, lambda: _train_all(program, train, args, folder, settings))
 
 
-def _train_all(program: str, train: Callable[[Job], Trained], args: argparse.Namespace, folder: str) -> int:
+def _train_all(
+    program: str, train: Callable[[Job], Trained], args: argparse.Namespace, folder: str, settings: type
+) -> int:
     """Do what a command line asks for; return the exit code."""
     from evaluate import evaluate, report  # what judges is not needed before
 
-    for job in jobs(args, folder):
+    for job in jobs(args, folder, settings):
         make_folder(job.out)
         print(f"training {job.env_id}, seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", flush=True)
         trained = train(job)

@@ -1,4 +1,4 @@
-"""PPO settings: what they are, and how they are read from a YAML file and the command line.
+"""Settings of learners: what they are, and how they are read from a YAML file and the command line.
 
 One file per robot and task lies in `config/`, found by the name of the environment. A file is complete: every setting
 is in it, none is inherited.
@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from ce_gym.policies import ACTIVATIONS, checked_arguments, parse_yaml
 
@@ -21,8 +21,8 @@ LIMITS = {
     "steps": 1e12, "num_envs": 2**20, "rollout": 10_000, "minibatches": 10_000, "epochs": 1000, "hidden": 2**13,
     "initial_std": (1e-6, 100), "final_std": (0, 100), "learning_rate": (0, 1), "target_kl": (0, 10), "gamma": (0, 1),
     "gae_lambda": (0, 1), "clip": (1e-6, 10), "entropy": (0, 10), "final_entropy": (0, 10), "value": (0, 1000),
-    "fall_cost": (0, 1e6),
-    "max_grad_norm": (1e-6, 1e9),
+    "fall_cost": (0, 1e6), "max_grad_norm": (1e-6, 1e9),
+    "decay": (1e-3, 1), "target_memory": (0, 1), "max_adjoint": (1e-9, 1e30),
 }  # fmt: skip
 """The largest of whole numbers, whose smallest is 1; the smallest and largest of other numbers."""
 
@@ -70,6 +70,8 @@ class Settings:
         max_grad_norm: Gradients are clipped to this norm.
     """
 
+    folder: ClassVar[Path] = CONFIG_FOLDER
+
     steps: int
     num_envs: int
     rollout: int
@@ -95,28 +97,28 @@ class Settings:
         return asdict(self)
 
 
-def config_file(env_id: str) -> Path:
-    """The settings file of an environment.
+def config_file(env_id: str, folder: Path = CONFIG_FOLDER) -> Path:
+    """The settings file of an environment, in the folder of a learner.
 
     `namespace/MyRobotTask-Level-v0` takes `my_robot_task_level.yaml` if there is one, else `my_robot_task.yaml`, else
     `default.yaml`.
     """
     name = re.sub(r"-v\d+$", "", env_id.rsplit("/", 1)[-1])
     for candidate in (name.replace("-", ""), name.split("-")[0]):
-        path = CONFIG_FOLDER / f"{_snake(candidate)}.yaml"
+        path = folder / f"{_snake(candidate)}.yaml"
         if path.exists():
             return path
-    return CONFIG_FOLDER / "default.yaml"
+    return folder / "default.yaml"
 
 
-def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
-    """Read a settings file and apply `KEY=VALUE` overrides.
+def load_settings(path: Path, overrides: Iterable[str] = (), kind: type = Settings) -> Any:
+    """Read a settings file of a learner and apply `KEY=VALUE` overrides; `kind` is its dataclass of settings.
 
     Raises:
         SettingsError: If the file cannot be read, or a key is missing, unknown or of the wrong kind.
     """
     data = {key: value for key, value in _read(path).items() if key != ENV_ARGS}
-    return make_settings(data | parsed(overrides), source=str(path))
+    return make_settings(data | parsed(overrides), str(path), kind)
 
 
 def load_env_args(path: Path) -> dict[str, Any]:
@@ -145,25 +147,25 @@ def _read(path: Path) -> dict[str, Any]:
     return data
 
 
-def make_settings(data: Mapping[str, Any], source: str) -> Settings:
-    """Check plain data, key by key, and return it as `Settings`; `source` names it in errors.
+def make_settings(data: Mapping[str, Any], source: str, kind: type = Settings) -> Any:
+    """Check plain data, key by key, and return it as settings of a kind; `source` names it in errors.
 
     Raises:
         SettingsError: If a key is missing, unknown or of the wrong kind.
     """
-    known = {field.name: str(field.type) for field in fields(Settings)}
+    known = {field.name: str(field.type) for field in fields(kind)}
     for key in data:
         if key not in known:
             raise SettingsError(f"{source}: {key}: unknown setting; expected one of {', '.join(known)}")
     for key in known:
         if key not in data:
             raise SettingsError(f"{source}: {key}: missing; expected {known[key]}")
-    result = Settings(**{key: _convert(source, key, data[key], kind) for key, kind in known.items()})
+    result = kind(**{key: _convert(source, key, data[key], form) for key, form in known.items()})
     _check_samples(source, result)
     return result
 
 
-def _check_samples(source: str, s: Settings) -> None:
+def _check_samples(source: str, s: Any) -> None:
     """See that every minibatch has two samples, or the spread of its advantages would be 0 / 0."""
     samples = s.num_envs * s.rollout
     if samples > MOST_SAMPLES:
@@ -216,6 +218,11 @@ def _convert(source: str, key: str, value: Any, kind: str) -> Any:
             if isinstance(value, bool) or not low <= number <= high:
                 raise ValueError
             return number
+        if kind.startswith("Mapping"):
+            wanted = "arguments by name"
+            if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
+                raise ValueError
+            return dict(value)
         if kind == "Activation" and value in ACTIVATIONS:
             return value
         if kind == "Activation" or not isinstance(value, list | tuple) or len(value) > 100:

@@ -1,0 +1,63 @@
+"""What short-horizon actor-critic does beside its networks' own loops: the way back through a network to what it saw.
+
+Knows numbers only; layouts are those of `networks.py`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from networks import CHUNK, LANES, ZERO, _backwards, _forwards, _gather, _product, _width
+from numba import njit as numba_njit
+
+njit = partial(numba_njit, error_model="numpy")
+
+
+@njit
+def _by_input(theta, sizes, first, n, turned, result):
+    """Fill `result`, n rows padded to whole vectors, with the gradient by observations; `first` is that by layer 1."""
+    n_in, n_out = sizes[0], _width(sizes, 1)
+    wide = (n_in + LANES - 1) // LANES * LANES
+    for j in range(n_out):
+        for i in range(n_in):
+            turned[j * wide + i] = theta[i * n_out + j]
+        for i in range(n_in, wide):
+            turned[j * wide + i] = ZERO
+    for i in range(n * wide):
+        result[i] = ZERO
+    r = result.ctypes.data
+    _product(first.ctypes.data, n_out, 1, turned.ctypes.data, wide, r, wide, r, wide, n, wide, n_out)
+    return wide
+
+
+@njit(cache=True, nogil=True)
+def back_through(theta, sizes, kind, observations, by_output, gradient, by_observations, work):
+    """Go back through a network.
+
+    Args:
+        theta: Its parameters.
+        sizes: Of its layers, the observation first.
+        kind: Activation, see `networks.KINDS`.
+        observations: Shape (n, n_obs).
+        by_output: Gradient of something with respect to its outputs, shape (n, n_out).
+        gradient: That by theta, added to.
+        by_observations: That by observations, shape (n, n_obs), overwritten.
+        work: Buffers of `networks.make_work`.
+    """
+    values, d, other, turned = work
+    for start in range(0, len(observations), CHUNK):
+        rows = np.arange(start, min(start + CHUNK, len(observations)))
+        n = len(rows)
+        _gather(observations, rows, values)
+        found = _forwards(theta, sizes, kind, values, n)
+        width = found.shape[1]
+        for i in range(n):
+            for j in range(width):
+                d[i * width + j] = by_output[start + i, j] if j < sizes[-1] else ZERO
+        _backwards(theta, sizes, kind, values, n, d, other, turned, gradient)
+        first, free = (d, other) if len(sizes) % 2 == 0 else (other, d)  # layers take turns in the two
+        wide = _by_input(theta, sizes, first, n, turned, free)
+        for i in range(n):
+            for j in range(sizes[0]):
+                by_observations[start + i, j] = free[i * wide + j]

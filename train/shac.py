@@ -1,0 +1,281 @@
+"""Train a policy with analytic gradients: rewards differentiated through physics, contacts and transmissions.
+
+Short-horizon actor-critic (Xu et al. 2022, arXiv:2204.07137). Robots act for a window of control steps; the gradient
+of their rewards, and of a critic's value of where the window ends, goes back through `env.unwrapped.differentiable()`
+to the weights of the policy. Same command line, files and settings machinery as train/fast_ppo.py; settings are in
+train/config/shac. They may change the task (`env_args`: a policy is judged with that) and how it is trained
+(`training`: softer ground, say). Uses public names of ce_gym only, and no name of a robot or task.
+
+    python train/shac.py --env ce_gym/MiniCheetahVelocity-v0
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from console import say_missing
+from gymnasium.vector import VectorEnv
+from job import Job, Trained
+from job import main as run_jobs
+from numpy.typing import NDArray
+from progress import RecentEpisodes, fall_cost, geometric, spread_episodes
+from settings import CONFIG_FOLDER, Activation
+
+try:
+    from fast_ppo import orthogonal, train_with
+    from loops import adam, advantages_of
+    from networks import KINDS, critic_gradient, layers_of, make_work, outputs, padded, parameter_count
+    from pathwise import back_through
+except ModuleNotFoundError as error:
+    raise SystemExit(say_missing("shac.py", error)) from None
+
+from ce_gym.policies import Actor
+
+F = np.float32
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that shapes learning, apart from the environment's id and the seed.
+
+    Attributes:
+        steps: Environment steps to train for, over all environments.
+        num_envs: Environments stepped at once.
+        rollout: Control steps of a window.
+        minibatches: Parts into which a window is divided for the critic.
+        epochs: Times the critic goes over a window.
+        hidden: Sizes of the hidden layers, the same for policy and value.
+        activation: Tanh, ReLU and so on, as in `torch.nn`; what follows the policy's last layer, too, so that Tanh
+            squashes its actions.
+        initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
+        final_std: At the end, geometric in between.
+        learning_rate: Of Adam, policy and critic, until the last part of training.
+        decay: That part: a share of training, over which the rate goes down to 0.
+        gamma: Discount per step.
+        gae_lambda: Of the critic's targets, TD(lambda).
+        fall_cost: What an episode that ends as a failure takes from these targets, in the end; see
+            `progress.fall_cost`.
+        target_memory: Share of the target critic that is kept in each update.
+        max_grad_norm: Gradients of the networks are clipped to this norm.
+        max_adjoint: A robot's gradient is shortened to this norm between control steps.
+        training: Arguments of the environment for training only; those that go with the policy are `env_args`.
+    """
+
+    folder: ClassVar[Path] = CONFIG_FOLDER / "shac"
+
+    steps: int
+    num_envs: int
+    rollout: int
+    minibatches: int
+    epochs: int
+    hidden: tuple[int, ...]
+    activation: Activation
+    initial_std: float
+    final_std: float
+    learning_rate: float
+    decay: float
+    gamma: float
+    gae_lambda: float
+    fall_cost: float
+    target_memory: float
+    max_grad_norm: float
+    max_adjoint: float
+    training: Mapping[str, Any]
+
+
+class SHAC:
+    """Short-horizon actor-critic.
+
+    Args:
+        envs: A vector environment of ours in SAME_STEP autoreset mode.
+        job: The training run.
+
+    Attributes:
+        theta: All parameters: those of the policy, then those of the value.
+        steps: Environment steps done.
+        step_seconds, collect_seconds: Time spent inside the environment, and in collection as a whole [s].
+    """
+
+    def __init__(self, envs: VectorEnv, job: Job) -> None:
+        self.envs, self.settings, s = envs, job.settings, job.settings
+        native: Any = envs.unwrapped
+        self.differentiable = native.differentiable(s.max_adjoint)
+        spaces: Any = envs.single_observation_space, envs.single_action_space
+        size, self.n_actions = (space.shape[0] for space in spaces)
+        # the last layer is the identity and stays it: so activations, which stand between layers, squash actions
+        self.actor_sizes = np.array([size, *s.hidden, self.n_actions, self.n_actions])
+        self.critic_sizes = np.array([size, *s.hidden, 1])
+        self.kind, self.rng = KINDS.index(s.activation), np.random.default_rng(job.seed)
+        self.n_actor, self.n_critic = parameter_count(self.actor_sizes), parameter_count(self.critic_sizes)
+        self.theta = np.zeros(self.n_actor + self.n_critic, F)
+        self.policy, self.value = self.theta[: self.n_actor], self.theta[self.n_actor :]
+        self.moments = np.zeros((2, self.theta.size), F)
+        self._start_parameters()
+        self.target = self.value.copy()
+        self.steps, self.updates, self.critic_updates = 0, 0, 0
+        self.episodes = RecentEpisodes(s.num_envs)
+        self.step_seconds = self.collect_seconds = 0.0
+        self.work = make_work(np.maximum(self.actor_sizes[:-1], self.critic_sizes))
+        shape = (s.rollout, s.num_envs)
+        self.seen, self.after = (np.zeros((*shape, size), F) for _ in range(2))
+        self.rewards, self.values, self.advantages = (np.zeros(shape, F) for _ in range(3))
+        self.terminated, self.dones = (np.zeros(shape, bool) for _ in range(2))
+        self.observed = np.ascontiguousarray(envs.reset(seed=job.seed)[0], F)
+        spread_episodes(native, self.rng)
+
+    def _start_parameters(self) -> None:
+        """Orthogonal weights, small ones where actions come from; biases are zero."""
+        for theta, sizes, last in ((self.policy, self.actor_sizes[:-1], 0.1), (self.value, self.critic_sizes, 1.0)):
+            layers = layers_of(theta, sizes)
+            for i, (weight, _) in enumerate(layers):
+                weight[:] = (last if i == len(layers) - 1 else 2**0.5) * orthogonal(self.rng, weight.shape)
+        layers_of(self.policy, self.actor_sizes)[-1][0][:] = np.eye(self.n_actions)
+
+    def iterate(self) -> dict[str, float]:
+        """Act for a window and learn from it; return what the log shows."""
+        s, done = self.settings, min(self.steps / self.settings.steps, 1.0)
+        rate = s.learning_rate * min(1.0, (1 - done) / s.decay)
+        start = time.perf_counter()
+        self.collect(F(geometric(s.initial_std, s.final_std, done)))
+        self.collect_seconds += time.perf_counter() - start
+        figures = self.learn_actor(rate) | self.learn_critic(rate, fall_cost(s.fall_cost, done))
+        self.steps += self.dones.size
+        return figures | {"train/learning_rate": rate}
+
+    def collect(self, std: np.float32) -> None:
+        """Act for a window."""
+        for t in range(self.settings.rollout):
+            self.seen[t] = self.observed
+            actions = self._run(self.policy, self.actor_sizes, self.seen[t])
+            actions += std * self.rng.standard_normal(actions.shape, F)
+            start = time.perf_counter()
+            self.observed, self.rewards[t], over, late, infos = self.differentiable.step(actions)
+            self.step_seconds += time.perf_counter() - start
+            self.after[t], self.terminated[t], self.dones[t] = self.observed, over, over | late
+            if self.dones[t].any():
+                self.episodes.add(self.dones[t], infos)
+                self.after[t][self.dones[t]] = infos["final_obs"][self.dones[t]]
+
+    def learn_actor(self, rate: float) -> dict[str, float]:
+        """Ascend discounted rewards of the window, and what the target critic thinks of where robots end.
+
+        A robot that falls is worth nothing from then on; with the next episode discounts begin anew.
+        """
+        s, (steps, n) = self.settings, self.dones.shape
+        weight = np.ones((steps, n), F)
+        for t in range(1, steps):
+            weight[t] = np.where(self.dones[t - 1], F(1), F(s.gamma) * weight[t - 1])
+        worth = weight * F(s.gamma) * ~self.terminated
+        worth[:-1] *= self.dones[:-1]
+        gradient, by_seen = np.zeros_like(self.policy), None
+        for t in range(steps - 1, -1, -1):
+            final = self._value_gradient(self.after[t], worth[t])
+            by_action = self.differentiable.backward(final if by_seen is None else by_seen, weight[t], final)
+            by_seen = np.empty_like(self.seen[t])
+            back_through(
+                self.policy, self.actor_sizes, self.kind, self.seen[t], by_action, gradient, by_seen, self.work
+            )
+        last = padded(self.n_actions)
+        gradient[-last * (last + 1) :] = 0
+        self.updates += 1
+        first, second = self.moments[:, : self.n_actor]
+        adam(self.policy, gradient / F(-n), first, second, self.updates, rate, s.max_grad_norm)
+        return {"train/gradient_norm": float(np.linalg.norm(gradient)) / n}
+
+    def _value_gradient(self, observations: NDArray, weight: NDArray) -> NDArray:
+        """Gradient of weighted values with respect to observations, where weights are not 0."""
+        result, rows = np.zeros_like(observations), np.flatnonzero(weight)
+        if len(rows):
+            found, unused = np.empty_like(observations[rows]), np.zeros_like(self.target)
+            by_value, seen = np.ascontiguousarray(weight[rows, None]), observations[rows]
+            back_through(self.target, self.critic_sizes, self.kind, seen, by_value, unused, found, self.work)
+            result[rows] = found
+        return result
+
+    def learn_critic(self, rate: float, cost: float) -> dict[str, float]:
+        """Fit values to TD(lambda) targets, which the target critic makes; a fall takes `cost` from the reward."""
+        s, n = self.settings, self.dones.size
+        seen, rewards = self.seen.reshape(n, -1), self.rewards.copy()
+        self.values[:] = self._run(self.target, self.critic_sizes, seen).reshape(self.values.shape)
+        rewards[self.terminated] -= F(cost)
+        late = self.dones & ~self.terminated  # an episode that was cut off by time is worth what its end is
+        if late.any():
+            rewards[late] += F(s.gamma) * self._run(self.target, self.critic_sizes, self.after[late])[:, 0]
+        last = self._run(self.target, self.critic_sizes, self.after[-1])[:, 0]
+        advantages_of(rewards, self.values, last, self.dones, F(s.gamma), F(s.gae_lambda), self.advantages)
+        returns, size = (self.advantages + self.values).reshape(n), -(-n // s.minibatches)
+        figures, (first, second) = np.zeros(4, F), self.moments[:, self.n_actor :]
+        for _ in range(s.epochs):
+            order = self.rng.permutation(n)
+            for i in range(0, n, size):
+                rows, gradient = order[i : i + size], np.zeros_like(self.value)
+                samples, options = (seen, returns), (F(1 / len(rows)), F(1), gradient, figures, self.work)
+                critic_gradient(self.value, self.critic_sizes, self.kind, samples, rows, *options)
+                self.critic_updates += 1
+                adam(self.value, gradient, first, second, self.critic_updates, rate, s.max_grad_norm)
+        self.target += F(1 - s.target_memory) * (self.value - self.target)
+        spread = float(np.var(returns))
+        unexplained = float(np.var(self.advantages)) / spread if spread else np.nan
+        loss = float(figures[1]) / s.epochs / s.minibatches
+        return {"train/value_loss": loss, "train/explained_variance": 1 - unexplained}
+
+    def _run(self, theta: NDArray, sizes: NDArray, observations: NDArray) -> NDArray:
+        result = np.empty((len(observations), sizes[-1]), F)
+        outputs(theta, sizes, self.kind, observations, result, self.work)
+        return result
+
+    def actor(self) -> Actor:
+        """The layers that turn observations into mean actions, copies."""
+        layers = layers_of(self.policy, self.actor_sizes)
+        return Actor(tuple((weight.T.copy(), bias.copy()) for weight, bias in layers), self.settings.activation)
+
+    def state(self) -> dict[str, NDArray]:
+        """All that going on needs, as arrays: see `restore`."""
+        native: Any = self.envs.unwrapped
+        facts = {
+            "steps": self.steps, "updates": [self.updates, self.critic_updates], "rng": self.rng.bit_generator.state,
+            "sizes": [self.actor_sizes.tolist(), self.critic_sizes.tolist()], "activation": self.settings.activation,
+            "episodes": self.episodes.names,
+        }  # fmt: skip
+        found = {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
+        found |= {"target": self.target, "observed": self.observed, "episodes": self.episodes.rows()}
+        return found | {f"env/{name}": array for name, array in native.snapshot().items()}
+
+    def restore(self, state: dict[str, NDArray]) -> None:
+        """Go on from a state; environments begin anew if they are more or fewer.
+
+        Raises:
+            ValueError: If it is of another network.
+        """
+        facts = json.loads(str(state["facts"]))
+        native: Any = self.envs.unwrapped
+        mine = [self.actor_sizes.tolist(), self.critic_sizes.tolist(), self.settings.activation]
+        if [*facts["sizes"], facts["activation"]] != mine:
+            raise ValueError(f"has layers {facts['sizes'][0]}, {facts['activation']}; expected {mine[0]}, {mine[2]}")
+        self.theta[:], self.moments[:], self.target[:] = (state[name] for name in ("theta", "moments", "target"))
+        self.steps, (self.updates, self.critic_updates) = facts["steps"], facts["updates"]
+        self.rng.bit_generator.state = facts["rng"]
+        if len(state["observed"]) == self.settings.num_envs:
+            native.restore({name.removeprefix("env/"): x for name, x in state.items() if name.startswith("env/")})
+            self.observed = state["observed"]
+            self.episodes.restore(facts["episodes"], state["episodes"])
+
+
+def train(job: Job) -> Trained:
+    """Train, and save the policy even if Ctrl-C ends training early; see `fast_ppo.train`."""
+    return train_with(SHAC, job, "shac", **job.settings.training)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line of this file."""
+    return run_jobs("shac.py", train, argv, folder="-shac", settings=Settings)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
