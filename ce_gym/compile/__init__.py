@@ -7,7 +7,7 @@ from ce_gym.compile.arrays import aligned_zeros, lane_count
 from ce_gym.compile.critical import CriticalSection
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.loading import load_kernel
-from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step
+from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While, calls_of
 from ce_gym.compile.sources import source_fingerprint
 
 __all__ = [
@@ -19,7 +19,9 @@ __all__ = [
     "Program",
     "Repeat",
     "Step",
+    "While",
     "aligned_zeros",
+    "calls_of",
     "lane_count",
     "load_kernel",
     "source_fingerprint",

@@ -5,6 +5,7 @@ Data and its checks only.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
@@ -86,7 +87,22 @@ class Lookup:
         return (self.output,)
 
 
-Step: TypeAlias = Call | Lookup
+@dataclass(frozen=True)
+class While:
+    """Steps run in order, again and again until a buffer is zero in all lanes of a tile; never if it is at first.
+
+    To keep lanes independent of their neighbours, what they change in a lane where it is zero must not be read later.
+
+    Attributes:
+        flag: a buffer of size 1, which the steps write.
+        calls: what is repeated.
+    """
+
+    flag: str
+    calls: tuple[Call | Lookup, ...]
+
+
+Step: TypeAlias = Call | Lookup | While
 
 
 @dataclass(frozen=True)
@@ -100,6 +116,15 @@ class Repeat:
 
     times: str
     calls: tuple[Step, ...]
+
+
+def calls_of(steps: Sequence[Step | Repeat]) -> Iterator[Call | Lookup]:
+    """Yield all calls and look-ups among steps, repeated or not, each once."""
+    for step in steps:
+        if isinstance(step, Repeat | While):
+            yield from calls_of(step.calls)
+        else:
+            yield step
 
 
 @dataclass(frozen=True)
@@ -119,9 +144,15 @@ class Program:
     skip_unless: str = ""
 
     @property
-    def calls(self) -> tuple[Step, ...]:
+    def calls(self) -> tuple[Call | Lookup, ...]:
         """All calls and look-ups, repeated or not, each once."""
-        return tuple(c for step in self.steps for c in (step.calls if isinstance(step, Repeat) else (step,)))
+        return tuple(calls_of(self.steps))
+
+    @property
+    def flags(self) -> set[str]:
+        """Buffers that say how often steps are run."""
+        inner = [step for outer in self.steps for step in (outer.calls if isinstance(outer, Repeat) else (outer,))]
+        return {step.flag for step in inner if isinstance(step, While)}
 
 
 def check_program(program: Program) -> None:
@@ -152,6 +183,10 @@ def check_program(program: Program) -> None:
         written.update(call.outputs)
     if unset := [b.name for b in program.buffers if b.name not in written and b.kind == "rows_out"]:
         raise ValueError(f"program {program.name!r}: no call writes the rows_out buffer {unset[0]!r}")
+    for flag in program.flags:
+        _check_flag(f"program {program.name!r}: flag {flag!r} of a loop", buffers.get(flag))
+        if flag not in written:
+            raise ValueError(f"program {program.name!r}: reads {flag!r}, expected a call to write it")
     if program.skip_unless:
         _check_flag(f"program {program.name!r}: skip_unless", buffers.get(program.skip_unless), ("tiles",))
 

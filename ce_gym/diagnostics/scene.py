@@ -18,7 +18,7 @@ from typing import Any, cast
 import casadi as ca
 import gymnasium
 
-from ce_gym.compile import Call, Repeat
+from ce_gym.compile import Call, Repeat, calls_of
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.friction import FRICTION
@@ -47,6 +47,9 @@ TERMS = {
 }
 """Fields of a `Task` that name terms, in the order in which they are added, and the kind of each."""
 
+AGAIN = {"iteration": "another iteration of a sub-step", "mend": "a sub-step in parts"}
+"""What is done in a sub-step only if some robot of a tile needs it, by name of the function."""
+
 NO_TERMS: dict[str, Any] = {"rewards": {}, "noise": {}, "history": 1} | {f: () for f in TERMS if f != "rewards"}
 """What makes a task one without terms."""
 
@@ -73,7 +76,7 @@ class SubStep:
     def calls(self) -> list[Call]:
         """The calls that the kernel of this sub-step repeats."""
         _, _, steps = substeps(self.model.mechanism, self.options, self.outputs)
-        return [call for step in steps if isinstance(step, Repeat) for call in step.calls if isinstance(call, Call)]
+        return [call for call in calls_of(steps) if isinstance(call, Call)]
 
     @property
     def instructions(self) -> int:
@@ -161,7 +164,7 @@ def report_scene(env_id: str, **arguments: Any) -> SceneReport:
     outputs = ("torque", "contact_forces") if program.contact_forces else ("torque",)
     whole = SubStep(program.model, program.options, outputs)
     again = dict.fromkeys(call.function for call in whole.calls if call.only_if)
-    sometimes = [("another iteration of a sub-step", f) for f in again] + [("reset", program.function("begin"))]
+    sometimes = [(AGAIN[f.name()], f) for f in again] + [("reset", program.function("begin"))]
     return SceneReport(
         name=env_id,
         program=program,

@@ -51,7 +51,8 @@ class DifferentiableEnv:
     """Control steps of an environment with gradients: sub-steps, observations and rewards, all terms included.
 
     What was decided (touching, sticking, a limit that acts, a term that counts) is differentiated as decided. A robot
-    whose episode ended, or that was reset, passes nothing on to what was before; one that diverged has no gradient.
+    whose episode ended, or that was reset, passes nothing on to what was before; one that diverged, or made a sub-step
+    in parts (see `Simulator`), has no gradient.
 
     Args:
         env: One of ours, unwrapped; on the CPU, on flat ground, without latency.
@@ -101,7 +102,9 @@ class DifferentiableEnv:
         for name, array in arrays.items():
             array[...] = batch.arrays[name]
         counters, ignored = batch.arrays["counters"].copy(), batch.arrays["finished"].copy()
+        retries = batch.arrays["retries"].copy()
         result = self.env.step(actions)
+        arrays["diverged"][batch.arrays["retries"] > retries] = 1  # made in parts, which are not differentiated
         action = np.clip(actions, -2, 2).astype(np.float32).reshape(batch.num_envs, -1)  # what is beyond 1 stays so
         replaced = np.reshape(np.logical_or(result[2], result[3]), -1) & same_step
         self._records.append(Record(arrays, counters, action, ignored, replaced))

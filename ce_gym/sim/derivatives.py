@@ -35,10 +35,11 @@ class StepDerivatives:
 
     Positions are differentiated in their tangent space: a rotation of the base, a translation of it, both in base axes,
     then the joints. What was decided in a step (touching, sticking, slipping, a limit that acts) is differentiated as
-    decided, through all iterations of the step.
+    decided, through all iterations of the step. A robot that made a sub-step in parts (see `Simulator`) passes nothing
+    on to what was before, like one that diverged.
 
     Args:
-        simulator: Whose steps; on the CPU, on flat ground and without retries.
+        simulator: Whose steps; on the CPU and on flat ground.
 
     Attributes:
         state_sizes: Of the tangent of each part of a state.
@@ -60,7 +61,6 @@ class StepDerivatives:
         for unfit, why in (
             (simulator.device != "cpu", f"on device {simulator.device!r}; expected 'cpu'"),
             (simulator.terrain is not None, "on terrain; expected flat ground"),
-            (simulator._retry.halvings > 0, "with retries; expected retry=0"),
         ):
             if unfit:
                 raise ValueError(f"derivatives of a simulator {why}")
@@ -84,7 +84,9 @@ class StepDerivatives:
         """Step the simulator, and record: the state before each sub-step is kept."""
         for _ in range(n_substeps):
             before = {name: _aligned_copy(self.simulator._arrays[name]) for name in self._kept}
+            retries = self.simulator._arrays["retries"].copy()
             self.simulator.step(target, 1)
+            before["diverged"][self.simulator._arrays["retries"] > retries] = 1  # made in parts, so not differentiated
             rows = self._target(target)
             self._records.append(Record(before, rows, (self.simulator.q, self.simulator.v)))
 

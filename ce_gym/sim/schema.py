@@ -55,7 +55,7 @@ def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str], dt:
     start = {"q": model.standing_q, "dependent": model.guess}
     sizes = state_sizes(model.mechanism, options)
     rows = [Row(name, size, "physics", start.get(name, 0.0)) for name, size in sizes.items()]
-    rows.append(Row("diverged", 1, "physics"))
+    rows += [Row("diverged", 1, "physics"), Row("retries", 1, "physics")]
     lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts, "motor_speed": motors}
     rows += [Row(name, size, "physics") for name in outputs if (size := lengths.get(name, 1))]
     if options.parameters:

@@ -27,11 +27,10 @@ from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.kernels import load_step_kernel, select_contacts
 from ce_gym.sim.pieces import piece_length, run_substeps
 from ce_gym.sim.placement import Placement
-from ce_gym.sim.retry import Retry
 from ce_gym.sim.schema import Row, physics_rows
 from ce_gym.sim.terrain import Terrain
 
-COUNTS = (Row("failures", 1, "host", dtype="int64"), Row("retries", 1, "host", dtype="int64"))
+FAILURES = Row("failures", 1, "host", dtype="int64")
 """How often a robot has diverged and been set anew, and how often it has been stepped again."""
 
 
@@ -59,8 +58,8 @@ class Simulator:
             motors themselves.
         parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
         terrain: The ground; the plane z = 0 if None, which is faster.
-        retry: How often the step is halved for a robot that diverges: it alone is taken back to where it was when
-            `step` was called and stepped again. 0, the default, costs nothing; otherwise each call copies the state.
+        retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move by more than
+            `ce_gym.dynamics.stepping.parts.LARGEST_MOVE`; it alone then makes the sub-step in parts.
         device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
 
     Attributes:
@@ -98,7 +97,7 @@ class Simulator:
         motors: str = "ideal",
         parameters: Sequence[str] = (),
         terrain: Terrain | None = None,
-        retry: int = 0,
+        retry: int = 4,
         device: str | Device = "cpu",
     ) -> None:
         self._made_with = {name: value for name, value in locals().items() if name != "self"}
@@ -117,8 +116,6 @@ class Simulator:
         if terrain is not None and not isinstance(terrain, Terrain):
             _check("terrain", terrain, False, "a Terrain or None")
         self._device = device_named(device)
-        if self._device.name != "cpu":
-            _check("retry", retry, retry == 0, f"0 on device {self._device.name!r}")
         self.device = self._device.name
         self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
         self.dtype, self.num_threads = dtype, num_threads
@@ -134,14 +131,14 @@ class Simulator:
             motors=motors,
             ground="field" if terrain is not None and self.contact_names else "flat",
             parameters=tuple(parameters),
+            retry=retry,
         )
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
-        self._retry = Retry(retry, self._kernel)
         self._section = CriticalSection(f"Simulator of {num_envs} {model.robot.name}")
         ground = terrain if self.options.ground == "field" else None
-        rows = [*physics_rows(model, self.options, asked, dt), *COUNTS]
+        rows = [*physics_rows(model, self.options, asked, dt), FAILURES]
         self._batch = Batch(rows, num_envs, dtype, self._device, ground)
         self._arrays = self._batch.arrays
         defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
@@ -218,16 +215,11 @@ class Simulator:
 
     def _advance(self, given: dict[str, Array], n_substeps: int) -> None:
         """Step all robots; the state is as before if that raises, by Ctrl-C in a long call."""
-        keep = self._retry.halvings > 0 or n_substeps > piece_length(self.num_envs)
+        keep = n_substeps > piece_length(self.num_envs)
         before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
-        tables = self._batch.tables
-        arrays = self._arrays | tables | given
+        arrays = self._arrays | self._batch.tables | given
         try:
             run_substeps(self._kernel, arrays, self.num_envs, n_substeps, self._section, self.num_threads)
-            if self._retry.halvings:
-                lanes = {name: array for name, array in before.items() if name in self._kernel.buffers}
-                again = (self.num_envs, given, tables, n_substeps, self._section)
-                self._arrays["retries"] += self._retry(lanes, self._arrays, *again)
         except BaseException:
             for name, array in before.items():
                 self._arrays[name][...] = array
@@ -312,8 +304,8 @@ class Simulator:
 
     @property
     def n_retried(self) -> int:
-        """How many times a robot has been stepped again, see `retry`."""
-        return int(self._arrays["retries"].sum())
+        """How many sub-steps robots have made in parts, see `retry`."""
+        return int(self._read("retries").sum())
 
     @property
     def torque(self) -> Array:

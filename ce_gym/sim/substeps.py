@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeAlias
 
 import casadi as ca
 
-from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step
+from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step, While
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.stepping.ground_lookup import places_function, planes_function, touching_function
 from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.plan import Plan, Rates
+from ce_gym.dynamics.stepping.parts import beginning_function, judging_function, mending_function
+from ce_gym.dynamics.stepping.plan import MOVED, Plan, Rates, Stage
 from ce_gym.dynamics.stepping.step import iterations_needed
 from ce_gym.dynamics.stepping.trace import combination_function, iteration_function, step_function
 from ce_gym.model.mechanism import Mechanism
@@ -34,36 +35,103 @@ def substeps(
     """Return how to advance a robot `n_substeps` times, as a part of a program.
 
     Returns:
-        Sizes of the buffers that the program must have: state, `diverged`, what `step_function` is given, `DT` among
-        it, `FRAME` on a field, and outputs; further buffers, for scratch and on a field the table `HEIGHTS`; and the
-        steps. An output that is empty for this robot is left out.
+        Sizes of the buffers that the program must have: state, `diverged`, `retries`, what `step_function` is given,
+        `DT` among it, `FRAME` on a field, and outputs; further buffers, for scratch and on a field the table `HEIGHTS`;
+        and the steps. An output that is empty for this robot is left out.
     """
     options = replace(options, dt=None)
     plan, most = METHODS[options.method], iterations_needed(mechanism, options)
     staged = any(min(stage.iterations, most) for stage in plan.stages)
-    asked = tuple(name for name in outputs if not staged or plan.single or name != "error")
+    asked = (*outputs, MOVED) if plan.single or not staged else tuple(name for name in outputs if name != "error")
     function = (iteration_function if staged else step_function)(mechanism, options, asked)
-    if empty := [name for name in asked if not function.numel_out(name)]:
-        return substeps(mechanism, options, tuple(name for name in outputs if name not in empty))
-    sizes = {name: function.numel_in(name) for name in function.name_in() if name != "iterate"}
-    state = tuple(name for name in sizes if f"{name}_next" in function.name_out())
-    sizes |= {name: function.numel_out(name) if name in asked else 1 for name in outputs}
-    on_field = "ground" in sizes
-    buffers, look = _look_up(mechanism, options) if on_field else ([], ())
-    if staged:
-        further, before, each = _staged(mechanism, options, function, {name: sizes[name] for name in outputs})
-    else:
-        further, before, each = [], (), (*look, Call(function, tuple(function.name_in()), (*state, *outputs)))
-    if on_field:
-        sizes = {name: size for name, size in sizes.items() if name != "ground"} | {FRAME: 3}
-    return sizes, [*further, *buffers], (*before, Repeat(TIMES, each))
+    told = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
+    if len(told) < len(outputs):
+        return substeps(mechanism, options, tuple(told))
+    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in ("iterate", "ground")}
+    sizes |= {"retries": 1, **told} | ({FRAME: 3} if "ground" in function.name_in() else {})
+    fractions = {TRIED: 1.0} | ({_own(plan, stage): stage.length for stage in plan.stages} if staged else {})
+    each = _staged(mechanism, options, function, told | {MOVED: 1}) if staged else _whole(mechanism, options, function)
+    buffers, try_part = each
+    begin, take = beginning_function(fractions), _take_part(mechanism, options, told, fractions)
+    started = tuple(begin.name_out())
+    buffers += [Buffer(name, 1, "scratch") for name in started]
+    return sizes, buffers, (Repeat(TIMES, (Call(begin, (DT,), started), While("unfinished", (*try_part, *take)))),)
 
 
-Parts: TypeAlias = tuple[list[Buffer], tuple[Step, ...], tuple[Step, ...]]
-"""Scratch buffers, what comes before the first sub-step, and what every sub-step consists of."""
+TRIED = "tried"
+"""What names of buffers begin with that have the state after a part of a step that is tried, and what it reports."""
+Parts: TypeAlias = tuple[list[Buffer], tuple[Call | Lookup, ...]]
+"""Buffers, and how such a part is made."""
 
 
-def _look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> tuple[list[Buffer], tuple[Step, ...]]:
+def _own(plan: Plan, stage: Stage) -> str:
+    """Return what names of buffers begin with that a stage writes."""
+    return TRIED if plan.single else stage.name
+
+
+def _take_part(
+    mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int], fractions: Mapping[str, float]
+) -> tuple[Call, ...]:
+    """Take what was tried where it is good; a tile whose robots all make the whole step just copies it."""
+    judge, mend = judging_function(), mending_function(mechanism, options, outputs, fractions)
+    left = tuple(name.removesuffix("_next") for name in mend.name_out())
+    tried = {name: mend.numel_out(i) for i, name in enumerate(left) if name.startswith(f"{TRIED}_")}
+    tried.pop(f"{TRIED}_{DT}", None)
+    values = [SX.sym(name, size) for name, size in tried.items()]
+    copy = ca.Function("copy", values, values)
+    return (
+        Call(judge, tuple(judge.name_in()), ("unfinished",)),
+        Call(mend, tuple(mend.name_in()), left, only_if="unfinished"),
+        Call(copy, tuple(tried), tuple(name.removeprefix(f"{TRIED}_") for name in tried)),
+    )
+
+
+def _whole(mechanism: Mechanism, options: StepOptions, step: ca.Function) -> Parts:
+    """Make a step by a method that does not iterate, in one call."""
+    results = {f"{TRIED}_{name.removesuffix('_next')}": step.numel_out(name) for name in step.name_out()}
+    buffers = [Buffer(name, size, "scratch") for name, size in results.items()]
+    ground, look = _look_up(mechanism, options) if "ground" in step.name_in() else ([], ())
+    given = tuple(f"{TRIED}_dt" if name == DT else name for name in step.name_in())
+    return buffers + ground, (*look, Call(step, given, tuple(results)))
+
+
+def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, outputs: Mapping[str, int]) -> Parts:
+    """Make every stage with the iterations that a tile needs, and combine what is after the step from them.
+
+    `iteration` is the traced iteration, `outputs` are sizes. A tile iterates again only if one of its robots has not
+    converged; the others reproduce their result.
+    """
+    plan, most = METHODS[options.method], iterations_needed(mechanism, options)
+    asked = tuple(name for name in outputs if name in iteration.name_out())
+    state = [name for name in iteration.name_in() if f"{name}_next" in iteration.name_out() and name != "iterate"]
+    zeros = ca.Function("zeros", [], [SX(ca.DM.zeros(iteration.numel_in("iterate")))])
+    sizes = {name: iteration.numel_in(name) for name in state} | {name: iteration.numel_out(name) for name in asked}
+    scratch = {f"{_own(plan, stage)}_{name}": size for stage in plan.stages for name, size in sizes.items()}
+    scratch |= {"iterate": iteration.numel_in("iterate"), "unconverged": 1}
+    buffers = _look_up(mechanism, options)[0] if "ground" in iteration.name_in() else []
+    each: list[Call | Lookup] = []
+    ground_at: str | None = None
+    for stage in plan.stages:
+        assert not isinstance(stage.start, Rates), "explicit stages do not iterate"
+        start, own = f"{stage.start}_" if stage.start else "", _own(plan, stage)
+        if buffers and stage.start != ground_at:
+            each += _look_up(mechanism, options, start)[1]
+            ground_at = stage.start
+        here = {name: f"{start}{name}" for name in state} | {DT: f"{own}_dt"}
+        given = tuple(here.get(name, name) for name in iteration.name_in())
+        left = (*(f"{own}_{name}" for name in state), "iterate", "unconverged", *(f"{own}_{name}" for name in asked))
+        each += [Call(zeros, (), ("iterate",)), Call(iteration, given, left)]
+        each += [Call(iteration, given, left, only_if="unconverged")] * min(stage.iterations, most)
+    if not plan.single:
+        combine = combination_function(mechanism, options, outputs)
+        tried = {f"{TRIED}_{name.removesuffix('_next')}": combine.numel_out(name) for name in combine.name_out()}
+        given = tuple(f"{TRIED}_{DT}" if name == DT else name for name in combine.name_in())
+        each.append(Call(combine, given, tuple(tried)))
+        scratch |= tried
+    return buffers + [Buffer(name, size, "scratch") for name, size in scratch.items()], tuple(each)
+
+
+def _look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> Parts:
     """Find the ground under the contacts; `at` is what the names of the state's buffers begin with."""
     places, touching = places_function(mechanism, options), touching_function(mechanism, options)
     n = len(options.contacts)
@@ -80,51 +148,3 @@ def _look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> tuple[
         Call(planes, tuple(planes.name_in()), ("ground",)),
     )
     return buffers, (*under, *beside)
-
-
-def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, outputs: dict[str, int]) -> Parts:
-    """Every stage with the iterations that a tile needs, and the state after the step combined from them.
-
-    `iteration` is the traced iteration, `outputs` are sizes. A tile iterates again only if one of its robots has not
-    converged; the others reproduce their result.
-    """
-    plan = METHODS[options.method]
-    alone = plan.is_euler
-    asked = tuple(name for name in outputs if name in iteration.name_out())
-    combine = combination_function(mechanism, options, {} if plan.single else outputs)
-    state = tuple(name.removesuffix("_next") for name in combine.name_out() if name.endswith("_next"))
-    most = iterations_needed(mechanism, options)
-    lengths, zeros = _lengths(plan), _zeros(iteration.numel_in("iterate"))
-    sizes = {name: iteration.numel_in(name) for name in state}
-    sizes |= {} if plan.single else {name: iteration.numel_out(name) for name in asked}
-    buffers = {f"{stage.name}_{name}": size for stage in plan.stages for name, size in sizes.items()}
-    buffers |= {"iterate": iteration.numel_in("iterate"), "unconverged": 1}
-    buffers |= {} if alone else dict.fromkeys(lengths.name_out(), 1)
-    each: list[Step] = []
-    ground_at: str | None = None
-    for stage in plan.stages:
-        assert not isinstance(stage.start, Rates), "explicit stages do not iterate"
-        start = f"{stage.start}_" if stage.start else ""
-        if "ground" in iteration.name_in() and stage.start != ground_at:
-            each += _look_up(mechanism, options, start)[1]
-            ground_at = stage.start
-        here = {name: f"{start}{name}" for name in state} | {DT: DT if alone else f"{stage.name}_dt"}
-        given = tuple(here.get(name, name) for name in iteration.name_in())
-        told = asked if plan.single else tuple(f"{stage.name}_{name}" for name in asked)
-        left = (*(f"{stage.name}_{name}" for name in state), "iterate", "unconverged", *told)
-        each += [Call(zeros, (), ("iterate",)), Call(iteration, given, left)]
-        each += [Call(iteration, given, left, only_if="unconverged")] * min(stage.iterations, most)
-    written = tuple(name.removesuffix("_next") for name in combine.name_out())
-    each.append(Call(combine, tuple(combine.name_in()), written))
-    before = () if alone else (Call(lengths, (DT,), tuple(lengths.name_out())),)
-    return [Buffer(name, size, "scratch") for name, size in buffers.items()], before, tuple(each)
-
-
-def _zeros(size: int) -> ca.Function:
-    return ca.Function("zeros", [], [SX(ca.DM.zeros(size))])
-
-
-def _lengths(plan: Plan) -> ca.Function:
-    """Return the function that gives the length of each stage [s]."""
-    dt = SX.sym(DT)
-    return traced("lengths", {DT: dt}, {f"{stage.name}_dt": stage.length * dt for stage in plan.stages})

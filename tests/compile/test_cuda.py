@@ -2,17 +2,19 @@
 
 import re
 from collections import Counter
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 import pytest
 import torch
 
-from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, load_kernel
+from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, While, load_kernel
 from ce_gym.compile.cuda import CudaUnavailable, host_kernel, nvrtc
 from ce_gym.compile.cuda.loading import cached_cubin, kernel_name
 from ce_gym.compile.cuda.source import BLOCK, LONG, emit_source
 from ce_gym.compile.lowering.random import uniform
+from ce_gym.compile.program import check_program
 
 DTYPES = pytest.mark.parametrize("dtype", ["float64", "float32"])
 N = BLOCK + 5
@@ -87,6 +89,35 @@ def test_each_thread_leaves_out_what_it_does_not_need(dtype, needs_host_compiler
         np.testing.assert_array_equal(result.numpy(), out)
         np.testing.assert_array_equal(out[:, 0], np.maximum(given[:, 0] - 3 * times, 0))
         np.testing.assert_array_equal(held.numpy(), counters + 1)
+
+
+def doubling():
+    """Doubles numbers until they are 100 or more, those of other lanes untouched."""
+    x = ca.SX.sym("x")
+    start = ca.Function("start", [x], [x, x < 100])
+    double = ca.Function("double", [x], [ca.if_else(x < 100, 2 * x, x), ca.if_else(x < 100, 2 * x, x) < 100])
+    show = ca.Function("show", [x], [x])
+    buffers = (Buffer("given", 1, "rows_in"), Buffer("x", 1, "scratch"), Buffer("below", 1, "scratch"))
+    loop = While("below", (Call(double, ("x",), ("x", "below")),))
+    steps = (Call(start, ("given",), ("x", "below")), loop, Call(show, ("x",), ("out",)))
+    return Program("cuda doubling", (*buffers, Buffer("out", 1, "rows_out")), steps)
+
+
+@DTYPES
+def test_a_loop_ends_when_no_lane_needs_it(dtype, needs_host_compiler):
+    given = np.linspace(1, 120, N, dtype=dtype)[:, None]
+    llvm, cuda = run_both(doubling(), {"given": given}, dtype)
+    expected = given * 2 ** np.maximum(np.ceil(np.log2(100 / given)), 0).astype(dtype)
+    np.testing.assert_array_equal(llvm["out"], expected)
+    np.testing.assert_array_equal(cuda["out"], expected)
+
+
+def test_a_loop_needs_a_flag():
+    program = doubling()
+    start, double, show = program.calls
+    without = replace(program, steps=(start, While("given", (double,)), show))
+    with pytest.raises(ValueError, match="flag 'given' of a loop must name a tiles or scratch buffer of size 1"):
+        check_program(without)
 
 
 def test_stages_of_one_launch(needs_host_compiler):

@@ -14,6 +14,7 @@ from ce_gym.diagnostics.scene import SceneReport, SubStep, layers, left_out, rep
 from ce_gym.diagnostics.scene_text import as_text
 from ce_gym.diagnostics.scene_timing import SceneTimes
 from ce_gym.dynamics import Model
+from ce_gym.dynamics.stepping.plan import MOVED
 from ce_gym.dynamics.stepping.step import iterate_size
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.envs.runtime.program import TaskProgram
@@ -23,6 +24,10 @@ from ce_gym.model import ContactMaterial
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
 ENVIRONMENT = "ce_gym/MiniCheetahVelocity-v0"
+OUTPUTS = ("torque", MOVED)
+"""Of the functions that sub-steps consist of."""
+AROUND = ("begin", "judge", "copy")
+"""Calls around the physics of a sub-step."""
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +43,12 @@ def always(program: TaskProgram) -> dict[str, int]:
 def test_lines_add_up_to_the_kernel(report: SceneReport):
     """The calls of the very program that an environment is compiled from."""
     counts, n = always(report.program), report.program.task.n_substeps
-    assert report.sub_step == counts["iteration"] + counts["combination"] + counts["zeros"]
+    assert report.sub_step == sum(counts[name] for name in (*AROUND, "iteration", "zeros"))
     assert report.env_step == n * report.sub_step + counts["act"] + counts["assess"]
     assert sum(group.instructions for group in report.groups) == counts["act"] + counts["assess"]
     assert {item.name: item.instructions for item in report.sometimes} == {
         "another iteration of a sub-step": counts["iteration"],
+        "a sub-step in parts": counts["mend"],
         "reset": report.program.reset_program().calls[0].function.n_instructions(),
     }
 
@@ -55,7 +61,7 @@ def test_lines_add_up_whatever_a_task_asks_for():
         friction="secant",
     )  # fmt: skip
     counts, n = always(report.program), report.program.task.n_substeps
-    assert report.sub_step == counts["iteration"] + counts["combination"] + counts["zeros"]
+    assert report.sub_step == sum(counts[name] for name in (*AROUND, "iteration", "zeros"))
     once = counts["act"] + counts["assess"] + n * counts["arrive"] + counts["arrived"]
     assert report.env_step == n * report.sub_step + once
     layers_there = {item.name: item.instructions for item in report.layers}
@@ -98,7 +104,7 @@ def test_layers_are_what_is_compiled_in(report: SceneReport):
 def test_a_left_out_feature_costs_what_it_adds_when_it_is_there(report: SceneReport, name: str, change: dict):
     mechanism, options = report.program.model.mechanism, report.program.options
     without, with_it = (  # an iteration, and the zeros it starts from
-        iteration_function(mechanism, o, ("torque",)).n_instructions() + iterate_size(mechanism, o)
+        iteration_function(mechanism, o, OUTPUTS).n_instructions() + iterate_size(mechanism, o)
         for o in (options, replace(options, **change))
     )
     assert cost(report, name) == with_it - without > 0
@@ -107,8 +113,7 @@ def test_a_left_out_feature_costs_what_it_adds_when_it_is_there(report: SceneRep
 def test_a_field_costs_its_look_up_too(report: SceneReport):
     mechanism, options = report.program.model.mechanism, report.program.options
     without, with_it = (
-        iteration_function(mechanism, o, ("torque",)).n_instructions()
-        for o in (options, replace(options, ground="field"))
+        iteration_function(mechanism, o, OUTPUTS).n_instructions() for o in (options, replace(options, ground="field"))
     )
     assert cost(report, "ground='field'") > with_it - without > 0
 
@@ -120,10 +125,11 @@ def cost(report: SceneReport, name: str) -> int:
 def test_methods_and_friction_count_every_call(report: SceneReport):
     """Alternatives change which calls there are: the combination of stages goes where none iterates."""
     mechanism, options = report.program.model.mechanism, report.program.options
-    explicit = step_function(mechanism, replace(options, method="rk4"), ("torque",)).n_instructions()
-    assert cost(report, "method='rk4' instead") == explicit - report.sub_step
+    explicit = step_function(mechanism, replace(options, method="rk4"), OUTPUTS).n_instructions()
+    around = sum(always(report.program)[name] for name in AROUND)
+    assert cost(report, "method='rk4' instead") == explicit + around - report.sub_step
     tangent, secant = (
-        iteration_function(mechanism, o, ("torque",)).n_instructions()
+        iteration_function(mechanism, o, OUTPUTS).n_instructions()
         for o in (options, replace(options, friction="secant"))
     )
     assert cost(report, "friction='secant' instead") == secant - tangent < 0
@@ -143,7 +149,8 @@ def test_what_is_enabled_is_a_layer_and_no_longer_left_out(report: SceneReport):
     options = replace(program.options, contacts=(), motors="limited", parameters=("friction", "kp"), method="rk4")
     whole = SubStep(Model(TRIPOD, "none"), options, ("torque",))
     running = {name: total for name, total, _ in layers(whole)}
-    assert running["outputs"] == step_function(whole.model.mechanism, options, ("torque",)).n_instructions()
+    around = sum(call.function.n_instructions() for call in whole.calls if call.function.name() in AROUND)
+    assert running["outputs"] == step_function(whole.model.mechanism, options, OUTPUTS).n_instructions() + around
     assert running["method"] > 2.5 * running["limited motors"] > 2.5 * running["joint stops"]
     assert "rotors" not in running, "this level has none"
     missing = [name for name, _ in left_out(whole)]

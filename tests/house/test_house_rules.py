@@ -36,7 +36,7 @@ LAYERS = {
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
     "dynamics": "algebra constraints standing recursion forces functions derivatives stepping evaluation model",
-    "sim": "tiles devices terrain placement substeps kernel_key kernels derivative_kernels schema batch pieces retry"
+    "sim": "tiles devices terrain placement substeps kernel_key kernels derivative_kernels schema batch pieces"
     " simulator derivatives",
     "envs": "terms task runtime policy_spec differentiable base rendering single vector registration custom",
     "export": "joint_ties mjcf_text mjcf_equalities mjcf mujoco_model mujoco_coordinates mujoco_batch mujoco_twin"

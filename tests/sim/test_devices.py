@@ -83,6 +83,20 @@ def test_a_method_of_several_steps_agrees():
 
 
 @needs_host_compiler
+def test_steps_in_parts_agree():
+    """Robots of one tile need one part, two and many; a thread of a GPU has one robot."""
+    model, found = ce_gym.Model("planar_leg_linkage"), []
+    v = np.linspace(0.0, 400.0, N)[:, None] * np.ones(model.nv)
+    for device in ("cpu", Emulated()):
+        sim = ce_gym.Simulator(model, N, device=device)
+        sim.set_state(np.tile(model.standing_q, (N, 1)), v)
+        sim.step(model.standing_q, 3)
+        found.append({name: to_numpy(getattr(sim, name)) for name in ("q", "v", "torque", "n_retried")})
+    assert found[0]["n_retried"] > N
+    assert_same(*found)
+
+
+@needs_host_compiler
 def test_a_diverged_robot_is_frozen_and_flagged():
     model = ce_gym.Model("mini_cheetah")
     for device in ("cpu", Emulated()):
@@ -107,11 +121,6 @@ def test_unknown_devices_are_refused(name):
 def test_without_a_gpu_one_line_says_so():
     with pytest.raises(ValueError, match=r"^device='cuda:0': torch .* sees no NVIDIA GPU; expected device='cpu'$"):
         ce_gym.Simulator(ce_gym.Model("six_bar"), device="cuda")
-
-
-def test_retries_are_for_the_processor():
-    with pytest.raises(ValueError, match="retry=1; expected 0 on device 'emulated cuda'"):
-        ce_gym.Simulator(ce_gym.Model("six_bar"), device=Emulated(), retry=1)
 
 
 @needs_gpu

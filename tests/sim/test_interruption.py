@@ -152,26 +152,6 @@ def test_a_handler_that_goes_on_lets_the_call_go_on(model: Model, monkeypatch: p
     assert seen(sim) == seen(twin)
 
 
-def test_robots_that_are_stepped_again_are_taken_back_too(model: Model, monkeypatch: pytest.MonkeyPatch):
-    """Ctrl-C comes after all robots have been stepped, while the one that diverged is stepped with half the step."""
-    sim = moving(model, contacts="foot", dt=0.01, retry=6)
-    v = sim.v
-    v[5, 6:] = 4500.0 * np.resize([1.0, -1.0], 12)
-    sim.set_state(sim.q, v)
-    before, load = seen(sim), sim._retry.kernel
-    monkeypatch.setattr(pieces, "LONGEST", 5 * pieces.FEWEST)
-
-    def kernel(*given, **more):
-        signal.raise_signal(signal.SIGINT)
-        load(*given, **more)
-
-    object.__setattr__(sim._retry, "kernel", kernel)
-    with pytest.raises(KeyboardInterrupt):
-        sim.step(model.standing_q[7:], 5)
-    assert seen(sim) == before
-    assert (sim.n_retried, sim.n_diverged) == (0, 0)
-
-
 @pytest.mark.parametrize("call", ["step", "set_state", "reset", "set_parameter"])
 def test_a_second_thread_is_refused(model: Model, call: str, monkeypatch: pytest.MonkeyPatch):
     sim, twin = (moving(model, parameters=("friction",)) for _ in range(2))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator, Terrain
-from ce_gym.compile import Call, Lookup, Repeat
+from ce_gym.compile import Call, Lookup, calls_of
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.plan import Rates
@@ -83,13 +83,13 @@ def test_stages_are_iterated_and_look_up_where_they_start(method: str):
     model = Model(hopper())
     options = StepOptions(0.005, contacts=model.contact_names, method=method, ground="field")
     _, _, steps = substeps(model.mechanism, options, ())
-    (repeat,) = [step for step in steps if isinstance(step, Repeat)]
+    calls = list(calls_of(steps))
     plan, most = METHODS[method], iterations_needed(model.mechanism, options)
-    iterations = [c for c in repeat.calls if isinstance(c, Call) and c.function.name() == "iteration"]
+    iterations = [c for c in calls if isinstance(c, Call) and c.function.name() == "iteration"]
     staged = [stage for stage in plan.stages if stage.iterations]
     assert len(iterations) == sum(1 + min(stage.iterations, most) for stage in staged)
     assert sum(not call.only_if for call in iterations) == len(staged)
-    under = [c for c in repeat.calls if isinstance(c, Lookup) and c.points == "places"]
+    under = [c for c in calls if isinstance(c, Lookup) and c.points == "places"]
     assert len(under) == (len({stage.start for stage in staged}) if staged else 1)
 
 

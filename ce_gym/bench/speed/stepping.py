@@ -13,6 +13,7 @@ import numpy as np
 
 from ce_gym.bench.measure.timing import Competitor
 from ce_gym.bench.peers import stand
+from ce_gym.compile import Call, calls_of
 from ce_gym.compile.lowering.counting import floating_point_operations
 from ce_gym.dynamics.model import Model
 from ce_gym.export.mujoco_batch import Batch
@@ -45,8 +46,8 @@ def operations(model: Model, dtype: str, dt: float) -> int:
     """Return floating-point operations of one robot's sub-step; what only some steps do is not counted."""
     sim = Simulator(model, 1, dt, dtype)
     _, _, steps = substeps(model.mechanism, sim.options, OUTPUTS)
-    calls = [call for step in steps for call in getattr(step, "calls", ())]
-    return sum(floating_point_operations(call.function, dtype) for call in calls if not call.only_if)
+    calls = [call for call in calls_of(steps) if isinstance(call, Call) and not call.only_if]
+    return sum(floating_point_operations(call.function, dtype) for call in calls)
 
 
 def bytes_per_robot(model: Model, dtype: str, dt: float) -> int:

@@ -21,7 +21,7 @@ from ce_gym.compile.cuda.prelude import prelude
 from ce_gym.compile.cuda.writer import Writer
 from ce_gym.compile.layout import Layout, layout_of
 from ce_gym.compile.lowering.function import lower_function
-from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, check_program
+from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While, check_program
 
 BLOCK, BLOCKS = 128, 2
 """Threads of a block, and blocks that a multiprocessor must have room for: 255 registers a thread at most.
@@ -166,9 +166,12 @@ class _KernelText:
         for _, same in groupby(steps, lambda s: replace(s, only_if="") if isinstance(s, Call) else s):
             equal = list(same)
             step = equal[0]
-            if isinstance(step, Repeat):
+            if isinstance(step, Repeat | While):
                 yield "#pragma unroll 1"
-                yield f"for (int turn = 0; turn < times_{step.times}; ++turn) {{"
+                if isinstance(step, Repeat):
+                    yield f"for (int turn = 0; turn < times_{step.times}; ++turn) {{"
+                else:
+                    yield f"while ({step.flag}_[0] != 0) {{"
                 yield from _indented(self._steps(step.calls))
                 yield "}"
             elif isinstance(step, Lookup):

@@ -14,7 +14,7 @@ from ce_gym.compile.lowering.function import lower_function
 from ce_gym.compile.lowering.lookup import Table, emit_lookup
 from ce_gym.compile.lowering.random import emit_uniform
 from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
-from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step
+from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While
 
 INT = ir.IntType(64)
 FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
@@ -72,12 +72,7 @@ class _TileWork:
         if kinds["random"]:
             self._fill_random(kinds["random"])
         for step in self.program.steps:
-            if isinstance(step, Repeat):
-                with self._repeated(step.times):
-                    for call in step.calls:
-                        self._step(call)
-            else:
-                self._step(step)
+            self._step(step)
         for buffer in kinds["rows_out"]:
             self._lanes_to_rows(buffer)
 
@@ -174,11 +169,28 @@ class _TileWork:
         with loop(self.builder, count, "repeat"):
             yield
 
-    def _step(self, step: Step) -> None:
-        if isinstance(step, Lookup):
+    def _step(self, step: Step | Repeat) -> None:
+        if isinstance(step, Repeat | While):
+            with self._repeated(step.times) if isinstance(step, Repeat) else self._while(step.flag):
+                for call in step.calls:
+                    self._step(call)
+        elif isinstance(step, Lookup):
             self._look_up(step)
         else:
             self._call(step)
+
+    @contextmanager
+    def _while(self, flag: str) -> Iterator[None]:
+        """What is built inside `with` is done again and again while a buffer is not zero in some lane."""
+        b = self.builder
+        head, body, end = (b.append_basic_block(f"while_{part}") for part in ("head", "body", "end"))
+        b.branch(head)
+        b.position_at_end(head)
+        b.cbranch(self.any_lane(flag), body, end)
+        b.position_at_end(body)
+        yield
+        b.branch(head)
+        b.position_at_end(end)
 
     def _look_up(self, lookup: Lookup) -> None:
         """Look up the surface over a table at every point."""

@@ -31,6 +31,7 @@ class StepOptions:
         motors: Name among `MOTORS` of the model of the motors.
         ground: "flat" for the plane z = 0, "field" for a height and slope under each contact that the caller supplies.
         parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
+        retry: How often a kernel may halve a step for a robot that fails in it, see `stepping/parts.py`.
     """
 
     dt: float | None = None
@@ -43,6 +44,7 @@ class StepOptions:
     motors: str = "ideal"
     ground: Ground = "flat"
     parameters: tuple[str, ...] = ()
+    retry: int = 4
 
 
 @dataclass

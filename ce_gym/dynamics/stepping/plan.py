@@ -17,6 +17,8 @@ from ce_gym.dynamics.forces.scene import State
 
 AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "contact_forces")
 """Outputs that belong to the start of a step, or are means over it; the others belong to its end."""
+MOVED = "moved"
+"""Name of the output that says how far a step moves its fastest joint, at the speed of its end [rad or m]."""
 AFTER = "after"
 """Name of the step as a whole, where outputs are evaluated at its end and not combined from stages."""
 

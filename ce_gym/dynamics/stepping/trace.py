@@ -15,7 +15,7 @@ from ce_gym.dynamics.functions import loop_gap, loop_state, traced
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.plan import AFTER, combined, error_estimate
+from ce_gym.dynamics.stepping.plan import AFTER, MOVED, combined, error_estimate
 from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
 from ce_gym.model.mechanism import Mechanism
@@ -36,7 +36,7 @@ def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
-        outputs: Names among `OUTPUTS`; what is not asked for costs nothing.
+        outputs: Names among `OUTPUTS`, or `MOVED`; what is not asked for costs nothing.
 
     Returns:
         Function (*state, diverged, *given) -> (*state, diverged, *outputs): `state` are the parts of `State` that the
@@ -64,7 +64,7 @@ def iteration_function(mechanism: Mechanism, options: StepOptions, outputs: tupl
 
 
 def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
-    """Trace what follows from the stages of a step, as the plan of its method has it.
+    """Trace what follows from the stages of a step, as the plan of its method has it, if there are several.
 
     Args:
         mechanism: The robot at a transmission level.
@@ -85,12 +85,11 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
     sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
     results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in before.items()}
     results["diverged_next"] = ca.if_else(sane, 0, 1)
-    if plan.single:  # which has seen to that
-        results = {f"{name}_next": value for name, value in after.items()}
-        results["diverged_next"] = flags[f"{plan.stages[0].name}_diverged"]
     for name, size in outputs.items():
-        if name == "error":
-            results[name] = error_estimate(plan, ends)
+        if name in ("error", MOVED):
+            dt, joints = SX.sym("dt"), len(mechanism.robot.independent)
+            results[name] = furthest(after.v, joints, dt) if name == MOVED else error_estimate(plan, ends)
+            given["dt"] = dt
             continue
         told = {stage: SX.sym(name, size) for stage in plan.shares(name)}
         given |= {f"{stage}_{name}": value for stage, value in told.items()}
@@ -159,6 +158,8 @@ class Given:
         n = len(self.mechanism.robot.independent)
         yd = stepped.state.v[stepped.state.v.numel() - n :]
         kinematics = stepped.solved.kinematics
+        if name == MOVED:
+            return furthest(stepped.state.v, n, self.dt)
         if name == "motor_speed":
             return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
         if name == "power":
@@ -175,6 +176,11 @@ def weighted(weights: Mapping[str, float], values: Mapping[str, SX]) -> SX:
     if len(set(weights.values())) == 1:
         return next(iter(weights.values())) * sum((values[name] for name in weights), SX(0))
     return sum((weight * values[name] for name, weight in weights.items()), SX(0))
+
+
+def furthest(v: SX, joints: int, dt: SX | float) -> SX:
+    """Return how far the fastest of the last `joints` among velocities (nv,) moves in a step [rad or m]."""
+    return dt * ca.norm_inf(ca.vertcat(v[v.numel() - joints :], 0))
 
 
 def loops_close(mechanism: Mechanism, before: Kinematics, after: State) -> SX:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from ce_gym.compile import Buffer, Call, Program, Step
+from ce_gym.compile import Buffer, Call, Program, Step, calls_of
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.functions import traced
@@ -61,7 +61,7 @@ class ControlStepGradient:
     def program(self) -> Program:
         """Return the program."""
         task, steps = self.task, [*self._forwards(), *self._backwards()]
-        used = {name for call in steps for name in (*call.inputs, *call.outputs)}
+        used = {name for call in calls_of(steps) for name in (*call.inputs, *call.outputs)}
         own = [
             Buffer("action_in", task.n_actions, "rows_in", "float32"),
             Buffer("w_observation", task.observation_size + task.critic_size, "rows_in"),

@@ -1,0 +1,90 @@
+"""A step made in parts, for robots that fail in a whole one or move too far: half of it, and again half of what failed.
+
+A light link under more torque than a step can follow turns by radians in one, and then its loops cannot be closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.scene import StepOptions, symbolic_state
+from ce_gym.dynamics.functions import traced
+from ce_gym.dynamics.stepping.plan import AT_START, MEANS, MOVED
+from ce_gym.model.mechanism import Mechanism
+
+LARGEST_MOVE = 0.5
+"""A step is made in parts if it moves a joint by more [rad or m]."""
+PROGRESS = ("part", "left", "unfinished")
+"""Fraction of the step that is tried, 0 for a robot that is through; fraction ahead; whether it goes on. 1 at first."""
+
+
+def lengths(part: SX, dt: SX, fractions: Mapping[str, float]) -> dict[str, SX]:
+    """Return the lengths of stages [s] in a part of a step, by the names of their buffers."""
+    return {f"{stage}_dt": fraction * (part * dt) for stage, fraction in fractions.items()}
+
+
+def beginning_function(fractions: Mapping[str, float]) -> ca.Function:
+    """Trace the beginning of a step: (dt) -> (*`PROGRESS`, lengths of the stages, of which `fractions` are given)."""
+    dt = SX.sym("dt")
+    return traced("begin", {"dt": dt}, dict.fromkeys(PROGRESS, SX(1)) | lengths(SX(1), dt, fractions))
+
+
+def judging_function() -> ca.Function:
+    """Trace whether a part that was tried is anything but a whole step with a good end.
+
+    Returns:
+        Function (tried_diverged, tried_moved, part) -> (unfinished).
+    """
+    given = {name: SX.sym(name) for name in ("tried_diverged", f"tried_{MOVED}", "part")}
+    diverged, moved, part = given.values()
+    good = ca.logic_and(ca.logic_and(moved <= LARGEST_MOVE, part >= 1), diverged < 0.5)
+    return traced("judge", given, {"unfinished": ca.logic_not(good)})
+
+
+def mending_function(
+    mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int], fractions: Mapping[str, float]
+) -> ca.Function:
+    """Trace what becomes of a part that was tried, and what is tried next, where some robot makes its step in parts.
+
+    A part is refused if the robot diverged in it or a joint moved too far, unless it is the smallest. A robot that had
+    diverged before, or does so in the smallest part, is through.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+        outputs: Sizes of what the step reports. Means are added up over the step; what belongs to its start is that of
+            the first part, all else that of the last one.
+        fractions: Lengths of the stages, as fractions of the step.
+
+    Returns:
+        Function (*state, diverged, *outputs, *the same tried, tried_moved, part, left, retries, dt) -> (*the same
+        tried, *`PROGRESS`, retries, *lengths of the stages), where `retries` counts steps made in parts.
+    """
+    sizes = {name: value.numel() for name, value in symbolic_state(mechanism, options).items()}
+    sizes |= {"diverged": 1, **outputs}
+    old, tried = ({name: SX.sym(name, size) for name, size in sizes.items()} for _ in range(2))
+    given = {name: SX.sym(name) for name in (f"tried_{MOVED}", "part", "left", "retries", "dt")}
+    moved, part, left, retries, dt = given.values()
+
+    unfit = ca.logic_or(tried["diverged"] > 0.5, ca.logic_not(moved <= LARGEST_MOVE))
+    divisible = ca.logic_and(part > 1.5 * 0.5**options.retry, old["diverged"] < 0.5)
+    refused = ca.logic_and(unfit, divisible)
+    taken = ca.logic_and(part > 0, ca.logic_not(refused))
+    results, first = dict(tried), left >= 1
+    for name in outputs:
+        if name in MEANS:
+            results[name] = ca.if_else(first, 0, old[name]) + part * tried[name]
+        elif name in AT_START:
+            results[name] = ca.if_else(first, tried[name], old[name])
+    after = {f"tried_{name}": ca.if_else(taken, value, old[name]) for name, value in results.items()}
+    ahead = ca.if_else(taken, left - part, left)
+    unfinished = ca.logic_or(refused, ca.logic_and(taken, ca.logic_and(ahead > 0, tried["diverged"] < 0.5)))
+    after |= {"left": ahead, "unfinished": unfinished}
+    after["part"] = ca.if_else(unfinished, ca.if_else(refused, part / 2, part), 0)
+    after["retries"] = retries + ca.logic_and(refused, part >= 1)
+    given |= old | {f"tried_{name}": value for name, value in tried.items()}
+    results = {name + "_next" * (name in given): value for name, value in after.items()}
+    return traced("mend", given, results | lengths(after["part"], dt, fractions))
