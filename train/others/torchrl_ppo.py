@@ -1,0 +1,41 @@
+# pyright: reportMissingImports=false
+"""TorchRL's PPO: on one robot (`GymEnv`), or with `--vector` on a native batch (`GymWrapper`)."""
+
+import sys
+
+import gymnasium
+import torch
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import GymEnv, GymWrapper
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+if "--vector" in sys.argv:  # the mode that TorchRL prefers: it resets whom it must
+    envs = gymnasium.make_vec(
+        "watched:watched/Stand-v0", 64, vectorization_mode="vector_entry_point", autoreset_mode="Disabled"
+    )
+    env, frames = GymWrapper(envs), 4096
+else:
+    env, frames = GymEnv("watched:watched/Stand-v0"), 1024
+n_actions = env.action_spec.shape[-1]
+network = torch.nn.Sequential(MLP(out_features=2 * n_actions, num_cells=[64, 64]), NormalParamExtractor())
+module = TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"])
+actor = ProbabilisticActor(module, ["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True)
+critic = ValueOperator(MLP(out_features=1, num_cells=[64, 64]), in_keys=["observation"])
+reset = env.reset()
+critic(actor(reset))  # fills in the sizes
+loss = ClipPPOLoss(actor, critic, entropy_coeff=1e-3)
+advantage = GAE(gamma=0.98, lmbda=0.95, value_network=critic)
+optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
+for data in Collector(env, actor, frames_per_batch=frames, total_frames=-1):
+    for _ in range(5):
+        advantage(data)
+        flat = data.reshape(-1)
+        for rows in torch.randperm(len(flat)).split(len(flat) // 4):
+            losses = loss(flat[rows])
+            optimizer.zero_grad()
+            (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+            torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
+            optimizer.step()
