@@ -10,14 +10,14 @@ from typing import Any
 
 import casadi as ca
 
-from ce_gym.compile import Buffer, Call, Program, load_kernel
+from ce_gym.compile import Buffer, Call, Program, Step, load_kernel
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
 from ce_gym.dynamics.stepping.linearization import Linearization
 from ce_gym.sim.kernel_key import laws_key, model_key
-from ce_gym.sim.substeps import DT
+from ce_gym.sim.substeps import DT, FRAME, look_up
 
 
 def _key(model: Model, options: StepOptions) -> str:
@@ -43,7 +43,8 @@ def gradient_program(model: Model, options: StepOptions) -> Program:
     if n > 1:
         scratch |= {"owed": adjoint.numel_in("owed"), "tried_diverged": 1}
         scratch |= {f"tried_{name}": size for name, size in parts.items()}
-    buffers = [Buffer(name, primal.numel_in(name), "tiles") for name in (*parts, "diverged", DT)]
+    ground, looks = _ground(model, options)
+    buffers = [Buffer(name, primal.numel_in(name), "tiles") for name in (*parts, "diverged", DT)] + ground
     if "parameters" in primal.name_in():
         buffers.append(Buffer("parameters", primal.numel_in("parameters"), "tiles"))
     if "target" in primal.name_in():
@@ -56,7 +57,7 @@ def gradient_program(model: Model, options: StepOptions) -> Program:
         SX.ones(size) if name in ("active0", "pending") else SX(ca.DM.zeros(size)) for name, size in begin.items()
     ]
     zeros = ca.Function("begin", [], [*values, SX(ca.DM.zeros(adjoint.numel_in("sums")))])
-    steps = [Call(zeros, (), (*begin, "sums"))]
+    steps = [*looks, Call(zeros, (), (*begin, "sums"))]
     for k in range(n - 1):
         given = tuple(f"iterate{k}" if name == "iterate" else name for name in primal.name_in())
         here = {"iterate_next": f"iterate{k + 1}", "unconverged": f"active{k + 1}"}
@@ -84,14 +85,26 @@ def linearization_program(model: Model, options: StepOptions) -> Program:
     """Return the program: `ends` becomes the derivatives of [q; v], for each direction of q, v and the target."""
     linear, n = Linearization(model.mechanism, options), iterations_of(model.mechanism, options)
     steps, sizes = _Columns(linear, n).steps, {}
-    given = linear.given.inputs()
-    buffers = [Buffer(x, given[x].numel(), "rows_in" if x == "target" else "tiles") for x in given]
+    ground, looks = _ground(model, options)
+    given = {name: x.numel() for name, x in linear.given.inputs().items() if name not in ("ground", "places")}
+    buffers = [Buffer(name, size, "rows_in" if name == "target" else "tiles") for name, size in given.items()]
+    buffers += ground
     buffers.append(Buffer("ends", 2 * linear.nv * len(linear.directions), "rows_out", "float64"))
     for call in steps:  # every other buffer is as large as what is first written to it
         for i, name in enumerate(call.outputs):
             sizes.setdefault(name, call.function.numel_out(i))
     scratch = [Buffer(name, size, "scratch") for name, size in sizes.items() if name != "ends"]
-    return Program(f"{model.robot.name} {model.transmission} step linearization", (*buffers, *scratch), tuple(steps))
+    return Program(
+        f"{model.robot.name} {model.transmission} step linearization", (*buffers, *scratch), (*looks, *steps)
+    )
+
+
+def _ground(model: Model, options: StepOptions) -> tuple[list[Buffer], tuple[Step, ...]]:
+    """Return buffers and calls that find the ground under the contacts, if it is a field."""
+    if options.ground != "field":
+        return [], ()
+    buffers, looks = look_up(model.mechanism, options)
+    return [*buffers, Buffer(FRAME, 3, "tiles")], looks
 
 
 class _Columns:
@@ -127,18 +140,18 @@ class _Columns:
         steps = [call(_copy(self.linear.iterate.numel()), copied="iterate", original="tried_iterate")] if k else []
         steps += [call(_copy(self.linear.nv), copied="vdot_before", original="vdot")] if passes else []
         steps += [call(self.attempt), *map(call, self.drift)]
-        steps += [_call(function, names, "touching") for function in self.pressed_drift]
+        steps += [_call(function, names, "contact_acts") for function in self.pressed_drift]
         steps += [call(self.gains, vdot="vdot_before")] if passes else []
         column = iter(self.columns)
         for g, change in enumerate(self.changes):
             steps.append(call(change))
-            steps += [_call(self.presses[g], names, "touching")] if g in self.presses else []
+            steps += [_call(self.presses[g], names, "contact_acts")] if g in self.presses else []
             for i in range(change.n_out()):
                 here = {"column": next(column), "change": f"change{i}"}
                 here |= {f"{name}_next": buffer for name, buffer in here.items()}
                 steps += [call(self.pass_on, direct=f"direct{g}_{i}", **here)] if passes else []
                 steps.append(call(self.solve, **here))
-        nothing = ca.Function("nothing", [], [SX(ca.DM.zeros(1))], [], ["touching"])
+        nothing = ca.Function("nothing", [], [SX(ca.DM.zeros(1))], [], ["contact_acts"])
         return steps + ([call(nothing)] if self.presses else [])
 
     def _ends(self) -> list[Call]:

@@ -7,7 +7,7 @@ them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -19,15 +19,26 @@ from ce_gym.dynamics.stepping.derivatives import primal_function, state_parts
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.sim.derivative_kernels import load_gradient_kernel, load_linearization_kernel
 from ce_gym.sim.simulator import Simulator
+from ce_gym.sim.substeps import TIMES
 
 
 @dataclass
 class Record:
-    """One sub-step: the state before it, the target, and the positions and velocities after it."""
+    """Some sub-steps one after the other.
+
+    Attributes:
+        arrays: State before the first.
+        kept: Robots that began where the record before left them, shape (num_envs,); None for all of them.
+        targets: Of each sub-step.
+        after: What is compared to see whether somebody has set it since.
+        in_parts: Of each sub-step the robots that made it in parts, shape (num_envs,); None for none.
+    """
 
     arrays: dict[str, NDArray]
-    target: NDArray
-    after: tuple[NDArray, NDArray]
+    kept: NDArray | None = None
+    targets: list[NDArray] = field(default_factory=list)
+    after: dict[str, NDArray] = field(default_factory=dict)
+    in_parts: list[NDArray | None] = field(default_factory=list)
 
 
 class StepDerivatives:
@@ -38,12 +49,18 @@ class StepDerivatives:
     decided, through all iterations of the step. A robot that made a sub-step in parts (see `Simulator`) passes nothing
     on to what was before, like one that diverged.
 
+    On terrain the ground under a contact is the plane that the step found there. A robot that made a sub-step in parts
+    (see `Simulator`) passes nothing on to what was before, like one that diverged.
+
     Args:
-        simulator: Whose steps; on the CPU and on flat ground.
+        simulator: Whose steps; on the CPU.
+        keep_every: The state is kept before every so manieth recorded sub-step; those between are made again on the way
+            back, which costs a step each.
 
     Attributes:
         state_sizes: Of the tangent of each part of a state.
         n_recorded: How many sub-steps have been recorded.
+        bytes_recorded: Memory of what has been recorded.
 
     Raises:
         ValueError: If the simulator's steps cannot be differentiated.
@@ -57,14 +74,13 @@ class StepDerivatives:
         (4, 4, 4) (4, 4, 2)
     """
 
-    def __init__(self, simulator: Simulator) -> None:
-        for unfit, why in (
-            (simulator.device != "cpu", f"on device {simulator.device!r}; expected 'cpu'"),
-            (simulator.terrain is not None, "on terrain; expected flat ground"),
-        ):
-            if unfit:
-                raise ValueError(f"derivatives of a simulator {why}")
+    def __init__(self, simulator: Simulator, keep_every: int = 1) -> None:
+        if simulator.device != "cpu":
+            raise ValueError(f"derivatives of a simulator on device {simulator.device!r}; expected 'cpu'")
+        if isinstance(keep_every, bool) or not isinstance(keep_every, int | np.integer) or keep_every < 1:
+            raise ValueError(f"keep_every={keep_every!r}; expected a whole number, at least 1")
         self.simulator, self._records = simulator, list[Record]()
+        self._keep_every = keep_every
         primal = primal_function(simulator.model.mechanism, simulator.options)
         floating = simulator.model.robot.floating
         self._parts = state_parts(primal)
@@ -78,19 +94,47 @@ class StepDerivatives:
     @property
     def n_recorded(self) -> int:
         """See above."""
-        return len(self._records)
+        return sum(len(record.targets) for record in self._records)
+
+    @property
+    def bytes_recorded(self) -> int:
+        """See above."""
+        held = [[*one.arrays.values(), *one.after.values(), *one.targets] for one in self._records]
+        return sum({id(array): array.nbytes for arrays in held for array in arrays}.values())
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
-        """Step the simulator, and record: the state before each sub-step is kept."""
+        """Step the simulator, and record: as `Simulator.step`."""
+        simulator, rows = self.simulator, self._target(target)
         for _ in range(n_substeps):
-            before = {name: _aligned_copy(self.simulator._arrays[name]) for name in self._kept}
-            retries = self.simulator._arrays["retries"].copy()
-            self.simulator.step(target, 1)
-            before["diverged"][self.simulator._arrays["retries"] > retries] = 1  # made in parts, so not differentiated
-            rows = self._target(target)
-            self._records.append(Record(before, rows, (self.simulator.q, self.simulator.v)))
+            last = self._records[-1] if self._records else None
+            if last is None or len(last.targets) >= self._keep_every or not self._is_as_left(last):
+                arrays = {name: _aligned_copy(simulator._arrays[name]) for name in self._kept}
+                self._records.append(Record(arrays, None if last is None else self._where_left(last)))
+            retries = simulator._batch.rows("retries")
+            simulator.step(rows, 1)
+            record = self._records[-1]
+            record.targets.append(rows)
+            record.after = {name: simulator._arrays[name].copy() for name in ("q", "v")}
+            parts = (simulator._batch.rows("retries") > retries).reshape(simulator.num_envs)
+            record.in_parts.append(parts if parts.any() else None)
 
-    def backward(self, weights: Mapping[str, ArrayLike]) -> tuple[dict[str, NDArray], list[NDArray], NDArray]:
+    def state(self) -> dict[str, NDArray]:
+        """Return all that steps depend on besides targets and parameters, by part, shape (num_envs, size) each."""
+        return {name: self.simulator._batch.rows(name) for name in self._parts}
+
+    def restore(self, state: Mapping[str, ArrayLike]) -> None:
+        """Set that, and clear divergence; parts that are left out stay as they are."""
+        for name, rows in {**state, "diverged": 0.0}.items():
+            self.simulator._batch.write(name, rows)
+
+    def take(self) -> list[Record]:
+        """Hand over what has been recorded, and begin anew."""
+        records, self._records = self._records, []
+        return records
+
+    def backward(
+        self, weights: Mapping[str, ArrayLike], records: list[Record] | None = None
+    ) -> tuple[dict[str, NDArray], list[NDArray], NDArray]:
         """Go back through all recorded sub-steps, and forget them.
 
         A robot that was reset or set in between, or diverged, passes nothing on to what was before.
@@ -98,24 +142,24 @@ class StepDerivatives:
         Args:
             weights: Gradient of something with respect to parts of the last state, shape (num_envs, size), see
                 `state_sizes`; those left out are zero.
+            records: What `take` handed over, which is kept, in place of what has been recorded since.
 
         Returns:
             Its gradient with respect to the first state, by part; to the target of each sub-step, first to last,
             (num_envs, n_targets) each; and to the declared parameters, (num_envs, n), in the order of declaration.
         """
-        now = self._weights(weights)
-        targets, parameters = [], np.zeros((self.simulator.num_envs, 0))
-        later: Record | None = None
-        for record in reversed(self._records):
-            if later is not None:
-                now = {name: self._unless_set(record, later, value) for name, value in now.items()}
-            found = self._gradient(record.arrays, record.target, now)
-            now = {name: found[name] for name in self.state_sizes}
-            targets.append(found.get("target", np.zeros((self.simulator.num_envs, 0))))
-            if "parameters" in found:
-                parameters = found["parameters"] + (parameters if parameters.size else 0)
-            later = record
-        self._records.clear()
+        now, none = self._weights(weights), np.zeros((self.simulator.num_envs, 0))
+        targets, parameters = list[NDArray](), none
+        for record in reversed(self.take() if records is None else records):
+            for (arrays, target), parts in zip(reversed(self._states(record)), reversed(record.in_parts), strict=True):
+                found = self._gradient(arrays, target, now)
+                if parts is not None:
+                    found = {name: np.where(parts[:, None], 0.0, value) for name, value in found.items()}
+                now = {name: found[name] for name in self.state_sizes}
+                targets.append(found.get("target", none))
+                parameters = parameters + found["parameters"] if parameters.size else found.get("parameters", none)
+            if record.kept is not None:
+                now = {name: np.where(record.kept[:, None], value, 0.0) for name, value in now.items()}
         return now, targets[::-1], parameters
 
     def gradient(self, target: ArrayLike, weights: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
@@ -145,7 +189,8 @@ class StepDerivatives:
         if not METHODS[simulator.options.method].is_euler:
             return self._linearize_by_rows(target)
         columns = np.empty((simulator.num_envs, 2 * nv + len(simulator.target_names), 2 * nv))
-        every = {**simulator._arrays, "target": self._target(target), "ends": columns.reshape(simulator.num_envs, -1)}
+        every = {**simulator._arrays, **simulator._batch.tables, "target": self._target(target)}
+        every |= {"ends": columns.reshape(simulator.num_envs, -1)}
         self._forward_kernel(every, simulator.num_envs, num_threads=simulator.num_threads)
         whole = columns.transpose(0, 2, 1)
         return whole[:, :, : 2 * nv], whole[:, :, 2 * nv :]
@@ -194,16 +239,38 @@ class StepDerivatives:
         simulator = self.simulator
         sums = np.zeros((simulator.num_envs, max(end.stop for end in self._columns.values())))
         given = {f"w_{name}": np.ascontiguousarray(value) for name, value in weights.items()}
-        every = {**arrays, **given, "target": target, "sums": sums}
+        every = {**arrays, **given, **simulator._batch.tables, "target": target, "sums": sums}
         self._kernel(every, simulator.num_envs, num_threads=simulator.num_threads)
         return {name: sums[:, columns] for name, columns in self._columns.items()}
 
-    def _unless_set(self, record: Record, later: Record, value: NDArray) -> NDArray:
-        """Return zeros for the robots that did not begin a sub-step where the one before had left them."""
+    def _is_as_left(self, record: Record) -> bool:
+        """Whether nobody has set robots or their figures since."""
+        now = self.simulator._arrays
+        figures = np.array_equal(now["parameters"], record.arrays["parameters"]) if "parameters" in now else True
+        return figures and all(np.array_equal(now[name], array) for name, array in record.after.items())
+
+    def _where_left(self, record: Record) -> NDArray | None:
+        """Return which robots are where a record left them, shape (num_envs,); None for all of them."""
+        now, n = self.simulator._arrays, self.simulator.num_envs
         read = self.simulator._device.read
-        began = [read(later.arrays[name], self.simulator.num_envs) for name in ("q", "v")]
-        same = np.logical_and(*[(a == b).all(axis=1) for a, b in zip(began, record.after, strict=True)])
-        return np.where(same[:, None], value, 0.0)
+        same = [(read(now[name], n) == read(array, n)).all(axis=1) for name, array in record.after.items()]
+        return None if np.all(same) else np.all(same, axis=0)
+
+    def _states(self, record: Record) -> list[tuple[dict[str, NDArray], NDArray]]:
+        """Return the state before each sub-step of a record and its target, all but the first are made again."""
+        states = [(record.arrays, record.targets[0])]
+        for target in record.targets[1:]:
+            states.append((self._stepped(states[-1][0], states[-1][1]), target))
+        return states
+
+    def _stepped(self, arrays: dict[str, NDArray], target: NDArray) -> dict[str, NDArray]:
+        """Return the state after one sub-step of all robots."""
+        simulator = self.simulator
+        every = {**simulator._arrays, **arrays}
+        lanes = {name: _aligned_copy(every[name]) for name in simulator._kernel.buffers if name in every}
+        given = {**lanes, **simulator._batch.tables, "target": target}
+        simulator._kernel(given, simulator.num_envs, {TIMES: 1}, num_threads=simulator.num_threads)
+        return {name: lanes[name] for name in self._kept}
 
 
 def _aligned_copy(array: NDArray) -> NDArray:

@@ -90,7 +90,7 @@ def _whole(mechanism: Mechanism, options: StepOptions, step: ca.Function) -> Par
     """Make a step by a method that does not iterate, in one call."""
     results = {f"{TRIED}_{name.removesuffix('_next')}": step.numel_out(name) for name in step.name_out()}
     buffers = [Buffer(name, size, "scratch") for name, size in results.items()]
-    ground, look = _look_up(mechanism, options) if "ground" in step.name_in() else ([], ())
+    ground, look = look_up(mechanism, options) if "ground" in step.name_in() else ([], ())
     given = tuple(f"{TRIED}_dt" if name == DT else name for name in step.name_in())
     return buffers + ground, (*look, Call(step, given, tuple(results)))
 
@@ -108,14 +108,14 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
     sizes = {name: iteration.numel_in(name) for name in state} | {name: iteration.numel_out(name) for name in asked}
     scratch = {f"{_own(plan, stage)}_{name}": size for stage in plan.stages for name, size in sizes.items()}
     scratch |= {"iterate": iteration.numel_in("iterate"), "unconverged": 1}
-    buffers = _look_up(mechanism, options)[0] if "ground" in iteration.name_in() else []
+    buffers = look_up(mechanism, options)[0] if "ground" in iteration.name_in() else []
     each: list[Call | Lookup] = []
     ground_at: str | None = None
     for stage in plan.stages:
         assert not isinstance(stage.start, Rates), "explicit stages do not iterate"
         start, own = f"{stage.start}_" if stage.start else "", _own(plan, stage)
         if buffers and stage.start != ground_at:
-            each += _look_up(mechanism, options, start)[1]
+            each += look_up(mechanism, options, start)[1]
             ground_at = stage.start
         here = {name: f"{start}{name}" for name in state} | {DT: f"{own}_dt"}
         given = tuple(here.get(name, name) for name in iteration.name_in())
@@ -131,7 +131,7 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
     return buffers + [Buffer(name, size, "scratch") for name, size in scratch.items()], tuple(each)
 
 
-def _look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> Parts:
+def look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> Parts:
     """Find the ground under the contacts; `at` is what the names of the state's buffers begin with."""
     places, touching = places_function(mechanism, options), touching_function(mechanism, options)
     n = len(options.contacts)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator, StepDerivatives, Terrain
+from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.sim.tiles import read_rows, write_rows
 
 STEP = 1e-6
@@ -228,10 +229,53 @@ def test_steps_in_parts_pass_nothing_on():
     assert not target[1].any()
 
 
+def sliding_block(**options) -> Simulator:
+    """Blocks with round corners on a slope and above it."""
+    places = [(x, y, -0.03) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
+    corners = tuple(ContactSphere(f"c{i}", "body", place, 0.02) for i, place in enumerate(places))
+    body = Body("body", "link", None, Placement(), Joint("free"), Inertial(5.0, (0.0, 0.0, 0.0), np.diag([0.4] * 3)))
+    material = ContactMaterial(5e4, 500.0, friction=0.5, slip_speed=1e-3, bristle=5e4)
+    model, rng = Model(Robot("block", (body,), contacts=corners, material=material)), np.random.default_rng(0)
+    sim = Simulator(model, 9, terrain=Terrain.slope(0.15, 0.4), outputs=(), **options)
+    q = sim.q
+    q[:, 2] += np.linspace(0, 0.05, 9)
+    sim.set_state(q, rng.normal(0, 0.2, (9, 6)))
+    sim.step(np.zeros(0), 40)
+    sim.set_state(sim.q, sim.v + rng.normal(0, 0.02, (9, 6)))
+    sim.step(np.zeros(0), 5)
+    return sim
+
+
+def test_linearize_on_a_slope():
+    sim = sliding_block()
+    assert (read_rows(sim._arrays["load"], 9).sum(1) > 5.0).sum() >= 5
+    A, _ = StepDerivatives(sim).linearize(np.zeros(0))
+    differences = Differences(sim, np.zeros(0))
+    theirs = [differences.column(part, i) for part in ("q", "v") for i in range(6)]
+    assert errors(A, np.stack(theirs, axis=2)).max() < 1e-6
+
+
+def test_what_is_not_kept_is_made_again():
+    every, some = (StepDerivatives(sliding_block(), keep_every=k) for k in (1, 4))
+    for derivatives in (every, some):
+        derivatives.step(np.zeros(0), 6)
+        pushed = np.arange(9) == 2
+        derivatives.simulator.set_state(derivatives.simulator.q, np.ones(6), pushed)
+        derivatives.step(np.zeros(0), 3)
+    assert every.n_recorded == some.n_recorded == 9
+    assert some.bytes_recorded < every.bytes_recorded / 2
+    weights = {"q": np.random.default_rng(0).normal(size=(9, 6))}
+    (ours, _, _), (theirs, _, _) = some.backward(weights), every.backward(weights)
+    for name in theirs:
+        np.testing.assert_array_equal(ours[name], theirs[name])
+    assert not ours["q"][2].any()
+    assert ours["q"][0].any()
+
+
 def test_what_cannot_be_differentiated_is_said():
     model = Model("planar_leg_linkage")
-    with pytest.raises(ValueError, match="on terrain; expected flat ground"):
-        StepDerivatives(Simulator(model, terrain=Terrain(np.zeros((4, 4)), 0.1)))
+    with pytest.raises(ValueError, match="keep_every=0; expected a whole number, at least 1"):
+        StepDerivatives(Simulator(model), keep_every=0)
     derivatives = StepDerivatives(Simulator(model))
     with pytest.raises(ValueError, match="weights of 'height'; expected some of q, v"):
         derivatives.backward({"height": np.zeros(1)})

@@ -30,7 +30,7 @@ def iterations_of(mechanism: Mechanism, options: StepOptions) -> int:
 def primal_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
     """Trace what is differentiated: an iteration of the step, or the step itself if that is one expression."""
     whole = iterations_of(mechanism, options) == 1
-    return (step_function if whole else iteration_function)(mechanism, options, outputs)
+    return (step_function if whole else iteration_function)(mechanism, options, outputs, follows=True)
 
 
 def adjoint_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:

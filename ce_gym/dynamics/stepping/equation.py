@@ -53,7 +53,7 @@ class Equation:
     """
 
     def __init__(self, mechanism: Mechanism, options: StepOptions) -> None:
-        self.given = given = Given(mechanism, options)
+        self.given = given = Given(mechanism, options, follows=True)
         self.mechanism, self.floating = given.scene.mechanism, mechanism.robot.floating
         self.iterate = SX.sym("iterate", iterate_size(mechanism, options))
         self.vdot = SX.sym("vdot", given.state.v.numel())

@@ -73,7 +73,7 @@ class Linearization(Equation):
             "factor": packed(factorised(self.implicit(), self.order)),
             "inertia": self.stacked_inertias(self.articulated),
         }
-        left |= {"touching": acts(self.acting.contacts)} if self.local else {}
+        left |= {"contact_acts": acts(self.acting.contacts)} if self.local else {}
         left |= {"forces": ca.vec(forces), "slopes": ca.vertcat(SX(0, 1), *map(packed, slopes))}
         return traced("attempt", {name: x for name, x in self.inputs.items() if name != "vdot"}, there(left))
 
@@ -90,11 +90,11 @@ class Linearization(Equation):
         """Trace the same with contacts.
 
         Returns:
-            Function (*inputs, touching, drift) -> drift, as it was for a robot that nothing touches.
+            Function (*inputs, contact_acts, drift) -> drift, as it was for a robot that nothing touches.
         """
-        before, touching = packed(self.drift), SX.sym("touching")
-        drift = ca.if_else(touching, packed(self.drift_of(self.articulated)), before)
-        return traced("drift", self.inputs | {"touching": touching, "drift": before}, {"drift_next": drift})
+        before, acting = packed(self.drift), SX.sym("contact_acts")
+        drift = ca.if_else(acting, packed(self.drift_of(self.articulated)), before)
+        return traced("drift", self.inputs | {"contact_acts": acting, "drift": before}, {"drift_next": drift})
 
     def change_function(self, group: list[Direction]) -> ca.Function:
         """Trace how the equation of motion changes along directions, for an unchanged acceleration.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import casadi as ca
 
@@ -30,33 +31,39 @@ SANE_DISTANCE = 1e6
 """A robot any of whose positions is beyond this, or NaN, has diverged [rad or m]."""
 
 
-def step_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
+def step_function(
+    mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = (), follows: bool = False
+) -> ca.Function:
     """Trace a step.
 
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
         outputs: Names among `OUTPUTS`, or `MOVED`; what is not asked for costs nothing.
+        follows: Whether contacts that move find the plane of the ground higher or lower there; for derivatives on a
+            field. `places`, where the centres of contacts are, is one more of what is given then.
 
     Returns:
         Function (*state, diverged, *given) -> (*state, diverged, *outputs): `state` are the parts of `State` that the
         scene has; `given` is `target` if there are joints, `parameters` if any are declared, `ground` on a field, and
         `dt` if the options leave it open.
     """
-    given, plan = Given(mechanism, options), METHODS[options.method]
+    given, plan = Given(mechanism, options, follows), METHODS[options.method]
     parts = unrolled(plan, given.scene, given.state, given.target, given.dt)
     told = {name: given.output(name, plan.shares(name), parts) for name in outputs}
     return traced("step", given.inputs(), given.guarded(parts[AFTER]) | told)
 
 
-def iteration_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
+def iteration_function(
+    mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = (), follows: bool = False
+) -> ca.Function:
     """Trace one iteration of an Euler step: repeated on its own iterate until it has converged, it makes the step.
 
     Returns:
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
         `step_function`; the iterate is zero at first, shape (iterate_size,).
     """
-    given, iterate = Given(mechanism, options), SX.sym("iterate", iterate_size(mechanism, options))
+    given, iterate = Given(mechanism, options, follows), SX.sym("iterate", iterate_size(mechanism, options))
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
     told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
     left = {"iterate_next": stepped.iterate, "unconverged": stepped.unconverged}
@@ -119,7 +126,7 @@ OUTPUTS = {
 class Given:
     """Symbols of one robot before a step, and what becomes of them."""
 
-    def __init__(self, mechanism: Mechanism, options: StepOptions) -> None:
+    def __init__(self, mechanism: Mechanism, options: StepOptions, follows: bool = False) -> None:
         robot, n = mechanism.robot, len(options.contacts)
         self.mechanism = mechanism
         self.state, self.diverged = symbolic_state(mechanism, options), SX.sym("diverged")
@@ -129,10 +136,14 @@ class Given:
         self.ground = SX.sym("ground", 3, n if options.ground == "field" else 0)
         self.dt: float = SX.sym("dt") if options.dt is None else options.dt  # type: ignore[assignment]  # used as one
         self.scene = make_scene(mechanism, options, self.parameters, self.ground)
+        self.places = SX.sym("places", 2, n if follows and options.ground == "field" else 0)
+        if self.places.numel():
+            self.scene = replace(self.scene, looked_up=self.places)
 
     def inputs(self) -> dict[str, SX]:
         """Return the symbols by name, without empty ones."""
         given = {"target": self.target, "parameters": self.parameters, "ground": ca.vec(self.ground)}
+        given |= {"places": ca.vec(self.places)}
         given = {name: value for name, value in given.items() if value.numel()}
         given |= {"dt": self.dt} if isinstance(self.dt, SX) else {}
         return dict(self.state.items()) | {"diverged": self.diverged} | given
