@@ -43,7 +43,7 @@ LAYERS = {
     " guesses new_robot",
     "viewer": "errors console rollouts page raytrace server feed window renderers live cli",
     "bench": "measure peers friction instructions soak digests fuzz speed throughput paper accuracy stability"
-    " gpu __main__",
+    " gpu exactness __main__",
 }
 """What a folder consists of, bottom first: a module imports from its own layer and from those below."""
 MOST_MODULES = 14

@@ -64,13 +64,11 @@ def torque_errors(name: str) -> tuple[list[str], NDArray[np.float64], dict[str, 
     return list(exact.joint_links), torque, errors
 
 
-def sinusoid(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def sinusoid(
+    n: int, frequency: float = FREQUENCY, amplitude: float = AMPLITUDE
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return positions [rad], speeds [rad/s] and accelerations [rad/s^2] of n joints, each of shape (n_samples, n)."""
     t = (np.arange(SAMPLES) * STEP)[:, None]
-    w = 2.0 * np.pi * FREQUENCY
-    same = np.ones((1, n))
-    return (
-        AMPLITUDE * np.sin(w * t) * same,
-        AMPLITUDE * w * np.cos(w * t) * same,
-        -AMPLITUDE * w**2 * np.sin(w * t) * same,
-    )
+    w = 2.0 * np.pi * frequency
+    same = np.full((1, n), amplitude)
+    return np.sin(w * t) * same, w * np.cos(w * t) * same, -(w**2) * np.sin(w * t) * same

@@ -1,0 +1,113 @@
+"""Closed loops: a controller that knows a leg at one level, on a plant that is exact, read and held every millisecond."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ce_gym.bench.exactness import signals
+from ce_gym.bench.exactness.control import Controllers
+from ce_gym.bench.exactness.mechanisms import leg_on_stand, without_limits
+from ce_gym.bench.exactness.protocol import BANDWIDTHS, COUNTED, HOLD, PLANT_STEP, POSES, SETTLE, SLOWEST, Array, Leg
+from ce_gym.bench.exactness.signals import Motion
+from ce_gym.bench.measure.progress import shown
+from ce_gym.dynamics.model import Model
+from ce_gym.model.mechanism import LEVELS
+from ce_gym.sim.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class Task:
+    """A motion to follow with a kind of controller.
+
+    Attributes:
+        controller: "joints" or "foot".
+        signal: "chirp" or "swing".
+        motion: Of the joints or of the foot.
+        start: State at the beginning, q and v, each of shape (n_poses, nq).
+        rest: The posture in the null space of the foot, shape (n_poses, nq).
+        band: Which band every sample is counted in, -1 for none, shape (n_times,).
+        frequencies: Of the bands [Hz].
+    """
+
+    controller: str
+    signal: str
+    motion: Motion
+    start: tuple[Array, Array]
+    rest: Array
+    band: Array
+    frequencies: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Root mean squares over a band, each of shape (n_bands, n_levels, n_bandwidths, n_poses).
+
+    Attributes:
+        error: Of a joint, mean square over them [rad], or of the foot [m].
+        torque_error: Of a joint's torque against an exact controller's in the same state [N m].
+        torque: Of that exact torque [N m].
+    """
+
+    error: Array
+    torque_error: Array
+    torque: Array
+
+
+def tasks(leg: Leg, seed: int) -> list[Task]:
+    """Return the four tasks of a leg."""
+    model = Model(leg_on_stand(leg))
+    joints, (foot, rest), running = (
+        signals.joint_chirp(model, seed),
+        signals.foot_chirp(model, seed),
+        signals.swing(model, leg, seed),
+    )
+    _, frequency = signals.chirp_times()
+    band = np.floor(frequency - SLOWEST).astype(int)
+    bands = tuple(SLOWEST + 0.5 + i for i in range(band.max() + 1))
+    push = np.linalg.pinv(signals.foot_jacobian(model, rest)) @ foot.xd[0][..., None]
+    pose, _ = signals.centres(model, seed, amplitude=0.0)
+    settling = np.arange(len(running.x)) < len(running.x) * SETTLE / (SETTLE + COUNTED)
+    counted, begin = np.where(settling, -1, 0), (running.x[0], running.xd[0])
+    stride = (leg.frequency,)
+    return [
+        Task("joints", "chirp", joints, (joints.x[0], joints.xd[0]), rest, band, bands),
+        Task("foot", "chirp", foot, (rest, push[..., 0]), rest, band, bands),
+        Task("joints", "swing", running, begin, pose, counted, stride),
+        Task("foot", "swing", signals.of_foot(model, running), begin, pose, counted, stride),
+    ]
+
+
+def follow(
+    leg: Leg,
+    task: Task,
+    levels: tuple[str, ...] = LEVELS,
+    bandwidths: tuple[float, ...] = BANDWIDTHS,
+    samples: int | None = None,
+) -> Tracked:
+    """Follow a motion with controllers of all levels and bandwidths [Hz], from all poses at the same time."""
+    robot = without_limits(leg_on_stand(leg))
+    exact, shape = Model(robot), (len(levels), len(bandwidths), POSES)
+    count, per_level = int(np.prod(shape)), int(np.prod(shape[1:]))
+    plant = Simulator(exact, count, PLANT_STEP, control="torque", contacts=(), outputs=(), method="rk4")
+    plant.set_state(*(np.broadcast_to(x, (*shape, exact.nv)).reshape(count, -1) for x in task.start))
+    controllers = Controllers({level: Model(robot, level) for level in levels}, task.controller, per_level)
+    w = np.repeat(2 * np.pi * np.array(bandwidths), POSES)[:, None]
+    rest = np.tile(task.rest, (len(bandwidths), 1))
+    times = range(len(task.band) if samples is None else samples)
+    sums, counts = np.zeros((3, len(task.frequencies), *shape)), np.zeros(len(task.frequencies))
+    for i in shown(times, f"{leg.robot} {task.controller} {task.signal}"):
+        q, v = (x.reshape(len(levels), per_level, -1) for x in (plant.q, plant.v))
+        motion = task.motion
+        aim = [np.tile(x[i], (len(bandwidths), 1)) for x in (motion.x, motion.xd, motion.xdd)]
+        torque, ideal = controllers(q, v, *aim, rest, w)
+        if task.band[i] >= 0:
+            foot = task.controller == "foot"
+            place = signals.foot_at(exact, q) if foot else q
+            error = ((place - aim[0]) ** 2).sum(-1) / (1 if foot else exact.nv)
+            squares = error, ((torque - ideal) ** 2).mean(-1), (ideal**2).mean(-1)
+            sums[:, task.band[i]] += np.reshape(squares, (3, *shape))
+            counts[task.band[i]] += 1
+        plant.step(torque.reshape(count, -1), round(HOLD / PLANT_STEP))
+    return Tracked(*np.sqrt(sums / np.maximum(counts, 1)[:, None, None, None]))
