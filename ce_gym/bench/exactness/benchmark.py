@@ -1,4 +1,4 @@
-"""Where exactness matters: controllers, contacts and designs of simplified levels, judged on exact; docs/exactness.md."""
+"""Where exactness matters: controllers, contacts and designs made on simplified levels, judged on exact."""
 
 from __future__ import annotations
 

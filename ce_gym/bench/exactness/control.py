@@ -17,7 +17,7 @@ def law(model: Model, controller: str) -> ca.Function:
 
     Args:
         model: Of a leg with a fixed base and one contact, its foot.
-        controller: "joints" for computed torque; "foot" for operational space (Khatib 1987), whose Jacobian's inverse is
+        controller: "joints" for computed torque; "foot" for operational space (Khatib 1987), whose inverse Jacobian is
             weighted by the mass matrix, and which takes the joints to a posture in its null space.
     """
     n = model.nv

@@ -11,7 +11,7 @@ from ce_gym.bench.exactness import feedforward
 from ce_gym.bench.exactness.feedforward import spread
 from ce_gym.bench.exactness.loops import follow, tasks
 from ce_gym.bench.exactness.mechanisms import leg_on_stand
-from ce_gym.bench.exactness.protocol import BANDWIDTHS, LEGS, Array, Leg
+from ce_gym.bench.exactness.protocol import BANDWIDTHS, LEGS, Leg
 from ce_gym.bench.exactness.signals import centres
 from ce_gym.bench.exactness.stable_gain import largest_bandwidth
 from ce_gym.bench.measure.progress import shown

@@ -1,4 +1,4 @@
-"""The torque a level gets wrong along a motion, without any feedback: sinusoids of all joints, the paper's among them."""
+"""The torque a level gets wrong along a motion without feedback: sinusoids of all joints, the paper's among them."""
 
 from __future__ import annotations
 

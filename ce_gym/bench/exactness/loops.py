@@ -1,4 +1,4 @@
-"""Closed loops: a controller that knows a leg at one level, on a plant that is exact, read and held every millisecond."""
+"""Closed loops: a controller that knows a leg at one level, on an exact plant, read and held every millisecond."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of the studies, as data; docs/exactness.md says in words what they are for. None is fitted to results."""
+"""The settings of the studies, as data; docs/exactness.md says what they are for. None is fitted to results."""
 
 from __future__ import annotations
 
@@ -73,10 +73,12 @@ RATIOS, INERTIAS = (0.25, 0.5, 1.0, 2.0), (0.25, 1.0, 4.0)
 """Factors on gear ratios and on rotor inertia."""
 STIFFNESSES = (5e4, 5e5, 5e6, 5e7)
 """Of the ground [N/m]; the last is for impulses only."""
-LOSS_TIME, DISSIPATION = 0.01, 0.5
-"""Damping over stiffness [s]; Hunt and Crossley's coefficient [s/m]."""
-WINDOW, STOPPED = 0.02, 0.01
-"""Longest time of a contact that is looked at [s]; share of the fall's speed at which it is over."""
+LOSS_TIME = 0.01
+"""Damping over stiffness, for impulses [s]; peak forces are on springs alone."""
+WINDOW = 0.02
+"""How long a contact is looked at on the softest ground [s]; inversely as the root of the stiffness on others."""
+CONTACT_STEP = 2e-6
+"""[s]."""
 
 # Designs
 RATIO_GRID = np.geomspace(0.4, 2.5, 13)
@@ -84,7 +86,7 @@ INERTIA_GRID = np.geomspace(0.25, 4.0, 7)
 RAMPS = (0.05, 0.1, 0.15)
 """Durations of the push [s]."""
 CROUCHED, TUCK, FLIGHT, JUMP = 0.5, 0.2, 0.25, 0.9
-"""Time in the crouch; from the push to the tuck; from the tuck to the look at pitch; of the push and what follows [s]."""
+"""Time in the crouch; from push to tuck; from tuck to the look at pitch; of the push and what follows [s]."""
 DROP, LANDING = 0.3, 0.3
 """Height of a drop [m] and time of its landing [s]."""
 DESIGN_STEP = 5e-4

@@ -129,7 +129,7 @@ def foot_jacobian(model: Model, q: Array) -> Array:
 
 
 def reach(model: Model, place: Array, q: Array, rest: Array, weight: float = 1e-3, steps: int = 5) -> Array:
-    """Return the poses (n, nq) near `rest` that bring the foot to a place (n, 3): damped least squares, Gauss-Newton."""
+    """Return the poses (n, nq) near `rest` whose foot is at a place (n, 3): damped least squares, Gauss-Newton."""
     for _ in range(steps):
         J = foot_jacobian(model, q)
         JT = np.swapaxes(J, -1, -2)
