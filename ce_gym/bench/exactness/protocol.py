@@ -81,15 +81,49 @@ CONTACT_STEP = 2e-6
 """[s]."""
 
 # Designs
-RATIO_GRID = np.geomspace(0.4, 2.5, 13)
-INERTIA_GRID = np.geomspace(0.25, 4.0, 7)
+RATIO_GRID, INERTIA_GRID = np.geomspace(0.4, 2.5, 13), np.geomspace(0.25, 4.0, 7)
+TORQUE_POWER = 2 / 3
+"""Of a rotor's inertia, that its motor's torque grows with: a thin ring of growing radius."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """How a robot jumps and runs: poses are factors on its standing pose.
+
+    Attributes:
+        crouch: Where it begins.
+        tuck: In flight.
+        gains: Factor on the robot's own.
+        gait: About which its legs run.
+        legs: First body, and share of a stride by which it is late, of the leg of each foot of `FEET`.
+        speed: [m/s].
+        frequency: Strides per second [Hz].
+    """
+
+    crouch: float
+    tuck: float
+    gains: float
+    gait: float
+    legs: tuple[tuple[str, float], ...]
+    speed: float
+    frequency: float
+
+
+PROGRAMS = {
+    "mini_cheetah": Program(1.375, 1.25, 3.0, 1.0, (
+        ("HR_abad_link", 0.0), ("HL_abad_link", 0.5), ("FR_abad_link", 0.5), ("FL_abad_link", 0.0)), 3.0, 4.0),
+    "mit_humanoid": Program(2.33, 2.0, 1.0, 1.5, (("right_hip_rz_link", 0.0), ("left_hip_rz_link", 0.5)), 2.0, 2.0),
+}  # fmt: skip
+PUSH = 0.3
+"""The pose that legs are pushed to, as a factor on the standing pose."""
 RAMPS = (0.05, 0.1, 0.15)
 """Durations of the push [s]."""
 CROUCHED, TUCK, FLIGHT, JUMP = 0.5, 0.2, 0.25, 0.9
 """Time in the crouch; from push to tuck; from tuck to the look at pitch; of the push and what follows [s]."""
 DROP, LANDING = 0.3, 0.3
 """Height of a drop [m] and time of its landing [s]."""
-DESIGN_STEP = 5e-4
+DESIGN_STEP, TARGET_STEP, LANDING_LAW = 5e-4, 5e-3, 0.5
+"""Step, and how long a target holds [s]; Hunt and Crossley's dissipation [s/m]."""
 SEEDS, FLIGHT_SEEDS = 8, 16
 POSE_NOISE, RAMP_NOISE = 0.02, 0.05
 """Of poses [rad] and, relative, of ramps."""

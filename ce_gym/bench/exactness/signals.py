@@ -102,12 +102,18 @@ def stride(model: Model, leg: Leg, centre: Array) -> tuple[Array, Array]:
 
 def swing(model: Model, leg: Leg, seed: int) -> Motion:
     """Return the joints' motion in strides at running speed."""
-    mean, series = stride(model, leg, centres(model, seed, amplitude=0.0)[0])
+    series = stride(model, leg, centres(model, seed, amplitude=0.0)[0])
     times = np.arange(0.0, (SETTLE + COUNTED) / leg.frequency, HOLD)
-    w = 2j * np.pi * leg.frequency * np.arange(1, len(series) + 1)
+    return Motion(*series_of(series, leg.frequency, times))
+
+
+def series_of(series: tuple[Array, Array], frequency: float, times: Array) -> tuple[Array, Array, Array]:
+    """Return a Fourier series, as `stride` gives it, and its two derivatives, each of shape (n_times, n_poses, nq)."""
+    mean, harmonics = series
+    w = 2j * np.pi * frequency * np.arange(1, len(harmonics) + 1)
     waves = np.exp(times[:, None] * w)
-    x, xd, xdd = (np.einsum("th,h,hpq->tpq", waves, w**order, series).real for order in range(3))
-    return Motion(x + mean, xd, xdd)
+    x, xd, xdd = (np.einsum("th,h,hpq->tpq", waves, w**order, harmonics).real for order in range(3))
+    return x + mean, xd, xdd
 
 
 def of_foot(model: Model, motion: Motion) -> Motion:
