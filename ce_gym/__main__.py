@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         "environment\ncosts, feature by feature.",
         epilog=examples(
             "inspect mini_cheetah",
-            "inspect my_robot.yaml --no-errors",
+            "inspect my_robot.yaml --levels",
             "inspect ce_gym/TelloVelocity-v0 --no-timing",
             "inspect ce_gym/TelloVelocity-v0 --no-timing --env-arg terrain=stairs",
         ),
@@ -94,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_env_arg(inspect)
     inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")
+    inspect.add_argument("--levels", action="store_true", help="robot: only what simplified levels get wrong of it")
     inspect.add_argument("--no-timing", action="store_true", help="environment: count instructions, compile nothing")
     inspect.set_defaults(run=_inspect)
     new = commands.add_parser(
@@ -149,6 +150,7 @@ def _new(args: argparse.Namespace) -> int:
 
 
 def _inspect(args: argparse.Namespace) -> int:
+    from ce_gym.diagnostics.levels_text import levels_report
     from ce_gym.diagnostics.transmission_text import transmission_report
     from ce_gym.dynamics import Model
     from ce_gym.envs.custom import missing
@@ -156,6 +158,9 @@ def _inspect(args: argparse.Namespace) -> int:
     if re.search(r"-v\d+$", args.name) and not args.name.endswith((".yaml", ".urdf", ".xml")):
         return _inspect_environment(args)
     model = Model(args.name, transmission=args.transmission)
+    if args.levels:
+        print(levels_report(model))
+        return 0
     print(f"{model.describe()}\n", flush=True)
     problems = missing(model.robot)
     print("Environments: it has what every task needs\n" if not problems else "Environments lack:")

@@ -22,8 +22,9 @@ from ce_gym.bench.exactness.protocol import (
     Array,
 )
 from ce_gym.bench.exactness.scaling import scaled
+from ce_gym.bench.exactness.tables import table
 from ce_gym.bench.measure.progress import shown
-from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
+from ce_gym.bench.measure.report import Cell, Report, Requirement
 from ce_gym.dynamics.model import Model
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim.simulator import Simulator
@@ -140,15 +141,17 @@ def run(arguments: argparse.Namespace, out: Path) -> Report:
     for name in robots:
         levels = ("exact", "armature") if arguments.quick else LEVELS
         rows += _rows(name, levels, STIFFNESSES[-2:] if arguments.quick else STIFFNESSES)
-    table = Table("Landings", COLUMNS, tuple(rows))
-    table.write_csv(out / "contacts.csv")
-    report = Report("exactness contacts", [replace(table, rows=tuple(r for r in rows if r[2] == r[3] == 1.0))])
+    landings = table("Landings", COLUMNS, rows)
+    landings.write_csv(out / "contacts.csv")
+    report = Report(
+        "exactness contacts", [replace(landings, rows=tuple(r for r in landings.rows if r[2] == r[3] == 1.0))]
+    )
     report.requirements += _requirements(rows)
     if not arguments.quick:
         from ce_gym.bench.exactness import plots
 
         report.remarks.append(_halved())
-        plots.contacts(table, out)
+        plots.contacts(landings, out)
     return report
 
 

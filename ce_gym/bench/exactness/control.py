@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
@@ -42,14 +44,15 @@ class Controllers:
     """Controllers of one kind that know one leg at several levels, each for the same number of states.
 
     Args:
-        models: Of the leg, by level.
+        exact: Of the leg, with whose torques the others are compared.
+        models: Of the leg, at the levels that are known.
         controller: As for `law`.
         count: Number of states of each level.
     """
 
-    def __init__(self, models: dict[str, Model], controller: str, count: int) -> None:
-        ideal = law(models["exact"], controller)
-        self._laws = [_beside(law(model, controller), ideal).map(count) for model in models.values()]
+    def __init__(self, exact: Model, models: Sequence[Model], controller: str, count: int) -> None:
+        ideal = law(exact, controller)
+        self._laws = [_beside(law(model, controller), ideal).map(count) for model in models]
 
     def __call__(self, *columns: Array) -> tuple[Array, Array]:
         """Return torques, and those of an exact controller in the same states, each shape (n_levels, count, n).

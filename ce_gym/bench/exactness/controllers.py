@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from ce_gym.bench.exactness import feedforward
-from ce_gym.bench.exactness.feedforward import spread
 from ce_gym.bench.exactness.loops import follow, tasks
 from ce_gym.bench.exactness.mechanisms import leg_on_stand
 from ce_gym.bench.exactness.protocol import BANDWIDTHS, LEGS, Leg
 from ce_gym.bench.exactness.signals import centres
 from ce_gym.bench.exactness.stable_gain import largest_bandwidth
+from ce_gym.bench.exactness.tables import spread, table
 from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.paper.tracking import FREQUENCY, PUBLISHED
@@ -33,12 +33,12 @@ def run(arguments: argparse.Namespace, out: Path) -> Report:
     quick, seed = arguments.quick, arguments.seed
     legs = dict(list(LEGS.items())[:1]) if quick else LEGS
     tables = {
-        "feedforward": Table("Without feedback", feedforward.COLUMNS, tuple(_map(quick, seed))),
-        "gain": Table("Largest stable bandwidth", GAIN, tuple(_gains(legs, seed, 2 if quick else None))),
-        "tracking": Table("Closed loop", TRACKING, tuple(_tracking(legs, seed, 500 if quick else None))),
+        "feedforward": table("Without feedback", feedforward.COLUMNS, _map(quick, seed)),
+        "gain": table("Largest stable bandwidth", GAIN, _gains(legs, seed, 2 if quick else None)),
+        "tracking": table("Closed loop", TRACKING, _tracking(legs, seed, 500 if quick else None)),
     }
-    for name, table in tables.items():
-        table.write_csv(out / f"controllers_{name}.csv")
+    for name, one in tables.items():
+        one.write_csv(out / f"controllers_{name}.csv")
     shown_rows = tuple(r for r in tables["tracking"].rows if r[5] == BANDWIDTHS[1] and r[4] != "exact")
     report = Report("exactness controllers", [tables["gain"], Table("Closed loop, 8 Hz", TRACKING, shown_rows)])
     report.requirements += _published(tables["feedforward"])
@@ -78,9 +78,9 @@ def _tracking(legs: dict[str, Leg], seed: int, samples: int | None) -> list[tupl
     return rows
 
 
-def _published(table: Table) -> list[Requirement]:
+def _published(points: Table) -> list[Requirement]:
     """Return whether the points that the paper gives are on the map."""
-    found = {(r[1], r[3]): r[5] for r in table.rows if r[0] == "mit_humanoid_leg, as published" and r[2] == FREQUENCY}
+    found = {(r[1], r[3]): r[5] for r in points.rows if r[0] == "mit_humanoid_leg, as published" and r[2] == FREQUENCY}
     requirements = []
     for (level, joint), expected in PUBLISHED.items():
         measured = float(found[level, joint])  # type: ignore[arg-type]

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ce_gym.bench.exactness.feedforward import spread
 from ce_gym.bench.exactness.gait import Gait
 from ce_gym.bench.exactness.jumps import Jump, Jumpers
 from ce_gym.bench.exactness.protocol import (
@@ -22,8 +21,9 @@ from ce_gym.bench.exactness.protocol import (
     SEEDS,
     Array,
 )
+from ce_gym.bench.exactness.tables import spread, table
 from ce_gym.bench.measure.progress import shown
-from ce_gym.bench.measure.report import Cell, Report, Table
+from ce_gym.bench.measure.report import Cell, Report
 from ce_gym.model.mechanism import LEVELS
 
 OBJECTIVES = {"jump [m]": 1.0, "landing [N]": -1.0, "transport [-]": -1.0}
@@ -72,12 +72,12 @@ def run(arguments: argparse.Namespace, out: Path) -> Report:
         choice += _choice_rows(name, surfaces, grid, arguments.seed)
         flight += _flight_rows(name, levels, arguments.seed)
     tables = {
-        "surface": Table("Surface", SURFACE, tuple(surface)),
-        "choice": Table("Designs chosen on a level, judged on exact", CHOICE, tuple(choice)),
-        "flight": Table("Jumps at the robot's own design, differences from exact", FLIGHT, tuple(flight)),
+        "surface": table("Surface", SURFACE, surface),
+        "choice": table("Designs chosen on a level, judged on exact", CHOICE, choice),
+        "flight": table("Jumps at the robot's own design, differences from exact", FLIGHT, flight),
     }
-    for key, table in tables.items():
-        table.write_csv(out / f"designs_{key}.csv")
+    for key, one in tables.items():
+        one.write_csv(out / f"designs_{key}.csv")
     if not quick:
         from ce_gym.bench.exactness import plots
 

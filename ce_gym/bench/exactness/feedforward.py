@@ -7,6 +7,7 @@ import numpy as np
 from ce_gym.bench.exactness.mechanisms import leg_on_stand
 from ce_gym.bench.exactness.protocol import AMPLITUDE, CORNER, FREQUENCIES, LEGS, Array, Leg
 from ce_gym.bench.exactness.signals import centres
+from ce_gym.bench.exactness.tables import spread
 from ce_gym.bench.measure.report import Cell
 from ce_gym.bench.paper import tracking
 from ce_gym.dynamics.model import Model
@@ -63,12 +64,6 @@ def as_published(frequencies: tuple[float, ...]) -> list[tuple[Cell, ...]]:
 def rms(x: Array) -> Array:
     """Return the root mean square over time, the first axis."""
     return np.sqrt(np.mean(x**2, axis=0))
-
-
-def spread(x: Array) -> tuple[float, float, float]:
-    """Return percentiles 5, 50 and 95."""
-    low, middle, high = np.percentile(x, (5, 50, 95))
-    return float(low), float(middle), float(high)
 
 
 def _rows(

@@ -92,7 +92,7 @@ def follow(
     count, per_level = int(np.prod(shape)), int(np.prod(shape[1:]))
     plant = Simulator(exact, count, PLANT_STEP, control="torque", contacts=(), outputs=(), method="rk4")
     plant.set_state(*(np.broadcast_to(x, (*shape, exact.nv)).reshape(count, -1) for x in task.start))
-    controllers = Controllers({level: Model(robot, level) for level in levels}, task.controller, per_level)
+    controllers = Controllers(exact, [Model(robot, level) for level in levels], task.controller, per_level)
     w = np.repeat(2 * np.pi * np.array(bandwidths), POSES)[:, None]
     rest = np.tile(task.rest, (len(bandwidths), 1))
     times = range(len(task.band) if samples is None else samples)
