@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ce_gym.bench.exactness import contacts, controllers, feedforward, loops, signals, stable_gain
+from ce_gym.bench.exactness import contacts, controllers
 from ce_gym.bench.exactness.gait import Gait
+from ce_gym.bench.exactness.legs import feedforward, loops, signals, stable_gain
 from ce_gym.bench.exactness.mechanisms import leg_on_stand, limb, on_soles
 from ce_gym.bench.exactness.protocol import FEET, HOLD, LEGS, STIFFNESSES
 from ce_gym.bench.exactness.scaling import scaled

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ce_gym.bench.exactness import feedforward
-from ce_gym.bench.exactness.loops import follow, tasks
+from ce_gym.bench.exactness.legs import feedforward
+from ce_gym.bench.exactness.legs.loops import follow, tasks
+from ce_gym.bench.exactness.legs.signals import centres
+from ce_gym.bench.exactness.legs.stable_gain import largest_bandwidth
 from ce_gym.bench.exactness.mechanisms import leg_on_stand
 from ce_gym.bench.exactness.protocol import BANDWIDTHS, LEGS, Leg
-from ce_gym.bench.exactness.signals import centres
-from ce_gym.bench.exactness.stable_gain import largest_bandwidth
 from ce_gym.bench.exactness.tables import spread, table
 from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ce_gym.bench.exactness.legs.signals import series_of, stride
 from ce_gym.bench.exactness.mechanisms import leg_on_stand
 from ce_gym.bench.exactness.protocol import FEET, K2, K2_INERTIA, PROGRAMS, Array, Leg
 from ce_gym.bench.exactness.scaling import scaled
-from ce_gym.bench.exactness.signals import series_of, stride
 from ce_gym.dynamics.model import Model
 from ce_gym.model import load_robot
 from ce_gym.model.mechanism import LEVELS

@@ -5,10 +5,10 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from ce_gym.bench.exactness.control import law
+from ce_gym.bench.exactness.legs.control import law
+from ce_gym.bench.exactness.legs.signals import foot_at
 from ce_gym.bench.exactness.mechanisms import leg_on_stand, without_limits
 from ce_gym.bench.exactness.protocol import HIGHEST_BANDWIDTH, HOLD, Array, Leg
-from ce_gym.bench.exactness.signals import foot_at
 from ce_gym.dynamics.model import Model
 
 STEPS, BISECTIONS = 400, 40

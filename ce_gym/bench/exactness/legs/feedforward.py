@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ce_gym.bench.exactness.legs.signals import centres
 from ce_gym.bench.exactness.mechanisms import leg_on_stand
 from ce_gym.bench.exactness.protocol import AMPLITUDE, CORNER, FREQUENCIES, LEGS, Array, Leg
-from ce_gym.bench.exactness.signals import centres
 from ce_gym.bench.exactness.tables import spread
 from ce_gym.bench.measure.report import Cell
 from ce_gym.bench.paper import tracking
