@@ -42,7 +42,7 @@ LAYERS = {
     "export": "joint_ties mjcf_text mjcf_equalities mjcf mujoco_model mujoco_coordinates mujoco_batch mujoco_twin"
     " guesses new_robot",
     "viewer": "errors console rollouts page raytrace server feed window renderers live cli",
-    "bench": "measure peers friction instructions soak digests fuzz speed throughput paper accuracy stability"
+    "bench": "measure peers instructions soak digests fuzz speed throughput paper accuracy stability"
     " gpu exactness __main__",
 }
 """What a folder consists of, bottom first: a module imports from its own layer and from those below."""

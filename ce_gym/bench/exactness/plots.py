@@ -10,13 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import NullFormatter
 
-from ce_gym.bench.exactness.protocol import BANDWIDTHS, INERTIA_GRID, RATIO_GRID, STIFFNESSES
+from ce_gym.bench.exactness.protocol import BANDWIDTHS, INERTIA_GRID, RATIO_GRID, RATIOS, STIFFNESSES
 from ce_gym.bench.measure.report import Cell, Table
 from ce_gym.bench.paper.plots import BLUE, GREEN, GREY, ORANGE, RED, STYLE, plt
+from ce_gym.bench.paper.tracking import FREQUENCY, PUBLISHED
 
 COLORS = {"exact": BLUE, "coupled": GREEN, "armature": ORANGE, "none": RED}
 MARKERS = {"exact": "*", "coupled": "D", "armature": "o", "none": "v"}
 AGAINST = "frequency [Hz]"
+PUBLISHED_LEG = "mit_humanoid_leg"
 Rows = list[dict[str, Cell]]
 
 
@@ -32,7 +34,9 @@ def controllers(tables: Mapping[str, Table], out: Path) -> Path:
     free, loop = tables["feedforward"], tables["tracking"]
     legs = list(dict.fromkeys(row[0] for row in loop.rows))
     with plt.rc_context(STYLE):
-        figure, panels = plt.subplots(3, len(legs), figsize=(1 + 3.6 * len(legs), 8.2), layout="constrained")
+        figure, panels = plt.subplots(
+            3, len(legs), figsize=(1 + 3.6 * len(legs), 8.2), layout="constrained", squeeze=False
+        )
         for column, leg in zip(panels.T, legs, strict=True):
             column[0].set_title(str(leg))
             for level in ("coupled", "armature", "none"):
@@ -51,16 +55,17 @@ def controllers(tables: Mapping[str, Table], out: Path) -> Path:
             for panel in column:
                 panel.set_yscale("log")
             column[2].set_xlabel(AGAINST)
-        for level, point in (("none", 4.3096), ("armature", 1.0446)):
-            panels[0][0].plot(1.5, point, "*", color=COLORS[level], markersize=11, markeredgecolor="black")
-        panels[0][0].text(1.7, 4.6, "the paper's knee", fontsize=8)
+        for (level, _), point in PUBLISHED.items() if PUBLISHED_LEG in legs else ():
+            at = panels[0][legs.index(PUBLISHED_LEG)]
+            at.plot(FREQUENCY, point, "*", color=COLORS[level], markersize=11, markeredgecolor="black")
         for row, name in enumerate(
             ("no feedback: rms torque error,\nworst joint [N m]", "torque error / exact torque", "tracking error [rad]")
         ):
             panels[row][0].set_ylabel(name)
-        panels[2][0].legend()
+        figure.legend(*panels[2][0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         figure.suptitle(
-            "Chirps of all joints: what a controller loses that knows a simplified level", fontweight="bold"
+            "Chirps of all joints: what a controller loses that knows a simplified level (stars: the paper)",
+            fontweight="bold",
         )
         return _saved(figure, out / "exactness_controllers.png")
 
@@ -69,7 +74,9 @@ def contacts(table: Table, out: Path) -> Path:
     """Draw impulses over their rigid limits against stiffness, and peak forces over exact against the gear ratio."""
     robots = list(dict.fromkeys(row[0] for row in table.rows))
     with plt.rc_context(STYLE):
-        figure, panels = plt.subplots(2, len(robots), figsize=(1 + 3.6 * len(robots), 6.0), layout="constrained")
+        figure, panels = plt.subplots(
+            2, len(robots), figsize=(1 + 3.6 * len(robots), 6.0), layout="constrained", squeeze=False
+        )
         for column, robot in zip(panels.T, robots, strict=True):
             column[0].set_title(str(robot))
             for level, color in COLORS.items():
@@ -88,8 +95,10 @@ def contacts(table: Table, out: Path) -> Path:
                 x = [r["ratio"] for r in rows]
                 column[1].plot(x, [r["peak over exact"] for r in rows], marker, color=color)
                 column[1].plot(x, [r["root of effective mass over exact"] for r in rows], "-", color=color)
-            column[0].set(xscale="log", xlabel="stiffness of the ground [N/m]")
+            column[0].set(xscale="log", yscale="log", xlabel="stiffness of the ground [N/m]")
             column[1].set(xscale="log", yscale="log", xlabel="factor on the gear ratios")
+            column[1].xaxis.set_ticks(RATIOS, [f"{ratio:g}" for ratio in RATIOS])
+            column[1].xaxis.set_minor_formatter(NullFormatter())
             column[0].axhline(1.0, color=GREY, linewidth=0.8)
             column[1].axhline(1.0, color=GREY, linewidth=0.8)
         panels[0][0].set_ylabel("impulse / rigid limit of the level")

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ce_gym.bench.friction import MASS, MU, Slider
 from ce_gym.bench.stability import scenes
+from ce_gym.bench.stability.friction import MASS, MU, Slider
 from ce_gym.bench.stability.scenes import GRAVITY, simulator
 from ce_gym.dynamics.model import Model
 from ce_gym.model import ContactMaterial, Robot, load_robot
