@@ -85,11 +85,11 @@ def report_levels(model: Model, poses: int = 200, seed: int = 0) -> LevelReport:
     M = {level: one.mass_matrix(q) for level, one in models.items()}
     size = np.sqrt(np.diagonal(M["exact"], axis1=1, axis2=2))
     relative = size[:, :, None] * size[:, None, :]
-    carried, shared = M["exact"] - M["coupled"], M["coupled"] - M["armature"]
-    largest = [_range(np.abs(x / relative).max((1, 2))) for x in (carried, shared)]
+    off_level = M["exact"] - M["coupled"], M["coupled"] - M["armature"]
+    carried, shared = (_range(np.abs(x / relative).max((1, 2))) for x in off_level)
     feet = foot_rows(models["exact"], q)
     rows = tuple(level_row(models["exact"], level, M, feet) for level in LEVELS[1:])
-    return LevelReport(model.robot.name, *largest, rows, len(q))
+    return LevelReport(model.robot.name, carried, shared, rows, len(q))
 
 
 def level_row(model: Model, level: str, M: Mapping[str, Array], feet: Array) -> LevelRow:
@@ -118,7 +118,7 @@ def in_flight(M: Array, base: int) -> tuple[Array, Array]:
     """Return the inertia of the joints with the base free (n, nj, nj), and the base's motion for theirs (n, 6, nj)."""
     if not base:
         return M, np.zeros((len(M), 0, M.shape[-1]))
-    turn = -np.linalg.solve(M[:, :base, :base], M[:, :base, base:])
+    turn = -np.asarray(np.linalg.solve(M[:, :base, :base], M[:, :base, base:]), dtype=float)
     return M[:, base:, base:] + M[:, base:, :base] @ turn, turn
 
 

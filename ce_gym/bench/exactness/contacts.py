@@ -8,6 +8,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ce_gym.bench.exactness.mechanisms import on_soles
 from ce_gym.bench.exactness.protocol import (
@@ -53,7 +54,7 @@ class Landing:
     impulse: Array
     peak: Array
     imbalance: Array
-    compressed: Array
+    compressed: NDArray[np.bool_]
 
 
 class Faller:
@@ -86,7 +87,8 @@ class Faller:
         q = np.tile(self.model.standing_q, (len(DESIGNS), 1))
         J = feet_jacobian(self.model, self.model.standing_q)
         yielding = J @ np.linalg.solve(self.mass_matrix(q), np.broadcast_to(J.T, (len(q), *J.T.shape)))
-        return np.linalg.solve(yielding, np.full((len(q), len(J), 1), FALL))[..., 0]
+        unit = np.full((len(q), len(J), 1), FALL)
+        return np.asarray(np.linalg.solve(yielding, unit), dtype=float)[..., 0]
 
     def land(self, stiffness: float, damping: float) -> Landing:
         """Fall on a ground."""
@@ -111,7 +113,7 @@ class Faller:
         impulse = gathered[last, np.arange(len(DESIGNS))]
         weight = model.total_mass * 9.81 * n * sim.dt
         imbalance = (self._momentum() - before - gathered[-1] + weight) / gathered[-1]
-        return Landing(impulse, force.max(0), imbalance, stopped.any(0))
+        return Landing(impulse, force.max(0), imbalance, np.asarray(stopped.any(0)))
 
     def _momentum(self) -> Array:
         """Return the vertical momentum [N s]; the base has not turned much, but its axes have."""

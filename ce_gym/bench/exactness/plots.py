@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from ce_gym.bench.exactness.protocol import BANDWIDTHS, INERTIA_GRID, RATIO_GRID, RATIOS, STIFFNESSES
@@ -157,7 +158,7 @@ def _band(panel: Axes, rows: Rows, name: str, level: str, unit: str = "") -> Non
     panel.fill_between(x, low, high, color=COLORS[level], alpha=0.2, linewidth=0)  # type: ignore[arg-type]
 
 
-def _saved(figure: plt.Figure, path: Path) -> Path:
+def _saved(figure: Figure, path: Path) -> Path:
     figure.savefig(path, dpi=90)
     plt.close(figure)
     return path

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from ce_gym.bench.exactness.protocol import (
     AMPLITUDE,
@@ -26,6 +27,8 @@ from ce_gym.bench.exactness.protocol import (
 )
 from ce_gym.dynamics.model import Model
 
+Series = tuple[Array, NDArray[np.complex128]]
+"""Mean and complex amplitudes of harmonics."""
 SAMPLES, HARMONICS = 128, 12
 """Poses of a stride that inverse kinematics finds, and harmonics that are kept of them."""
 
@@ -82,7 +85,7 @@ def foot_chirp(model: Model, seed: int) -> tuple[Motion, Array]:
     return Motion(x + place, xd + still, xdd + still), centre
 
 
-def stride(model: Model, leg: Leg, centre: Array) -> tuple[Array, Array]:
+def stride(model: Model, leg: Leg, centre: Array) -> Series:
     """Return the Fourier series of the joints in a stride whose lowest point is the foot's place at the centres.
 
     Returns:
@@ -107,7 +110,7 @@ def swing(model: Model, leg: Leg, seed: int) -> Motion:
     return Motion(*series_of(series, leg.frequency, times))
 
 
-def series_of(series: tuple[Array, Array], frequency: float, times: Array) -> tuple[Array, Array, Array]:
+def series_of(series: Series, frequency: float, times: Array) -> tuple[Array, Array, Array]:
     """Return a Fourier series, as `stride` gives it, and its two derivatives, each of shape (n_times, n_poses, nq)."""
     mean, harmonics = series
     w = 2j * np.pi * frequency * np.arange(1, len(harmonics) + 1)
