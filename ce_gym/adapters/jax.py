@@ -10,13 +10,15 @@ function of JAX has no memory.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from typing import Any
 
-import jax
 import numpy as np
 
 from ce_gym import Simulator
 from ce_gym.adapters.pure_steps import PureSteps
+
+jax: Any = import_module("jax")  # no extra of ours: it may be absent, and so may its types
 
 State = Mapping[str, Any]
 """Parts of the state of all robots by name, shape (num_envs, size) each; "q" are coordinates, quaternions included."""

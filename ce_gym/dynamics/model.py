@@ -17,6 +17,7 @@ from ce_gym.dynamics.evaluation import Evaluator
 from ce_gym.dynamics.standing import check_standing
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
+from ce_gym.model.frames import added
 from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
@@ -83,7 +84,7 @@ class Model(Evaluator):
     def total_mass(self) -> float:
         """Mass of all bodies, the same at every level unless locked rotors are deleted [kg]."""
         deleted = not self.locked_rotors and self.transmission != "exact"
-        return self.robot.total_mass - (sum(r.inertial.mass for r in self.robot.rotors()) if deleted else 0.0)
+        return self.robot.total_mass - (added(r.inertial.mass for r in self.robot.rotors()) if deleted else 0.0)
 
     @property
     def body_names(self) -> tuple[str, ...]:

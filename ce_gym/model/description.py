@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ce_gym.model.constraints import Constraint
-from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3
+from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
 
 
 @dataclass(frozen=True)
@@ -268,4 +268,4 @@ class Robot:
     @property
     def total_mass(self) -> float:
         """Mass of all bodies [kg]."""
-        return sum(body.inertial.mass for body in self.bodies)
+        return added(body.inertial.mass for body in self.bodies)

@@ -1,7 +1,8 @@
-"""Frames of bodies, as plain numbers in tuples, and rotations by quaternions."""
+"""Frames of bodies, as plain numbers in tuples, rotations by quaternions, and sums with the same bits everywhere."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,14 @@ class Placement:
 
 ORIGIN = Placement()
 """The pose of a frame that coincides with its parent."""
+
+
+def added(numbers: Iterable[float]) -> float:
+    """Return a sum made from left to right: Python's own compensates rounding from 3.12 on, which changes bits."""
+    total = 0.0
+    for number in numbers:
+        total += number
+    return total
 
 
 def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:

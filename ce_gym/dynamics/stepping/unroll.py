@@ -24,6 +24,7 @@ from ce_gym.dynamics.stepping.step import (
     looked_up_from,
     stacked,
 )
+from ce_gym.model.frames import added
 
 
 def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> dict[str, Stepped]:
@@ -69,7 +70,7 @@ def _moved(rates: Rates, before: State, parts: list[Stepped], dt: float, floatin
     moved = _from_flat(_flat(before, floating) + dt * sum(terms, SX(0)), before, floating)
     if rates.weights:
         first = parts[0].solved
-        moved.dependent = guessed_coordinates(first.kinematics, first.vdot, dt * sum(rates.weights))
+        moved.dependent = guessed_coordinates(first.kinematics, first.vdot, dt * added(rates.weights))
     return moved
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ce_gym.model.description import Inertial
-from ce_gym.model.frames import IDENTITY, Mat3, Placement, Vec3
+from ce_gym.model.frames import IDENTITY, Mat3, Placement, Vec3, added
 
 # Entries this close to 0 or 1 come from a rounded right angle. They are made exact because the compiler of the
 # dynamics drops multiplications by 0 and 1: sin(pi) = 1.2e-16 would keep them all.
@@ -66,7 +66,7 @@ def merge_inertials(parts: Sequence[Inertial]) -> Inertial:
     """Return the mass properties of rigidly joined bodies, all given in one frame (parallel axis theorem)."""
     if len(parts) == 1:
         return parts[0]
-    mass = sum(part.mass for part in parts)
+    mass = added(part.mass for part in parts)
     if mass == 0.0:
         return Inertial(0.0, parts[0].com, mat3(np.sum([part.inertia for part in parts], axis=0)))
     com = np.average([part.com for part in parts], axis=0, weights=[part.mass for part in parts])

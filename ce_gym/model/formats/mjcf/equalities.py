@@ -22,7 +22,7 @@ from ce_gym.model.constraints import Constraint, LinearConstraint, LoopConstrain
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement
 from ce_gym.model.formats.placement import compose, transform_point, vec3
-from ce_gym.model.frames import Placement, Vec3
+from ce_gym.model.frames import Placement, Vec3, added
 
 RANK_TOLERANCE = 1e-8
 """Relative size of a row or column of a constraint Jacobian that counts as zero."""
@@ -196,7 +196,7 @@ def _linear(
     for joint, value in second[0].items():
         coefficients[joint] = coefficients.get(joint, 0.0) - ratio * value
     offset = constant + ratio * second[1] - first[1]
-    offset -= sum(value * locked[joint] for joint, value in coefficients.items() if joint in locked)
+    offset -= added(value * locked[joint] for joint, value in coefficients.items() if joint in locked)
     pairs = tuple((tree.moved_by[j], x) for j, x in coefficients.items() if j not in locked and x != 0.0)
     if len(pairs) > 1:
         yield LinearConstraint(name, pairs, offset)

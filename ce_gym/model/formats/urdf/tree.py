@@ -21,7 +21,7 @@ from ce_gym.model.formats.placement import compose, merge_inertials, transform_i
 from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.graph import UrdfGraph, UrdfJoint
-from ce_gym.model.frames import Placement
+from ce_gym.model.frames import Placement, added
 
 Base = Literal["floating", "fixed"]
 Frame = tuple[str | None, Placement]  # the body (None: the world) that carries a frame, and the frame's pose in it
@@ -101,7 +101,7 @@ class _Reader:
         for joint in floating:
             if joint.parent != self.graph.root or base == "fixed":
                 raise bad(self.file, f"{joint.where} type", "floating", "a joint with one degree of freedom")
-        mass = sum(part.mass for link in self.graph.welded_to(self.graph.root) if (part := self.inertials[link]))
+        mass = added(part.mass for link in self.graph.welded_to(self.graph.root) if (part := self.inertials[link]))
         if floating and mass:
             raise bad(self.file, f"link {self.graph.root!r} mass", mass, "none, because a floating joint hangs on it")
         if base is not None:
