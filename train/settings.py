@@ -201,7 +201,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 
 def _convert(source: str, key: str, value: Any, kind: str) -> Any:
-    """Convert one value. Numbers may be written 1e-3 or 6e6, which YAML 1.1 reads as text."""
+    """Convert one value. Numbers may be quoted."""
     wanted = f"one of {', '.join(ACTIVATIONS)}" if kind == "Activation" else "a list of layer sizes"
     try:
         if kind == "int":

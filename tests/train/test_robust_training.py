@@ -255,9 +255,9 @@ def test_ctrl_c_before_learning_starts_is_one_line(tmp_path, capsys, monkeypatch
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        (["--num-envs", "1e12"], "num_envs: '1e12'; expected a positive whole number, at most"),
+        (["--num-envs", "1e12"], "num_envs: 1000000000000.0; expected a positive whole number, at most"),
         (["--num-envs", "1e6", "--set", "rollout=1e4"], "num_envs * rollout: 10000000000; expected at most"),
-        (["--set", "minibatches=1e9"], "minibatches: '1e9'; expected a positive whole number, at most"),
+        (["--set", "minibatches=1e9"], "minibatches: 1000000000.0; expected a positive whole number, at most"),
         (["--set", "num_envs=1", "rollout=4", "minibatches=4"], "expected at least 2 samples in each"),
         (["--set", "num_envs=5", "rollout=1", "minibatches=2", "hidden=[4"], "--set hidden: cannot be read as YAML"),
         (["--set", "num_envs=7", "rollout=1", "minibatches=4"], "minibatches: 4 of 7 samples"),
@@ -265,7 +265,7 @@ def test_ctrl_c_before_learning_starts_is_one_line(tmp_path, capsys, monkeypatch
         (["--set", "hidden=2020-99-99"], "--set hidden: cannot be read as YAML"),
         (["--set", "hidden='64'"], "hidden: '64'; expected a list"),
         (["--set", "hidden={1: 2}"], "hidden: {1: 2}; expected a list"),
-        (["--set", "hidden=[1e9]"], "hidden: '1e9'; expected a positive whole number, at most"),
+        (["--set", "hidden=[1e9]"], "hidden: 1000000000.0; expected a positive whole number, at most"),
         (["--set", "activation=[Tanh]"], "activation: ['Tanh']; expected one of"),
         (["--set", "gamma=2"], "gamma: 2; expected a number from 0 to 1"),
         (["--set", "gamma=-0.1"], "gamma: -0.1; expected a number from 0 to 1"),
