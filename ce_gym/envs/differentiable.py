@@ -70,7 +70,7 @@ class DifferentiableEnv:
         >>> observations, _ = env.reset(seed=0)
         >>> differentiable = env.unwrapped.differentiable()
         >>> for _ in range(3):
-        ...     differentiable.step(np.zeros((8, 12)))
+        ...     result = differentiable.step(np.zeros((8, 12)))
         >>> gradients = [differentiable.backward(by_reward=np.ones(8)) for _ in range(3)]
         >>> print(gradients[0].shape)
         (8, 12)
