@@ -177,7 +177,7 @@ def test_environments_show_their_ground(capsys: pytest.CaptureFixture[str]):
         events.readline()
         moves = json.loads(events.readline()[len("data: ") :])
         x, y = env.batch.rows("q")[0, :2]
-        np.testing.assert_allclose(moves["/robot"][12:14], [-x, -y], atol=1e-6)
+        np.testing.assert_allclose(moves["/world"][12:14], [-x, -y], atol=1e-6)
         env.close()
 
 
@@ -267,10 +267,10 @@ def test_a_page_gets_every_pose_and_closing_frees_the_port(capsys: pytest.Captur
         assert moves != first
         x, y = env.batch.rows("q")[0, :2]
         newest = moves
-        while (line := events.readline()) and not np.allclose(newest["/robot"][12:14], [-x, -y], atol=1e-6):
+        while (line := events.readline()) and not np.allclose(newest["/world"][12:14], [-x, -y], atol=1e-6):
             if line.startswith(b"data: "):
                 newest = json.loads(line[len("data: ") :])
-        assert np.allclose(newest["/robot"][12:14], [-x, -y], atol=1e-6)
+        assert np.allclose(newest["/world"][12:14], [-x, -y], atol=1e-6)
         env.close()
         assert b"data" not in events.read()  # the stream ends
     env.close()
