@@ -200,7 +200,7 @@ def test_only_environments_of_a_robot_and_a_task():
 
 def test_ids_that_somebody_registered_and_arguments_are_reported(report: SceneReport, monkeypatch):
     """What an id leaves out is as in the environment; arguments that change no kernel change no figure."""
-    kwargs = {"robot": "mini_cheetah", "task": "velocity", "num_threads": 1}
+    kwargs = {"robot": TRIPOD, "task": "velocity", "num_threads": 1}
     spec = gymnasium.envs.registration.EnvSpec("my/Dog-v0", entry_point="ce_gym.envs.single:LeggedEnv", kwargs=kwargs)
     monkeypatch.setitem(gymnasium.registry, "my/Dog-v0", spec)
     assert report_scene("my/Dog-v0", obs_mode="dict").env_step == report.env_step

@@ -43,7 +43,8 @@ def policy(tmp_path_factory):
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_onnx_acts_as_the_learner(activation, tmp_path):
-    path = trained_policy(tmp_path, f"activation={activation}", "learning_rate=0.1", "target_kl=0")
+    rate = 0.03 if activation == "Softplus" else 0.1  # fast enough that some are clipped, not so that all are
+    path = trained_policy(tmp_path, f"activation={activation}", f"learning_rate={rate}", "target_kl=0")
     assert main([str(path), str(tmp_path / "out.onnx")]) == 0
     obs = 3 * np.random.default_rng(0).standard_normal((500, 2)).astype(np.float32)
     expected, _ = load_learner(path)[0].predict(obs, deterministic=True)
