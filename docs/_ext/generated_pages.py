@@ -99,7 +99,8 @@ def _motor_list() -> str:
 def _own_robot(folder: Path) -> str:
     """A picture and the tree of the walk-through's robot: the URDF of the tests' data with the YAML of the page."""
     docs = folder.parent
-    (text,) = re.findall(r"^```yaml\n(.*?)^```", (docs / "own_robot.md").read_text(encoding="utf-8"), re.M | re.S)
+    page = (docs / "own_robot.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"^```yaml\n(# pup.yaml\n.*?)^```", page, re.M | re.S)
     with TemporaryDirectory() as place:
         shutil.copy(docs.parent / "tests" / "data" / "own_robot" / "pup.urdf", place)
         path = Path(place) / "pup.yaml"
