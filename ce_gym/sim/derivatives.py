@@ -46,8 +46,7 @@ class StepDerivatives:
 
     Positions are differentiated in their tangent space: a rotation of the base, a translation of it, both in base axes,
     then the joints. What was decided in a step (touching, sticking, slipping, a limit that acts) is differentiated as
-    decided, through all iterations of the step. A robot that made a sub-step in parts (see `Simulator`) passes nothing
-    on to what was before, like one that diverged.
+    decided, through all iterations of the step.
 
     On terrain the ground under a contact is the plane that the step found there. A robot that made a sub-step in parts
     (see `Simulator`) passes nothing on to what was before, like one that diverged.
