@@ -13,9 +13,9 @@ from ce_gym.compile.cuda.host import host_compiler
 _numbers = itertools.count()
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def kernel_cache(tmp_path_factory):
-    """The cache folder of this session, new and empty."""
+    """The cache folder of this file's tests, new and empty; those of other folders share theirs with other processes."""
     before = os.environ.get("CE_GYM_CACHE_DIR")
     folder = tmp_path_factory.mktemp("kernels")
     os.environ["CE_GYM_CACHE_DIR"] = str(folder)
