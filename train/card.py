@@ -165,7 +165,7 @@ def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:
     for level, figures in result["levels"].items():
         own = " (trained)" if level == record["transmission"] else ""
         rows.append([f"`{level}`{own}", *(f"{figures[key]:{form}}" for key, form in (*keys, ("reward", ".2f")))])
-    count, length = figures["episodes"], record["contract"]["control_dt"]
+    count, length = figures["episodes"], record["policy_spec"]["control_dt"]
     errors = f"Mean absolute errors over every step of {count} episodes of the mean action; a step is {length:g} s."
     return f"{markdown(rows)}\n\n{errors} Seed {result['seed']}: the first 32 bits of the SHA-256 of the weights."
 
@@ -215,10 +215,10 @@ def short_name(record: dict[str, Any]) -> str:
         PolicyError: If the record says nothing that can be the name of a folder.
     """
     name = "_".join(
-        str(x) for x in (*(record["contract"].get(key) for key in ("robot", "task")), record["transmission"])
+        str(x) for x in (*(record["policy_spec"].get(key) for key in ("robot", "task")), record["transmission"])
     )
     if not re.fullmatch(r"[\w-]+", name):
-        raise PolicyError(f"contract: robot, task and level {name!r}; expected letters, digits, _ and - only")
+        raise PolicyError(f"policy_spec: robot, task and level {name!r}; expected letters, digits, _ and - only")
     return name
 
 

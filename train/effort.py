@@ -151,11 +151,11 @@ def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: i
         name is in peak_torque_at and peak_power_at; None where limits are unknown. motors: the same for each motor in
         N m and W. An empty dictionary if the environment does not say how its control step is cut.
     """
-    contract = policy.record["contract"]
-    if "physics_dt" not in contract:
+    spec = policy.record["policy_spec"]
+    if "physics_dt" not in spec:
         return {}
-    dt = contract["physics_dt"]
-    hold, history = round(contract["control_dt"] / dt), contract["observation"]["history"]
+    dt = spec["physics_dt"]
+    hold, history = round(spec["control_dt"] / dt), spec["observation"]["history"]
     kwargs = {k: x for k, x in kwargs.items() if k not in ("critic", "obs_mode")}
     kwargs |= {"n_substeps": 1, "latency": (0, 0), "history": 1, "max_episode_steps": 10**9}
     envs = make_sb3_vec_env(policy.record["env"], episodes, seed, **kwargs)
@@ -166,7 +166,7 @@ def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: i
         sums = Sums(0, 0.0, *(np.zeros(n) for _ in range(5)))
         frame: Any = envs.reset()
         seen, running = np.tile(frame, history), np.ones(episodes, bool)
-        for _ in range(round(seconds / contract["control_dt"])):
+        for _ in range(round(seconds / spec["control_dt"])):
             action, _ = policy.predict(seen)
             for _ in range(hold):
                 before = native.batch.rows("q")[:, :2]

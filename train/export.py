@@ -1,9 +1,9 @@
 """Write a trained policy as ONNX, with all that somebody must know to run it elsewhere.
 
 The network takes observations `obs` (n, n_obs) and returns clipped mean actions `actions` (n, n_actions). The metadata
-of the file holds the record of the policy, and in it the contract: joint order, default pose, what an action means,
-what an observation is made of, gains, time steps, robot, task and transmission level; the contract also lies beside the
-file as JSON. Only weights are read from the policy, no pickled code is run. No name of a robot or task here.
+of the file holds the record of the policy with its specification: joint order, default pose, meaning of actions,
+blocks of an observation, gains, time steps, robot, task and transmission level. The specification is also written
+beside the file as JSON. Only weights are read from the policy; no pickled code is run. No robot or task is named here.
 
     python train/export.py runs/mini_cheetah_velocity/policy.zip policy.onnx
 """
@@ -50,27 +50,27 @@ def to_onnx(actor: Actor, record: dict[str, Any]) -> onnx.ModelProto:
 
 
 def add_record(model: onnx.ModelProto, record: dict[str, Any]) -> None:
-    """Put the record of a policy into a model's metadata, and its contract once more, entry by entry."""
-    entries = {RECORD_KEY: record, **record["contract"]}
+    """Put the record of a policy into a model's metadata, and its specification once more, entry by entry."""
+    entries = {RECORD_KEY: record, **record["policy_spec"]}
     helper.set_model_props(model, {k: x if isinstance(x, str) else json.dumps(x) for k, x in entries.items()})
 
 
 def write(model: onnx.ModelProto, record: dict[str, Any], out: Path) -> None:
-    """Write `out` and the contract beside it as JSON.
+    """Write `out` and the policy's specification beside it as JSON.
 
     Raises:
         PolicyError: If that cannot be done.
     """
     try:
         onnx.save(model, out)
-        out.with_suffix(".json").write_text(json.dumps(record["contract"], indent=2) + "\n", encoding="utf-8")
+        out.with_suffix(".json").write_text(json.dumps(record["policy_spec"], indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise PolicyError(f"{out}: cannot be written: {error.strerror}") from None
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = Parser(description="Write a trained policy as ONNX with its contract.")
+    parser = Parser(description="Write a trained policy as ONNX with its specification.")
     parser.add_argument("policy", type=Path, help="policy.zip written by train/ppo.py (its policy.json lies beside it)")
     parser.add_argument(
         "out", type=Path, nargs="?", help="ONNX file to write (default: exported.onnx beside the policy)"

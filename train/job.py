@@ -90,7 +90,7 @@ def make_record(job: Job, native: Any, steps: int, seconds: float, packages: tup
         "observation_size": observation[0] if observation else 0,
         "action_size": action[0] if action else 0,
         "activation": job.settings.activation,
-        "contract": native.contract(),
+        "policy_spec": native.policy_spec(),
         "steps": steps,
         "seed": job.seed,
         "resumed_from": str(job.resume) if job.resume else None,

@@ -50,13 +50,13 @@ def push_envelope(
         envelope: for each direction, the largest speed up to which at least `SAFE` survive every push [m/s], None if
         not even the smallest.
     """
-    contract = policy.record["contract"]
-    dt = contract["control_dt"]
+    spec = policy.record["policy_spec"]
+    dt = spec["control_dt"]
     angles = np.arange(directions) * 360.0 / directions
     angle, speed, repeat = (x.ravel() for x in np.meshgrid(angles, speeds, np.arange(repeats), indexing="ij"))
     when = np.round((SETTLE + SPREAD * repeat / repeats) / dt).astype(int)
     push = speed[:, None] * np.stack([np.cos(np.radians(angle)), np.sin(np.radians(angle))], axis=1)
-    command = [contract["command"]["range"][0][1] / 2, 0.0, 0.0]
+    command = [spec["command"]["range"][0][1] / 2, 0.0, 0.0]
     still = {"push_period": 0.0, "command_period": 1e6, "heading": False, "max_episode_steps": 10**9}
     envs = make_sb3_vec_env(policy.record["env"], len(angle), seed, **{**kwargs, **still})
     try:

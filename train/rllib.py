@@ -3,8 +3,8 @@
 
 Needs the extra `ray` in an environment of its own, see docs/rllib.md. Settings come from the same files as those of
 train/ppo.py; `num_envs` counts the environments of all processes together. The policy is written as `policy.onnx` with
-its contract, which evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read. Uses public names of ce_gym
-only, and no name of a robot or task. (Ray is not installed where types are checked, hence the line above.)
+its specification, which evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read. Uses public names of
+ce_gym only, and no name of a robot or task. (Ray is not installed where types are checked, hence the line above.)
 
     python train/rllib.py --env ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --minutes 1
 """
@@ -188,7 +188,7 @@ def _record(native: Any, env_id: str, kwargs: dict[str, Any], s: Settings, steps
         "observation_size": native.single_observation_space.shape[0],
         "action_size": native.single_action_space.shape[0],
         "activation": s.activation,
-        "contract": native.contract(),
+        "policy_spec": native.policy_spec(),
         "settings": s.as_dict(),
         "steps": steps,
     }

@@ -1,8 +1,8 @@
 """Train a policy with rsl_rl's PPO: any registered environment, from the same settings files as train/ppo.py.
 
 Writes rsl_rl's own checkpoints and TensorBoard logs into the output folder, and the policy as `policy.onnx` with its
-contract, which evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read. Needs the extra `rsl-rl`. Uses
-public names of ce_gym only, and no name of a robot or task.
+specification, which evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read. Needs the extra `rsl-rl`.
+Uses public names of ce_gym only, and no name of a robot or task.
 
     python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --steps 6e6
     python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --critic contact_forces base_height
@@ -89,7 +89,7 @@ def record_of(envs: RslRlVecEnv, env_id: str, env_kwargs: dict[str, Any], settin
         "observation_size": envs.get_observations()["policy"].shape[-1],
         "action_size": envs.num_actions,
         "activation": settings.activation,
-        "contract": native.contract(),
+        "policy_spec": native.policy_spec(),
         "settings": settings.as_dict(),
     }
 

@@ -92,11 +92,11 @@ class MujocoWorld:
     def __init__(self, native: Any, obs: Any, level: str) -> None:
         from ce_gym.export.mujoco_twin import MujocoTwin
 
-        self.native, self.contract = native, native.contract()
-        action = self.contract["action"]
+        self.native, self.policy_spec = native, native.policy_spec()
+        action = self.policy_spec["action"]
         if action["kind"] != "joint_pd":
             raise PolicyError(f"actions={action['kind']!r}; expected 'joint_pd': MuJoCo has position control here")
-        joints = self.contract["joints"]
+        joints = self.policy_spec["joints"]
         self.moved, self.scale = [joints.index(name) for name in action["joints"]], np.array(action["scale"])
         state = native.state()
         self.twin = MujocoTwin(native.model.robot, level, len(state["q"]))
@@ -107,9 +107,9 @@ class MujocoWorld:
     def step(self, action: NDArray, command: NDArray) -> tuple[Any, NDArray, NDArray]:
         """Step MuJoCo and look; see `World`."""
         action = np.clip(action, -1.0, 1.0)
-        target = np.tile(self.contract["default_pose"], (len(action), 1))
+        target = np.tile(self.policy_spec["default_pose"], (len(action), 1))
         target[:, self.moved] += self.scale * action
-        self.twin.step(target, self.contract["control_dt"])
+        self.twin.step(target, self.policy_spec["control_dt"])
         self.clock += 1
         q, v = self.twin.state()
         clock = np.full((len(q), 1), self.clock)
@@ -132,12 +132,12 @@ class Course:
     control_dt: float
 
 
-def course(contract: dict[str, Any], first: NDArray, seconds: float, every: float, seed: int) -> Course:
+def course(policy_spec: dict[str, Any], first: NDArray, seconds: float, every: float, seed: int) -> Course:
     """Draw commands from the task's range, new ones `every` so many seconds; the first are given, shape (n, 3)."""
-    dt, rng = contract["control_dt"], np.random.default_rng(seed)
+    dt, rng = policy_spec["control_dt"], np.random.default_rng(seed)
     steps = round(seconds / dt)
     period = min(max(round(min(every, seconds + dt) / dt), 1), steps + 1)
-    low, high = np.array(contract["command"]["range"]).T
+    low, high = np.array(policy_spec["command"]["range"]).T
     drawn = [first]
     for _ in range(steps // period):
         standing = rng.random((len(first), 1)) < STANDING_FRACTION
@@ -233,12 +233,12 @@ def _environment(
     record: dict[str, Any], level: str, n: int, seconds: float, every: float, seed: int
 ) -> tuple[SB3VecEnv, Any, Course]:
     """An environment just reset, its observations, and what is commanded; the same for every level."""
-    clear = {block["name"]: 0.0 for block in record["contract"]["observation"]["blocks"]}
+    clear = {block["name"]: 0.0 for block in record["policy_spec"]["observation"]["blocks"]}
     kwargs = {**env_kwargs(record, level), **STEADY, "noise": clear, "max_episode_steps": 10**9}
     envs = make_sb3_vec_env(record["env"], n, seed, **kwargs)
     obs = envs.reset()
     native: Any = envs.envs.unwrapped
-    return envs, obs, course(native.contract(), native.state()["command"], seconds, every, seed)
+    return envs, obs, course(native.policy_spec(), native.state()["command"], seconds, every, seed)
 
 
 def table(result: dict[str, Any]) -> str:

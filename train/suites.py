@@ -98,7 +98,7 @@ def judge_suites(policy: Policy, episodes: int, seed: int, **kwargs: Any) -> dic
     Raises:
         PolicyError: If the task of the policy has no commands.
     """
-    ranges = policy.record["contract"].get("command", {}).get("range")
+    ranges = policy.record["policy_spec"].get("command", {}).get("range")
     if ranges is None:
         raise PolicyError(f"suites: {policy.record['env']} has no commanded velocities; expected a task with them")
     still = {"push_period": 0.0, "command_period": 1e6, "heading": False}

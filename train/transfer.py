@@ -193,7 +193,7 @@ def judge(
 
 def _task(record: dict[str, Any]) -> tuple[Any, ...]:
     """What policies that are compared have in common; ids of one task may name different levels."""
-    return tuple(record["contract"].get(key, record["env"]) for key in ("robot", "task"))
+    return tuple(record["policy_spec"].get(key, record["env"]) for key in ("robot", "task"))
 
 
 def write_report(result: dict[str, Any], folder: Path) -> list[Path]:

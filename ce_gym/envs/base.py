@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from ce_gym.compile import CriticalSection
 from ce_gym.envs.differentiable import DifferentiableEnv
-from ce_gym.envs.policy_spec import contract
+from ce_gym.envs.policy_spec import policy_spec
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
@@ -143,9 +144,14 @@ class BaseEnv(EzPickle):
         """Length of each observation block, in order."""
         return self.batch.program.observation_sizes
 
+    def policy_spec(self) -> dict[str, Any]:
+        """Return what is needed to run a policy of this environment elsewhere; see `ce_gym.envs.policy_spec`."""
+        return policy_spec(self.batch.program, self.task)
+
     def contract(self) -> dict[str, Any]:
-        """What somebody must know to run a policy of this environment elsewhere; see `ce_gym.envs.policy_spec`."""
-        return contract(self.batch.program, self.task)
+        """The former name of `policy_spec`."""
+        warnings.warn("contract() is called policy_spec() now", DeprecationWarning, stacklevel=2)
+        return self.policy_spec()
 
     @cached_property
     def symmetry(self) -> Symmetry | None:

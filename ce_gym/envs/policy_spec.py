@@ -1,4 +1,4 @@
-"""The contract of a policy: all that somebody must know to run it on another simulator or on a robot.
+"""The specification of a policy: all that somebody must know to run it on another simulator or on a robot.
 
 Plain data, so that it can be written beside a policy or into its file. Nothing is said here that is written elsewhere:
 where the numbers of an observation come from is read off the traced terms.
@@ -17,7 +17,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
 
-FORMAT = "ce_gym policy contract, version 1"
+FORMAT = "ce_gym policy specification, version 1"
 
 MEANINGS = {
     "joint_pd": "joint target [rad] = default_pose + scale * clip(action, -1, 1); torque = kp * (target - position) "
@@ -39,8 +39,8 @@ COORDINATES = {
 """What an observation is made of, by the name that its blocks use."""
 
 
-def contract(program: TaskProgram, task: str) -> dict[str, Any]:
-    """Return the contract of policies for a task on a robot.
+def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
+    """Return the specification of policies for a task on a robot.
 
     Args:
         program: The task on the robot.

@@ -51,7 +51,7 @@ class Policy:
 
     Attributes:
         act: Actions (n, n_actions) for observations (n, n_obs), float32; `n` may be missing.
-        record: What training wrote: `env`, `env_kwargs`, `transmission`, `contract`, seed, settings and so on.
+        record: What training wrote: `env`, `env_kwargs`, `transmission`, `policy_spec`, seed, settings and so on.
     """
 
     act: Callable[[NDArray], Array]

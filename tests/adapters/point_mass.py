@@ -1,4 +1,4 @@
-"""A toy vector environment that keeps ce_gym's contract: a point that must move at a commanded speed.
+"""A toy vector environment that has the interface of ours: a point that must move at a commanded speed.
 
 It exists so that the shells for learners and the training scripts are tested without a robot: one action is a force,
 the observation is (speed, command), the reward is one minus the squared error of speed. In a dictionary of
@@ -74,7 +74,7 @@ class PointMassVectorEnv(VectorEnv):
     def elapsed_steps(self, steps):
         self.clock[:] = steps
 
-    def contract(self):
+    def policy_spec(self):
         return {"format": "toy", "transmission": self.model.transmission, "joints": ["slider"], "control_dt": 0.02}
 
     def state(self):

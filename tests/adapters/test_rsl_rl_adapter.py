@@ -1,4 +1,4 @@
-"""The rsl_rl shell keeps the contract that its runner relies on."""
+"""The rsl_rl adapter has the interface that its runner relies on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Stable-Baselines3 shell keeps the contract that the learner relies on."""
+"""The Stable-Baselines3 adapter has the interface that the learner relies on."""
 
 import subprocess
 import sys

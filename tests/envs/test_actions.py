@@ -9,7 +9,7 @@ from tripod import TRIPOD
 
 import ce_gym  # noqa: F401 - registers the environments
 from ce_gym.envs.base import spaces
-from ce_gym.envs.policy_spec import contract
+from ce_gym.envs.policy_spec import policy_spec
 from ce_gym.envs.runtime.setup import make_program
 
 TELLO = "ce_gym/TelloVelocity-v0"
@@ -67,7 +67,7 @@ def test_a_unit_moves_the_joint_that_a_motor_drives_most():
     knee = model.joint_links.index("left-shin")
     assert moved[knee] == pytest.approx(0.2)
     assert np.abs(np.delete(moved, knee)).max() < 1e-9
-    assert "rest" in contract(program, "velocity")["action"]
+    assert "rest" in policy_spec(program, "velocity")["action"]
 
 
 @pytest.mark.parametrize("kind", KINDS)

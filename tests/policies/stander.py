@@ -18,7 +18,7 @@ BIAS = 0.05
 
 
 def record(**changes: Any) -> dict[str, Any]:
-    usual = {"env": ENV, "env_kwargs": {"transmission": "exact"}, "transmission": "exact", "contract": {}}
+    usual = {"env": ENV, "env_kwargs": {"transmission": "exact"}, "transmission": "exact", "policy_spec": {}}
     return usual | {"observation_size": 48, "action_size": 12, "activation": "ELU"} | changes
 
 

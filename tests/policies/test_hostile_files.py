@@ -133,7 +133,7 @@ def test_records_nested_without_end(tmp_path: Path) -> None:
         ({"activation": []}, r"activation: \[\]; expected text"),
         ({"observation_size": 48.0}, "observation_size: 48.0; expected a whole number"),
         ({"action_size": True}, "action_size: True; expected a whole number"),
-        ({"contract": None}, "contract: None; expected a JSON object"),
+        ({"policy_spec": None}, "policy_spec: None; expected a JSON object"),
         ({"activation": "\x1b[2J" + 999 * "x"}, r"activation: '\\x1b\[2Jxx"),
     ],
 )

@@ -74,7 +74,7 @@ def test_fresh_trains_again(demo, capsys):
 
 
 def test_the_adapter_hands_on_what_the_robot_environment_says():
-    """The real environments keep the contract that the toy environment stands for."""
+    """The real environments have the interface that the toy environment stands for."""
     envs = make_sb3_vec_env(ROBOT_ENV, 8, seed=1, max_episode_steps=5)
     obs = envs.reset()
     action = np.zeros((8, *envs.action_space.shape), np.float32)

@@ -47,8 +47,8 @@ def test_an_unknown_motor_has_no_largest_power():
 def policy(target, **kwargs):
     """Holds one action; its record is that of an environment."""
     native = make_sb3_vec_env(WALKING, 1, **kwargs).envs.unwrapped
-    size = native.contract()["observation"]["size"]
-    record = {"env": WALKING, "contract": native.contract(), "observation_size": size}
+    size = native.policy_spec()["observation"]["size"]
+    record = {"env": WALKING, "policy_spec": native.policy_spec(), "observation_size": size}
     return Policy(lambda obs: np.full((len(obs), 12), target, np.float32), record)
 
 

@@ -1,4 +1,4 @@
-"""Policies as files: ONNX acts as the learner does, the contract says what a policy sees, and no file runs code."""
+"""Policies as files: ONNX acts as the learner does, a specification says what it sees, and no file runs code."""
 
 import json
 import pickle
@@ -71,18 +71,18 @@ def test_an_asymmetric_policy_needs_no_critic_to_act(tmp_path):
     np.testing.assert_allclose(load_policy(tmp_path / "out.onnx").predict(obs["policy"])[0], expected, atol=1e-5)
 
 
-def test_the_contract_lies_in_the_file_and_beside_it(policy):
+def test_the_specification_lies_in_the_file_and_beside_it(policy):
     beside = json.loads((policy.parent / "out.json").read_text())
     entries = {entry.key: entry.value for entry in onnx.load(policy.parent / "out.onnx").metadata_props}
-    assert beside == gymnasium.make_vec(ROBOT_ENV, 1).unwrapped.contract()
+    assert beside == gymnasium.make_vec(ROBOT_ENV, 1).unwrapped.policy_spec()
     assert json.loads(entries["joints"]) == beside["joints"]
     assert json.loads(entries["observation"]) == beside["observation"]
     assert entries["transmission"] == beside["transmission"] == "exact"
     assert json.loads(entries["ce_gym_policy"])["env"] == ROBOT_ENV
 
 
-def test_the_contract_rebuilds_observations():
-    """From the contract alone, and from the environment's own terms, on states the environment has been in."""
+def test_the_specification_rebuilds_observations():
+    """From the specification alone, and from the environment's own terms, on states the environment has been in."""
     envs = gymnasium.make_vec(ROBOT_ENV, 5).unwrapped
     envs.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -91,8 +91,10 @@ def test_the_contract_rebuilds_observations():
         obs, *_ = envs.step(action)
     state = {**envs.state(), "action": action}
     np.testing.assert_array_equal(envs.look(state)[0], obs)
+    with pytest.warns(DeprecationWarning, match="policy_spec"):
+        assert envs.contract() == envs.policy_spec()
     start, found = 0, 0
-    for block in envs.contract()["observation"]["blocks"]:
+    for block in envs.policy_spec()["observation"]["blocks"]:
         rows = slice(start, start + block["size"])
         start += block["size"]
         if "of" in block:
@@ -176,9 +178,9 @@ def test_mistakes_are_one_line(tmp_path, capsys):
         error = capsys.readouterr().err.strip()
         assert words in error
         assert "\n" not in error
-    record.write_text(json.dumps({k: v for k, v in json.loads(record.read_text()).items() if k != "contract"}))
+    record.write_text(json.dumps({k: v for k, v in json.loads(record.read_text()).items() if k != "policy_spec"}))
     assert main([str(path)]) == 2
-    assert "contract: missing" in capsys.readouterr().err
+    assert "policy_spec: missing" in capsys.readouterr().err
 
 
 def test_observations_of_another_size_are_refused(policy):

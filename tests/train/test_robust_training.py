@@ -154,7 +154,7 @@ def raising(policy):
 def test_no_module_is_imported_because_a_file_names_it(run, tmp_path, capsys, monkeypatch):
     layers = ((np.zeros((1, 2), np.float32), np.zeros(1, np.float32)),)
     record = {"env": f"trap:{ID}", "env_kwargs": {}, "transmission": "exact", "observation_size": 2, "action_size": 1}
-    record |= {"activation": "Tanh", "contract": {"robot": "a", "task": "b"}, "seed": 0, "steps": 0}
+    record |= {"activation": "Tanh", "policy_spec": {"robot": "a", "task": "b"}, "seed": 0, "steps": 0}
     write_npz(Actor(layers, "Tanh"), record, tmp_path / "policy.npz")
     (tmp_path / "trap.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')")
     monkeypatch.syspath_prepend(tmp_path)
@@ -171,7 +171,7 @@ def test_no_module_is_imported_because_a_file_names_it(run, tmp_path, capsys, mo
 def test_arguments_that_an_environment_does_not_take_are_one_line(tmp_path, capsys):
     layers = ((np.zeros((12, 48), np.float32), np.zeros(12, np.float32)),)
     record = {"env": "ce_gym/MiniCheetahVelocity-v0", "env_kwargs": {"num_envs": 3}, "transmission": "exact"}
-    record |= {"observation_size": 48, "action_size": 12, "activation": "Tanh", "contract": {}}
+    record |= {"observation_size": 48, "action_size": 12, "activation": "Tanh", "policy_spec": {}}
     write_npz(Actor(layers, "Tanh"), record, tmp_path / "policy.npz")
     assert "num_envs" in one_line([str(tmp_path / "policy.npz")], capsys, evaluate_main)
 

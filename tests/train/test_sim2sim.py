@@ -76,10 +76,10 @@ def test_a_history_is_kept_newest_first():
 
 
 def test_commands_last_a_period_and_stay_in_range():
-    contract = {"control_dt": 0.02, "command": {"range": [[-1, 1], [0, 0.5], [2, 2]]}}
+    policy_spec = {"control_dt": 0.02, "command": {"range": [[-1, 1], [0, 0.5], [2, 2]]}}
     first = np.full((200, 3), 9.0)
-    assert (course(contract, first, 0.5, every=np.inf, seed=1).commands == first).all()
-    drawn = course(contract, first, 0.5, every=0.1, seed=1).commands
+    assert (course(policy_spec, first, 0.5, every=np.inf, seed=1).commands == first).all()
+    drawn = course(policy_spec, first, 0.5, every=0.1, seed=1).commands
     assert drawn.shape == (26, 200, 3)
     assert (drawn[:5] == first).all()
     assert (drawn[5:10] == drawn[5]).all()
@@ -117,7 +117,7 @@ def test_standing_robots_stand_and_tilted_ones_fall():
     state["q"][1, 3:7] = (np.cos(0.6), np.sin(0.6), 0.0, 0.0)  # rolled by 69 degrees
     assert not made.native.look({**state, "action": np.zeros((2, 12))})[1].any()
     made.twin.start(state["q"], state["v"])
-    result = play(stand, made, obs, course(made.contract, np.zeros((2, 3)), 1.0, every=1.0, seed=0))
+    result = play(stand, made, obs, course(made.policy_spec, np.zeros((2, 3)), 1.0, every=1.0, seed=0))
     assert result["falls"] == 0.5
 
 

@@ -139,7 +139,7 @@ def test_judging_leaves_curricula_out():
 def test_a_task_without_commands_has_no_suites(tmp_path, capsys):
     layers = ((np.zeros((1, 2), "f4"), np.zeros(1, "f4")),)
     record = {"env": ID, "env_kwargs": {}, "transmission": "exact", "observation_size": 2, "action_size": 1}
-    write_npz(Actor(layers, "Tanh"), record | {"activation": "Tanh", "contract": {}}, tmp_path / "policy.npz")
+    write_npz(Actor(layers, "Tanh"), record | {"activation": "Tanh", "policy_spec": {}}, tmp_path / "policy.npz")
     assert evaluate_main([str(tmp_path / "policy.npz"), "--episodes", "2", "--suites"]) == 2
     error = capsys.readouterr().err
     assert "has no commanded velocities" in error

@@ -85,7 +85,7 @@ def test_bad_command_lines_are_refused(argv):
 
 def test_policies_of_different_tasks_are_not_compared(runs, tmp_path, capsys):
     record = json.loads((runs / "none" / "seed_0" / "policy.json").read_text())
-    record["contract"] |= {"robot": "another", "task": "velocity"}
+    record["policy_spec"] |= {"robot": "another", "task": "velocity"}
     (tmp_path / "policy.json").write_text(json.dumps(record))
     (tmp_path / "policy.zip").write_bytes((runs / "none" / "seed_0" / "policy.zip").read_bytes())
     assert main([str(runs / "exact" / "seed_0"), str(tmp_path), "--episodes", "2"]) == 2
