@@ -11,7 +11,7 @@ from hopper import StandIn, make_robot, make_rollout
 from ce_gym.dynamics import Model
 from ce_gym.viewer import Rollout, ViewerError
 from ce_gym.viewer.page.charts import charts, chosen
-from ce_gym.viewer.page.scene import make_actors
+from ce_gym.viewer.page.scene import pose_rollouts
 
 FRAMES = 40
 
@@ -36,7 +36,7 @@ def rollout() -> Rollout:
 
 @pytest.fixture(scope="module")
 def found(rollout: Rollout):
-    return charts(make_actors([rollout], [Model("mini_cheetah")], max_fps=50)[0])
+    return charts(pose_rollouts([rollout], [Model("mini_cheetah")], max_fps=50)[0])
 
 
 def test_signals_are_those_of_the_frames_shown(rollout: Rollout, found) -> None:
@@ -70,7 +70,7 @@ def test_effort_is_torque_over_limit(rollout: Rollout, found) -> None:
 
 
 def test_without_torques_there_is_no_effort() -> None:
-    found = charts(make_actors([make_rollout()], [StandIn(make_robot())])[0])
+    found = charts(pose_rollouts([make_rollout()], [StandIn(make_robot())])[0])
     assert found.as_json()["effort"] == ""
     assert found.as_json()["paths"] == []
 
@@ -87,6 +87,6 @@ def test_chosen_by_name_and_by_default(rollout: Rollout, found) -> None:
 def test_torques_that_do_not_fit_are_refused(rollout: Rollout) -> None:
     from dataclasses import replace
 
-    actor = make_actors([replace(rollout, torques=rollout.torques[:, :5])], [Model("mini_cheetah")])[0]
+    run = pose_rollouts([replace(rollout, torques=rollout.torques[:, :5])], [Model("mini_cheetah")])[0]
     with pytest.raises(ViewerError, match="torques of 5 joints; the robot has 12"):
-        charts(actor)
+        charts(run)

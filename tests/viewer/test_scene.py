@@ -16,13 +16,13 @@ from ce_gym.viewer import Rollout, ViewerError
 from ce_gym.viewer.page import animation, three
 from ce_gym.viewer.page.arrows import HIDDEN
 from ce_gym.viewer.page.fallback_shapes import frame_along, rotor_discs
-from ce_gym.viewer.page.scene import ROOT, make_actors, places
-from ce_gym.viewer.page.scene import build_scene as build_scene_of_actors
+from ce_gym.viewer.page.scene import ROOT, places, pose_rollouts
+from ce_gym.viewer.page.scene import build_scene as build_scene_of_runs
 from ce_gym.viewer.rollouts.ground_patch import around
 
 
 def build_scene(rollouts: list, models: list, max_fps: float = 50.0, **options: float | None) -> list[dict]:
-    return build_scene_of_actors(make_actors(rollouts, models, max_fps), **options)
+    return build_scene_of_runs(pose_rollouts(rollouts, models, max_fps), **options)
 
 
 def clips_of(commands: list[dict]) -> dict[str, dict[str, np.ndarray]]:
@@ -154,8 +154,8 @@ def test_many_stand_in_a_square_and_start_towards_the_same_side() -> None:
     turned.q[:, 3] += 1.0
     turned.q[:, :2] += [3.0, 4.0]
     rollouts = [make_rollout(), turned] * 4 + [make_rollout()]
-    actors = make_actors(rollouts, [StandIn(make_robot())] * 9)
-    poses = [pose @ actor.start for pose, actor in zip(places(actors, 2.0), actors, strict=True)]
+    runs = pose_rollouts(rollouts, [StandIn(make_robot())] * 9)
+    poses = [pose @ run.start for pose, run in zip(places(runs, 2.0), runs, strict=True)]
     expected = [[x, y, 0.0] for x in (2.0, 0.0, -2.0) for y in (2.0, 0.0, -2.0)]
     np.testing.assert_allclose([pose[:3, 3] for pose in poses], expected, atol=1e-12)
     np.testing.assert_allclose([pose[:3, :3] for pose in poses], [np.eye(3)] * 9, atol=1e-12)
@@ -217,8 +217,8 @@ def test_ghosts_share_ground_and_neighbours_have_their_own() -> None:
     assert field["bodies"] == [f"{ROOT}/0/base", f"{ROOT}/1/base"]
     apart = fields_of(build_scene(rollouts, models))
     assert [field["bodies"] for field in apart.values()] == [[f"{ROOT}/0/base"], [f"{ROOT}/1/base"]]
-    actors = make_actors(rollouts, models)
-    assert all(field["reach"] == pytest.approx(1.5 * actors[0].radius) for field in apart.values())  # no two meet
+    runs = pose_rollouts(rollouts, models)
+    assert all(field["reach"] == pytest.approx(1.5 * runs[0].radius) for field in apart.values())  # no two meet
     mixed = fields_of(build_scene([rollouts[0], make_rollout()], models))
     flat = mixed[f"{ROOT}/ground_1"]
     assert (flat["low"], flat["step"]) == (0.0, 0.0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ce_gym.viewer.page import animation, three
 from ce_gym.viewer.page.fallback_shapes import frame_along
-from ce_gym.viewer.page.poses import Actor, smooth
+from ce_gym.viewer.page.poses import PosedRollout, smooth
 from ce_gym.viewer.page.three import Color, Command
 
 Array = NDArray[np.float64]
@@ -66,48 +66,48 @@ class Arrow:
         }
 
 
-def all_arrows(actor: Actor) -> Iterator[Arrow]:
+def all_arrows(run: PosedRollout) -> Iterator[Arrow]:
     """Yield the arrows that the rollout has figures for."""
-    yield from force_arrows(actor)
-    if actor.rollout.commands.shape[1] >= 2:
-        yield from speed_arrows(actor)
+    yield from force_arrows(run)
+    if run.rollout.commands.shape[1] >= 2:
+        yield from speed_arrows(run)
 
 
-def force_arrows(actor: Actor) -> Iterator[Arrow]:
+def force_arrows(run: PosedRollout) -> Iterator[Arrow]:
     """Yield one arrow for each contact; the robot's weight would be 1.5 times as long as its radius."""
-    robot, forces = actor.robot, actor.rollout.contact_forces[actor.frames]
+    robot, forces = run.robot, run.rollout.contact_forces[run.frames]
     weight = robot.total_mass * float(np.linalg.norm(robot.gravity)) or 1.0
     spheres = {sphere.name: sphere for sphere in robot.contacts}
     bodies = [body.name for body in robot.bodies]
-    for name, force in zip(actor.contact_names, np.moveaxis(forces, 1, 0), strict=True):
+    for name, force in zip(run.contact_names, np.moveaxis(forces, 1, 0), strict=True):
         sphere = spheres[name]
         index = bodies.index(sphere.body)
-        centre = actor.positions[:, index] + actor.rotations[:, index] @ np.array(sphere.position)
-        vector = limited(1.5 * force * actor.radius / weight, LONGEST * actor.radius)
-        path = f"{actor.path}/contact forces/{name.replace('/', '_')}"
-        yield Arrow(path, FORCE_COLOR, 0.035 * actor.radius, centre - [0.0, 0.0, sphere.radius], vector)
+        centre = run.positions[:, index] + run.rotations[:, index] @ np.array(sphere.position)
+        vector = limited(1.5 * force * run.radius / weight, LONGEST * run.radius)
+        path = f"{run.path}/contact forces/{name.replace('/', '_')}"
+        yield Arrow(path, FORCE_COLOR, 0.035 * run.radius, centre - [0.0, 0.0, sphere.radius], vector)
 
 
-def speed_arrows(actor: Actor) -> Iterator[Arrow]:
+def speed_arrows(run: PosedRollout) -> Iterator[Arrow]:
     """Yield arrows of the commanded and of the real horizontal speed, 1 m/s as long as 0.7 of the robot's radius."""
-    base, forward = actor.positions[:, 0], actor.rotations[:, 0, :, 0]
+    base, forward = run.positions[:, 0], run.rotations[:, 0, :, 0]
     yaw = np.arctan2(forward[:, 1], forward[:, 0])
-    x, y = actor.rollout.commands[actor.frames, :2].T
+    x, y = run.rollout.commands[run.frames, :2].T
     command = np.column_stack([np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y, 0 * x])
-    top = base + [0.0, 0.0, float(actor.high[2] - base[0, 2]) + 0.25 * actor.radius]
-    arrows = {"command": (COMMAND_COLOR, 0.0, command), "velocity": (VELOCITY_COLOR, 0.12, velocity(actor))}
+    top = base + [0.0, 0.0, float(run.high[2] - base[0, 2]) + 0.25 * run.radius]
+    arrows = {"command": (COMMAND_COLOR, 0.0, command), "velocity": (VELOCITY_COLOR, 0.12, velocity(run))}
     for name, (color, drop, speed) in arrows.items():
-        vector = limited(0.7 * speed * actor.radius, LONGEST * actor.radius)
-        start = top - [0.0, 0.0, drop * actor.radius]
-        yield Arrow(f"{actor.path}/{name}", color, 0.03 * actor.radius, start, vector)
+        vector = limited(0.7 * speed * run.radius, LONGEST * run.radius)
+        start = top - [0.0, 0.0, drop * run.radius]
+        yield Arrow(f"{run.path}/{name}", color, 0.03 * run.radius, start, vector)
 
 
-def velocity(actor: Actor, seconds: float = 0.2) -> Array:
+def velocity(run: PosedRollout, seconds: float = 0.2) -> Array:
     """Return the base's horizontal velocity [m/s], shape (F, 3), averaged over a step or so of walking."""
-    if len(actor.times) < 2:
-        return np.zeros((len(actor.times), 3))
-    speed = np.gradient(actor.positions[:, 0], actor.times, axis=0) * [1.0, 1.0, 0.0]
-    return smooth(speed, actor.times, seconds)
+    if len(run.times) < 2:
+        return np.zeros((len(run.times), 3))
+    speed = np.gradient(run.positions[:, 0], run.times, axis=0) * [1.0, 1.0, 0.0]
+    return smooth(speed, run.times, seconds)
 
 
 def limited(vectors: Array, longest: float) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.viewer.errors import ViewerError
-from ce_gym.viewer.page.poses import Actor
+from ce_gym.viewer.page.poses import PosedRollout
 from ce_gym.viewer.page.robot import body_paths
 
 Array = NDArray[np.float64]
@@ -55,13 +55,13 @@ def packed(values: Array) -> str:
     return base64.b64encode(values.astype("<f4").tobytes()).decode()
 
 
-def charts(actor: Actor) -> Charts:
-    """Return what can be plotted of an actor.
+def charts(run: PosedRollout) -> Charts:
+    """Return what can be plotted of a posed rollout.
 
     Raises:
         ViewerError: Torques do not fit the robot's joints.
     """
-    rollout, rows, robot = actor.rollout, actor.frames, actor.robot
+    rollout, rows, robot = run.rollout, run.frames, run.robot
     joints, torques, v = robot.independent, rollout.torques[rows], rollout.v[rows]
     if torques.shape[1] not in (0, len(joints)):
         raise ViewerError(
@@ -73,7 +73,7 @@ def charts(actor: Actor) -> Charts:
     if robot.floating and v.shape[1] >= 6:
         signals |= {name: v[:, column] for name, column in SPEEDS.items()}
         commanded |= dict(zip(SPEEDS, rollout.commands[rows].T, strict=False))
-        signals["height of the base [m]"] = actor.positions[:, 0, 2]
+        signals["height of the base [m]"] = run.positions[:, 0, 2]
     if rollout.contact_forces.shape[1]:
         signals["force from the ground [N]"] = rollout.contact_forces[rows, :, 2].sum(1)
     signals |= dict(zip(rollout.signal_names, rollout.signals[rows].T, strict=True))
@@ -84,7 +84,7 @@ def charts(actor: Actor) -> Charts:
             limit = body.joint.torque if kind == "torque" else body.joint.velocity
             signals[name] = column
             limits |= {name: limit} if np.isfinite(limit) else {}
-    paths = body_paths(robot, actor.path)
+    paths = body_paths(robot, run.path)
     largest = np.array([body.joint.torque for body in bodies])
     effort = np.abs(torques) / largest if torques.shape[1] else np.empty((len(rows), 0))
     return Charts(signals, commanded, limits, effort, tuple(paths[name] for name in joints))

@@ -15,8 +15,8 @@ from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.page import arrows, three
 from ce_gym.viewer.page.charts import charts, chosen, packed
 from ce_gym.viewer.page.lights_and_camera import HORIZON
-from ce_gym.viewer.page.poses import Actor, PosedModel
-from ce_gym.viewer.page.scene import GHOST_TINTS, ROW, build_scene, make_actors
+from ce_gym.viewer.page.poses import PosedModel, PosedRollout
+from ce_gym.viewer.page.scene import GHOST_TINTS, ROW, build_scene, pose_rollouts
 from ce_gym.viewer.rollouts.rollout import Rollout
 
 FIRST_COLOR = (0.15, 0.20, 0.27)
@@ -49,19 +49,19 @@ def page(
     rollouts = [rollouts] if isinstance(rollouts, Rollout) else list(rollouts)
     code = meshcat_code()
     max_fps = max_fps or (50.0 if len(rollouts) <= ROW else 25.0)
-    actors = make_actors(rollouts, models, max_fps)
-    commands = [base64.b64encode(three.pack(command)).decode() for command in build_scene(actors, spacing=spacing)]
+    runs = pose_rollouts(rollouts, models, max_fps)
+    commands = [base64.b64encode(three.pack(command)).decode() for command in build_scene(runs, spacing=spacing)]
     title = title or " / ".join(dict.fromkeys(Path(rollout.robot).stem for rollout in rollouts))
     return _template("player.html").substitute(
         title=html.escape(title),
-        legend=_legend(actors),
+        legend=_legend(runs),
         meshcat=code,
         ground=source("ground.js"),
         belts=source("belts.js"),
         plots=source("plots.js"),
         player=source("player.js"),
         commands=json.dumps(commands),
-        data=_data(actors, plot, ghosts=spacing == 0),
+        data=_data(runs, plot, ghosts=spacing == 0),
         frame=repr(max(rollouts[0].dt, 1.0 / max_fps)),
         horizon=three.hex_color(HORIZON),
     )
@@ -95,44 +95,44 @@ def _template(name: str) -> string.Template:
     return string.Template(source(name))
 
 
-def _data(actors: Sequence[Actor], plot: Sequence[str], *, ghosts: bool) -> str:
+def _data(runs: Sequence[PosedRollout], plot: Sequence[str], *, ghosts: bool) -> str:
     """Return what is plotted, as JSON that may stand in a script: of few robots, or nobody could tell lines apart."""
-    shown = list(actors[:ROW])
-    found = [charts(actor) for actor in shown]
+    shown = list(runs[:ROW])
+    found = [charts(run) for run in shown]
     robots = [
         {
-            "name": name_of(actor),
+            "name": name_of(run),
             "color": _css(color_of(index)),
             "ghost": ghosts and index > 0,
-            "times": packed(actor.times),
+            "times": packed(run.times),
             **one.as_json(),
         }
-        for index, (actor, one) in enumerate(zip(shown, found, strict=True))
+        for index, (run, one) in enumerate(zip(shown, found, strict=True))
     ]
     text = json.dumps({"robots": robots, "chosen": chosen(found, plot)})
     return text.replace("<", "\\u003c")  # a label must not end the script
 
 
-def name_of(actor: Actor) -> str:
-    """Return what the legend calls an actor."""
-    rollout = actor.rollout
+def name_of(run: PosedRollout) -> str:
+    """Return the name of a rollout in the legend."""
+    rollout = run.rollout
     return rollout.label or f"{Path(rollout.robot).stem}, {rollout.transmission} transmission"
 
 
 def color_of(index: int) -> three.Color:
-    """Return the colour of an actor's lines, and of itself if it is a ghost."""
+    """Return the colour of a rollout's lines, and of the robot if it is a ghost."""
     return GHOST_TINTS[(index - 1) % len(GHOST_TINTS)] if index else FIRST_COLOR
 
 
-def _legend(actors: Sequence[Actor]) -> str:
+def _legend(runs: Sequence[PosedRollout]) -> str:
     """Return list items that show and hide what they name: robots, left to right, and kinds of arrows."""
-    items = [(color_of(i), name_of(actor), [actor.path]) for i, actor in enumerate(actors[:ROW])]
-    if rest := actors[ROW:]:
-        items.append((OTHERS_COLOR, f"and {len(rest)} more", [actor.path for actor in rest]))
+    items = [(color_of(i), name_of(run), [run.path]) for i, run in enumerate(runs[:ROW])]
+    if rest := runs[ROW:]:
+        items.append((OTHERS_COLOR, f"and {len(rest)} more", [run.path for run in rest]))
     arrows_of = (
-        (arrows.FORCE_COLOR, "contact forces", "contact forces", [a for a in actors if a.contact_names]),
-        (arrows.COMMAND_COLOR, "commanded speed", "command", [a for a in actors if a.rollout.commands.shape[1] >= 2]),
-        (arrows.VELOCITY_COLOR, "actual speed", "velocity", [a for a in actors if a.rollout.commands.shape[1] >= 2]),
+        (arrows.FORCE_COLOR, "contact forces", "contact forces", [a for a in runs if a.contact_names]),
+        (arrows.COMMAND_COLOR, "commanded speed", "command", [a for a in runs if a.rollout.commands.shape[1] >= 2]),
+        (arrows.VELOCITY_COLOR, "actual speed", "velocity", [a for a in runs if a.rollout.commands.shape[1] >= 2]),
     )
     items += [(color, text, [f"{a.path}/{leaf}" for a in who]) for color, text, leaf, who in arrows_of if who]
     return "".join(

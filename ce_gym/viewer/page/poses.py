@@ -1,4 +1,4 @@
-"""An actor: one rollout with the world poses of its robot's bodies at the frames to show."""
+"""A rollout with the world poses of its robot's bodies at the frames to show."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class PosedModel(Protocol):
         ...
 
 
-class Actor:
-    """One rollout with the world poses of its robot's bodies at the frames to show.
+class PosedRollout:
+    """A rollout with the world poses of its robot's bodies at the frames to show.
 
     Attributes:
         path: Scene path of the robot's world.

@@ -15,7 +15,7 @@ from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.page import animation, arrows, three
 from ce_gym.viewer.page.lights_and_camera import camera_commands, eye, field_command, stage_commands
-from ce_gym.viewer.page.poses import Actor, PosedModel, smooth
+from ce_gym.viewer.page.poses import PosedModel, PosedRollout, smooth
 from ce_gym.viewer.page.robot import body_paths, robot_commands
 from ce_gym.viewer.page.three import Color, Command
 from ce_gym.viewer.rollouts.ground_patch import around, clear_view, reach
@@ -31,9 +31,9 @@ APART = 3.0  # distance of robots that stand apart, each on ground of its own, i
 FOLLOW_SECONDS = 0.8  # the camera averages the robots' path over this time [s]
 
 
-def make_actors(
+def pose_rollouts(
     rollouts: Sequence[Rollout], models: Sequence[PosedModel] | None = None, max_fps: float = 50.0
-) -> list[Actor]:
+) -> list[PosedRollout]:
     """Pose the robots of rollouts.
 
     Args:
@@ -51,32 +51,32 @@ def make_actors(
         built = {key: load_model(rollout) for key, rollout in known.items()}
         models = [built[rollout.robot, rollout.transmission] for rollout in rollouts]
     pairs = zip(rollouts, models, strict=True)
-    return [Actor(rollout, model, f"{ROOT}/{index}", max_fps) for index, (rollout, model) in enumerate(pairs)]
+    return [PosedRollout(rollout, model, f"{ROOT}/{index}", max_fps) for index, (rollout, model) in enumerate(pairs)]
 
 
-def build_scene(actors: Sequence[Actor], *, spacing: float | None = None) -> list[Command]:
-    """Return the commands that show actors, the animation last.
+def build_scene(runs: Sequence[PosedRollout], *, spacing: float | None = None) -> list[Command]:
+    """Return the commands that show posed rollouts, the animation last.
 
     Args:
-        actors: At least one.
+        runs: At least one.
         spacing: Distance between neighbours [m]; zero draws all but the first as ghosts in the same place. By default
             neighbours keep clear of each other. Robots that stand apart all start towards the same side, x.
     """
     if spacing is None:
-        spacing = (1.6 if _all_flat(actors) else APART) * max(actor.radius for actor in actors)
-    poses = places(actors, spacing)
-    end = max(max(actor.times[-1], actor.rollout.dt) for actor in actors)
-    commands = [*_stage(actors, poses), *_fields(actors, poses, spacing)]
-    clips = [_follow(actors, poses, end)]
-    for index, actor in enumerate(actors):
+        spacing = (1.6 if _all_flat(runs) else APART) * max(run.radius for run in runs)
+    poses = places(runs, spacing)
+    end = max(max(run.times[-1], run.rollout.dt) for run in runs)
+    commands = [*_stage(runs, poses), *_fields(runs, poses, spacing)]
+    clips = [_follow(runs, poses, end)]
+    for index, run in enumerate(runs):
         ghost = index > 0 and spacing == 0
         tint = GHOST_TINTS[(index - 1) % len(GHOST_TINTS)] if ghost else None
-        commands += robot_commands(actor.robot, actor.path, tint=tint, opacity=GHOST_OPACITY if ghost else 1.0)
-        commands.append(three.set_transform(actor.path, poses[index]))
-        clips += actor.clips(end)
-        for arrow in () if ghost else arrows.all_arrows(actor):
+        commands += robot_commands(run.robot, run.path, tint=tint, opacity=GHOST_OPACITY if ghost else 1.0)
+        commands.append(three.set_transform(run.path, poses[index]))
+        clips += run.clips(end)
+        for arrow in () if ghost else arrows.all_arrows(run):
             commands += arrow.commands()
-            clips.append(animation.moving(arrow.path, actor.times, end, arrow.values()))
+            clips.append(animation.moving(arrow.path, run.times, end, arrow.values()))
     return [*commands, animation.set_animation(clips)]
 
 
@@ -87,69 +87,69 @@ def load_model(rollout: Rollout) -> PosedModel:
     return Model(rollout.robot, transmission=rollout.transmission)
 
 
-def places(actors: Sequence[Actor], spacing: float) -> list[Array]:
-    """Return where the world of each actor is put, shape (4, 4); ghosts share that of the first."""
-    count = len(actors)
+def places(runs: Sequence[PosedRollout], spacing: float) -> list[Array]:
+    """Return the pose of each rollout's world in the scene, shape (4, 4); ghosts share that of the first."""
+    count = len(runs)
     if spacing == 0:
-        return [np.linalg.inv(actors[0].start).astype(np.float64)] * count
+        return [np.linalg.inv(runs[0].start).astype(np.float64)] * count
     columns = count if count <= ROW else int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     result = []
-    for index, actor in enumerate(actors):
+    for index, run in enumerate(runs):
         row, column = divmod(index, columns)
         place = [spacing * ((rows - 1) / 2 - row), spacing * ((columns - 1) / 2 - column), 0.0]
-        result.append(three.transform(place) @ np.linalg.inv(actor.start))
+        result.append(three.transform(place) @ np.linalg.inv(run.start))
     return result
 
 
-def _stage(actors: Sequence[Actor], poses: Sequence[Array]) -> Iterator[Command]:
-    paths = [_moved(actor.positions[..., :2].reshape(-1, 2), pose) for actor, pose in zip(actors, poses, strict=True)]
-    starts = np.array([_moved(actor.middle[:1], pose)[0] for actor, pose in zip(actors, poses, strict=True)])
-    radius = max(actor.radius for actor in actors) + float(np.linalg.norm(np.ptp(starts, 0))) / 2
+def _stage(runs: Sequence[PosedRollout], poses: Sequence[Array]) -> Iterator[Command]:
+    paths = [_moved(run.positions[..., :2].reshape(-1, 2), pose) for run, pose in zip(runs, poses, strict=True)]
+    starts = np.array([_moved(run.middle[:1], pose)[0] for run, pose in zip(runs, poses, strict=True)])
+    radius = max(run.radius for run in runs) + float(np.linalg.norm(np.ptp(starts, 0))) / 2
     corners = np.concatenate(paths)
-    flat, height = _all_flat(actors), _height(actors)
+    flat, height = _all_flat(runs), _height(runs)
     yield from stage_commands(corners.min(0), corners.max(0), root=ROOT, radius=radius, flat=flat)
     yield three.set_transform(ROOT, three.transform([0.0, 0.0, -height]))
     place = eye(radius)
-    if len(actors) == 1 or np.ptp(starts, 0).max() == 0:
-        place[2] = _sight(actors[0], height, radius, place)
+    if len(runs) == 1 or np.ptp(starts, 0).max() == 0:
+        place[2] = _sight(runs[0], height, radius, place)
     yield from camera_commands(place)
 
 
-def _sight(actor: Actor, height: float, radius: float, place: Array) -> float:
+def _sight(run: PosedRollout, height: float, radius: float, place: Array) -> float:
     """Return how high the camera must be for the ground never to come between it and the robot [m]."""
-    ground, frames, turn = actor.rollout.ground, slice(None, None, 10), actor.start[:3, :3]
-    targets = np.column_stack([actor.middle, actor.levels + height])[frames]
+    ground, frames, turn = run.rollout.ground, slice(None, None, 10), run.start[:3, :3]
+    targets = np.column_stack([run.middle, run.levels + height])[frames]
     return max(float(clear_view(ground, at, at + turn @ place, radius / 4)[2] - at[2]) for at in targets)
 
 
-def _all_flat(actors: Sequence[Actor]) -> bool:
-    return all(actor.rollout.ground is None for actor in actors)
+def _all_flat(runs: Sequence[PosedRollout]) -> bool:
+    return all(run.rollout.ground is None for run in runs)
 
 
-def _fields(actors: Sequence[Actor], poses: Sequence[Array], spacing: float) -> Iterator[Command]:
+def _fields(runs: Sequence[PosedRollout], poses: Sequence[Array], spacing: float) -> Iterator[Command]:
     """Draw the ground where it is not flat: one piece for ghosts, else a disc that goes along with each robot."""
-    if _all_flat(actors):
+    if _all_flat(runs):
         return
-    bases = [body_paths(actor.robot, actor.path)[actor.robot.bodies[0].name] for actor in actors]
-    grounds = [actor.rollout.ground or around(Terrain.flat(), actor.middle) for actor in actors]
-    if len(actors) > 1 and spacing > 0:
-        for index, actor in enumerate(actors):
-            far = min(spacing / 2, reach(grounds[index], actor.middle))
-            piece = around(grounds[index], actor.middle, far)
+    bases = [body_paths(run.robot, run.path)[run.robot.bodies[0].name] for run in runs]
+    grounds = [run.rollout.ground or around(Terrain.flat(), run.middle) for run in runs]
+    if len(runs) > 1 and spacing > 0:
+        for index, run in enumerate(runs):
+            far = min(spacing / 2, reach(grounds[index], run.middle))
+            piece = around(grounds[index], run.middle, far)
             yield field_command(f"{ROOT}/ground_{index}", piece, [bases[index]], far, fading=0.8)
             yield three.set_transform(f"{ROOT}/ground_{index}", poses[index])
         return
-    everywhere = np.concatenate([actor.middle for actor in actors])
+    everywhere = np.concatenate([run.middle for run in runs])
     widest = max(grounds, key=lambda ground: reach(ground, everywhere))
-    yield field_command(f"{ROOT}/ground", widest, bases, reach(widest, actors[0].middle))
+    yield field_command(f"{ROOT}/ground", widest, bases, reach(widest, runs[0].middle))
     yield three.set_transform(f"{ROOT}/ground", poses[0])
 
 
-def _height(actors: Sequence[Actor]) -> float:
+def _height(runs: Sequence[PosedRollout]) -> float:
     """Return the height of the middle of the robots above the ground where they start [m]; the camera looks there."""
-    low = min(actor.low[2] - actor.levels[0] for actor in actors)
-    return float(low + max(actor.high[2] - actor.levels[0] for actor in actors)) / 2
+    low = min(run.low[2] - run.levels[0] for run in runs)
+    return float(low + max(run.high[2] - run.levels[0] for run in runs)) / 2
 
 
 def _moved(points: Array, pose: Array) -> Array:
@@ -157,14 +157,14 @@ def _moved(points: Array, pose: Array) -> Array:
     return points @ pose[:2, :2].T + pose[:2, 3]
 
 
-def _follow(actors: Sequence[Actor], poses: Sequence[Array], end: float) -> Command:
+def _follow(runs: Sequence[PosedRollout], poses: Sequence[Array], end: float) -> Command:
     """Move the world against the mean path of the robots' middles, so that they stay before the camera."""
-    times = max((actor.times for actor in actors), key=len)
-    middles = [_moved(actor.middle, pose) for actor, pose in zip(actors, poses, strict=True)]
-    levels = [actor.levels + pose[2, 3] for actor, pose in zip(actors, poses, strict=True)]
+    times = max((run.times for run in runs), key=len)
+    middles = [_moved(run.middle, pose) for run, pose in zip(runs, poses, strict=True)]
+    levels = [run.levels + pose[2, 3] for run, pose in zip(runs, poses, strict=True)]
     paths = [
-        [np.interp(times, actor.times, values) for values in (*middle.T, height)]
-        for actor, middle, height in zip(actors, middles, levels, strict=True)
+        [np.interp(times, run.times, values) for values in (*middle.T, height)]
+        for run, middle, height in zip(runs, middles, levels, strict=True)
     ]
     centre = smooth(np.mean(paths, 0).T, times, FOLLOW_SECONDS)
-    return animation.moving(ROOT, times, end, {"position": -centre - [0.0, 0.0, _height(actors)]})
+    return animation.moving(ROOT, times, end, {"position": -centre - [0.0, 0.0, _height(runs)]})
