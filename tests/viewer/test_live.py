@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from ce_gym.viewer import Rollout, ViewerError
-from ce_gym.viewer.live.messages import WISHES, parsed, wish_of
+from ce_gym.viewer.live.messages import REQUESTS, parsed, request_of
 from ce_gym.viewer.live.pull import FREQUENCY, GRAVITY, MOST, force_responses, point_velocity, pulled
 from ce_gym.viewer.live.robot import LiveRobot
+from ce_gym.viewer.live.runner import Runner
 from ce_gym.viewer.live.session import DROP, THROW, Session
 from ce_gym.viewer.live.setup import Setup, named
-from ce_gym.viewer.live.stage import Stage
 
 POLICY = "mini_cheetah_velocity"
 
@@ -34,7 +34,7 @@ def session(robot: LiveRobot) -> Session:
 
 
 def ask(session: Session, **message: Any) -> None:
-    wish_of(message)(session)
+    request_of(message)(session)
 
 
 def test_it_goes_where_it_is_driven(session: Session):
@@ -202,7 +202,7 @@ def test_friction_and_load_are_those_of_the_physics(session: Session):
 )  # fmt: skip
 def test_messages_that_make_no_sense_are_refused_in_one_line(message: dict[str, Any]):
     with pytest.raises(ValueError, match=r"expected|missing") as refused:
-        wish_of(message)
+        request_of(message)
     assert "\n" not in str(refused.value)
 
 
@@ -214,7 +214,7 @@ def test_bodies_that_are_no_message_are_refused(body: bytes):
 
 def test_every_wish_can_be_asked_for_by_the_page():
     script = Path(__file__).parents[2].joinpath("ce_gym/viewer/live/live.js").read_text()
-    for name in WISHES:
+    for name in REQUESTS:
         assert f'do: "{name}"' in script or f'"{name}"' in script, name
 
 
@@ -228,55 +228,55 @@ def test_setups_say_what_is_wrong():
 
 
 @pytest.fixture(scope="module")
-def stage(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    with closing(Stage(Setup(policy=POLICY), tmp_path_factory.mktemp("live"))) as stage:
-        yield stage
+def runner(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with closing(Runner(Setup(policy=POLICY), tmp_path_factory.mktemp("live"))) as runner:
+        yield runner
 
 
-def settle(stage: Stage) -> None:
-    """Do what the thread of the stage does, until what is done beside it is done."""
-    stage._answer()
-    if stage._making:
-        stage._making.exception()
-        stage._answer()
+def settle(runner: Runner) -> None:
+    """Do what the thread of the runner does, until what is done beside it is done."""
+    runner._answer()
+    if runner._making:
+        runner._making.exception()
+        runner._answer()
 
 
-def test_a_choice_goes_on_from_where_the_robot_is(stage: Stage):
-    stage.receive(b'{"do": "drive", "shares": [0, 0, 1]}')
-    settle(stage)
-    stage.session.advance(1.0)
-    before = stage.session.robots[0].state()
-    stage.receive(json.dumps({"do": "choose", "policy": ""}).encode())
-    settle(stage)
-    assert all(np.array_equal(a, b) for a, b in zip(stage.session.robots[0].state(), before, strict=True))
-    assert stage.state()["setup"]["policy"] == ""
-    stage.receive(json.dumps({"do": "choose", "ghost": "exact"}).encode())
-    settle(stage)
-    stage.session.advance(0.5)
-    poses = stage.session.poses()
+def test_a_choice_goes_on_from_where_the_robot_is(runner: Runner):
+    runner.receive(b'{"do": "drive", "shares": [0, 0, 1]}')
+    settle(runner)
+    runner.session.advance(1.0)
+    before = runner.session.robots[0].state()
+    runner.receive(json.dumps({"do": "choose", "policy": ""}).encode())
+    settle(runner)
+    assert all(np.array_equal(a, b) for a, b in zip(runner.session.robots[0].state(), before, strict=True))
+    assert runner.state()["setup"]["policy"] == ""
+    runner.receive(json.dumps({"do": "choose", "ghost": "exact"}).encode())
+    settle(runner)
+    runner.session.advance(0.5)
+    poses = runner.session.poses()
     assert np.array_equal(poses[0], poses[1])  # a ghost on the same level does the same
-    assert set(stage.scene.moves([r.model for r in stage.session.robots], poses)) >= {"/world", "/stage"}
+    assert set(runner.scene.moves([r.model for r in runner.session.robots], poses)) >= {"/world", "/surroundings"}
 
 
-def test_a_choice_that_fails_leaves_what_is_there(stage: Stage):
+def test_a_choice_that_fails_leaves_what_is_there(runner: Runner):
     for message in ({"policy": "../secret"}, {"terrain": "lava"}, {"shape": "x"}):
         with pytest.raises(ValueError, match="expected one of"):
-            stage.receive(json.dumps({"do": "choose", **message}).encode())
-    robots = stage.session.robots
-    stage._make({"policy": "no such policy"})
-    settle(stage)
-    assert stage.session.robots is robots
-    assert "no such policy" in stage.state()["notice"]
+            runner.receive(json.dumps({"do": "choose", **message}).encode())
+    robots = runner.session.robots
+    runner._make({"policy": "no such policy"})
+    settle(runner)
+    assert runner.session.robots is robots
+    assert "no such policy" in runner.state()["notice"]
 
 
-def test_what_is_recorded_becomes_a_page_and_rollouts(stage: Stage):
-    stage.receive(b'{"do": "record", "on": true}')
-    settle(stage)
-    stage.session.advance(0.5)
-    stage.receive(b'{"do": "record", "on": false}')
-    settle(stage)
-    stage._beside.submit(lambda: None).result()
-    page = Path(stage.state()["notice"].removeprefix("written: "))
+def test_what_is_recorded_becomes_a_page_and_rollouts(runner: Runner):
+    runner.receive(b'{"do": "record", "on": true}')
+    settle(runner)
+    runner.session.advance(0.5)
+    runner.receive(b'{"do": "record", "on": false}')
+    settle(runner)
+    runner._beside.submit(lambda: None).result()
+    page = Path(runner.state()["notice"].removeprefix("written: "))
     assert "MeshCat" in page.read_text(encoding="utf-8")
     rollout = Rollout.load(page.with_name(f"{page.stem}_exact.npz"))
-    assert np.array_equal(rollout.q[-1], np.float32(stage.session.robots[0].state()[0]))
+    assert np.array_equal(rollout.q[-1], np.float32(runner.session.robots[0].state()[0]))

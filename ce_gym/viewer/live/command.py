@@ -58,11 +58,11 @@ def live(args: argparse.Namespace) -> int:
 def serving(setup: Any, folder: Path) -> Any:
     """Run a setup and serve its page; yield the address."""
     from ce_gym.viewer.live.page import live_page
-    from ce_gym.viewer.live.stage import Stage
+    from ce_gym.viewer.live.runner import Runner
     from ce_gym.viewer.server import PageServer
 
-    with contextlib.closing(Stage(setup, folder)) as stage:
-        server = PageServer(live_page(stage), stage.feed.events, stage.receive)
+    with contextlib.closing(Runner(setup, folder)) as runner:
+        server = PageServer(live_page(runner), runner.feed.events, runner.receive)
         with contextlib.closing(server):
-            stage.start()
+            runner.start()
             yield server.url

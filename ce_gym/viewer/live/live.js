@@ -64,7 +64,7 @@ function tell() {
   find("record").classList.toggle("on", state.recording);
   find("align").style.display = state.ghost ? "" : "none";
   show("/world/1", state.ghost);
-  show("/stage/ground", state.flat);
+  show("/surroundings/ground", state.flat);
   show("/world/ground", !state.flat);
   for (const name of ["policy", "transmission", "ghost", "terrain"]) {
     if (document.activeElement !== find(name) && !state.making) find(name).value = state.setup[name] || find(name).value;

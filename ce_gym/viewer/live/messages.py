@@ -12,20 +12,20 @@ from ce_gym.viewer.live.session import Session
 
 MOST_SPEED = 4.0
 
-Wish = Callable[[Session], None]
+Request = Callable[[Session], None]
 
 
-def wish_of(message: Mapping[str, Any]) -> Wish:
+def request_of(message: Mapping[str, Any]) -> Request:
     """Return what a message does to a session.
 
     Raises:
         ValueError: If it makes no sense.
     """
     name = message.get("do")
-    if not isinstance(name, str) or name not in WISHES:
-        raise ValueError(f"do={name!r}; expected one of {', '.join(WISHES)}")
+    if not isinstance(name, str) or name not in REQUESTS:
+        raise ValueError(f"do={name!r}; expected one of {', '.join(REQUESTS)}")
     try:
-        return WISHES[name](message)
+        return REQUESTS[name](message)
     except KeyError as missing:
         raise ValueError(f"do={name!r}: {missing} is missing") from None
 
@@ -69,44 +69,44 @@ def _switch(message: Mapping[str, Any]) -> bool:
     return on
 
 
-def _drive(message: Mapping[str, Any]) -> Wish:
+def _drive(message: Mapping[str, Any]) -> Request:
     shares = _vector(message, "shares")
     return lambda session: session.drive(shares)
 
 
-def _pause(message: Mapping[str, Any]) -> Wish:
+def _pause(message: Mapping[str, Any]) -> Request:
     on = _switch(message)
     return lambda session: session.pause(on)
 
 
-def _set_speed(message: Mapping[str, Any]) -> Wish:
+def _set_speed(message: Mapping[str, Any]) -> Request:
     speed = _number(message, "speed", 0.01, MOST_SPEED)
     return lambda session: setattr(session, "speed", speed)
 
 
-def _look_back(message: Mapping[str, Any]) -> Wish:
+def _look_back(message: Mapping[str, Any]) -> Request:
     seconds = _number(message, "seconds", 0.0, 1e4)
     return lambda session: session.look_back(seconds)
 
 
-def _drag(message: Mapping[str, Any]) -> Wish:
+def _drag(message: Mapping[str, Any]) -> Request:
     body, point, target = message["body"], _vector(message, "point"), _vector(message, "target")
 
-    def wish(session: Session) -> None:
+    def request(session: Session) -> None:
         if body in session.robots[0].model.body_names:
             session.drag(body, point, target)
 
-    return wish
+    return request
 
 
-def _set_figure(message: Mapping[str, Any]) -> Wish:
+def _set_figure(message: Mapping[str, Any]) -> Request:
     if (name := message["name"]) not in RANGES:
         raise ValueError(f"name={name!r}; expected one of {', '.join(RANGES)}")
     value = _number(message, "value", *RANGES[name])
     return lambda session: session.set_figures({name: value})
 
 
-WISHES: Mapping[str, Callable[[Mapping[str, Any]], Wish]] = {
+REQUESTS: Mapping[str, Callable[[Mapping[str, Any]], Request]] = {
     "drive": _drive,
     "pause": _pause,
     "speed": _set_speed,

@@ -8,8 +8,8 @@ import string
 from pathlib import Path
 
 from ce_gym.viewer.live.robot import RANGES
+from ce_gym.viewer.live.runner import Runner
 from ce_gym.viewer.live.setup import GROUNDS, LEVELS
-from ce_gym.viewer.live.stage import Stage
 from ce_gym.viewer.page import three
 from ce_gym.viewer.page.html import meshcat_code, source
 from ce_gym.viewer.page.lights_and_camera import HORIZON
@@ -17,30 +17,30 @@ from ce_gym.viewer.page.lights_and_camera import HORIZON
 _HERE = Path(__file__).parent
 
 
-def live_page(stage: Stage, title: str | None = None) -> str:
-    """Return the page of a stage.
+def live_page(runner: Runner, title: str | None = None) -> str:
+    """Return the page of a runner.
 
     Args:
-        stage: What runs.
+        runner: What runs.
         title: Heading; the robot's name by default.
 
     Raises:
         ViewerError: meshcat is not installed.
     """
-    scene = stage.scene
+    scene = runner.scene
     return string.Template((_HERE / "live.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(title or scene.robot.name),
         meshcat=meshcat_code(),
         ground=source("ground.js"),
         live=(_HERE / "live.js").read_text(encoding="utf-8"),
         commands=json.dumps(scene.commands()),
-        offer=json.dumps(_offer(stage)).replace("<", "\\u003c"),  # a name must not end the script
+        offer=json.dumps(_offer(runner)).replace("<", "\\u003c"),  # a name must not end the script
         horizon=three.hex_color(HORIZON),
     )
 
 
-def _offer(stage: Stage) -> dict[str, object]:
-    policies = [(name, Path(name).stem if Path(name).suffix else name) for name in stage.offered]
+def _offer(runner: Runner) -> dict[str, object]:
+    policies = [(name, Path(name).stem if Path(name).suffix else name) for name in runner.offered]
     levels = [(name, name) for name in LEVELS]
     choices = {
         "policy": [*policies, ("", "none: hold the pose")],
@@ -48,5 +48,5 @@ def _offer(stage: Stage) -> dict[str, object]:
         "ghost": [("", "none"), *levels],
         "terrain": [(name, name) for name in GROUNDS],
     }
-    bodies = {path: name for name, path in stage.scene.paths[0].items()}
+    bodies = {path: name for name, path in runner.scene.paths[0].items()}
     return {"choices": choices, "figures": RANGES, "bodies": bodies}

@@ -33,10 +33,10 @@ _MESHCAT_OWN = (
 )
 
 
-def stage_commands(
+def surroundings(
     low: NDArray[np.float64], high: NDArray[np.float64], *, root: str, radius: float, flat: bool = True
 ) -> Iterator[Command]:
-    """Set the stage.
+    """Return the commands that draw ground, sky and lights.
 
     Args:
         low: Smallest x and y that the robots visit [m].

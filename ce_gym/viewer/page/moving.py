@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.page import three
-from ce_gym.viewer.page.lights_and_camera import TILE, camera_commands, eye, field_command, stage_commands
+from ce_gym.viewer.page.lights_and_camera import TILE, camera_commands, eye, field_command, surroundings
 from ce_gym.viewer.page.poses import PosedModel
 from ce_gym.viewer.page.robot import body_paths, extent, robot_commands
 from ce_gym.viewer.page.scene import GHOST_OPACITY, GHOST_TINTS
@@ -19,7 +19,7 @@ from ce_gym.viewer.rollouts.ground_patch import around, level, reach
 
 Array = NDArray[np.float64]
 
-WORLD, STAGE = "/world", "/stage"
+WORLD, SURROUNDINGS = "/world", "/surroundings"
 BLOCK = 4.0  # edge of the squares of the world that share a piece of ground that is not flat [m]
 
 
@@ -55,8 +55,8 @@ class MovingScene:
     def commands(self) -> list[str]:
         """Return meshcat's commands for all that is there from the start, packed, as base64."""
         here = np.zeros(2)
-        commands = [*stage_commands(here, here, root=STAGE, radius=self._radius)]
-        commands.append(three.set_property(f"{STAGE}/ground", "visible", self._terrain is None))
+        commands = [*surroundings(here, here, root=SURROUNDINGS, radius=self._radius)]
+        commands.append(three.set_property(f"{SURROUNDINGS}/ground", "visible", self._terrain is None))
         for index in range(len(self.paths)):
             tint, opacity = (GHOST_TINTS[index - 1], GHOST_OPACITY) if index else (None, 1.0)
             commands += robot_commands(self.robot, f"{WORLD}/{index}", tint=tint, opacity=opacity)
@@ -77,7 +77,7 @@ class MovingScene:
         z = level(self._terrain, place[None], self._radius / 2)[0]
         matrices[WORLD] = three.transform([-x, -y, -self._height - z])
         # the same everywhere, so it never ends
-        matrices[STAGE] = three.transform([-(x % TILE), -(y % TILE), -self._height])
+        matrices[SURROUNDINGS] = three.transform([-(x % TILE), -(y % TILE), -self._height])
         return {path: np.round(matrix.T.ravel(), 6).tolist() for path, matrix in matrices.items()}
 
     def _body_matrices(self, model: PosedModel, q: Array, paths: dict[str, str]) -> Iterator[tuple[str, Array]]:

@@ -1,4 +1,4 @@
-"""Rollouts -> the commands of one meshcat scene: robots, arrows, stage and the animation that moves them.
+"""Rollouts -> the commands of one meshcat scene: robots, arrows, surroundings and the animation.
 
 Robots stand side by side, many of them in a square, or on top of each other as ghosts. The world moves under the camera
 so that the first thing to leave the picture is the ground, not the robot.
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.page import animation, arrows, three
-from ce_gym.viewer.page.lights_and_camera import camera_commands, eye, field_command, stage_commands
+from ce_gym.viewer.page.lights_and_camera import camera_commands, eye, field_command, surroundings
 from ce_gym.viewer.page.poses import PosedModel, PosedRollout, smooth
 from ce_gym.viewer.page.robot import body_paths, robot_commands
 from ce_gym.viewer.page.three import Color, Command
@@ -66,7 +66,7 @@ def build_scene(runs: Sequence[PosedRollout], *, spacing: float | None = None) -
         spacing = (1.6 if _all_flat(runs) else APART) * max(run.radius for run in runs)
     poses = places(runs, spacing)
     end = max(max(run.times[-1], run.rollout.dt) for run in runs)
-    commands = [*_stage(runs, poses), *_fields(runs, poses, spacing)]
+    commands = [*_surroundings(runs, poses), *_fields(runs, poses, spacing)]
     clips = [_follow(runs, poses, end)]
     for index, run in enumerate(runs):
         ghost = index > 0 and spacing == 0
@@ -102,13 +102,13 @@ def places(runs: Sequence[PosedRollout], spacing: float) -> list[Array]:
     return result
 
 
-def _stage(runs: Sequence[PosedRollout], poses: Sequence[Array]) -> Iterator[Command]:
+def _surroundings(runs: Sequence[PosedRollout], poses: Sequence[Array]) -> Iterator[Command]:
     paths = [_moved(run.positions[..., :2].reshape(-1, 2), pose) for run, pose in zip(runs, poses, strict=True)]
     starts = np.array([_moved(run.middle[:1], pose)[0] for run, pose in zip(runs, poses, strict=True)])
     radius = max(run.radius for run in runs) + float(np.linalg.norm(np.ptp(starts, 0))) / 2
     corners = np.concatenate(paths)
     flat, height = _all_flat(runs), _height(runs)
-    yield from stage_commands(corners.min(0), corners.max(0), root=ROOT, radius=radius, flat=flat)
+    yield from surroundings(corners.min(0), corners.max(0), root=ROOT, radius=radius, flat=flat)
     yield three.set_transform(ROOT, three.transform([0.0, 0.0, -height]))
     place = eye(radius)
     if len(runs) == 1 or np.ptp(starts, 0).max() == 0:

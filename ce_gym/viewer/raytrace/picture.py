@@ -31,7 +31,7 @@ CORNERS = np.array([[-0.3, 0.3], [0.3, -0.3]])  # where more rays go through a p
 CLOSE = 1e-4  # a shadow's ray starts this far off its surface [m]
 
 
-class _Stage(NamedTuple):
+class _View(NamedTuple):
     """The robot in one pose, where it is and from where it is seen."""
 
     scene: Any  # what rays are sent into
@@ -120,17 +120,17 @@ class Picture:
                 axes = _axes(eye - [0.0, 0.0, self._middle])
                 pixels = self._directions(self._pixels, axes)
             behind = self._land(pixels, eye, centre)
-        stage = _Stage(self._embree.scene(vertices, mesh.triangles), normals, on_tiles, eye.astype(np.float32), axes)
-        image = self._background(behind, stage)
-        window = self._window(vertices, stage, lowest)
+        view = _View(self._embree.scene(vertices, mesh.triangles), normals, on_tiles, eye.astype(np.float32), axes)
+        image = self._background(behind, view)
+        window = self._window(vertices, view, lowest)
         part = image[window]  # a view
-        colors, thing = self._trace(stage, pixels[window].reshape(-1, 3), behind.part(window), part.reshape(-1, 3))
+        colors, thing = self._trace(view, pixels[window].reshape(-1, 3), behind.part(window), part.reshape(-1, 3))
         part[:] = colors.reshape(part.shape)
         edges = _outline(thing.reshape(part.shape[:2]))
         if edges.any():  # more rays where neighbours differ, so that edges are smooth
             rays = self._directions((self._pixels[window][edges][:, None] + CORNERS).reshape(-1, 2), axes)
             backdrop = self._behind(rays) if self._field is None else self._land(rays, eye, centre)
-            colors, _ = self._trace(stage, rays, backdrop, self._background(backdrop, stage))
+            colors, _ = self._trace(view, rays, backdrop, self._background(backdrop, view))
             part[edges] = (part[edges] + colors.reshape(-1, len(CORNERS), 3).sum(1)) / (1 + len(CORNERS))
         return (255 * image + 0.5).astype(np.uint8)
 
@@ -190,15 +190,15 @@ class Picture:
         shapes = [(*rays.shape[:-1], *values.shape[1:]) for values in found]
         return _Backdrop(*(np.reshape(v, shape).astype(np.float32) for v, shape in zip(found, shapes, strict=True)))
 
-    def _background(self, backdrop: _Backdrop, stage: _Stage) -> Floats:
+    def _background(self, backdrop: _Backdrop, view: _View) -> Floats:
         """Return the colours of ground and sky, shape (..., 3)."""
-        x, y = backdrop.x + stage.centre[0], backdrop.y + stage.centre[1]
+        x, y = backdrop.x + view.centre[0], backdrop.y + view.centre[1]
         return backdrop.light + _dark_share(x, y, backdrop.footprint)[..., None] * backdrop.contrast
 
-    def _window(self, vertices: Array, stage: _Stage, lowest: float) -> tuple[slice, slice]:
+    def _window(self, vertices: Array, view: _View, lowest: float) -> tuple[slice, slice]:
         """Return the rows and columns that may show the robot or its shadow, on ground nowhere below `lowest` [m]."""
         onto_ground = vertices - np.maximum(vertices[:, 2:] - lowest, 0) / SUN[2] * SUN
-        seen = (np.concatenate([vertices, onto_ground]) - stage.eye) @ stage.axes.T
+        seen = (np.concatenate([vertices, onto_ground]) - view.eye) @ view.axes.T
         width, height = self._size
         if (seen[:, 2] > -1e-3).any():  # something is beside or behind the camera
             return slice(None), slice(None)
@@ -208,22 +208,22 @@ class Picture:
         return slice(top, bottom), slice(left, right)
 
     def _trace(
-        self, stage: _Stage, rays: Floats, backdrop: _Backdrop, background: Floats
+        self, view: _View, rays: Floats, backdrop: _Backdrop, background: Floats
     ) -> tuple[Floats, NDArray[np.intp]]:
         """Return what rays from the camera show, shape (n, 3), and a number for the thing they meet, shape (n,)."""
-        found = self._embree.meet(stage.scene, np.broadcast_to(stage.eye, rays.shape), rays)
+        found = self._embree.meet(view.scene, np.broadcast_to(view.eye, rays.shape), rays)
         triangle = found["primID"]
         hit = (triangle >= 0) & (found["tfar"] < backdrop.distance)
         triangle, u, v = triangle[hit], found["u"][hit, None], found["v"][hit, None]
-        a, b, c = stage.normals[self._mesh.triangles[triangle]].swapaxes(0, 1)
+        a, b, c = view.normals[self._mesh.triangles[triangle]].swapaxes(0, 1)
         normal = (1 - u - v) * a + u * b + v * c
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        surface = stage.eye + found["tfar"][hit, None] * rays[hit] + CLOSE * normal
+        surface = view.eye + found["tfar"][hit, None] * rays[hit] + CLOSE * normal
         ground = ~hit & np.isfinite(backdrop.distance)
         x, y = backdrop.x[ground] * np.float32(TILE), backdrop.y[ground] * np.float32(TILE)
         spots = np.column_stack([x, y, backdrop.height[ground] + np.float32(CLOSE)])
         starts = np.concatenate([surface, spots])
-        dark = self._embree.meets(stage.scene, starts, np.broadcast_to(SUN.astype(np.float32), starts.shape))
+        dark = self._embree.meets(view.scene, starts, np.broadcast_to(SUN.astype(np.float32), starts.shape))
         sunny, shadow = ~dark[: len(surface)], np.zeros(len(rays), bool)
         shadow[ground] = dark[len(surface) :]
         light = _light(normal, sunny)

@@ -1,4 +1,4 @@
-"""A session in real time: a thread steps it, answers the page's wishes and sends what is seen, 60 times a second.
+"""A session in real time: a thread steps it, answers the page's requests and sends what is seen, 60 times a second.
 
 Compiling another scene and writing what was recorded take seconds; they are done beside it.
 """
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ce_gym.viewer.feed import Feed
-from ce_gym.viewer.live.messages import parsed, wish_of
+from ce_gym.viewer.live.messages import parsed, request_of
 from ce_gym.viewer.live.session import Session
 from ce_gym.viewer.live.setup import GROUNDS, LEVELS, Setup, policies_for
 from ce_gym.viewer.page.moving import MovingScene
@@ -26,7 +26,7 @@ RATE = 60.0  # of what is sent [1/s]
 LATEST = 0.1  # more than this is not caught up with [s]
 
 
-class Stage:
+class Runner:
     """Runs one session until it is closed.
 
     Args:
@@ -44,7 +44,7 @@ class Stage:
         first = self.session.robots[0]
         self.offered = policies_for(first.model.robot.name, [setup.policy])
         self.scene = MovingScene(first.model, first.model.standing_q, count=2, terrain=first.terrain)
-        self.feed, self._wishes, self._notice = Feed(), queue.SimpleQueue[Callable[[Session], None]](), ""
+        self.feed, self._requests, self._notice = Feed(), queue.SimpleQueue[Callable[[Session], None]](), ""
         self._rate, self._ended = 1.0, threading.Event()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="live")
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -71,14 +71,14 @@ class Stage:
         """
         message = parsed(body)
         if message.get("do") == "choose":
-            self._wishes.put(self._choice(message))
+            self._requests.put(self._choice(message))
         elif message.get("do") == "record":
-            self._wishes.put(self._record if message.get("on") is True else self._keep)
+            self._requests.put(self._record if message.get("on") is True else self._keep)
         else:
-            self._wishes.put(wish_of(message))
+            self._requests.put(request_of(message))
 
     def _choice(self, message: dict[str, Any]) -> Callable[[Session], None]:
-        """Return the wish for another policy, level, ghost or ground."""
+        """Return the request for another policy, level, ghost or ground."""
         allowed = {"policy": ["", *self.offered], "transmission": LEVELS, "ghost": ("", *LEVELS), "terrain": GROUNDS}
         given = {name: value for name, value in message.items() if name != "do"}
         for name, value in given.items():
@@ -146,7 +146,7 @@ class Stage:
         self._take()
         with contextlib.suppress(queue.Empty):
             while True:
-                self._wishes.get_nowait()(self.session)
+                self._requests.get_nowait()(self.session)
 
     def _send(self) -> None:
         session = self.session
