@@ -1,6 +1,6 @@
-"""Zip files from strangers, read within a limit on memory and without unpickling.
+"""Untrusted zip files, read within a limit on memory and without unpickling.
 
-What a header says about sizes is not believed: a member is never unpacked beyond its stated size, that size is checked
+Sizes in headers are not trusted: a member is never unpacked beyond its stated size, that size is checked
 before anything is allocated, and an array must fill its member exactly.
 """
 

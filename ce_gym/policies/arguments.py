@@ -13,7 +13,7 @@ CHOSEN = {
     "act", "autoreset_mode", "device", "env", "env_id", "episodes", "id", "label", "model", "num_envs", "policy",
     "render_mode", "robots", "script", "seconds", "seed", "vector_kwargs", "vectorization_mode", "wrappers",
 }  # fmt: skip
-"""Arguments that whoever runs a policy chooses in other ways: neither records nor settings have them."""
+"""Arguments with options of their own on the command line; records and settings must not hold them."""
 
 DEEPEST = 20
 """Most levels of lists and mappings within a value."""
@@ -56,8 +56,8 @@ def env_argument(text: str) -> tuple[str, Any]:
     try:
         checked = checked_arguments({key.strip(): parse_yaml(value)})
     except ValueError as error:
-        told = str(error)
-        raise argparse.ArgumentTypeError(told if told.startswith(key.strip()) else f"{key.strip()}: {told}") from None
+        text = str(error)
+        raise argparse.ArgumentTypeError(text if text.startswith(key.strip()) else f"{key.strip()}: {text}") from None
     return key.strip(), checked[key.strip()]
 
 

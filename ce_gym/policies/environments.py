@@ -1,4 +1,4 @@
-"""Which environment a policy runs in, when its file comes from a stranger.
+"""The environment of a policy whose file is not trusted.
 
 Gymnasium imports `module` when an environment `module:id` is made. So an id with a module is taken from the user's own
 words only, never from a file, unless the module is imported already.

@@ -1,4 +1,4 @@
-"""What is said of policies that cannot be used, or are used elsewhere than they were trained."""
+"""Errors and warnings about policies."""
 
 from __future__ import annotations
 

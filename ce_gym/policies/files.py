@@ -59,7 +59,7 @@ def load_policy(path: str | Path, transmission: str | None = None) -> Policy:
     Args:
         path: A file; a folder that has one; or the name of a shipped policy such as "mini_cheetah_velocity_exact",
             whose level may be left out if it is exact.
-        transmission: Level that it will run on; a `LevelWarning` tells if it was trained on another.
+        transmission: Level that it will run on; a `LevelWarning` is issued if it was trained on another.
 
     Returns:
         The policy. `policy.predict(obs)[0]` is its mean action; `policy.record["env"]` names its environment.

@@ -1,4 +1,4 @@
-"""Where policies lie: in files, in folders of training runs, and among the assets. Opens none but to tell its kind."""
+"""Finds policies: files, folders of training runs, and shipped ones. Opens a file only to see what kind it is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WHERE = "a file (policy.zip, .npz or .onnx), the folder of a training run, or th
 
 
 def shelf() -> Path:
-    """Return where shipped policies lie: a folder each, named `<robot>_<task>_<level>`."""
+    """Return the folder of shipped policies, which has a folder for each, named `<robot>_<task>_<level>`."""
     return assets_folder() / "policies"
 
 
@@ -68,5 +68,5 @@ def _is_other_npz(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as arrays:
             return "record.npy" not in arrays.namelist()
-    except zipfile.BadZipFile:  # whoever reads it says so
+    except zipfile.BadZipFile:  # reading it reports that
         return False

@@ -21,7 +21,7 @@ from ce_gym.policies.archive import read_member
 
 
 def read_weights(file: Path, member: str = "policy.pth") -> dict[str, Any]:
-    """Return the arrays of a policy by name; or those of another member, in the dictionaries in which they lie.
+    """Return the arrays of a policy by name; or the content of another member.
 
     Raises:
         Exception: Of many kinds, if the file is damaged, too large, or names anything but arrays.
@@ -55,7 +55,7 @@ class _Arrays(pickle.Unpickler):
 
 
 def _rebuild(storage: NDArray, offset: int, shape: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> NDArray:
-    """Return a tensor whose numbers lie row by row."""
+    """Return a tensor stored row by row."""
     count = int(np.prod(shape))
     if stride != tuple(int(np.prod(shape[i + 1 :])) for i in range(len(shape))):
         raise pickle.UnpicklingError(f"strides {stride}; expected an array of shape {shape} stored row by row")

@@ -1,4 +1,4 @@
-"""Recorded rollouts and what shows them: one HTML file, or a page on this machine's loopback.
+"""Recorded rollouts, shown as one HTML file or as a page served on the loopback interface.
 
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0", contact_forces=True)
     rollout = record(env, lambda observation: env.action_space.sample(), seconds=5.0)

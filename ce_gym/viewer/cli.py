@@ -1,4 +1,4 @@
-"""`python -m ce_gym view` and `play`: their arguments, and what they do with them."""
+"""The commands `python -m ce_gym view` and `play`."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def play(args: argparse.Namespace) -> int:
     from ce_gym.viewer.rollouts.driving import SHOW, walk
 
     file = locate_policy(args.policy)
-    meshcat_code()  # a missing meshcat is told before all else, not after the simulation
+    meshcat_code()  # fails before the simulation if meshcat is missing
     if args.robots > 1 and len(args.transmission) > 1:
         raise ViewerError(f"--robots {args.robots}: expected 1, or one level of --transmission")
     script = [(time, (x, y, turn)) for time, x, y, turn in args.command] if args.command else SHOW

@@ -1,4 +1,4 @@
-"""How the commands of the package speak: help that reads well, mistakes in one line."""
+"""Command-line parsers: help texts keep their line breaks, errors are one line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that keeps line breaks of its texts and tells mistakes in one line."""
+    """An argument parser that keeps the line breaks of its texts and reports an error in one line."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **options)

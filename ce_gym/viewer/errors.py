@@ -1,4 +1,4 @@
-"""What the viewer says when it cannot show something."""
+"""Errors of the viewer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the browsers of a live page are sent, as server-sent events: the newest poses, and the ground around them."""
+"""Server-sent events of a live page: the newest poses and the ground around the robots."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 
 class Feed:
-    """Hands events to whoever watches; who is slow misses some.
+    """Sends events to all connected browsers; a slow one misses some.
 
     Attributes:
         closed: Whether it has ended.
@@ -20,7 +20,7 @@ class Feed:
         self.closed = False
 
     def publish(self, event: bytes) -> bool:
-        """Send an event to whoever watches; return whether anybody does."""
+        """Send an event to all connected browsers; return whether there are any."""
         with self._news:
             self._event, self._count = event, self._count + 1
             self._news.notify_all()

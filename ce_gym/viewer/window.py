@@ -1,6 +1,6 @@
-"""A live window: meshcat's page at this machine's loopback, to which poses are sent as they come.
+"""A live window: meshcat's page, served on the loopback interface, that receives each new pose.
 
-Nothing is opened and nothing waits: where no browser looks, drawing costs next to nothing.
+No browser is opened and no call waits for one; without a connected browser drawing costs almost nothing.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Window:
     Args:
         model: The robot and its forward kinematics.
         q: Positions in a typical pose, shape (nq,); they set how far the camera is away.
-        fps: Poses in a second of real time: drawing waits for it while somebody looks [1/s].
+        fps: Poses in a second of real time: drawing waits for it while a browser is connected [1/s].
         terrain: The ground, the plane z = 0 if None.
 
     Raises:

@@ -44,7 +44,7 @@ def live(args: argparse.Namespace) -> int:
     from ce_gym.viewer.live.setup import named
     from ce_gym.viewer.page.html import meshcat_code
 
-    meshcat_code()  # a missing meshcat is told before all else
+    meshcat_code()  # fails at once if meshcat is missing
     setup = named(args.name, args.env, transmission=args.transmission, ghost=args.ghost, terrain=args.terrain)
     with contextlib.suppress(KeyboardInterrupt), serving(setup, args.folder) as url:
         print(f"live at {url} (Ctrl-C to stop)", flush=True)

@@ -1,4 +1,4 @@
-"""What a page may ask of a session, as JSON: `{"do": name, ...}`. Whatever else arrives is refused in one line."""
+"""Requests of a live page, as JSON: `{"do": name, ...}`. Any other message is refused in one line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def request_of(message: Mapping[str, Any]) -> Request:
     """Return what a message does to a session.
 
     Raises:
-        ValueError: If it makes no sense.
+        ValueError: If it is not a valid request.
     """
     name = message.get("do")
     if not isinstance(name, str) or name not in REQUESTS:

@@ -18,10 +18,10 @@ _HERE = Path(__file__).parent
 
 
 def live_page(runner: Runner, title: str | None = None) -> str:
-    """Return the page of a runner.
+    """Return the live page of a runner.
 
     Args:
-        runner: What runs.
+        runner: The runner of the session.
         title: Heading; the robot's name by default.
 
     Raises:

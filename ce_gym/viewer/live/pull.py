@@ -1,4 +1,4 @@
-"""A pull on a point of a body by a damped spring, taken one control step ahead: stiff on a light foot, and stable."""
+"""A damped spring that pulls on a point of a body, integrated implicitly: stable however stiff it is."""
 
 from __future__ import annotations
 

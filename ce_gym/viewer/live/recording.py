@@ -1,4 +1,4 @@
-"""What a session records: a rollout of each robot, written as files and as one page."""
+"""A recording of a session: a rollout of each robot, written as files and as one page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One robot that walks without an end: an environment that neither commands, pushes nor resets by itself."""
+"""One robot of a live page: an environment without commands, pushes or resets of its own."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A session in real time: a thread steps it, answers the page's requests and sends what is seen, 60 times a second.
+"""A session in real time: a thread steps it, answers the page's requests and sends poses, 60 times a second.
 
-Compiling another scene and writing what was recorded take seconds; they are done beside it.
+Compiling another scene and writing a recording take seconds; another thread does that.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from ce_gym.viewer.live.setup import GROUNDS, LEVELS, Setup, policies_for
 from ce_gym.viewer.page.moving import MovingScene
 
 RATE = 60.0  # of what is sent [1/s]
-LATEST = 0.1  # more than this is not caught up with [s]
+LATEST = 0.1  # a longer delay is dropped, not caught up with [s]
 
 
 class Runner:
     """Runs one session until it is closed.
 
     Args:
-        setup: What is shown first.
+        setup: The first setup.
         folder: Where recordings are written.
 
     Attributes:
-        feed: What the page gets.
+        feed: The events that the page receives.
         offered: Policies that the page may choose: the first one, and those that ship for the robot.
     """
 
@@ -51,11 +51,11 @@ class Runner:
         self._making: Future[list[Any]] | None = None
 
     def start(self) -> None:
-        """Let time run."""
+        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """End it, and wait until it has ended."""
+        """Stop the thread, and wait until it has ended."""
         self._ended.set()
         self.feed.close()
         if self._thread.is_alive():
@@ -67,7 +67,7 @@ class Runner:
         """Take a message of the page; see `messages`, and `choose` and `record` here.
 
         Raises:
-            ValueError: If it makes no sense.
+            ValueError: If it is not a valid request.
         """
         message = parsed(body)
         if message.get("do") == "choose":
@@ -93,13 +93,13 @@ class Runner:
             self._making = self._beside.submit(lambda: [wanted, wanted.robots()])
 
     def _take(self) -> None:
-        """Go on with robots that have been made."""
+        """Replace the robots if others have been made."""
         if self._making is None or not self._making.done():
             return
         making, self._making = self._making, None
         try:
             wanted, robots = making.result()
-        except Exception as problem:  # whatever it is, the page goes on with what it has
+        except Exception as problem:  # the page keeps the robots it has
             self._notice = str(problem)
             return
         old, same_ground = self.session.robots, wanted.terrain == self._setup.terrain
@@ -156,7 +156,7 @@ class Runner:
         self.feed.publish(f"data: {json.dumps({'moves': moves, 'state': self.state()})}\n\n".encode())
 
     def state(self) -> dict[str, Any]:
-        """Return what the page shows in words and figures."""
+        """Return the state that the page shows as text."""
         session = self.session
         kept, back = session.past
         q, v = session.robots[0].state()

@@ -1,7 +1,7 @@
-"""A session: what a live page shows and what it may ask for. Knows no clock, no thread and no browser.
+"""The simulation behind a live page, without clock, thread or browser.
 
-Robots are stepped as time is given to the session: the one that is driven, and its ghost, which gets the same commands
-and the same pushes on another transmission level.
+`advance` steps the driven robot and its ghost, which gets the same commands and the same pushes on another transmission
+level.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from ce_gym.viewer.live.robot import LiveRobot
 
 Array = NDArray[np.float64]
 
-REMEMBERED = 30.0  # so far back can be gone [s]
+REMEMBERED = 30.0  # length of the history [s]
 THROW = (0.0, 0.0, 2.5)  # change of velocity [m/s]
-DROP = 0.5  # how far it is lifted [m]
+DROP = 0.5  # height from which `drop` lets the robot fall [m]
 
 
 class Session:
     """Robots under one command.
 
     Args:
-        robots: The one that is driven, then its ghost if there is one.
+        robots: The driven robot, then its ghost if there is one.
 
     Attributes:
         robots: The same.
         command: Forward [m/s], sideways [m/s], yaw rate [rad/s].
-        paused: Whether time stands still.
+        paused: Whether the simulation is paused.
         speed: Seconds of simulation in a second.
-        time: That is shown [s].
+        time: The time that is shown [s].
     """
 
     def __init__(self, robots: list[LiveRobot]) -> None:
@@ -44,7 +44,7 @@ class Session:
         self.take(robots)
 
     def take(self, robots: list[LiveRobot]) -> None:
-        """Go on with other robots, from where they are."""
+        """Replace the robots; the history starts anew."""
         self.robots, self.dt = robots, robots[0].dt
         self._steps = 0
         self._start = self.time
@@ -55,7 +55,7 @@ class Session:
     # Time.
 
     def advance(self, seconds: float) -> None:
-        """Let time pass in which nothing else is asked for [s]."""
+        """Simulate some seconds of real time [s], scaled by `speed`."""
         if self.paused:
             return
         self.time += seconds * self.speed
@@ -63,27 +63,27 @@ class Session:
             self._step()
 
     def step_once(self) -> None:
-        """Let one control step pass and stand still."""
+        """Simulate one control step, and pause."""
         self.pause(True)
         self._continue_here()
         self._step()
         self.time = self._simulated
 
     def pause(self, on: bool) -> None:
-        """Stop time, or let it go on from what is shown."""
+        """Pause, or continue from the moment that is shown."""
         if not on and self.paused:
             self._continue_here()
         self.paused = on
 
     def look_back(self, seconds: float) -> None:
-        """Show what was some time before the newest moment, at rest [s]."""
+        """Pause, and show the moment some seconds before the newest one [s]."""
         self.paused = True
         first, last = self._history.span
         self.time = float(np.clip(last - seconds, first, last))
 
     @property
     def past(self) -> tuple[float, float]:
-        """How far back can be gone and how far back it is that is shown [s]."""
+        """Length of the history, and the age of the moment that is shown [s]."""
         first, last = self._history.span
         return last - first, max(last - self.time, 0.0)
 
@@ -114,14 +114,14 @@ class Session:
         self._history.add(Moment(self._simulated, poses, tuple(robot.snapshot() for robot in self.robots)))
 
     def poses(self) -> tuple[Array, ...]:
-        """Return positions of the robots as they are shown, shape (nq,) each; at most one control step old."""
+        """Return the positions to show, shape (nq,) each; at most one control step old."""
         shown = self.time if self.paused else self.time - self.dt
         return between(*self._history.around(shown), shown)
 
-    # What the robot is told and what is done to it.
+    # Commands and disturbances.
 
     def drive(self, shares: ArrayLike) -> None:
-        """Command shares from -1 to 1 of what the task commands forward, to the left and in turning."""
+        """Command shares from -1 to 1 of the largest forward, sideways and turning speeds of the task."""
         low, high = self.robots[0].command_range.T
         shares = np.clip(np.asarray(shares, float), -1.0, 1.0)
         self.command = np.where(shares < 0, -shares * low, shares * high)
@@ -136,11 +136,11 @@ class Session:
         return self._drag[0] if self._drag else None
 
     def release(self) -> None:
-        """Let go."""
+        """End the pull of `drag`."""
         self._drag = None
 
     def _pull(self) -> None:
-        """Let the drag act for a control step."""
+        """Apply the pull for a control step."""
         if self._drag:
             for robot in self.robots:
                 q, v = robot.state()
@@ -166,7 +166,7 @@ class Session:
             ghost.write(q, v)
 
     def reset(self) -> None:
-        """Let all robots stand up where episodes begin, in one place."""
+        """Put all robots into the standing pose, in one place."""
         for robot in self.robots:
             robot.reset()
         self.align_ghost()
@@ -180,14 +180,14 @@ class Session:
         for robot in self.robots:
             robot.write(*change(robot, *robot.state()))
 
-    # What is kept.
+    # Recording.
 
     def record(self, on: bool) -> LiveRecording | None:
-        """Begin to record, or end it and return what was recorded."""
+        """Start a recording, or end it and return it."""
         done, self.recording = self.recording, LiveRecording(self.robots) if on else None
         return None if on else done
 
     def close(self) -> None:
-        """Give back what the environments hold."""
+        """Close the environments."""
         for robot in self.robots:
             robot.close()

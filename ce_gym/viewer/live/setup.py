@@ -1,4 +1,4 @@
-"""What a live page shows, in words: which policy, on which levels, on which ground. Makes the robots of a session."""
+"""The setup of a live page, as data: policy, transmission levels, ground. Makes the robots of a session."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GROUNDS: Mapping[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class Setup:
-    """What is shown.
+    """A policy on a robot at one or two transmission levels.
 
     Attributes:
         policy: A file, a folder or the name of a shipped policy; "" for none, which holds the standing pose.

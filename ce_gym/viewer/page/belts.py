@@ -1,4 +1,4 @@
-"""Belts, for whoever looks through the links: where a rotor drives a joint that it does not sit on.
+"""Belts, visible through transparent links: between a rotor and a joint that it drives from another axis.
 
 A robot file says how fast a rotor turns with which joints, not by what. Where axes are parallel and farther apart than
 a pulley is wide, something flexible must run between them, and it is drawn: two strands, tangents to pulleys of one

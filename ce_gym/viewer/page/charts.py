@@ -1,4 +1,4 @@
-"""What the page plots beside the scene, and how close each joint is to its torque limit."""
+"""The signals that a page can plot, and each joint's torque as a share of its limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rollouts -> one HTML file that plays them: no server, no network, nothing beside it."""
+"""Rollouts -> one self-contained HTML file that plays them, without server or network."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _template(name: str) -> string.Template:
 
 
 def _data(runs: Sequence[PosedRollout], plot: Sequence[str], *, ghosts: bool) -> str:
-    """Return what is plotted, as JSON that may stand in a script: of few robots, or nobody could tell lines apart."""
+    """Return the plotted data of the first robots as JSON that may stand in a script."""
     shown = list(runs[:ROW])
     found = [charts(run) for run in shown]
     robots = [

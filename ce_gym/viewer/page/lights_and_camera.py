@@ -82,8 +82,8 @@ def field_command(path: str, ground: Terrain, bodies: Sequence[str], reach: floa
         reach: How far around them [m].
         fading: Share of that from which on it fades into the horizon.
     """
-    told = {**as_json(ground), "bodies": list(bodies), "reach": float(reach), "fading": fading, "steep": STEEP}
-    return _tiled(path, three.plane(TILE, TILE), np.eye(4), userData={"field": told})
+    data = {**as_json(ground), "bodies": list(bodies), "reach": float(reach), "fading": fading, "steep": STEEP}
+    return _tiled(path, three.plane(TILE, TILE), np.eye(4), userData={"field": data})
 
 
 def _unit(vector: list[float]) -> NDArray[np.float64]:

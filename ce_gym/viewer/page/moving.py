@@ -1,4 +1,4 @@
-"""A scene whose poses come as they are computed: robots in one place, under a camera that follows the first."""
+"""A scene of a live page: robots in one place, whose poses are sent one by one; the camera follows the first."""
 
 from __future__ import annotations
 

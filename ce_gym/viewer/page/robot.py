@@ -59,7 +59,7 @@ def robot_commands(robot: Robot, root: str, *, tint: Color | None = None, opacit
 def _part_commands(
     path: str, part: Part, robot: Robot, paths: dict[str, str], tint: Color | None, opacity: float
 ) -> Iterator[Command]:
-    """Draw a rotor, pulley or strand for whoever looks through the links."""
+    """Draw a rotor, pulley or strand, visible through transparent links."""
     color = tint or part.shape.color
     command = _shape_command(path, part.shape, color, opacity)
     if part.links:  # moved by belts.js
@@ -94,7 +94,7 @@ def _shape_command(path: str, shape: Shape, color: Color, opacity: float) -> Com
 
 
 def _spoke_command(path: str, shape: Shape, color: Color, opacity: float) -> Command:
-    """Draw a bar across both faces of a rotor's disc, without which nobody would see it spin."""
+    """Draw a bar across both faces of a rotor's disc, which makes its spin visible."""
     radius, length = shape.size
     bar = three.box(1.7 * radius, 0.3 * radius, 1.04 * length)
     contrast = DARK if sum(color[:3]) > 1.5 else LIGHT

@@ -1,7 +1,7 @@
 """Rollouts -> the commands of one meshcat scene: robots, arrows, surroundings and the animation.
 
-Robots stand side by side, many of them in a square, or on top of each other as ghosts. The world moves under the camera
-so that the first thing to leave the picture is the ground, not the robot.
+Robots stand side by side, many of them in a square, or on top of each other as ghosts. The camera is fixed and
+the world moves under it, so that robots stay in view.
 """
 
 from __future__ import annotations

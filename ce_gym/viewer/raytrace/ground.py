@@ -1,4 +1,4 @@
-"""The ground of pictures where it is not flat: what rays meet on the surface of a height field."""
+"""Intersections of rays with a height field, for pictures."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Met(NamedTuple):
 class Field:
     """Ground that is not flat, of which only what is around a place is built.
 
-    What is built depends on the block of the world in which that place lies, not on what was asked before.
+    The mesh depends on the block of the world around that place only, not on earlier calls.
 
     Args:
         embree: Sends rays.

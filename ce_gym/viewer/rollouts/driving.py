@@ -1,4 +1,4 @@
-"""What policies do, recorded: a policy drives robots through a list of commands."""
+"""Rollouts of a policy that follows a list of commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ground around a robot, where it is not flat: a piece of a height field, small enough to be kept and drawn."""
+"""A piece of a height field around a robot, small enough to be stored and drawn."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Records any environment of the package while somebody acts in it: a single one, or lanes of a vector.
+"""Records a rollout in any environment of the package: a single one, or lanes of a vector environment.
 
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0", contact_forces=True)
     rollout = record(env, lambda observation: env.action_space.sample(), seconds=5.0)
 
-What acts, a policy or any function of the observation, is an argument.
+The actions come from an argument: a policy, or any function of the observation.
 """
 
 from __future__ import annotations

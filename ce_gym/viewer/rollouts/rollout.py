@@ -47,7 +47,7 @@ class Rollout:
         v: Velocities, shape (T, nv).
         contact_forces: Force of the ground on each contact, world axes [N], shape (T, n_contacts, 3); n_contacts may
             be zero. None means zero contacts.
-        commands: What the robot was told to do, shape (T, n); n may be zero. The first two columns are drawn as
+        commands: The robot's commands, shape (T, n); n may be zero. The first two columns are drawn as
             speed forward and to the left in the frame of the base's heading [m/s]. None means n = 0.
         torques: Torque of the motors at each independent joint over the control step that led here [N m], shape
             (T, n_joints); n_joints may be zero. None means none.
