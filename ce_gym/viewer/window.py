@@ -5,9 +5,7 @@ No browser is opened and no call waits for one; without a connected browser draw
 
 from __future__ import annotations
 
-import html
 import json
-import string
 import time
 import weakref
 from pathlib import Path
@@ -17,9 +15,7 @@ from numpy.typing import NDArray
 
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.feed import Feed
-from ce_gym.viewer.page import three
-from ce_gym.viewer.page.html import meshcat_code, source
-from ce_gym.viewer.page.lights_and_camera import HORIZON
+from ce_gym.viewer.page.html import filled
 from ce_gym.viewer.page.moving import MovingScene
 from ce_gym.viewer.page.poses import PosedModel
 from ce_gym.viewer.server import PageServer
@@ -78,13 +74,7 @@ class Window:
             self._server.close()
 
     def _page(self) -> str:
-        return string.Template(_PAGE.read_text(encoding="utf-8")).substitute(
-            title=html.escape(self._scene.robot.name),
-            meshcat=meshcat_code(),
-            ground=source("ground.js"),
-            commands=json.dumps(self._scene.commands()),
-            horizon=three.hex_color(HORIZON),
-        )
+        return filled(_PAGE, self._scene.robot.name, commands=json.dumps(self._scene.commands()))
 
 
 def _stop(server: PageServer, feed: Feed) -> None:

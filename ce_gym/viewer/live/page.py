@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import html
 import json
-import string
 from pathlib import Path
 
 from ce_gym.viewer.live.robot import RANGES
 from ce_gym.viewer.live.runner import Runner
 from ce_gym.viewer.live.setup import GROUNDS, LEVELS
-from ce_gym.viewer.page import three
-from ce_gym.viewer.page.html import meshcat_code, source
-from ce_gym.viewer.page.lights_and_camera import HORIZON
+from ce_gym.viewer.page.html import filled
 
 _HERE = Path(__file__).parent
 
@@ -28,14 +24,12 @@ def live_page(runner: Runner, title: str | None = None) -> str:
         ViewerError: meshcat is not installed.
     """
     scene = runner.scene
-    return string.Template((_HERE / "live.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(title or scene.robot.name),
-        meshcat=meshcat_code(),
-        ground=source("ground.js"),
+    return filled(
+        _HERE / "live.html",
+        title or scene.robot.name,
         live=(_HERE / "live.js").read_text(encoding="utf-8"),
         commands=json.dumps(scene.commands()),
         offer=json.dumps(_offer(runner)).replace("<", "\\u003c"),  # a name must not end the script
-        horizon=three.hex_color(HORIZON),
     )
 
 

@@ -19,6 +19,7 @@ from ce_gym.viewer.page.poses import PosedModel, PosedRollout
 from ce_gym.viewer.page.scene import GHOST_TINTS, ROW, build_scene, pose_rollouts
 from ce_gym.viewer.rollouts.rollout import Rollout
 
+HERE = Path(__file__).parent
 FIRST_COLOR = (0.15, 0.20, 0.27)
 OTHERS_COLOR = (0.62, 0.66, 0.70)
 
@@ -47,23 +48,21 @@ def page(
         ViewerError: meshcat is not installed, a rollout does not fit its robot, or there is no such signal.
     """
     rollouts = [rollouts] if isinstance(rollouts, Rollout) else list(rollouts)
-    code = meshcat_code()
+    meshcat_code()  # fails before anything is computed if meshcat is missing
     max_fps = max_fps or (50.0 if len(rollouts) <= ROW else 25.0)
     runs = pose_rollouts(rollouts, models, max_fps)
     commands = [base64.b64encode(three.pack(command)).decode() for command in build_scene(runs, spacing=spacing)]
     title = title or " / ".join(dict.fromkeys(Path(rollout.robot).stem for rollout in rollouts))
-    return _template("player.html").substitute(
-        title=html.escape(title),
+    return filled(
+        HERE / "player.html",
+        title,
         legend=_legend(runs),
-        meshcat=code,
-        ground=source("ground.js"),
         belts=source("belts.js"),
         plots=source("plots.js"),
         player=source("player.js"),
         commands=json.dumps(commands),
         data=_data(runs, plot, ghosts=spacing == 0),
         frame=repr(max(rollouts[0].dt, 1.0 / max_fps)),
-        horizon=three.hex_color(HORIZON),
     )
 
 
@@ -88,11 +87,19 @@ def meshcat_code() -> str:
 
 def source(name: str) -> str:
     """Return the text of a file of the page."""
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+    return (HERE / name).read_text(encoding="utf-8")
 
 
-def _template(name: str) -> string.Template:
-    return string.Template(source(name))
+def filled(template: Path, title: str, **values: str) -> str:
+    """Return the text of a page: a template with its values and what all pages share.
+
+    Raises:
+        ViewerError: meshcat is not installed.
+    """
+    common = {"title": html.escape(title), "horizon": str(three.hex_color(HORIZON)), "ground": source("ground.js")}
+    head = string.Template(source("head.html")).substitute(common)
+    text = string.Template(template.read_text(encoding="utf-8"))
+    return text.substitute(common | values, head=head, meshcat=meshcat_code())
 
 
 def _data(runs: Sequence[PosedRollout], plot: Sequence[str], *, ghosts: bool) -> str:
