@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,16 +31,22 @@ def chosen(table: Table, **where: Cell) -> Rows:
     return [row for row in rows if all(row[names[name]] == value for name, value in where.items())]
 
 
+def _panels(names: list[Cell], rows: int, height: float) -> tuple[Any, Any]:
+    """Return a figure with a column of panels for each name."""
+    size = (1 + 3.6 * len(names), height)
+    figure, panels = plt.subplots(rows, len(names), figsize=size, layout="constrained", squeeze=False)
+    for panel, name in zip(panels[0], names, strict=True):
+        panel.set_title(str(name))
+    return figure, panels
+
+
 def controllers(tables: Mapping[str, Table], out: Path) -> Path:
     """Draw torque errors without feedback, and torque and tracking errors of computed torque at 8 Hz."""
     free, loop = tables["feedforward"], tables["tracking"]
     legs = list(dict.fromkeys(row[0] for row in loop.rows))
     with plt.rc_context(STYLE):
-        figure, panels = plt.subplots(
-            3, len(legs), figsize=(1 + 3.6 * len(legs), 8.2), layout="constrained", squeeze=False
-        )
+        figure, panels = _panels(legs, rows=3, height=8.2)
         for column, leg in zip(panels.T, legs, strict=True):
-            column[0].set_title(str(leg))
             for level in ("coupled", "armature", "none"):
                 _worst_joint(column[0], chosen(free, mechanism=leg, level=level), level)
                 rows = chosen(loop, mechanism=leg, level=level, controller="joints", signal="chirp")
@@ -75,11 +82,8 @@ def contacts(table: Table, out: Path) -> Path:
     """Draw impulses over their rigid limits against stiffness, and peak forces over exact against the gear ratio."""
     robots = list(dict.fromkeys(row[0] for row in table.rows))
     with plt.rc_context(STYLE):
-        figure, panels = plt.subplots(
-            2, len(robots), figsize=(1 + 3.6 * len(robots), 6.0), layout="constrained", squeeze=False
-        )
+        figure, panels = _panels(robots, rows=2, height=6.0)
         for column, robot in zip(panels.T, robots, strict=True):
-            column[0].set_title(str(robot))
             for level, color in COLORS.items():
                 own = [r for r in chosen(table, robot=robot, level=level, inertia=1.0) if r["ratio"] == 1.0]
                 marker = MARKERS[level]
