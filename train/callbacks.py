@@ -188,11 +188,14 @@ class ShowProgress(_Quiet):
 
     Args:
         total: Steps at which training ends.
+
+    Attributes:
+        shares: See `ProgressBar`; empty before training.
     """
 
     def __init__(self, total: int) -> None:
         super().__init__()
-        self.total = total
+        self.total, self.shares = total, dict[str, float]()
 
     def _on_training_start(self) -> None:
         self.bar = ProgressBar(self.total, self.num_timesteps)
@@ -210,6 +213,7 @@ class ShowProgress(_Quiet):
         self.collecting += time.perf_counter() - self.rollout_started
         physics = self._physics() - self.physics_before
         self.bar.describe(episode_means(self.model.ep_info_buffer), physics, self.collecting)
+        self.shares = self.bar.shares
 
     def _on_training_end(self) -> None:
         self.bar.close()

@@ -100,7 +100,8 @@ def command(record: dict[str, Any]) -> str:
     usual = json.loads(json.dumps(asdict(load_settings(config_file(record["env"], kind.folder), kind=kind))))
     chosen = record["settings"] | {"steps": min(record["settings"]["steps"], record["steps"])}  # a deadline may end it
     changed = {key: value for key, value in chosen.items() if value != usual[key]}
-    words += ["--set", *(f"{key}={value}" for key, value in changed.items())] if changed else []
+    texts = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in changed.items()}
+    words += ["--set", *(f"{key}={text}" for key, text in texts.items())] if texts else []
     return shlex.join(words)
 
 
@@ -131,6 +132,7 @@ def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, f
         ["seed", str(record["seed"])],
         ["steps", f"{record['steps']:,}"],
         ["wall-clock time", f"{seconds:.0f} s"],
+        *([["processor time", f"{spent:.0f} s"]] if (spent := record.get("processor_seconds")) else []),
         ["observation, action", f"{record['observation_size']} numbers, {record['action_size']} numbers"],
         ["date", record["date"]],
         ["versions", versions],

@@ -26,7 +26,7 @@ import gymnasium
 import numpy as np
 from console import say_missing
 from gymnasium.vector import AutoresetMode, VectorEnv
-from job import CHECKPOINTS, Job, Trained, make_record
+from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
 from job import main as run_jobs
 from numpy.typing import NDArray
 from progress import (
@@ -299,21 +299,20 @@ def train(job: Job) -> Trained:
     return train_with(FastPPO, job, "fast_ppo")
 
 
-def train_with(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str, **training: Any) -> Trained:
+def train_with(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str) -> Trained:
     """Train with a learner that has the methods of `FastPPO`.
 
     Args:
         kind: Makes the learner.
         job: The training run.
         name: Of the learner's file.
-        **training: Arguments of the environment beside those of the job, which no policy is judged with.
 
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
     make_folder(job.out)
     options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
-    mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **training}
+    mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **job.settings.training}
     envs = gymnasium.make_vec(job.env_id, num_envs=job.settings.num_envs, vectorization_mode=mode, **options)
     try:
         learner = kind(envs, job)
@@ -326,14 +325,14 @@ def train_with(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str, **tra
 
 def _learn(learner: Any, job: Job, name: str) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
-    s, start = job.settings, time.perf_counter()
+    s, native = job.settings, acting_environment(job, learner.envs.unwrapped)
+    start, clock = time.perf_counter(), Clock()
     curve = Curve(job.out / "curve.csv", _earlier(job.resume), learner.steps)
     bar, log = ProgressBar(s.steps, learner.steps), Log(job.out / "progress.csv")
 
     def record(finished: bool = False) -> dict[str, Any]:
-        seconds = time.perf_counter() - start
-        written = make_record(job, learner.envs.unwrapped, learner.steps, seconds, ("numba",))
-        return written | {"learner": name, "finished": finished}
+        written = make_record(job, native, learner.steps, clock, ("numba",))
+        return written | {"learner": name, "finished": finished, "shares": bar.shares}
 
     every = max(s.steps // CHECKPOINTS, 1)
     with StopInOrder(job.seconds) as stop:

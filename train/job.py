@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium
 from console import EPISODES, SEED, THREADS, Parser, above_zero, run
 from run_folder import make_folder
-from settings import NETWORK, Settings, config_file, load_env_args, load_settings, make_settings, parsed
+from settings import NETWORK, Settings, SettingsError, config_file, load_env_args, load_settings, make_settings, parsed
 
 from ce_gym import usable_cores
 from ce_gym.policies import PolicyError, add_env_arg, environment_of, load_policy, locate_policy
@@ -71,14 +71,51 @@ class Trained:
     interrupted: bool
 
 
-def make_record(job: Job, native: Any, steps: int, seconds: float, packages: tuple[str, ...]) -> dict[str, Any]:
+class Clock:
+    """Time since it was made [s]."""
+
+    def __init__(self) -> None:
+        self._start = self._now()
+
+    def spent(self) -> dict[str, float]:
+        """Return the time on the wall, and that of processors in all threads."""
+        wall, processor = (now - start for now, start in zip(self._now(), self._start, strict=True))
+        return {"training_seconds": round(wall, 1), "processor_seconds": round(processor, 1)}
+
+    @staticmethod
+    def _now() -> tuple[float, float]:
+        return time.perf_counter(), time.process_time()
+
+
+def acting_environment(job: Job, native: Any) -> Any:
+    """Return the environment that a policy will act in, which is the one it is trained in but for `training`.
+
+    Args:
+        job: The training run.
+        native: The environment of training, unwrapped.
+
+    Raises:
+        SettingsError: If policies see or do something else there.
+    """
+    if not job.settings.training:
+        return native
+    mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
+    acting = gymnasium.make_vec(job.env_id, num_envs=1, vectorization_mode=mode, **job.env_kwargs).unwrapped
+    for space in ("single_observation_space", "single_action_space"):
+        there, here = getattr(acting, space), getattr(native, space)
+        if there != here:
+            raise SettingsError(f"training: {space} is {here}; expected {there}, that of the policy's environment")
+    return acting
+
+
+def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple[str, ...]) -> dict[str, Any]:
     """Return what somebody needs to know to use or repeat a policy.
 
     Args:
         job: The training run.
-        native: The environment, unwrapped.
+        native: The environment that the policy acts in, unwrapped.
         steps: Environment steps done.
-        seconds: Time that they took.
+        clock: Made when they began.
         packages: Whose versions matter, beside those of ce_gym, gymnasium, numpy and Python.
     """
     seen, action = native.single_observation_space, native.single_action_space.shape
@@ -94,7 +131,7 @@ def make_record(job: Job, native: Any, steps: int, seconds: float, packages: tup
         "steps": steps,
         "seed": job.seed,
         "resumed_from": str(job.resume) if job.resume else None,
-        "training_seconds": round(seconds, 1),
+        **clock.spent(),
         "settings": asdict(job.settings),
         "date": time.strftime("%Y-%m-%d"),
         "versions": {name: _version(name) for name in ("ce_gym", "gymnasium", *packages, "numpy")}

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import io
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ from callbacks import (
     Stop,
     WriteCurve,
 )
-from job import CHECKPOINTS, Job, Trained, make_record, resumed_record
+from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record, resumed_record
 from job import main as run_jobs
 from learner import ThreadedPPO
 from progress import StopInOrder, read_curve
@@ -59,9 +58,8 @@ def train(job: Job) -> Trained:
     """
     torch.set_num_threads(1)  # threads belong to the learner and to the kernel, see learner.py
     make_folder(job.out)
-    envs = make_sb3_vec_env(
-        job.env_id, job.settings.num_envs, job.seed, **{"num_threads": job.threads, **job.env_kwargs}
-    )
+    options = {"num_threads": job.threads, **job.env_kwargs, **job.settings.training}
+    envs = make_sb3_vec_env(job.env_id, job.settings.num_envs, job.seed, **options)
     try:
         model = make_learner(envs, job)
         return _learn(model, envs, job)
@@ -75,12 +73,13 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
     model.set_logger(Logger(str(job.out), [Lenient(writer) for writer in logger.output_formats]))
     settings, before = job.settings, model.num_timesteps
     earlier = read_curve(job.resume.parent / "curve.csv") if job.resume else []
-    start = time.perf_counter()
+    progress = ShowProgress(settings.steps)
+    native, clock = acting_environment(job, envs.envs.unwrapped), Clock()
 
     def record(finished: bool = False) -> dict[str, Any]:
-        seconds = time.perf_counter() - start
-        written = make_record(job, envs.envs.unwrapped, model.num_timesteps, seconds, ("stable_baselines3", "torch"))
-        return written | {"activation": model.policy.activation_fn.__name__, "finished": finished}  # type: ignore[union-attr]
+        written = make_record(job, native, model.num_timesteps, clock, ("stable_baselines3", "torch"))
+        activation = model.policy.activation_fn.__name__  # type: ignore[union-attr]
+        return written | {"activation": activation, "finished": finished, "shares": progress.shares}
 
     def checkpoint() -> None:
         with going_on():
@@ -88,7 +87,7 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
 
     with StopInOrder(job.seconds) as stop:
         callbacks = [Stop(stop), Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog(), SpreadEpisodes()]
-        callbacks += [WriteCurve(job.out / "curve.csv", earlier), ShowProgress(settings.steps)]
+        callbacks += [WriteCurve(job.out / "curve.csv", earlier), progress]
         callbacks.append(EntropySchedule(settings.entropy, settings.final_entropy, settings.steps))
         if settings.fall_cost:
             callbacks.append(FallCost(settings.fall_cost, settings.steps))

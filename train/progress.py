@@ -224,6 +224,9 @@ class ProgressBar:
     Args:
         total: Steps at which training ends.
         steps: Steps done so far.
+
+    Attributes:
+        shares: Of the time since it was made, what each of these three took.
     """
 
     def __init__(self, total: int, steps: int = 0) -> None:
@@ -234,7 +237,7 @@ class ProgressBar:
             total=total, initial=steps, unit=" steps", unit_scale=True, mininterval=interval,
             bar_format=form, dynamic_ncols=True, smoothing=0.05,
         )  # fmt: skip
-        self.started = time.perf_counter()
+        self.started, self.shares = time.perf_counter(), dict.fromkeys(("physics", "policy", "learning"), 0.0)
 
     def advance(self, steps: int) -> None:
         """Show that so many steps are done."""
@@ -242,7 +245,11 @@ class ProgressBar:
 
     def describe(self, means: Mapping[str, float], physics: float, collecting: float) -> None:
         """Show the means of recent episodes and the seconds spent in physics and in collection as a whole."""
-        self.bar.set_postfix_str(f"| {self._figures(means)} | {self._shares(physics, collecting)}", refresh=False)
+        total = time.perf_counter() - self.started
+        parts = {"physics": physics, "policy": collecting - physics, "learning": total - collecting}
+        self.shares = {name: round(seconds / total, 3) for name, seconds in parts.items()}
+        shares = " ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
+        self.bar.set_postfix_str(f"| {self._figures(means)} | {shares}", refresh=False)
 
     def close(self) -> None:
         """Leave the bar as it is."""
@@ -256,9 +263,3 @@ class ProgressBar:
         ]
         shown = [("reward", means["r"]), ("length", means["l"]), *metrics[:2]]
         return ", ".join(f"{name} {value:.3g}" for name, value in shown)
-
-    def _shares(self, physics: float, collecting: float) -> str:
-        """Where the time went since training began."""
-        total = time.perf_counter() - self.started
-        parts = {"physics": physics, "policy": collecting - physics, "learning": total - collecting}
-        return " ".join(f"{name} {100 * seconds / total:.0f}%" for name, seconds in parts.items())

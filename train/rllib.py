@@ -166,7 +166,7 @@ def _work(args: argparse.Namespace) -> int:
     s = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
     one = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # says in one line what is wrong, and fills the cache
     ray.init(address=args.address, log_to_driver=False, include_dashboard=False)
-    algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **kwargs)
+    algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **{**kwargs, **s.training})
     set_initial_std(algo, s.initial_std)
     steps = train(algo, s.steps, 60.0 * args.minutes)
     out = args.out or Path("runs") / f"{path.stem}-rllib"

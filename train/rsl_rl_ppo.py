@@ -20,7 +20,7 @@ import torch
 from console import EPISODES, SEED, Parser, run
 from evaluate import evaluate, report
 from export import to_onnx, write
-from job import env_kwargs_of
+from job import Job, acting_environment, env_kwargs_of
 from rsl_rl.runners import OnPolicyRunner
 from run_folder import make_folder
 from settings import Settings, config_file, load_env_args, load_settings
@@ -121,9 +121,12 @@ def _work(args: argparse.Namespace) -> int:
     settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
     out = args.out or Path("runs") / f"{path.stem}-rsl_rl"
     make_folder(out)
-    envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **kwargs)
+    training = {**kwargs, **settings.training}
+    envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **training)
     runner = train(envs, settings, args.seed, out)
     record = record_of(envs, args.env, kwargs, settings)
+    acting = acting_environment(Job(args.env, settings, out, kwargs), envs.envs.unwrapped)
+    record["policy_spec"] = acting.policy_spec()
     write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
     policy = load_policy(out / "policy.onnx")
     print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))

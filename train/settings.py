@@ -68,6 +68,8 @@ class Settings:
             `progress.fall_cost`. Rewards that are reported are without it.
         value: Weight of the value loss.
         max_grad_norm: Gradients are clipped to this norm.
+        training: Arguments of the environment for training only, by which no policy is judged; those that go with the
+            policy are `env_args`.
     """
 
     folder: ClassVar[Path] = CONFIG_FOLDER
@@ -91,6 +93,7 @@ class Settings:
     fall_cost: float
     value: float
     max_grad_norm: float
+    training: Mapping[str, Any]
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain data, for a record beside the policy."""
@@ -219,10 +222,8 @@ def _convert(source: str, key: str, value: Any, kind: str) -> Any:
                 raise ValueError
             return number
         if kind.startswith("Mapping"):
-            wanted = "arguments by name"
-            if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
-                raise ValueError
-            return dict(value)
+            wanted = "arguments of the environment by name, as plain data"
+            return checked_arguments(value)
         if kind == "Activation" and value in ACTIVATIONS:
             return value
         if kind == "Activation" or not isinstance(value, list | tuple) or len(value) > 100:

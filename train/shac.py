@@ -269,7 +269,7 @@ class SHAC:
 
 def train(job: Job) -> Trained:
     """Train, and save the policy even if Ctrl-C ends training early; see `fast_ppo.train`."""
-    return train_with(SHAC, job, "shac", **job.settings.training)
+    return train_with(SHAC, job, "shac")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import warnings
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -17,11 +18,11 @@ from card import command
 from evaluate import evaluate
 from evaluate import main as evaluate_main
 from fast_ppo import FastPPO, main, train
-from job import Job, jobs, parser
+from job import Job, acting_environment, jobs, parser
 from point_mass import ID
 from ppo import train as reference_train
 from progress import fall_cost, read_curve
-from settings import config_file, load_settings
+from settings import SettingsError, config_file, load_settings
 
 from ce_gym.policies import PolicyError, load_policy
 
@@ -79,6 +80,23 @@ def test_the_command_on_its_card_repeats_it(trained):
     (again,) = jobs(parser().parse_args(words[2:]), folder="-fast")
     assert json.loads(json.dumps(again.settings.as_dict())) == record["settings"]
     assert again.out.name.endswith("-fast")
+
+
+@pytest.mark.parametrize("learn", [train, reference_train])
+def test_what_is_for_training_only_is_no_part_of_the_policy(learn, tmp_path):
+    given = {"dt": 0.004, "max_episode_steps": 7}
+    settings = ["num_envs=16", f"training={json.dumps(given)}"]
+    record = load_policy(learn(job(tmp_path, 2 * 256, ROBOT, settings, tensorboard=False)).policy).record
+    assert read_curve(tmp_path / "curve.csv")[-1]["length"] <= 7
+    assert (record["env_kwargs"], record["policy_spec"]["physics_dt"]) == ({}, 0.005)
+    (again,) = jobs(parser().parse_args(shlex.split(command(record))[2:]))
+    assert again.settings.training == record["settings"]["training"] == given
+
+
+def test_training_does_not_change_what_a_policy_sees(tmp_path):
+    other = SimpleNamespace(single_observation_space=gymnasium.spaces.Box(-1, 1, (5,)))
+    with pytest.raises(SettingsError, match=r"training: single_observation_space is .*expected"):
+        acting_environment(job(tmp_path, 1, settings=["training={history: 2}"]), other)
 
 
 def test_checkpoints_are_policies(trained):

@@ -123,7 +123,7 @@ def test_the_policy_squashes_its_actions(tmp_path):
 
 def test_wrong_settings_are_one_line():
     for change, message in (
-        ("training=[1]", r"training: \[1\]; expected arguments by name"),
+        ("training=[1]", r"training: \[1\]; expected arguments of the environment by name"),
         ("clip=0.2", "clip: unknown setting; expected one of steps"),
         ("max_adjoint=0", "max_adjoint: 0; expected a number from 1e-09"),
     ):
