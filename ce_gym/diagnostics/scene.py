@@ -187,7 +187,7 @@ def layers(whole: SubStep) -> Iterator[tuple[str, int, SubStep | ca.Function]]:
     options, robot = whole.options, whole.model.robot
     loose = _with_joints(robot, position=(-math.inf, math.inf))
     bare = replace(options, control="torque", contacts=(), motors="ideal", ground="flat", method="euler", parameters=())
-    step = SubStep(Model(_with_joints(loose, torque=math.inf, damping=0.0), "none"), bare, ())
+    step = SubStep(Model(_with_joints(loose, torque=math.inf, damping=0.0, friction=0.0), "none"), bare, ())
     kinematics, acceleration = _parts_of_dynamics(step)
     # the results of the first are not results of the whole, so that writing them does not count
     yield "kinematics", kinematics.n_instructions() - kinematics.nnz_out(), kinematics

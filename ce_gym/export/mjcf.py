@@ -145,6 +145,7 @@ def _add_body(
         for key, value in (
             ("ref", ref),
             ("damping", body.joint.damping),
+            ("frictionloss", body.joint.friction),
             ("armature", armature.get(moving.name, 0.0)),
         ):
             if value:

@@ -47,8 +47,8 @@ def check_expressible(mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:
     """Check that MJCF can say what is left of a robot at a transmission level.
 
     Raises:
-        RobotError: A constraint is a function; what a left-out rotor moves cannot move without it; or its reflected
-            inertia varies with the pose and only its diagonal is wanted.
+        RobotError: A constraint is a function; what a left-out rotor moves cannot move without it; its joint has dry
+            friction; or its reflected inertia varies with the pose and only its diagonal is wanted.
     """
     robot, level = mechanism.robot, mechanism.level
     for body in robot.bodies:
@@ -65,6 +65,9 @@ def check_expressible(mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:
                 what = f"constraint {constraint.name!r} ends on rotor {body!r}, which {level!r} leaves out"
                 raise _error(robot, what, "transmission 'exact' for MJCF")
     for name in ties:
+        if name not in mechanism.bodies and robot.body(name).joint.friction:
+            what = f"the joint of rotor {name!r}, which {level!r} leaves out, has dry friction"
+            raise _error(robot, what, "transmission 'exact', or friction of links' joints, for MJCF")
         if name not in mechanism.bodies and name in ties[name].ratios:
             what = f"rotor {name!r}, which {level!r} leaves out, is an independent joint"
             raise _error(robot, what, "transmission 'exact', or independent links, for MJCF")

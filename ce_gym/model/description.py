@@ -45,6 +45,7 @@ class Joint:
         torque: Largest actuator effort at the joint [N m or N].
         velocity: Largest speed the actuator reaches [rad/s or m/s].
         damping: Viscous friction at the joint [N m s/rad or N s/m].
+        friction: Dry friction at the joint [N m or N].
     """
 
     type: Literal["free", "revolute", "prismatic"]
@@ -53,6 +54,7 @@ class Joint:
     torque: float = float("inf")
     velocity: float = float("inf")
     damping: float = 0.0
+    friction: float = 0.0
 
     @property
     def turn(self) -> float:

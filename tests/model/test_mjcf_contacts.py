@@ -130,7 +130,10 @@ def test_physics_that_the_file_switches_off(write):
     ("text", "what"),
     [
         (mjcf(CHAIN.replace('name="a"', 'name="a" stiffness="3"')), "spring of joint a"),
-        (mjcf(CHAIN.replace('name="a"', 'name="a" frictionloss="3"')), "dry friction of joint a"),
+        (
+            f"<mujoco>{GEOMS}</mujoco>".replace("<freejoint/>", '<joint name="f" type="free" frictionloss="3"/>'),
+            "friction of joint f",
+        ),
         (mjcf(CHAIN.replace('name="arm"', 'name="arm" gravcomp="1"')), "gravity compensation of body arm"),
         (mjcf(CHAIN, extra='<option wind="1 0 0"/>'), "wind"),
         (mjcf(CHAIN, '<joint name="e" joint1="f" joint2="a" polycoef="0 1 2 0 0"/>'), "polynomial of equality e"),

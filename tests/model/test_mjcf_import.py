@@ -46,6 +46,14 @@ def test_what_is_read_of_a_tree(write):
     assert dict(robot.pose.joints)["arm"] == 0.4, "ref is the coordinate at which the file was drawn"
 
 
+def test_dry_friction_of_joints_comes_in_and_goes_out(write):
+    chain = CHAIN.replace('name="a"', 'name="a" frictionloss="0.7"').replace('name="s"', 'name="s" frictionloss="3"')
+    robot = load_robot(write(mjcf(chain)))
+    again = load_robot(write(to_mjcf(robot, "none")))
+    for each in (robot, again):
+        assert [each.body(name).joint.friction for name in ("arm", "slider", "finger")] == [0.7, 3.0, 0.0]
+
+
 @pytest.mark.parametrize(
     ("equality", "tendon", "dependent"),
     [

@@ -51,6 +51,8 @@ YAML_ERRORS = [
     (("axis: [0, 1, 0]\n", "axis: [0, 0, 0]\n"), ["leg.yaml", "hip_rotor.axis", "length other than 0"]),
     (("[1e-4, 0, 0, 2e-4, 0, 1e-4]", "[-1e-4, 0, 0, 2e-4, 0, 1e-4]"), ["leg.yaml", "inertia", "semidefinite"]),
     (("[1e-4, 0, 0, 2e-4, 0, 1e-4]", "[1e-4, 9, 0, 2e-4, 0, 1e-4]"), ["leg.yaml", "inertia", "semidefinite"]),
+    (("gains:", "joint_friction: -1\ngains:"), ["leg.yaml", "link 'thigh' joint friction", "-1.0", "0 or more"]),
+    (("gains:", "joint_friction: {hip_rotor: 1}\ngains:"), ["leg.yaml", "joint_friction", "'hip_rotor'", "a link"]),
     (("gains:", "gians:"), ["leg.yaml", "top level", "'gians'", "'gains'"]),
     (("base: floating", "base: flying"), ["leg.yaml", "base", "'flying'", "floating, fixed"]),
     (("base: floating", "base: yes"), ["leg.yaml", "base", "True", "text"]),

@@ -49,6 +49,21 @@ def test_yaml_says_what_urdf_cannot(write_robot):
     assert robot.floating
 
 
+def test_dry_friction_of_joints_is_the_urdf_s_where_the_yaml_is_silent(write_robot, load_urdf):
+    plain = load_urdf(
+        link("a", block()), link("b", block()), joint("continuous", "a", "b", '<dynamics friction="0.3"/>')
+    )
+    assert plain.body("b").joint.friction == 0.3
+    frictions = [
+        [
+            load_robot(write_robot(("gains:", f"joint_friction: {given}\ngains:"))).body(name).joint.friction
+            for name in ("thigh", "shank", "hip_rotor")
+        ]
+        for given in ("0.2", "{shank: 0.4}", "{'*': 0.1, thigh: 0.5}")
+    ]
+    assert frictions == [[0.2, 0.2, 0.0], [0.0, 0.4, 0.0], [0.5, 0.1, 0.0]]
+
+
 def test_contact_on_a_welded_link_moves_to_the_body_that_carries_it(write_robot):
     toe = load_robot(write_robot()).contacts[0]
     assert (toe.body, toe.position) == ("shank", (0.0, 0.0, -0.3))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator, StepDerivatives, Terrain
-from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
+from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot, load_robot
 from ce_gym.sim.tiles import read_rows, write_rows
 
 STEP = 1e-6
@@ -170,6 +172,28 @@ def test_backward_through_steps_in_contact():
     assert carried.sum() > 4
     expected = np.stack([theirs["load", i] for i in range(4)], axis=1)
     assert np.abs(ours["load"] - expected)[carried].max() < 1e-5 * np.abs(expected[carried]).max()
+
+
+def test_dry_friction_of_joints_that_stick_and_slip():
+    """Forwards and backwards, in a leg whose links are loops: friction of dependent joints varies with the pose."""
+    robot = load_robot("planar_leg_linkage")
+    bodies = [replace(b, joint=replace(b.joint, friction=0.2 + 0.1 * i)) for i, b in enumerate(robot.bodies)]
+    model, rng = Model(replace(robot, bodies=tuple(bodies))), np.random.default_rng(3)
+    sim = Simulator(model, 11, control="torque", outputs=())
+    q, target = model.standing_q + rng.normal(0, 0.1, (11, 2)), rng.normal(0, 2, (11, 2))
+    v = rng.choice([-1.0, 1.0], (11, 2)) * rng.uniform(0.5, 3, (11, 2))
+    v[:5] = 0.0  # these stick, or have just been let go
+    sim.set_state(q, v)
+    differences, derivatives = Differences(sim, target), StepDerivatives(sim)
+    moved = np.abs(differences.center[0] - q).max(1)
+    assert 0 < (moved == 0).sum() < 11
+    differences.restore()
+    A, B = derivatives.linearize(target)
+    theirs = [differences.column(part, i) for part in ("q", "v", "target") for i in range(2)]
+    differences.restore()
+    ours = np.concatenate([A, B], axis=2)
+    assert errors(ours, np.stack(theirs, axis=2)).max() < 1e-5
+    assert errors(ours, np.dstack(derivatives._linearize_by_rows(target))).max() < 1e-9
 
 
 def test_resets_and_diverged_robots_pass_nothing_on():

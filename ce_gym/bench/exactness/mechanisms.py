@@ -56,7 +56,7 @@ def limb(robot: Robot, root: str) -> Robot:
 
 def without_limits(robot: Robot) -> Robot:
     """Return a robot without limits and friction of joints and motors."""
-    free = {"position": (-inf, inf), "torque": inf, "velocity": inf, "damping": 0.0}
+    free = {"position": (-inf, inf), "torque": inf, "velocity": inf, "damping": 0.0, "friction": 0.0}
     bodies = tuple(b if b.joint.type == "free" else replace(b, joint=replace(b.joint, **free)) for b in robot.bodies)
     return replace(robot, bodies=bodies, motors=())
 

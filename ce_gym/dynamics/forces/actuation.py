@@ -11,66 +11,27 @@ Limits and friction there do not depend on the transmission level.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.law import JointForce, Motion
+from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction
+from ce_gym.dynamics.forces.law import JointForce
 from ce_gym.dynamics.forces.motors import MOTORS, MotorModel
-from ce_gym.dynamics.forces.saturation import Saturation
+from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.description import Motor
 from ce_gym.model.mechanism import Mechanism
 
 
-@dataclass
-class MotorForce(JointForce):
-    """What motors deliver to the joints: a `LinearForce`.
-
-    Attributes:
-        size: Of its iterate: the expected torque of each of the joints, of the motors, and of the motors' dry friction
-            if there is any; and 1 once there is an iterate.
-        limited: The torques that are kept within limits, at their places in the iterate.
-        held: Rows of `y` that all motors of a cluster hold by dry friction, each with 1 if they do, else 0.
-    """
-
-    size: int
-    limited: dict[int, Saturation] = field(default_factory=dict)
-    held: dict[int, SX] = field(default_factory=dict)
-
-    def check(self, motion: Motion) -> SX:
-        """Return 1 if a torque is not where it was taken to be among its limits; else 0."""
-        changed = SX(0)
-        for one in self.limited.values():
-            if one.answers:
-                after = one.after(motion.ydd)
-                elsewhere = ca.logic_or(after.at_high != one.at_high, after.at_low != one.at_low)
-                changed = ca.logic_or(changed, elsewhere)
-        return changed
-
-    def next_iterate(self, motion: Motion) -> SX:
-        """Return the iterate for another iteration, shape (size,)."""
-        iterate = SX(self.size, 1)
-        for place, one in self.limited.items():
-            if one.answers:
-                iterate[place] = one.after(motion.ydd).expected
-        if self.size:
-            iterate[-1] = 1
-        return iterate
-
-
-STICK_SPEED = 1e-4
-"""Rotor speed at which dry friction that sticks carries its full torque [rad/s]."""
-ITERATIONS = 4
-"""How many iterations of a step saturation may ask for after the first."""
-
-
 def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
-    """Return the size of the iterate of all motors, see `MotorForce`; 0 if no active set depends on accelerations.
+    """Return the size of the iterate of all motors; 0 if no active set depends on accelerations.
 
-    That is so if there are limits and what they limit, or the limits themselves, answers to accelerations.
+    It has the expected torque of each of the joints, of the motors, and of the motors' dry friction if there is any;
+    and 1 once there is an iterate. It is needed if there are limits and what they limit, or the limits themselves,
+    answers to accelerations.
     """
     robot, model = mechanism.robot, MOTORS[options.motors]
     motors = robot.motors if model.at_motors or options.control.startswith("motor") else ()
@@ -91,10 +52,12 @@ def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce
     return JointForce(scene.figures.kp * (target - y) - damping * yd, ca.diag(dt * damping))
 
 
-def motor_forces(scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float, iterate: SX) -> MotorForce:
+def motor_forces(
+    scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float, iterate: SX
+) -> SaturatedForce:
     """Return what the motors deliver of the torques they are asked for."""
     strength = scene.figures.strength
-    force = MotorForce(strength * asked.tau, strength * asked.slope, iterate.numel())
+    force = SaturatedForce(strength * asked.tau, strength * asked.slope, iterate.numel())
     model = MOTORS[scene.options.motors]
     actuated = actuated_clusters(scene.mechanism, kinematics) if model.at_motors else []
     for cluster in actuated:
@@ -105,7 +68,7 @@ def motor_forces(scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX
     return within_joint_limits(scene, force, [row for row in range(yd.numel()) if row not in driven], iterate)
 
 
-def within_joint_limits(scene: Scene, force: MotorForce, rows: list[int], iterate: SX) -> MotorForce:
+def within_joint_limits(scene: Scene, force: SaturatedForce, rows: list[int], iterate: SX) -> SaturatedForce:
     """Return a force of the motors that the joints `rows` limit; it is changed in place."""
     robot, strength = scene.mechanism.robot, scene.figures.strength
     for row in rows:
@@ -158,7 +121,7 @@ def actuated_clusters(mechanism: Mechanism, kinematics: Kinematics) -> list[Actu
 
 def deliver(
     model: MotorModel,
-    force: MotorForce,
+    force: SaturatedForce,
     asked: JointForce,
     cluster: Actuated,
     yd: SX,
@@ -205,25 +168,6 @@ def deliver(
         all_stick = SX(ca.sum1(ca.vertcat(*sticks)) > len(sticks) - 0.5)
         force.held |= dict.fromkeys(rows, all_stick)
     force.tau[rows], force.slope[rows, rows] = W.T @ tau, W.T @ (free @ slope @ free + own) @ W
-
-
-def dry_friction(friction: float, speed: SX, turning: SX, dt: float, iterate: SX, place: int) -> Saturation:
-    """Return the dry friction of a rotor: what would stop it, up to what friction has.
-
-    It sticks by a damping so large that the rotor is at rest at the end of the step but for `STICK_SPEED`; where that
-    would take more than it has it slips, and is a constant torque against the motion at the end of the step.
-
-    Args:
-        friction: Its largest torque [N m].
-        speed: Of the rotor [rad/s].
-        turning: Speed of the rotor for unit velocities of all independent joints, shape (1, nj).
-        dt: Length of the step [s].
-        iterate: From the iteration before, shape (limit_count,).
-        place: Of this torque in it.
-    """
-    sticking, still = friction / STICK_SPEED, SX(1, turning.numel())
-    ends = JointForce(SX(friction), still), JointForce(SX(-friction), still)
-    return Saturation.about(iterate, place, JointForce(-sticking * speed, dt * sticking * turning), *ends)
 
 
 def _effort_matrix(W: SX) -> SX:

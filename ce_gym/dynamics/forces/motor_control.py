@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.actuation import (
     Actuated,
-    MotorForce,
     actuated_clusters,
     controller,
     deliver,
@@ -36,6 +35,7 @@ from ce_gym.dynamics.forces.actuation import (
 )
 from ce_gym.dynamics.forces.law import JointForce
 from ce_gym.dynamics.forces.motors import MOTORS
+from ce_gym.dynamics.forces.saturation import SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, target_names
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
@@ -66,7 +66,7 @@ class Motors:
         """How many numbers its iterate has."""
         return limit_count(self.scene.mechanism, self.scene.options)
 
-    def linearise(self, iterate: SX) -> MotorForce:
+    def linearise(self, iterate: SX) -> SaturatedForce:
         """Linearise about an iterate, shape (size,)."""
         scene, y, yd, dt = self.scene, self.y, self.yd, self.dt
         if scene.options.control in ("position", "torque"):
@@ -92,10 +92,10 @@ class Motors:
             asked = JointForce(tau, self.dt * damping)
         return JointForce(strength * asked.tau, ca.diag(strength * asked.slope))
 
-    def _at_joints(self, names: tuple[str, ...], rows: list[int], size: int) -> MotorForce:
+    def _at_joints(self, names: tuple[str, ...], rows: list[int], size: int) -> SaturatedForce:
         """Return what is asked of the joints that no motor drives, and nothing of the others."""
         scene, n, strength = self.scene, self.y.numel(), self.scene.figures.strength
-        force = MotorForce(SX(n, 1), SX(n, n), size)
+        force = SaturatedForce(SX(n, 1), SX(n, n), size)
         joints = scene.mechanism.robot.independent
         control = "position" if scene.options.control == "motor_position" else "torque"
         full = SX.zeros(n)

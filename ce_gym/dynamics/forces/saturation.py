@@ -8,12 +8,15 @@ matters on light links: deciding saturation at zero acceleration applies an exce
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.law import JointForce
+from ce_gym.dynamics.forces.law import JointForce, Motion
+
+ITERATIONS = 4
+"""How many iterations of a step saturation may ask for after the first."""
 
 
 @dataclass
@@ -76,3 +79,38 @@ class Saturation:
             asked = ca.if_else(over > 0, self.high.tau + over, ca.if_else(under > 0, self.low.tau - under, within))
         kept = ca.if_else(self.at_low, ca.fmin(asked, self.high.tau), asked)
         return replace(self, expected=ca.if_else(self.at_high, ca.fmax(asked, self.low.tau), kept))
+
+
+@dataclass
+class SaturatedForce(JointForce):
+    """A force on joints that is made of torques kept within limits: a `LinearForce`.
+
+    Attributes:
+        size: Of its iterate: the expected torques, and 1 once there is an iterate.
+        limited: The torques that are kept within limits, at their places in the iterate.
+        held: Rows of `y` that dry friction holds, each with 1 if it does, else 0.
+    """
+
+    size: int
+    limited: dict[int, Saturation] = field(default_factory=dict)
+    held: dict[int, SX] = field(default_factory=dict)
+
+    def check(self, motion: Motion) -> SX:
+        """Return 1 if a torque is not where it was taken to be among its limits; else 0."""
+        changed = SX(0)
+        for one in self.limited.values():
+            if one.answers:
+                after = one.after(motion.ydd)
+                elsewhere = ca.logic_or(after.at_high != one.at_high, after.at_low != one.at_low)
+                changed = ca.logic_or(changed, elsewhere)
+        return changed
+
+    def next_iterate(self, motion: Motion) -> SX:
+        """Return the iterate for another iteration, shape (size,)."""
+        iterate = SX(self.size, 1)
+        for place, one in self.limited.items():
+            if one.answers:
+                iterate[place] = one.after(motion.ydd).expected
+        if self.size:
+            iterate[-1] = 1
+        return iterate

@@ -4,8 +4,9 @@ The step is linearly implicit: whatever is stiff (contact, friction, joint stops
 one step ahead, which adds to inertias and leaves the recursion as it is. A step of length 0 gives the acceleration of
 the moment.
 
-Which contacts act, slip or stick and which motors are at their limits is an active set. `iteration` makes the step with
-the set that its iterate assumes, says whether that is the set it came to, and returns the next iterate.
+Which contacts act, slip or stick, which motors are at their limits and which joints dry friction holds is an active
+set. `iteration` makes the step with the set that its iterate assumes, says whether that is the set it came to, and
+returns the next iterate.
 """
 
 from __future__ import annotations
@@ -18,13 +19,15 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.actuation import ITERATIONS, MotorForce, limit_count
+from ce_gym.dynamics.forces.actuation import limit_count
 from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground
+from ce_gym.dynamics.forces.dry_friction import JointFriction, friction_count
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.law import JointForce, Motion
 from ce_gym.dynamics.forces.motor_control import Motors
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.passive import passive_forces
+from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
 from ce_gym.dynamics.functions import guessed_coordinates
 from ce_gym.dynamics.recursion.ce_aba import (
@@ -50,13 +53,15 @@ class Solved:
         motion: The same of joints and bodies.
         contacts: Forces of the contacts of the scene.
         motors: What the motors deliver to the joints.
+        friction: Dry friction of the joints, one or none.
     """
 
     kinematics: Kinematics
     vdot: SX
     motion: Motion
     contacts: list[LinearContact]
-    motors: MotorForce
+    motors: SaturatedForce
+    friction: list[SaturatedForce]
 
 
 def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Solved:
@@ -67,7 +72,7 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
         state: At the start of the step.
         target: Targets or torques of what `target_names` says, shape (n_targets,).
         dt: Length of the step [s].
-        iterate: From the iteration before: of each contact, then of the motors, shape (iterate_size,).
+        iterate: From the iteration before: of each contact, the motors, joints' dry friction, shape (iterate_size,).
     """
     mechanism, acting = scene.mechanism, acting_forces(scene, state, target, dt, iterate)
     kinematics, contacts, gravity = acting.kinematics, acting.contacts, acting.gravity
@@ -88,20 +93,22 @@ class Acting:
         kinematics: At the start of the step.
         contacts: Forces of the contacts of the scene.
         motors: What the motors deliver to the joints.
-        joints: That and what the joints do by themselves.
+        friction: Dry friction of the joints, one or none.
+        joints: Those and what the joints do by themselves.
         gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
     """
 
     kinematics: Kinematics
     contacts: list[LinearContact]
-    motors: MotorForce
+    motors: SaturatedForce
+    friction: list[SaturatedForce]
     joints: JointTerms
     gravity: dict[str, SX]
 
     def solved(self, vdot: SX, a: dict[str, SX]) -> Solved:
         """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each."""
         motion = Motion(vdot[vdot.numel() - self.motors.tau.numel() :], a, self.gravity)
-        return Solved(self.kinematics, vdot, motion, self.contacts, self.motors)
+        return Solved(self.kinematics, vdot, motion, self.contacts, self.motors, self.friction)
 
 
 def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Acting:
@@ -110,14 +117,17 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     y, yd = state.q[state.q.shape[0] - n :], state.v[state.v.shape[0] - n :]
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
 
-    laws = touching(scene, kinematics, state, dt)
-    *of_contacts, of_motors = split(iterate, [law.size for law in laws])
+    laws, driven = touching(scene, kinematics, state, dt), Motors(scene, kinematics, y, yd, target, dt)
+    *of_contacts, of_motors, of_friction = split(iterate, [law.size for law in (*laws, driven)])
     contacts = [law.linearise(part) for law, part in zip(laws, of_contacts, strict=True)]
-    motors = Motors(scene, kinematics, y, yd, target, dt).linearise(of_motors)
+    motors = driven.linearise(of_motors)
+    rubbing = JointFriction(mechanism, kinematics, yd, dt)
+    friction = [rubbing.linearise(of_friction)] if rubbing.size else []
 
-    joints = on_coordinates(mechanism, motors + passive_forces(mechanism.robot, y, yd, dt))
+    forces = sum(friction, motors + passive_forces(mechanism.robot, y, yd, dt))
+    joints = on_coordinates(mechanism, forces)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    return Acting(kinematics, contacts, motors, joints, gravity)
+    return Acting(kinematics, contacts, motors, friction, joints, gravity)
 
 
 @dataclass
@@ -130,7 +140,7 @@ class Stepped:
         solved: How it came about.
         torque: Motor torque at each joint, mean over the step [N m or N], shape (nj,).
         contact_forces: Mean force on each contact over the step, world axes [N], shape (3, n_contacts).
-        unconverged: 1 if the active set of a contact or a motor is not the one that was assumed, else 0.
+        unconverged: 1 if the active set of a contact, a motor or a joint's friction is not as was assumed, else 0.
         iterate: For the next iteration; once converged, a fixed point.
         error: Estimate of the error of the step in `v` [rad/s or m/s]; 0 for a method that has none.
     """
@@ -154,7 +164,8 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
     """Return what a step leaves behind whose acceleration is known; arguments as for `solve`."""
     kinematics, motion, motors = solved.kinematics, solved.motion, solved.motors
     q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.floating)
-    for row, held in motors.held.items():  # a joint that dry friction holds does not move at all
+    saturated = [motors, *solved.friction]
+    for row, held in [pair for force in saturated for pair in force.held.items()]:  # such a joint does not move at all
         place = q.numel() - motors.tau.numel() + row
         q[place] = ca.if_else(held, state.q[place], q[place])
     contacts = [(kinematics.bodies[c.body].R, c, c.gain(motion)) for c in solved.contacts]
@@ -166,8 +177,9 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         anchor=stacked(anchors) if state.anchor.numel() else state.anchor,
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
     )
-    changed = ca.sum1(stacked([c.check(motion) for c in solved.contacts])) > 0
-    unconverged = ca.logic_or(motors.check(motion), changed)
+    unconverged = ca.sum1(stacked([c.check(motion) for c in solved.contacts])) > 0
+    for force in saturated:
+        unconverged = ca.logic_or(force.check(motion), unconverged)
     of_contacts = stacked([c.next_iterate(motion) for c in solved.contacts])
     # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of torques are fixed
     # points by themselves.
@@ -179,7 +191,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         torque=motors.tau - motors.slope @ motion.ydd,
         contact_forces=ca.horzcat(SX(3, 0), *[R @ c.force_after(gain) for R, c, gain in contacts]),
         unconverged=unconverged,
-        iterate=ca.vertcat(of_contacts, motors.next_iterate(motion)),
+        iterate=ca.vertcat(of_contacts, *[force.next_iterate(motion) for force in saturated]),
         error=SX(0),
     )
 
@@ -187,7 +199,8 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
 def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many iterations of a step may follow the first."""
     contacts = FRICTION[options.friction].iterations if options.contacts else 0
-    return max(contacts, ITERATIONS if limit_count(mechanism, options) else 0)
+    limited = limit_count(mechanism, options) + friction_count(mechanism)
+    return max(contacts, ITERATIONS if limited else 0)
 
 
 def first_iterate(scene: Scene) -> SX:
@@ -197,7 +210,7 @@ def first_iterate(scene: Scene) -> SX:
 
 def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many numbers an iteration leaves for the next."""
-    return Contact.size * len(options.contacts) + limit_count(mechanism, options)
+    return Contact.size * len(options.contacts) + limit_count(mechanism, options) + friction_count(mechanism)
 
 
 def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:

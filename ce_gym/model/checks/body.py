@@ -51,6 +51,7 @@ def _check_joint(file: str, where: str, joint: Joint) -> None:
         if not value >= 0.0:
             raise bad(file, f"{where} joint {name}", value, "0 or more")
     check_not_negative(file, f"{where} joint damping", joint.damping)
+    check_not_negative(file, f"{where} joint friction", joint.friction)
 
 
 def check_finite(file: str, key: str, values: Iterable[float]) -> None:

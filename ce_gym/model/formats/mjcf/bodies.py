@@ -132,6 +132,7 @@ def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, fram
         axis=_axis(source, j),
         position=(float(limits[0]), float(limits[1])),
         damping=float(model.dof_damping[dof]),
+        friction=float(model.dof_frictionloss[dof]),
     )
     at_zero = compose(frame, _motion(source, j, 0.0))
     pivot = compose(at_zero, Placement(_pivot(source, j)))
@@ -170,12 +171,13 @@ def _motion(source: MjcfSource, j: int, coordinate: float) -> Placement:
 def _report_forces(source: MjcfSource) -> None:
     """Note passive forces of joints and bodies that a robot cannot have."""
     model = source.model
-    for attribute, what in (("dof_frictionloss", "dry friction"), ("dof_dampingpoly", "nonlinear damping")):
-        values = np.atleast_1d(getattr(model, attribute, np.zeros(model.nv)))
-        joints = {int(model.dof_jntid[dof]) for dof in range(model.nv) if np.any(values[dof])}
-        for j in sorted(joints):
-            source.leave_out(f"{what} of joint {{}}", source.name("joint", j))
+    bent = np.atleast_1d(getattr(model, "dof_dampingpoly", np.zeros(model.nv)))
     for j in range(model.njnt):
+        dof, free = model.jnt_dofadr[j], model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE
+        if free and np.any(model.dof_frictionloss[dof : dof + 6]):
+            source.leave_out("dry friction of joint {}", source.name("joint", j))
+        if np.any(bent[dof : dof + (6 if free else 1)]):
+            source.leave_out("nonlinear damping of joint {}", source.name("joint", j))
         if model.jnt_stiffness[j] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[j]):
             source.leave_out("spring of joint {}", source.name("joint", j))
     for i in range(1, model.nbody):

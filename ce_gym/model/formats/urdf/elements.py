@@ -104,6 +104,7 @@ def joint(file: str, where: str, element: Element, joint_type: str) -> Joint:
         torque=number(file, where, limit, "effort", _NO_LIMIT),
         velocity=number(file, where, limit, "velocity", _NO_LIMIT),
         damping=number(file, where, dynamics, "damping", 0.0),
+        friction=number(file, where, dynamics, "friction", 0.0),
     )
 
 

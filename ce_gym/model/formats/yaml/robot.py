@@ -13,8 +13,8 @@ from pathlib import Path
 
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.constraints import Constraint
-from ce_gym.model.description import ContactMaterial, ContactSphere, Gains, Pose, Robot
-from ce_gym.model.errors import bad
+from ce_gym.model.description import Body, ContactMaterial, ContactSphere, Gains, Pose, Robot
+from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import transform_point, vec3
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
 from ce_gym.model.formats.standing import with_limits
@@ -26,6 +26,7 @@ from ce_gym.model.formats.yaml.rotors import add_rotors, read_motors
 _KEYS = (
     *("name", "urdf", "mjcf", "base", "sources", "notes", "kept_inertia", "gravity", "gears"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
+    "joint_friction",
 )
 
 
@@ -37,6 +38,7 @@ def robot_from_yaml(path: Path) -> Robot:
     file.texts("sources")  # for readers of the file; only its form is checked
     library, motors = read_motors(file.section("motors"))
     bodies, gears = add_rotors(file.section("rotors"), links, library)
+    bodies = _with_friction(file, bodies)
     ties = (*gears, *read_constraints(file, bodies, links.frames))
     independent = _independent(file, below, ties)
     robot = replace(
@@ -64,6 +66,19 @@ def robot_from_yaml(path: Path) -> Robot:
     robot = replace(robot, pose=_pose(file.section("pose"), robot), gains=_gains(file.section("gains"), robot))
     check_robot(robot)
     return robot
+
+
+def _with_friction(file: Section, bodies: tuple[Body, ...]) -> tuple[Body, ...]:
+    """Return bodies whose joints have the dry friction that the YAML gives them; it says nothing about rotors."""
+    joints = tuple(body.name for body in bodies if body.kind == "link" and body.joint.type != "free")
+    given = dict(_for_each(file, "joint_friction", joints)) if "joint_friction" in file else {}
+    for name in given:
+        if name not in joints:
+            raise unknown(file.file, "joint_friction", name, joints, "a link with a joint")
+    return tuple(
+        replace(body, joint=replace(body.joint, friction=given[body.name])) if body.name in given else body
+        for body in bodies
+    )
 
 
 def _independent(file: Section, below: Robot, ties: tuple[Constraint, ...]) -> tuple[str, ...]:
@@ -115,15 +130,12 @@ def _gains(section: Section, robot: Robot) -> Gains:
     return Gains(**{**below, **{key: _for_each(section, key, robot.independent) for key in section}})
 
 
-def _for_each(section: Section, key: str, independent: tuple[str, ...]) -> tuple[tuple[str, float], ...]:
-    """Return pairs in the order of the independent joints; names that are none of them stay, for the checks to see."""
+def _for_each(section: Section, key: str, joints: tuple[str, ...]) -> tuple[tuple[str, float], ...]:
+    """Return pairs in the order of the joints; names that are none of them stay, for the checks to see."""
     value = section.get(key)
     if isinstance(value, dict):
-        each = section.section(key).figures(independent)
-        order = [
-            *(joint for joint in independent if joint in each),
-            *(name for name in each if name not in independent),
-        ]
+        each = section.section(key).figures(joints)
+        order = [*(joint for joint in joints if joint in each), *(name for name in each if name not in joints)]
         return tuple((joint, each[joint]) for joint in order)
     gain = finite(section.file, section.key(key), value)
-    return tuple((joint, gain) for joint in independent)
+    return tuple((joint, gain) for joint in joints)
