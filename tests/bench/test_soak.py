@@ -7,21 +7,26 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from tripod import TRIPOD
 
 from ce_gym.bench.soak import benchmark as soak
+from ce_gym.bench.soak import substeps
 from ce_gym.envs.runtime.batch import TaskBatch
 
 IDS = ["ce_gym/MiniCheetahVelocity-v0", "ce_gym/MiniCheetahRun-v0"]
 
 
 def arguments(**changes) -> argparse.Namespace:
-    return argparse.Namespace(**{"minutes": 0.05, "env": IDS, "steps": 80, "seed": 0, "interrupts": None, **changes})
+    return argparse.Namespace(
+        **{"minutes": 0.05, "env": IDS, "steps": 80, "seed": 0, "interrupts": None, "substeps": None, **changes}
+    )
 
 
 def test_a_few_seconds_of_it():
     report = soak.run(arguments())
-    assert [r.met for r in report.requirements] == [True, True, True], report.as_text()
+    assert [r.met for r in report.requirements] == [True] * 4, report.as_text()
     rows = report.tables[0].rows
     assert [row[0] for row in rows] == IDS
     assert all(row[1] >= 3 * 80 * 64 and row[2] > 64 and row[3] == row[4] > 0 for row in rows)
@@ -48,6 +53,38 @@ def test_it_notices_a_process_that_grows(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(soak, "resident_memory", lambda: next(memory, 200.0))
     report = soak.run(arguments(minutes=0.1, env=IDS[:1], steps=20))
     assert not report.requirements[2].met
+
+
+def test_it_notices_files_that_stay_open(monkeypatch: pytest.MonkeyPatch):
+    clock, files = itertools.count(), itertools.count()
+    monkeypatch.setattr(soak, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    monkeypatch.setattr(soak, "open_files", lambda: next(files))
+    report = soak.run(arguments(minutes=0.1, env=IDS[:1], steps=20))
+    assert not report.requirements[3].met
+
+
+def shares(case: substeps.Case) -> substeps.Case:
+    case.run(1, np.random.default_rng(0))
+    return case
+
+
+def test_random_sub_steps_of_a_robot():
+    case = shares(substeps.Case(TRIPOD, "exact", "float64", "position"))
+    assert case.steps == substeps.NUM_ENVS * substeps.DRAWS * substeps.N_SUBSTEPS
+    assert (case.diverged, case.complaints) == (0, [])
+    assert all(r.met for r in substeps.reported([case], 1).requirements)
+
+
+def test_random_sub_steps_notice_neighbours_and_failures_that_are_not_flagged(monkeypatch: pytest.MonkeyPatch):
+    """A robot that is moved where its twin is not, and robots that are too fast and nobody says so."""
+    monkeypatch.setattr(substeps, "DRAWS", 2)
+    monkeypatch.setattr(substeps.Simulator, "diverged", property(lambda sim: np.zeros(sim.num_envs, bool)))
+    monkeypatch.setattr(substeps, "WATCHED", np.arange(1, 16, 4))
+    case = shares(substeps.Case(TRIPOD, "exact", "float64", "position"))
+    said = " ".join(case.complaints)
+    assert "q of robots depends on their neighbours" in said
+    assert "are not flagged" in said
+    assert not substeps.reported([case], 1).requirements[0].met
 
 
 def test_interrupted_calls(tmp_path):

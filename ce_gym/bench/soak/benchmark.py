@@ -3,13 +3,15 @@
 Every environment gets a batch with episodes short enough to end by every cause: time, falls, and divergence, which is
 put in by writing a number that is not one into the velocity of a robot now and then. Checked are, beside that nothing
 raises: all that comes out is finite; exactly the robots that were spoilt are flagged, and the counts agree; sums and
-lengths belong to the episodes; and after three rounds through all environments the process does not grow any more.
+lengths belong to the episodes; and after three rounds through all environments the process does not grow any more, nor
+hold more threads and files (sockets are files), though every other environment is dropped without `close`.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import threading
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,8 +21,8 @@ from numpy.typing import NDArray
 
 from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
-from ce_gym.bench.soak import interrupts
-from ce_gym.compile.system import resident_memory
+from ce_gym.bench.soak import interrupts, substeps
+from ce_gym.compile.system import open_files, resident_memory
 
 NUM_ENVS = 64
 """Robots in a batch."""
@@ -60,16 +62,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=150, help="control steps in one environment before the next")
     parser.add_argument("--seed", type=int, default=0, help="of actions and failures")
     parser.add_argument("--interrupts", type=int, metavar="N", help="instead, interrupt N calls by Ctrl-C")
+    parser.add_argument("--substeps", type=float, metavar="N", help="instead, make N random sub-steps of all robots")
 
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the soak; at least one round through the environments, and `WARM_UP` more to judge memory by."""
     if arguments.interrupts:
         return interrupts.run(arguments.interrupts, arguments.seed)
+    if arguments.substeps:
+        return substeps.run(arguments.substeps, arguments.seed)
     import ce_gym
 
     ids = arguments.env or sorted(ce_gym.environment_ids())
-    rng, accounts, memory = np.random.default_rng(arguments.seed), {name: Account() for name in ids}, []
+    rng, accounts = np.random.default_rng(arguments.seed), {name: Account() for name in ids}
+    memory, held = list[float](), list[int]()
     end = time.monotonic() + 60 * arguments.minutes
     while len(memory) <= WARM_UP or time.monotonic() < end:
         for name in shown(ids, f"round {len(memory) + 1}"):
@@ -78,7 +84,8 @@ def run(arguments: argparse.Namespace) -> Report:
                 break
         gc.collect()
         memory.append(resident_memory())
-    return reported(accounts, memory, arguments.minutes)
+        held.append(threading.active_count() + open_files())
+    return reported(accounts, memory, held, arguments.minutes)
 
 
 def soak(env_id: str, steps: int, rng: np.random.Generator, account: Account) -> None:
@@ -86,7 +93,8 @@ def soak(env_id: str, steps: int, rng: np.random.Generator, account: Account) ->
     import gymnasium
 
     mode = str(rng.choice(["SameStep", "NextStep"]))
-    envs: Any = gymnasium.make_vec(env_id, num_envs=NUM_ENVS, max_episode_steps=EPISODE, autoreset_mode=mode).unwrapped
+    made: dict[str, Any] = {"num_envs": NUM_ENVS, "max_episode_steps": EPISODE, "num_threads": int(rng.integers(1, 3))}
+    envs: Any = gymnasium.make_vec(env_id, autoreset_mode=mode, **made).unwrapped
     envs.reset(seed=int(rng.integers(2**31)))
     length, over, diverged = np.zeros(NUM_ENVS, int), np.zeros(NUM_ENVS, bool), 0
     for step in range(steps):
@@ -111,7 +119,8 @@ def soak(env_id: str, steps: int, rng: np.random.Generator, account: Account) ->
     account.diverged += diverged
     if envs.n_diverged != diverged:
         account.complaints.append(f"{env_id}: n_diverged is {envs.n_diverged} after {diverged} flags")
-    envs.close()
+    if rng.random() < 0.5:  # others are dropped as they are
+        envs.close()
 
 
 def spoil(envs: Any, rng: np.random.Generator, spared: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -141,7 +150,7 @@ def inconsistent(
     return wrong
 
 
-def reported(accounts: dict[str, Account], memory: list[float], minutes: float) -> Report:
+def reported(accounts: dict[str, Account], memory: list[float], held: list[int], minutes: float) -> Report:
     """Return the report of a soak."""
     report = Report("soak")
     rows = tuple((n, a.steps, a.episodes, a.spoilt, a.diverged, len(a.complaints)) for n, a in accounts.items())
@@ -156,5 +165,8 @@ def reported(accounts: dict[str, Account], memory: list[float], minutes: float) 
     claim = f"after {WARM_UP + 1} rounds the process grows by no more than {GROWTH:g} MiB"
     measured = f"{grown:.1f} MiB in {len(memory) - WARM_UP - 1} more rounds ({memory[WARM_UP]:.0f} MiB)"
     report.requirements.append(Requirement(claim, measured, not grown > GROWTH))
+    more = max(held[WARM_UP:]) - held[WARM_UP]
+    claim = f"after {WARM_UP + 1} rounds it holds no more threads and open files"
+    report.requirements.append(Requirement(claim, f"{more} more than {held[WARM_UP]}", more <= 0))
     report.remarks += complaints[:20]
     return report

@@ -1,0 +1,141 @@
+"""Random targets and torques on every robot, at every level and in both precisions: failures are flagged, and alone.
+
+Each batch takes its share of the sub-steps at the default `dt`, in episodes that begin in the standing pose. Some of
+its robots are made to diverge at the start of each; some, in the same vector registers, have a batch of their own that
+is told the same, and must be the same bit for bit. All must be finite, and no other robot may diverge.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.bench.measure.progress import shown
+from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.dynamics.model import Model
+from ce_gym.model import load_robot, robots
+from ce_gym.model.mechanism import LEVELS
+from ce_gym.sim import Simulator
+
+NUM_ENVS = 256
+"""Robots in a batch."""
+DRAWS, N_SUBSTEPS = 150, 4
+"""Random targets in an episode, and sub-steps that each is held for."""
+WATCHED, SPOILT = np.arange(0, 16, 4), np.arange(1, 16, 4)
+"""Robots that have a batch of their own, and robots beside them that are made to diverge."""
+TOO_FAST = 2e4
+"""A speed at which a robot has diverged [rad/s or m/s]."""
+NO_LIMIT = 20.0
+"""Largest torque at joints that have no limit [N m or N]."""
+
+
+@dataclass
+class Case:
+    """One robot at one level, in one precision, under one kind of control.
+
+    Attributes:
+        robot, level, dtype, control: Which.
+        steps: Sub-steps of robots.
+        retried: How many of them were made in parts.
+        diverged: Robots that diverged and were not made to.
+        complaints: What was not as it should be, one line each.
+    """
+
+    robot: str
+    level: str
+    dtype: str
+    control: str
+    steps: int = 0
+    retried: int = 0
+    diverged: int = 0
+    complaints: list[str] = field(default_factory=list)
+
+    def run(self, share: float, rng: np.random.Generator) -> None:
+        """Make at least `share` sub-steps of robots."""
+        model = Model(self.robot, self.level)
+        batch, alone = (Simulator(model, n, dtype=self.dtype, control=self.control) for n in (NUM_ENVS, len(WATCHED)))
+        while self.steps < share:
+            self.episode(batch, alone, rng)
+            self.steps += NUM_ENVS * DRAWS * N_SUBSTEPS
+        self.retried = batch.n_retried
+
+    def episode(self, batch: Any, alone: Any, rng: np.random.Generator) -> None:
+        """Make one episode."""
+        model, spoilt = batch.model, np.isin(np.arange(NUM_ENVS), SPOILT)
+        for sim in (batch, alone):
+            sim.reset()
+        batch.set_state(model.standing_q, np.full(model.nv, TOO_FAST), spoilt)
+        for _ in range(DRAWS):
+            targets = self.draw(model, rng)
+            batch.step(targets, N_SUBSTEPS)
+            alone.step(targets[WATCHED], N_SUBSTEPS)
+            self.look(batch, alone)
+        if not batch.diverged[spoilt].all():
+            self.complaints.append(f"{self}: robots that are too fast are not flagged")
+        self.diverged += int((batch.diverged & ~spoilt).sum())
+
+    def draw(self, model: Any, rng: np.random.Generator) -> NDArray:
+        """Draw targets anywhere between the stops, or torques up to the joints' limits, shape (NUM_ENVS, nj)."""
+        joints = [model.robot.body(name).joint for name in model.joint_links]
+        if self.control == "torque":
+            most = np.array([joint.torque if math.isfinite(joint.torque) else NO_LIMIT for joint in joints])
+            return rng.uniform(-most, most, (NUM_ENVS, len(joints)))
+        low, high = np.clip([joint.position for joint in joints], -math.pi, math.pi).reshape(-1, 2).T
+        return rng.uniform(low, high, (NUM_ENVS, len(joints)))
+
+    def look(self, batch: Any, alone: Any) -> None:
+        """Judge what a call has left."""
+        for name in ("q", "v", "torque", "contact_forces", "diverged"):
+            whole, part = getattr(batch, name), getattr(alone, name)
+            if not np.isfinite(whole).all():
+                self.complaints.append(f"{self}: {name} is not finite")
+            if whole[WATCHED].tobytes() != part.tobytes():
+                self.complaints.append(f"{self}: {name} of robots depends on their neighbours")
+
+    def __str__(self) -> str:
+        return f"{self.robot} {self.level} {self.dtype} {self.control}"
+
+
+def all_cases() -> list[Case]:
+    """Return a case for each robot, level, precision and kind of control; robots without gains know torques only."""
+    found = []
+    for robot in robots():
+        controls = ("position", "torque") if load_robot(robot).gains.kp else ("torque",)
+        found += [Case(robot, lvl, dtype, c) for lvl in LEVELS for dtype in ("float64", "float32") for c in controls]
+    return found
+
+
+def run(substeps: float, seed: int = 0) -> Report:
+    """Make `substeps` sub-steps of robots, shared among all cases; Ctrl-C reports those that are done."""
+    cases, done, left = all_cases(), list[Case](), substeps
+    rng = np.random.default_rng(seed)
+    try:
+        for case in shown(cases, "robots"):
+            case.run(left / (len(cases) - len(done)), rng)
+            left -= case.steps
+            done.append(case)
+    except KeyboardInterrupt:
+        pass
+    return reported(done, len(cases))
+
+
+def reported(done: list[Case], cases: int) -> Report:
+    """Return the report on cases."""
+    report, steps = Report("substeps"), sum(case.steps for case in done)
+    complaints = [text for case in done for text in dict.fromkeys(case.complaints)]
+    rows = tuple(
+        (c.robot, c.level, c.dtype, c.control, c.steps, c.retried, c.diverged, len(c.complaints)) for c in done
+    )
+    columns = ("robot", "level", "precision", "control", "sub-steps", "made in parts", "diverged", "complaints")
+    report.tables.append(Table(f"{steps:.3g} sub-steps under random targets and torques", columns, rows))
+    claim = "every failure flagged, none spread, nothing that is not finite"
+    measured = f"{len(complaints)} complaints in {len(done)} of {cases} cases"
+    report.requirements.append(Requirement(claim, measured, not complaints and len(done) == cases))
+    diverged = sum(case.diverged for case in done)
+    report.requirements.append(Requirement("robots do not diverge at the default step", f"{diverged}", not diverged))
+    report.remarks += complaints[:20]
+    return report
