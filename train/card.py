@@ -10,6 +10,10 @@ which the other programs find it. Uses public names of ce_gym only, and no name 
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import argparse
 import json
 import re

@@ -8,6 +8,10 @@ Uses public names of ce_gym only.
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import argparse
 from pathlib import Path
 

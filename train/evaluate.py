@@ -9,6 +9,10 @@ task.
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import argparse
 from collections.abc import Iterable
 from dataclasses import replace

@@ -10,6 +10,10 @@ beside the file as JSON. Only weights are read from the policy; no pickled code 
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import json
 import sys
 from pathlib import Path

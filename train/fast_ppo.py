@@ -12,6 +12,10 @@ of ce_gym only, and no name of a robot or task.
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import io
 import json
 import time

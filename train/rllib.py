@@ -11,6 +11,10 @@ ce_gym only, and no name of a robot or task. (Ray is not installed where types a
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import argparse
 import time
 from pathlib import Path

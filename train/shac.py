@@ -11,6 +11,10 @@ train/config/shac. They may change the task (`env_args`: a policy is judged with
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import json
 import time
 from collections.abc import Mapping

@@ -11,6 +11,10 @@ public names of ce_gym only, and no name of a robot or task.
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import argparse
 from dataclasses import dataclass
 from typing import Any, Protocol

@@ -10,6 +10,10 @@ of ce_gym only, and no name of a robot or task.
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import argparse
 import json
 import sys

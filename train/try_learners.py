@@ -9,6 +9,10 @@ on a standing robot whose returns are watched (`train/others/watched.py`). What 
 
 from __future__ import annotations
 
+import interruption  # noqa: F401
+
+# isort: split
+
 import argparse
 import os
 import subprocess

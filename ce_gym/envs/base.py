@@ -86,13 +86,16 @@ class BaseEnv(EzPickle):
 
         Raises:
             ValueError: If the shape is wrong or a number is not finite.
+            RuntimeError: If another thread steps or resets this environment.
+            gymnasium.error.ClosedEnvironmentError: After `close`.
         """
         batch = self.batch
         given, shapes = batch.place.rows(command, batch.dtype), ((3,), (batch.num_envs, 3))
         if tuple(given.shape) not in shapes or not np.isfinite(batch.place.host(given)).all():
             expected = f"(3,) or {shapes[1]}, finite"
             raise ValueError(f"command has shape {tuple(given.shape)}; expected {expected}")
-        batch.write("command", given)
+        with self._changing():
+            batch.write("command", given)
 
     def _keys(self, seed: Any) -> NDArray[np.uint64]:
         """Return keys of random streams, shape (num_envs,): for one seed `s` those of s, s + 1, and so on."""

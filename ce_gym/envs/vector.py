@@ -202,8 +202,9 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
 
     @elapsed_steps.setter
     def elapsed_steps(self, steps: Any) -> None:
-        batch = self.batch
-        batch.write("elapsed", batch.place.rows(steps, batch.dtype, (self.num_envs,))[:, None])
+        rows = self.batch.place.rows(steps, self.batch.dtype, (self.num_envs,))[:, None]
+        with self._changing():
+            self.batch.write("elapsed", rows)
 
     def _checked(self, actions: Any) -> Array:
         shape = (self.num_envs, self.batch.program.n_actions)

@@ -150,6 +150,22 @@ def test_a_diverged_robot_has_no_gradient(env):
     env.batch.write("v", 0.0)
 
 
+def test_a_step_in_parts_has_no_gradient_though_a_reset_followed(env):
+    """One robot of those whose time is up is too fast for its sub-step, and a new one in its place when it is seen."""
+    differentiable, ones = env.differentiable(), np.ones((N, 48))
+    env.reset(seed=0)
+    env.elapsed_steps = np.where(np.arange(N) < 4, env.max_episode_steps - 1, 0)
+    v = env.batch.rows("v")
+    v[2, 8] = 500.0  # rad/s, a knee's, more than half a radian in a sub-step
+    env.batch.write("v", v)
+    *_, truncated, infos = differentiable.step(np.zeros((N, 12)))
+    assert truncated[:4].all()
+    assert not infos["diverged"].any()
+    differentiable.backward(ones, np.ones(N), ones)
+    to_speed = differentiable.state_gradient()["v"].any(axis=1)
+    assert to_speed.tolist() == [i != 2 for i in range(N)]
+
+
 def test_carried_gradients_are_shortened(env):
     gradients = {}
     for largest in (np.inf, 1e-3):

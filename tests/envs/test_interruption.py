@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,17 @@ def begin(env: Any, number: int) -> None:
     env.reset(seed=number)
 
 
+def command(env: Any, number: int) -> None:
+    env.set_command([0.1 * number, 0.0, 0.0])
+
+
+def count(env: Any, number: int) -> None:
+    env.elapsed_steps = np.full(SIZE, number)
+
+
+EVERY_CALL = [*product((single, vector), (act, begin, command)), (vector, count)]
+
+
 @pytest.mark.parametrize("call", [act, begin])
 @pytest.mark.parametrize("make", [single, vector, lambda: vector("NextStep"), lambda: vector(num_threads=2)])
 def test_ctrl_c_at_any_line(make, call):
@@ -94,8 +106,7 @@ def test_ctrl_c_at_any_line(make, call):
     assert outcomes.count(True) > 20, "interrupted when it had to be finished"
 
 
-@pytest.mark.parametrize("call", [act, begin])
-@pytest.mark.parametrize("make", [single, vector])
+@pytest.mark.parametrize(("make", "call"), EVERY_CALL)
 def test_a_second_thread_is_refused(make, call, monkeypatch: pytest.MonkeyPatch):
     env, twin, errors = make(), make(), []
     kernel = env.batch._step
@@ -122,8 +133,7 @@ def test_a_second_thread_is_refused(make, call, monkeypatch: pytest.MonkeyPatch)
     assert seen(env) == seen(twin)
 
 
-@pytest.mark.parametrize("call", [act, begin])
-@pytest.mark.parametrize("make", [single, vector])
+@pytest.mark.parametrize(("make", "call"), EVERY_CALL)
 def test_what_is_closed_is_not_stepped(make, call):
     env = make()
     begin(env, 0)

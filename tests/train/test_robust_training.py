@@ -4,12 +4,15 @@ import base64
 import contextlib
 import errno
 import json
+import os
 import pickle
+import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 import numpy as np
+import ppo
 import pytest
 import torch
 from card import main as card_main
@@ -295,3 +298,14 @@ def test_a_folder_that_is_a_file_is_one_line(inside, tmp_path, capsys):
     error = one_line(["--env", ID, "--out", f"{tmp_path}/out{inside}", *QUICK], capsys)
     assert str(tmp_path / "out") in error
     assert (tmp_path / "out").read_text() == "mine"
+
+
+@pytest.mark.parametrize("program", ["ppo.py", "rsl_rl_ppo.py"])
+def test_ctrl_c_while_torch_is_imported(program, tmp_path):
+    """A torch that somebody interrupts stands in for the real one."""
+    (tmp_path / "torch.py").write_text("raise KeyboardInterrupt\n")
+    command = [sys.executable, str(Path(ppo.__file__).parent / program), "--help"]
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert done.stderr == f"{program}: interrupted\n"

@@ -137,7 +137,8 @@ class Stages:
         On a field the robots have been placed: their state has where they stand, all but the height of the ground.
         """
         p, draws = self.program, Draws()
-        ours = {name for name, row in self.schema.items() if row.writer in ("physics", "task", "term")} - {"chosen"}
+        ours = {name for name, row in self.schema.items() if row.writer in ("physics", "task", "term")}
+        ours -= {"chosen", "retries"}  # the latter counts on, so that who looks after a reset sees it too
         state = {name: x for name, x in self.state.items() if name in ours}
         fresh = {name: SX(np.broadcast_to(self.schema[name].reset, x.shape[0])) for name, x in state.items()}
         fresh |= {name: state[name] for name in ("failures", "level") if name in state}
