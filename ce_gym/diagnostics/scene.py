@@ -20,11 +20,11 @@ import gymnasium
 
 from ce_gym.compile import Call, Repeat, calls_of
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.parameters import PARAMETERS
 from ce_gym.dynamics.forces.scene import StepOptions, make_scene, symbolic_state
-from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.step import solve

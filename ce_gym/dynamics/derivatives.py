@@ -21,8 +21,9 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, quaternion_product, quaternion_to_rotation
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.parameters import parameter_defaults, with_parameters
-from ce_gym.dynamics.functions import FUNCTIONS, traced
+from ce_gym.dynamics.functions import FUNCTIONS
 from ce_gym.model.mechanism import Mechanism
 
 PLAIN_FIGURES, BODY_FIGURES = ("gravity", "rotor_inertia", "ratio"), ("added_mass", "com_shift")

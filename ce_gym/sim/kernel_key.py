@@ -4,12 +4,12 @@ from dataclasses import replace
 
 from ce_gym.compile import source_fingerprint
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.residuals import residual
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import iteration_function

@@ -13,7 +13,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.motor_control import motor_springs
 from ce_gym.dynamics.forces.passive import limit_stiffness
 from ce_gym.dynamics.forces.scene import Scene, State
-from ce_gym.dynamics.functions import kinetic_and_potential
+from ce_gym.dynamics.recursion.derived import kinetic_and_potential
 from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
 from ce_gym.dynamics.stepping.step import touching
 

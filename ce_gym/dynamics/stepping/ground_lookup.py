@@ -12,8 +12,8 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.scene import StepOptions, symbolic_state
-from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
 from ce_gym.dynamics.stepping.step import contact_places, contact_spheres
 from ce_gym.model.mechanism import Mechanism

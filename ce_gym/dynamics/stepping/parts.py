@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.scene import StepOptions, symbolic_state
-from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.stepping.plan import AT_START, MEANS, MOVED
 from ce_gym.model.mechanism import Mechanism
 

@@ -29,7 +29,6 @@ from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.passive import passive_forces
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
-from ce_gym.dynamics.functions import guessed_coordinates
 from ce_gym.dynamics.recursion.ce_aba import (
     BodyTerms,
     JointTerms,
@@ -37,6 +36,7 @@ from ce_gym.dynamics.recursion.ce_aba import (
     inward_inertia_pass,
     outward_acceleration_pass,
 )
+from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, turning_momentum
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.model.description import ContactSphere

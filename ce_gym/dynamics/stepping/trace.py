@@ -8,11 +8,12 @@ from dataclasses import replace
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.actuation import actuated_clusters
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import State, StepOptions, make_scene, symbolic_state, target_names
-from ce_gym.dynamics.functions import loop_gap, loop_state, traced
+from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.methods import METHODS

@@ -13,7 +13,7 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_product, quaternion_to_rotation
 from ce_gym.dynamics.forces.scene import Scene, State
-from ce_gym.dynamics.functions import guessed_coordinates
+from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.stepping.plan import AFTER, Plan, Rates, combined, error_estimate
 from ce_gym.dynamics.stepping.step import (
     Solved,

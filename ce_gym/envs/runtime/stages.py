@@ -16,7 +16,7 @@ import numpy as np
 
 from ce_gym.compile import Call
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.functions import traced
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.envs.task.commands import Commands
 from ce_gym.envs.task.ground import SEEN, resting_load, starting_place
 from ce_gym.envs.task.sampling import Draws

@@ -9,9 +9,9 @@ import numpy as np
 
 from ce_gym.compile import Call, Repeat, Step
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.motor_control import standing_motors
 from ce_gym.dynamics.forces.scene import Control, target_names
-from ce_gym.dynamics.functions import traced
 from ce_gym.envs.task.tasks import Task
 from ce_gym.model.mechanism import Mechanism
 

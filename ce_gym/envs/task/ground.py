@@ -13,10 +13,10 @@ import numpy as np
 
 from ce_gym.compile import Buffer, Call, Lookup, Step
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.ground import above, lift
 from ce_gym.dynamics.forces.parameters import figures
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.functions import traced
 from ce_gym.dynamics.recursion.kinematics import constant, outward_velocity_pass
 from ce_gym.envs.task.curriculum import Curriculum
 from ce_gym.envs.task.sampling import Draws

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.ground import above as over_ground
-from ce_gym.dynamics.functions import spanning_coordinates
+from ce_gym.dynamics.recursion.derived import spanning_coordinates
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
 
