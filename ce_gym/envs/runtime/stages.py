@@ -19,7 +19,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.envs.task.commands import Commands
 from ce_gym.envs.task.ground import SEEN, resting_load, starting_place
-from ce_gym.envs.task.sampling import Draws
+from ce_gym.envs.task.sampling import Sampler
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.registry import Term
 from ce_gym.sim.schema import Row
@@ -94,7 +94,7 @@ class Stages:
 
     def assess(self) -> tuple[Call, int]:
         """Trace what follows the sub-steps; return the call and how many random numbers it takes."""
-        p, task, state, draws = self.program, self.task, self.state, Draws()
+        p, task, state, sampler = self.program, self.task, self.state, Sampler()
         clipped = SX.sym("clipped", p.n_actions)
         values = state | self.seen_ground | {"action": clipped, "previous_action": state["action"]}
         s = self._context(values)
@@ -110,14 +110,14 @@ class Stages:
             after["air_time"] = ca.if_else(s.foot_contact, 0, state["air_time"] + p.control_dt)
         after |= p.curriculum.followed(s, state) | s.kept
 
-        fresh = self.commands.new(draws, state.get("grown"))
+        fresh = self.commands.new(sampler, state.get("grown"))
         due = self._every(task.command_period, after["clock"])
         commanded = {name: ca.if_else(due, fresh[name], state[name]) for name in fresh}
         if task.push_period:
-            after["v"] = self._pushed(state["v"], after["clock"], draws)
+            after["v"] = self._pushed(state["v"], after["clock"], sampler)
         after |= self.commands.steered(values | after, commanded)
         seen = self._context(values | after)
-        observation, history = self._observation(seen, state.get("history"), draws)
+        observation, history = self._observation(seen, state.get("history"), sampler)
         after |= seen.kept | ({"history": history} if "history" in state else {})
 
         truncated = ca.logic_or(after["elapsed"] >= state["limit"], diverged)
@@ -128,15 +128,15 @@ class Stages:
         sums = ca.if_else(ca.logic_and(done, ca.fabs(after["sums"]) < ca.inf), after["sums"], 0)
         ended = ca.vertcat(ca.if_else(done, after["elapsed"], 0), sums)
         outputs = after | {"observation": observation, "outcome": outcome, "ended": ended}
-        given = state | self.seen_ground | {"clipped": clipped, "draws": draws.symbols}
-        return _call("assess", given, outputs), draws.symbols.numel()
+        given = state | self.seen_ground | {"clipped": clipped, "draws": sampler.symbols}
+        return _call("assess", given, outputs), sampler.symbols.numel()
 
     def begin(self) -> tuple[Call, int]:
         """Trace a reset where `chosen`; return the call and how many random numbers it takes.
 
         On a field the robots have been placed: their state has where they stand, all but the height of the ground.
         """
-        p, draws = self.program, Draws()
+        p, sampler = self.program, Sampler()
         ours = {name for name, row in self.schema.items() if row.writer in ("physics", "task", "term")}
         ours -= {"chosen", "retries"}  # the latter counts on, so that who looks after a reset sees it too
         state = {name: x for name, x in self.state.items() if name in ours}
@@ -147,40 +147,40 @@ class Stages:
             fresh["q"] = SX(state["q"])
             fresh["q"][2] += p.ground.lift(state["q"], state.get("dependent"), ground)
         else:
-            fresh["q"] = self._starting_pose(draws)
-        fresh["v"] = self._starting_velocity(draws)
+            fresh["q"] = self._starting_pose(sampler)
+        fresh["v"] = self._starting_velocity(sampler)
         if "grown" in fresh:
             fresh["grown"] = p.curriculum.grown(state)
         if "draw" in fresh:
-            fresh["draw"] = ca.vertcat(*[draws.unit() for _ in range(p.randomised.n_draws)])
+            fresh["draw"] = ca.vertcat(*[sampler.unit() for _ in range(p.randomised.n_draws)])
             fresh["parameters"] = p.randomised.values(fresh["draw"])
         if "delay" in fresh:
             low, high = self.task.latency
-            fresh["delay"] = ca.floor(draws.uniform(low, high + 1))
+            fresh["delay"] = ca.floor(sampler.uniform(low, high + 1))
             fresh["target"] = SX(p.actions.rest)
         if "load" in fresh:
             fresh["load"] = resting_load(self.model.mechanism, p.options, fresh, ground)
-        fresh |= self.commands.new(draws, fresh.get("grown"))
+        fresh |= self.commands.new(sampler, fresh.get("grown"))
         fresh |= self.commands.steered(fresh, {name: fresh[name] for name in ("command", "heading") if name in fresh})
         chosen = self.state["chosen"] > 0.5
         after = {name: ca.if_else(chosen, ca.densify(fresh[name]), x) for name, x in state.items()}
         s = self._context(self.state | after | self.seen_ground | {"previous_action": after["action"]})
-        observation, history = self._observation(s, None, draws)
+        observation, history = self._observation(s, None, sampler)
         later = s.kept | ({"history": history} if "history" in state else {})
         after |= {name: ca.if_else(chosen, value, state[name]) for name, value in later.items()}
-        given = self.state | self.seen_ground | {"first_draws": draws.symbols}
-        return _call("begin", given, after | {"observation": observation}), draws.symbols.numel()
+        given = self.state | self.seen_ground | {"first_draws": sampler.symbols}
+        return _call("begin", given, after | {"observation": observation}), sampler.symbols.numel()
 
     def place(self) -> tuple[Call, int]:
         """Trace how those who are `chosen` take a pose on a tile of the field as if the ground were at 0."""
-        state, draws, curriculum = self.state, Draws(), self.program.curriculum
-        level = curriculum.level(state, draws, self.program.control_dt)
-        place = starting_place(curriculum, level, draws)
-        fresh = {"q": self._starting_pose(draws), "level": level}
+        state, sampler, curriculum = self.state, Sampler(), self.program.curriculum
+        level = curriculum.level(state, sampler, self.program.control_dt)
+        place = starting_place(curriculum, level, sampler)
+        fresh = {"q": self._starting_pose(sampler), "level": level}
         fresh["q"][:2] = place
         fresh |= {"dependent": SX(self.model.guess)} if "dependent" in state else {}
         after = {name: ca.if_else(state["chosen"] > 0.5, value, state[name]) for name, value in fresh.items()}
-        return _call("place", state | {"place_draws": draws.symbols}, after), draws.symbols.numel()
+        return _call("place", state | {"place_draws": sampler.symbols}, after), sampler.symbols.numel()
 
     def _context(self, values: Mapping[str, SX]) -> TermContext:
         values = dict(values) | ({"scaled_parameters": 2 * values["draw"] - 1} if "draw" in values else {})
@@ -189,34 +189,34 @@ class Stages:
     def _failed(self, s: TermContext) -> SX:
         return sum([term.number(s) for term in self.program.termination_terms.values()], SX(0)) > 0
 
-    def _starting_pose(self, draws: Draws) -> SX:
+    def _starting_pose(self, sampler: Sampler) -> SX:
         """Positions near the standing pose, heading anywhere."""
         standing = self.model.standing_q
-        half_yaw = draws.uniform(-np.pi / 2, np.pi / 2)
-        noise = draws.symmetric(len(standing) - 7, self.task.reset_noise["joint_position"])
+        half_yaw = sampler.uniform(-np.pi / 2, np.pi / 2)
+        noise = sampler.symmetric(len(standing) - 7, self.task.reset_noise["joint_position"])
         heading = ca.vertcat(ca.cos(half_yaw), 0, 0, ca.sin(half_yaw))
         return ca.densify(ca.vertcat(standing[:3], heading, standing[7:] + noise))
 
-    def _starting_velocity(self, draws: Draws) -> SX:
+    def _starting_velocity(self, sampler: Sampler) -> SX:
         """Velocities near rest."""
         noise = self.task.reset_noise
-        base = draws.symmetric(6, noise["base_velocity"])
-        return ca.vertcat(base, draws.symmetric(self.model.nv - 6, noise["joint_velocity"]))
+        base = sampler.symmetric(6, noise["base_velocity"])
+        return ca.vertcat(base, sampler.symmetric(self.model.nv - 6, noise["joint_velocity"]))
 
     def _every(self, period: float, clock: SX) -> SX:
         """1 once in a period [s], else 0."""
         return ca.fmod(clock, max(round(period / self.program.control_dt), 1)) < 0.5
 
-    def _pushed(self, v: SX, clock: SX, draws: Draws) -> SX:
+    def _pushed(self, v: SX, clock: SX, sampler: Sampler) -> SX:
         """Now and then change the horizontal velocity of the base, as seen from it, at a stroke."""
-        push = ca.vertcat(SX(3, 1), draws.symmetric(2, self.task.push_speed), SX(v.numel() - 5, 1))
+        push = ca.vertcat(SX(3, 1), sampler.symmetric(2, self.task.push_speed), SX(v.numel() - 5, 1))
         return v + ca.if_else(self._every(self.task.push_period, clock), ca.densify(push), 0)
 
-    def _observation(self, s: TermContext, before: SX | None, draws: Draws) -> tuple[SX, SX]:
+    def _observation(self, s: TermContext, before: SX | None, sampler: Sampler) -> tuple[SX, SX]:
         """The policy's observation, noisy and with its history, then the critic's; and the history to keep."""
         task, p = self.task, self.program
         blocks = {name: term(s) for name, term in p.observation_terms.items()}
-        noisy = [b + draws.symmetric(b.numel(), task.noise[n]) if task.noise.get(n) else b for n, b in blocks.items()]
+        noisy = [b + sampler.symmetric(b.numel(), task.noise[n]) if task.noise.get(n) else b for n, b in blocks.items()]
         now = _clipped(ca.vertcat(*noisy))
         kept = SX(0, 1)
         if task.history > 1:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.task.curriculum import Curriculum
-from ce_gym.envs.task.sampling import Draws
+from ce_gym.envs.task.sampling import Sampler
 from ce_gym.envs.task.tasks import Task
 
 HEADING_GAIN = 0.5
@@ -25,13 +25,13 @@ class Commands:
     def __init__(self, task: Task, curriculum: Curriculum) -> None:
         self.task, self.curriculum = task, curriculum
 
-    def new(self, draws: Draws, grown: SX | None) -> dict[str, SX]:
+    def new(self, sampler: Sampler, grown: SX | None) -> dict[str, SX]:
         """Return a command within the range that the robot has come to, or to stand still; and a heading."""
-        standing = draws.unit() < self.task.standing_fraction
-        moving = draws.within(self.task.command_range)
+        standing = sampler.unit() < self.task.standing_fraction
+        moving = sampler.within(self.task.command_range)
         moving = moving if grown is None else self.curriculum.share(grown) * moving
         command = {"command": ca.if_else(standing, 0, moving)}
-        return command | ({"heading": draws.uniform(-np.pi, np.pi)} if self.task.heading else {})
+        return command | ({"heading": sampler.uniform(-np.pi, np.pi)} if self.task.heading else {})
 
     def steered(self, values: dict[str, SX], command: dict[str, SX]) -> dict[str, SX]:
         """Replace the commanded yaw rate by one that turns the robot to its heading."""

@@ -16,7 +16,7 @@ import math
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.task.sampling import Draws
+from ce_gym.envs.task.sampling import Sampler
 from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.rewards import track_linear_velocity
@@ -63,10 +63,10 @@ class Curriculum:
             after["tracked"] = state["tracked"] + track_linear_velocity(s)
         return after
 
-    def level(self, state: dict[str, SX], draws: Draws, control_dt: float) -> SX:
+    def level(self, state: dict[str, SX], sampler: Sampler, control_dt: float) -> SX:
         """Return the level of the terrain on which the next episode begins."""
         count = self.task.terrain["levels"]
-        anywhere = ca.floor(draws.uniform(0, count))
+        anywhere = ca.floor(sampler.uniform(0, count))
         if not self.climbing:
             return anywhere
         walked, asked = state["walked"][0], state["walked"][1]

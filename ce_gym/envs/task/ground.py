@@ -19,7 +19,7 @@ from ce_gym.dynamics.forces.parameters import figures
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.recursion.kinematics import constant, outward_velocity_pass
 from ce_gym.envs.task.curriculum import Curriculum
-from ce_gym.envs.task.sampling import Draws
+from ce_gym.envs.task.sampling import Sampler
 from ce_gym.envs.task.terrain_tiles import PLATFORM
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.substeps import FRAME, HEIGHTS
@@ -99,9 +99,9 @@ def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str,
     return ca.vertcat(*load)
 
 
-def starting_place(curriculum: Curriculum, level: SX, draws: Draws) -> SX:
+def starting_place(curriculum: Curriculum, level: SX, sampler: Sampler) -> SX:
     """Return where an episode begins, x and y [m]: about the middle of a tile of a level, in any column."""
     terrain = curriculum.task.terrain
-    column = ca.floor(draws.uniform(0, terrain["columns"]))
+    column = ca.floor(sampler.uniform(0, terrain["columns"]))
     middle = terrain["size"] * (ca.vertcat(level, column) + 0.5)
-    return middle + draws.symmetric(2, PLATFORM / 2)
+    return middle + sampler.symmetric(2, PLATFORM / 2)

@@ -1,7 +1,7 @@
-"""Named use of a vector of uniform random numbers while a function is traced.
+"""Random numbers of a traced function.
 
-The kernel fills a buffer with uniform numbers from a counter-based stream; a traced function consumes them one after
-the other and afterwards knows how many it needed.
+The kernel fills a buffer with uniform numbers from a counter-based stream. A function takes them one by one while it is
+traced; how many it has taken is the size of the buffer.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 
 
-class Draws:
+class Sampler:
     """Uniform numbers in [0, 1), consumed in order."""
 
     def __init__(self) -> None:
