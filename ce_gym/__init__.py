@@ -15,6 +15,7 @@ from ce_gym.envs.registration import environment_ids, register_environments
 from ce_gym.envs.rendering import use_renderers
 from ce_gym.envs.terms.registry import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.policies import LevelWarning, Policy, PolicyError, load_policy, shipped_policies
 from ce_gym.sim.derivatives import StepDerivatives
 from ce_gym.sim.simulator import Simulator
@@ -23,6 +24,7 @@ from ce_gym.sim.terrain import Terrain
 __version__ = "0.1.0"
 
 __all__ = [
+    "LEVELS",
     "InertiaWarning",
     "LevelWarning",
     "LossyImportWarning",

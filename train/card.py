@@ -30,8 +30,8 @@ from progress import read_curve
 from pushes import direction_name, push_envelope
 from settings import Settings, config_file, load_settings
 from suites import judge_suites, level_table, suite_table, weights_seed
-from transfer import LEVELS
 
+from ce_gym import LEVELS
 from ce_gym.policies import (
     Policy,
     PolicyError,

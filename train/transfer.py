@@ -26,13 +26,12 @@ from console import SEED, THREADS, Parser, Table, markdown, print_result, run
 from evaluate import add_arguments, env_kwargs, evaluate, load
 from settings import Settings, config_file, load_env_args, load_settings
 
-from ce_gym import usable_cores
+from ce_gym import LEVELS, usable_cores
 from ce_gym.policies import WHERE, Policy, PolicyError, add_env_arguments, load_policy, locate_policy
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
-LEVELS = ("exact", "coupled", "armature", "none")
 """Transmission levels, from what is kept in full to what is ignored."""
 
 COLUMNS = (

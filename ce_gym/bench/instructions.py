@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import LinearConstraint, load_robot, robots
-from ce_gym.model.mechanism import is_axisymmetric
+from ce_gym.model.mechanism import LEVELS, is_axisymmetric
 
-LEVELS = ("exact", "coupled", "armature", "none")
 FUNCTIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix")
 LARGEST_RATIO = {"gears": 1.03, "belts or differentials": 1.10}
 """Most instructions that exact forward dynamics may take, as a multiple of armature, by what the robot has."""

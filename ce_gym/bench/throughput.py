@@ -15,7 +15,8 @@ from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved
 from ce_gym.compile.system import resident_memory, usable_cores
 
-LEVELS = ("exact", "armature")
+MEASURED = ("exact", "armature")
+"""Transmission levels."""
 DTYPES = ("float64", "float32")
 CALLS = 20
 REQUIRED = 400_000.0
@@ -83,7 +84,7 @@ def run(arguments: argparse.Namespace) -> Report:
 def steps_per_second(arguments: argparse.Namespace, report: Report) -> None:
     """Measure levels, types and thread counts in one run."""
     cores = usable_cores()
-    settings = [(level, d, n) for level in LEVELS for d in DTYPES for n in sorted({1, cores}, reverse=True)]
+    settings = [(level, d, n) for level in MEASURED for d in DTYPES for n in sorted({1, cores}, reverse=True)]
     competitors = {
         setting: stepping(
             arguments.env, arguments.num_envs, transmission=setting[0], dtype=setting[1], num_threads=setting[2]

@@ -31,6 +31,7 @@ from ce_gym.model.errors import RobotError
 
 Level = Literal["exact", "coupled", "armature", "none"]
 LEVELS: tuple[Level, ...] = get_args(Level)
+"""Transmission levels, the exact one first."""
 Array = NDArray[np.float64]
 
 AXISYMMETRY_TOLERANCE = 1e-9

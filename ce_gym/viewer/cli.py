@@ -9,13 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy
 from ce_gym.viewer.console import examples, has_display
 
 if TYPE_CHECKING:
     from ce_gym.viewer.rollouts.rollout import Rollout
-
-LEVELS = ("exact", "coupled", "armature", "none")
 
 
 def add_view_command(subparsers: Any) -> None:

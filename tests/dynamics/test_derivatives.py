@@ -9,8 +9,8 @@ from linkages import rod_leg, spatial_four_bar
 
 from ce_gym.dynamics import Model
 from ce_gym.model import Robot
+from ce_gym.model.mechanism import LEVELS
 
-LEVELS = ["exact", "coupled", "armature", "none"]
 SMALL = ["planar_leg_linkage", "mit_humanoid_leg", rod_leg(), spatial_four_bar()]
 CASES = [(robot, level) for robot in SMALL for level in LEVELS] + [("mini_cheetah", "exact"), ("tello", "exact")]
 

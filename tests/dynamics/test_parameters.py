@@ -16,6 +16,7 @@ from ce_gym.dynamics.forces.parameters import PARAMETERS, parameter_defaults
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import LinearConstraint, Robot, load_robot
+from ce_gym.model.mechanism import LEVELS
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -164,7 +165,7 @@ def with_ratios(robot: Robot, factor: float) -> Robot:
 
 
 @pytest.mark.parametrize("motors", ["ideal", "limited"])
-@pytest.mark.parametrize("level", ["exact", "coupled", "armature", "none"])
+@pytest.mark.parametrize("level", LEVELS)
 def test_ratio_is_that_of_every_gear(tripod: Robot, states, level: str, motors: str):
     other = with_ratios(tripod, 1.2)
     ours = results(tripod, states, level, {"ratio": 1.2}, motors=motors)

@@ -11,10 +11,10 @@ import ce_gym  # noqa: F401 - registers the environments
 from ce_gym.envs.base import spaces
 from ce_gym.envs.policy_spec import policy_spec
 from ce_gym.envs.runtime.setup import make_program
+from ce_gym.model.mechanism import LEVELS
 
 TELLO = "ce_gym/TelloVelocity-v0"
 KINDS = ("joint_pd", "joint_torque", "motor_pd", "motor_torque")
-LEVELS = ("exact", "coupled", "armature", "none")
 
 
 def make(n: int = 2, env_id: str = "ce_gym/MiniCheetahVelocity-v0", robot: str = TRIPOD, **arguments):

@@ -23,10 +23,10 @@ from progress import read_curve
 from saved import load_learner
 from settings import config_file, load_settings
 from stable_baselines3 import PPO
-from transfer import LEVELS
 from transfer import main as transfer_main
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
+from ce_gym.model.mechanism import LEVELS
 
 ROOT = Path(__file__).parents[2]
 SMALL = [

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from point_mass import ID
 from ppo import train as really_train
-from transfer import LEVELS, interval, main, summary, table
+from transfer import interval, main, summary, table
 
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.policies import load_policy
 
 SMALL = ["--train", "--env", ID, "--steps", "600", "--seeds", "0", "1", "--threads", "1", "--episodes", "4"]

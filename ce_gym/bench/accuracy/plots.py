@@ -22,7 +22,7 @@ OURS = {
 APPROXIMATE = ("ce_gym, armature or coupled, Euler", GREY, "o-")
 COLORS = {"": ORANGE, "exact": "#CC79A7", "stiff": RED}
 """MuJoCo's: without rotors, rotors as bodies or loops at its default, and held stiffly."""
-LEVELS = {"": "without rotor bodies", "exact": "rotors and loops as equalities", "stiff": "the same, stiff"}
+VARIANTS = {"": "without rotor bodies", "exact": "rotors and loops as equalities", "stiff": "the same, stiff"}
 MARKERS = {"Euler": "o", "implicitfast": "^", "RK4": "D"}
 
 
@@ -69,5 +69,5 @@ def _look(curve: Curve) -> tuple[str, dict[str, Any]]:
         return label, {"color": color, "marker": line[0], "linestyle": "--" if dashed else "-", "zorder": 5}
     kind = "stiff" if "stiff" in curve.level else "exact" if curve.level == "exact" else ""
     marker = MARKERS[curve.method]
-    label = f"MuJoCo {curve.method}, {LEVELS[kind]}"
+    label = f"MuJoCo {curve.method}, {VARIANTS[kind]}"
     return label, {"color": COLORS[kind], "marker": marker, "linestyle": "--", "markerfacecolor": "none"}

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ce_gym
+from ce_gym.model.mechanism import LEVELS
 
-LEVELS = ("exact", "coupled", "armature", "none")
 DTYPES = ("float64", "float32")
 NUM_ENVS = 17
 """Robots in a batch: no multiple of the lanes of a vector."""

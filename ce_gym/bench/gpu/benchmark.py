@@ -21,10 +21,10 @@ from ce_gym.dynamics.model import Model
 from ce_gym.envs.runtime.batch import programs
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.model import robots
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device, Emulated, device_named
 
-LEVELS = ("exact", "coupled", "armature", "none")
 DTYPES = ("float32", "float64")
 ARCHITECTURES = ("sm_80", "sm_90")
 BATCHES = (4096, 16384, 65536, 262144, 1048576)

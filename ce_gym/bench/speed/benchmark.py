@@ -24,10 +24,11 @@ from ce_gym.bench.speed import robots as speed_robots
 from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Robot, load_robot, robots
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim import Simulator
 
-LEVELS = ("armature", "exact")
-ALL_LEVELS = ("exact", "coupled", "armature", "none")
+IN_DEPTH = ("armature", "exact")
+"""Levels of the comparison in depth."""
 DTYPES = ("float64", "float32")
 BATCHES = (1, 8, 64, 512, 4096, 65536)
 REQUIRED = {"armature": 30.0, "exact": 55.0}
@@ -42,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     parser.add_argument("--robot", default="mini_cheetah", help="name or path of the robot measured in depth")
     parser.add_argument("--robots", nargs="*", default=robots(), help="names or paths of the robots in the tables")
-    parser.add_argument("--levels", nargs="+", default=ALL_LEVELS, choices=ALL_LEVELS, help="levels in the tables")
+    parser.add_argument("--levels", nargs="+", default=LEVELS, choices=LEVELS, help="levels in the tables")
     parser.add_argument("--contacts", choices=("foot", "all"), default="foot", help="which contact spheres take part")
     parser.add_argument("--dt", type=float, default=0.005, help="sub-step [s]")
     parser.add_argument("--num-envs", type=int, default=1024, help="robots in our batch")
@@ -55,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
     if arguments.quick:
-        arguments.robots, arguments.levels = [arguments.robot], LEVELS
+        arguments.robots, arguments.levels = [arguments.robot], IN_DEPTH
         arguments.batches, arguments.rounds = [n for n in arguments.batches if n <= 512], 3
     stepping.quiet()
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -84,12 +85,12 @@ def run(arguments: argparse.Namespace) -> Report:
 
 def _in_depth(robot: Robot, arguments: argparse.Namespace, report: Report) -> None:
     """Compare one robot's sub-step with MuJoCo at its best, and with the machine's peak."""
-    sides = [_our_side(robot, level, dtype, arguments) for level in LEVELS for dtype in DTYPES]
-    sides += [_mujoco_side(robot, level, arguments.dt) for level in LEVELS]
+    sides = [_our_side(robot, level, dtype, arguments) for level in IN_DEPTH for dtype in DTYPES]
+    sides += [_mujoco_side(robot, level, arguments.dt) for level in IN_DEPTH]
     peaks = {f"peak {dtype}": peak.competitor(dtype) for dtype in DTYPES}
     timings = interleaved({s.name: s.competitor for s in sides} | peaks, arguments.rounds, clock=time.thread_time)
     report.tables.append(_step_table(robot, sides, timings))
-    for level in LEVELS:
+    for level in IN_DEPTH:
         compared = ratio(timings[f"MuJoCo {level}"], timings[f"ce_gym {level} float64"])
         claim = f"MuJoCo / ce_gym, {level}, float64, at least {REQUIRED[level]:.0f}"
         report.requirements.append(Requirement(claim, str(compared), compared.cautious >= REQUIRED[level]))

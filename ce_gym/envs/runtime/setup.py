@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, get_args
+from typing import Any
 
 from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
@@ -19,7 +19,7 @@ from ce_gym.envs.task.checks import checked_value, merged_rewards
 from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
-from ce_gym.model.mechanism import Level
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim.devices import Device, device_named
 
 
@@ -97,8 +97,8 @@ def make_program(
         raise ValueError(f"contact_forces={contact_forces!r}; expected true or false")
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"task={task!r}; expected one of {', '.join(TASKS)}")
-    if transmission not in get_args(Level):
-        raise ValueError(f"transmission={transmission!r}; expected one of {', '.join(get_args(Level))}")
+    if transmission not in LEVELS:
+        raise ValueError(f"transmission={transmission!r}; expected one of {', '.join(LEVELS)}")
     model = Model(robot, transmission)
     figures = own_task(model.robot, task)
     for name, given in (("reward_weights", reward_weights), ("rewards", rewards)):

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.policies import environment_of, find_policy, load_policy, shipped_policies
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.live.robot import Act, LiveRobot
 
-LEVELS = ("exact", "coupled", "armature", "none")
 GROUNDS: Mapping[str, Mapping[str, Any]] = {
     "flat": {"kind": "flat"},
     **{kind: {"kind": kind, "curriculum": False, "levels": 2} for kind in ("slope", "rough", "stairs")},
