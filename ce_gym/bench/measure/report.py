@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ce_gym.bench.measure import machine
-
-Cell = str | int | float | bool | None
+from ce_gym.model.table import Cell, table_text
 
 
 @dataclass(frozen=True)
@@ -28,15 +27,7 @@ class Table:
 
     def as_text(self) -> str:
         """Return the table with aligned columns: text to the left, numbers to the right."""
-        cells = [[cell_text(cell) for cell in row] for row in self.rows]
-        widths = [max(len(row[i]) for row in [list(self.columns), *cells]) for i in range(len(self.columns))]
-        numeric = [all(not isinstance(row[i], str) for row in self.rows) for i in range(len(self.columns))]
-
-        def line(row: list[str]) -> str:
-            aligned = (x.rjust(w) if right else x.ljust(w) for x, w, right in zip(row, widths, numeric, strict=True))
-            return "  ".join(aligned).rstrip()
-
-        return "\n".join([self.title, "", line(list(self.columns)), line(["-" * w for w in widths]), *map(line, cells)])
+        return f"{self.title}\n\n{table_text(self.columns, self.rows, indent='', text=cell_text)}"
 
     def as_markdown(self) -> str:
         """Return the table in Markdown, under its title."""
