@@ -66,8 +66,7 @@ class Batch:
 
     def rows(self, name: str) -> Array:
         """Return a copy of a state buffer, one robot per row; KeyError if there is none."""
-        array = self.arrays[name]
-        return self.place.copy(array) if self.schema[name].dtype else self.place.read(array, self.num_envs)
+        return self.place.read(self.arrays[name], self.num_envs)
 
     def write(self, name: str, values: Any, mask: Any = None) -> None:
         """Overwrite a state buffer.
@@ -77,11 +76,7 @@ class Batch:
             values: Shape (num_envs, size) or what broadcasts to it; (num_envs,) for a plain buffer of size 1.
             mask: Which robots, bool, shape (num_envs,); all of them if None.
         """
-        array = self.arrays[name]
-        if self.schema[name].dtype:
-            self.place.assign(array, values, mask)
-        else:
-            self.place.write(array, values, mask)
+        self.place.write(self.arrays[name], values, mask)
 
     def snapshot(self, file: File | None = None) -> Snapshot:
         """Return the state by name, shape (num_envs, size) or (num_envs,); write it to a file, too, if one is given."""

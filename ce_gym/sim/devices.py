@@ -1,8 +1,8 @@
 """Where robots live: numpy arrays and the CPU's kernels, or torch tensors and a GPU's.
 
-A device makes, reads and writes the state arrays of `ce_gym.sim.tiles` and loads the kernels that work on them; whoever
-holds robots asks it and does not mind which it is. A GPU's arrays are one tile with a lane for each robot. torch is
-imported when a GPU is asked for.
+A device makes, reads and writes state arrays and loads the kernels that work on them. A state array is either in tiles,
+as kernels take it (see `ce_gym.sim.tiles`; a GPU has one tile with a lane for each robot), or plain, one robot per row.
+torch is imported when a GPU is asked for.
 """
 
 from __future__ import annotations
@@ -33,35 +33,31 @@ class Device(Protocol):
     fuses: bool
 
     def tiles(self, num_envs: int, size: int, dtype: str) -> Array:
-        """Return zeros for `size` values of each robot, as kernels take them."""
-        ...
-
-    def copy(self, array: Array) -> Array:
-        """Return a copy of such an array."""
-        ...
-
-    def read(self, array: Array, num_envs: int) -> Array:
-        """Return a copy of such an array as rows, shape (num_envs, size)."""
-        ...
-
-    def write(self, array: Array, rows: Any, mask: Any = None) -> None:
-        """Write rows, shape (num_envs, size) or anything that broadcasts to it, of robots where `mask` is true."""
-        ...
-
-    def rows(self, values: Any, dtype: str, shape: tuple[int, ...] = ()) -> Array:
-        """Return values as an array of this device, contiguous; broadcast to `shape`, if one is given."""
+        """Return zeros in tiles, `size` values of each robot."""
         ...
 
     def zeros(self, shape: tuple[int, ...], dtype: str) -> Array:
-        """Return zeros as a plain array, one robot per row."""
+        """Return zeros as a plain array."""
         ...
 
     def empty(self, shape: tuple[int, ...], dtype: str) -> Array:
         """Return a plain array whose values are yet to be written."""
         ...
 
-    def assign(self, array: Array, rows: Any, mask: Any = None) -> None:
-        """Write rows of a plain array, where `mask` is true."""
+    def rows(self, values: Any, dtype: str, shape: tuple[int, ...] = ()) -> Array:
+        """Return values as a plain array of this device; broadcast to `shape` and contiguous, if one is given."""
+        ...
+
+    def copy(self, array: Array) -> Array:
+        """Return a copy of an array, in tiles or plain."""
+        ...
+
+    def read(self, array: Array, num_envs: int) -> Array:
+        """Return a copy of a state array as a plain one, shape (num_envs, size)."""
+        ...
+
+    def write(self, array: Array, rows: Any, mask: Any = None) -> None:
+        """Write rows that broadcast to (num_envs, size) into a state array, where `mask` is true."""
         ...
 
     def host(self, array: Array) -> NDArray:
@@ -74,46 +70,33 @@ class Device(Protocol):
 
 
 class Cpu:
-    """numpy arrays and the kernels of `ce_gym.compile`."""
+    """numpy arrays and the kernels of `ce_gym.compile`, one stage each."""
 
     name, fuses = "cpu", False
     tiles = staticmethod(host_tiles.tiles)
-    read = staticmethod(host_tiles.read_rows)
-    write = staticmethod(host_tiles.write_rows)
-
-    def copy(self, array: Array) -> NDArray:
-        """Return a copy."""
-        return array.copy()
+    zeros, empty = staticmethod(np.zeros), staticmethod(np.empty)
 
     def rows(self, values: Any, dtype: str, shape: tuple[int, ...] = ()) -> NDArray:
-        """Return values as an array; broadcast to `shape` and contiguous, if one is given."""
         array = np.asarray(values, dtype)
         return np.ascontiguousarray(np.broadcast_to(array, shape)) if shape else array
 
-    def zeros(self, shape: tuple[int, ...], dtype: str) -> NDArray:
-        """Return zeros."""
-        return np.zeros(shape, dtype)
+    def copy(self, array: Array) -> NDArray:
+        return array.copy()
 
-    def empty(self, shape: tuple[int, ...], dtype: str) -> NDArray:
-        """Return an array whose values are yet to be written."""
-        return np.empty(shape, dtype)
+    def read(self, array: Array, num_envs: int) -> NDArray:
+        return host_tiles.read_rows(array, num_envs) if array.ndim == 3 else array.copy()
 
-    def assign(self, array: Array, rows: Any, mask: Any = None) -> None:
-        """Write rows where `mask` is true."""
-        array[...] = rows if mask is None else np.where(_beside(mask, array.ndim), rows, array)
+    def write(self, array: Array, rows: Any, mask: Any = None) -> None:
+        if array.ndim == 3:
+            host_tiles.write_rows(array, rows, mask)
+        else:
+            array[...] = rows if mask is None else np.where(_beside(mask, array.ndim), rows, array)
 
     def host(self, array: Array) -> NDArray:
-        """Return the array itself."""
         return array
 
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
-        """Return the kernel of one stage."""
-
-        def only() -> Program:
-            (stage,) = build()
-            return stage
-
-        return load_kernel(key, only, dtype)
+        return load_kernel(key, lambda: build()[0], dtype)
 
 
 class Cuda:
@@ -136,68 +119,38 @@ class Cuda:
         self._gpu = gpu
 
     def tiles(self, num_envs: int, size: int, dtype: str) -> Array:
-        """Return zeros, shape (1, size, num_envs)."""
-        import torch
+        return self.zeros((1, size, num_envs), dtype)
 
-        return torch.zeros((1, size, num_envs), dtype=getattr(torch, dtype), device=self._place)
+    def zeros(self, shape: tuple[int, ...], dtype: str) -> Array:
+        return _torch().zeros(shape, dtype=getattr(_torch(), dtype), device=self._place)
+
+    def empty(self, shape: tuple[int, ...], dtype: str) -> Array:
+        return _torch().empty(shape, dtype=getattr(_torch(), dtype), device=self._place)
+
+    def rows(self, values: Any, dtype: str, shape: tuple[int, ...] = ()) -> Array:
+        tensor = _torch().as_tensor(values, dtype=getattr(_torch(), dtype), device=self._place)
+        return (tensor.expand(shape) if shape else tensor).contiguous()
 
     def copy(self, array: Array) -> Array:
-        """Return a copy."""
         return array.clone()
 
     def read(self, array: Array, num_envs: int) -> Array:
-        """Return a copy as rows, shape (num_envs, size)."""
-        import torch
-
-        return array[0].T.clone(memory_format=torch.contiguous_format)
+        return array[0].T.clone(memory_format=_torch().contiguous_format) if array.ndim == 3 else array.clone()
 
     def write(self, array: Array, rows: Any, mask: Any = None) -> None:
-        """Write rows of robots where `mask` is true."""
-        import torch
-
-        _, size, num_envs = array.shape
-        rows = (
-            rows if isinstance(rows, torch.Tensor) else np.array(rows, float)
-        )  # torch warns of arrays it may not write
-        values = torch.as_tensor(rows, dtype=array.dtype, device=array.device).expand(num_envs, size).T
-        if mask is None:
-            array[0] = values
-        else:
-            array[0] = torch.where(torch.as_tensor(mask, dtype=torch.bool, device=array.device), values, array[0])
-
-    def rows(self, values: Any, dtype: str, shape: tuple[int, ...] = ()) -> Array:
-        """Return values as a tensor, contiguous; broadcast to `shape`, if one is given."""
-        import torch
-
-        tensor = torch.as_tensor(values, dtype=getattr(torch, dtype), device=self._place)
-        return (tensor.expand(shape) if shape else tensor).contiguous()
-
-    def zeros(self, shape: tuple[int, ...], dtype: str) -> Array:
-        """Return zeros."""
-        import torch
-
-        return torch.zeros(shape, dtype=getattr(torch, dtype), device=self._place)
-
-    def empty(self, shape: tuple[int, ...], dtype: str) -> Array:
-        """Return a tensor whose values are yet to be written."""
-        import torch
-
-        return torch.empty(shape, dtype=getattr(torch, dtype), device=self._place)
-
-    def assign(self, array: Array, rows: Any, mask: Any = None) -> None:
-        """Write rows where `mask` is true."""
-        import torch
-
+        torch, target = _torch(), array[0].T if array.ndim == 3 else array
+        if not isinstance(rows, torch.Tensor):
+            rows = np.array(rows)  # torch warns of arrays it may not write
         new = torch.as_tensor(rows, dtype=array.dtype, device=array.device)
-        chosen = None if mask is None else torch.as_tensor(mask, dtype=torch.bool, device=array.device)
-        array[...] = new if chosen is None else torch.where(_beside(chosen, array.ndim), new, array)
+        if mask is not None:
+            chosen = torch.as_tensor(mask, dtype=torch.bool, device=array.device)
+            new = torch.where(_beside(chosen, target.ndim), new, target)
+        target[...] = new
 
     def host(self, array: Array) -> NDArray:
-        """Return a copy in the memory of the CPU."""
         return array.cpu().numpy()
 
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
-        """Return the kernel of some stages."""
         from ce_gym.compile.cuda import load_cuda_kernel
 
         return load_cuda_kernel(key, build, dtype, self._gpu)
@@ -210,10 +163,15 @@ class Emulated(Cuda):
         self.name, self._place = "emulated cuda", "cpu"
 
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
-        """Return the kernel of some stages, run by the CPU."""
         from ce_gym.compile.cuda import host_kernel
 
         return host_kernel(build, dtype)
+
+
+def _torch() -> Any:
+    import torch
+
+    return torch
 
 
 def _beside(mask: Array, ndim: int) -> Array:
