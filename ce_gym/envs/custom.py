@@ -13,13 +13,10 @@ import os
 import re
 from pathlib import Path
 
-import gymnasium
-
-from ce_gym.envs.task.tasks import TASKS
+from ce_gym.envs.registration import ids_of, register
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad
 from ce_gym.model.load import load_robot
-from ce_gym.model.mechanism import LEVELS
 
 
 def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tuple[str, ...]:
@@ -47,25 +44,11 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
         raise bad("register_robot", "path", f"{type(path).__name__} {given}", expected)
     file = Path(path).resolve()
     robot = load_robot(file)
-    check_ready(robot)
-    stem = id_stem(robot, name)
-    ids = []
-    for task in TASKS:
-        for level in (None, *LEVELS):
-            env_id = f"{stem}{task.capitalize()}{f'-{level.capitalize()}' if level else ''}-v0"
-            _register(env_id, {"robot": str(file), "task": task, "transmission": level or "exact"})
-            ids.append(env_id)
+    if problems := missing(robot):
+        raise problems[0]
+    ids = ids_of(id_stem(robot, name), str(file))
+    register(ids)
     return tuple(ids)
-
-
-def check_ready(robot: Robot) -> None:
-    """Check that a robot has what every task needs.
-
-    Raises:
-        RobotError: It has not; one line that says what to add.
-    """
-    for problem in missing(robot):
-        raise problem
 
 
 def missing(robot: Robot) -> list[RobotError]:
@@ -97,17 +80,3 @@ def id_stem(robot: Robot, name: str | None = None) -> str:
     if not stem:
         raise bad(robot.source, "name", name or robot.name, "a name with letters or digits in it")
     return f"ce_gym/{stem}"
-
-
-def _register(env_id: str, arguments: dict[str, str]) -> None:
-    if env_id in gymnasium.registry:
-        if dict(gymnasium.registry[env_id].kwargs) != arguments:
-            raise bad(arguments["robot"], "environment id", env_id, "an id that no other robot has; give it a `name`")
-        return
-    gymnasium.register(
-        env_id,
-        entry_point="ce_gym.envs.single:LeggedEnv",
-        vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
-        max_episode_steps=TASKS[arguments["task"]].episode_length,
-        kwargs=arguments,
-    )

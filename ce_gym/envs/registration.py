@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import gymnasium
 
 from ce_gym.envs.task.tasks import TASKS
+from ce_gym.model.errors import bad
 from ce_gym.model.mechanism import LEVELS
 
 ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1", "go1", "go2", "berkeley_humanoid")
@@ -23,25 +26,42 @@ def environment_ids() -> dict[str, dict[str, str]]:
         >>> ce_gym.environment_ids()["ce_gym/TelloVelocity-None-v0"]
         {'robot': 'tello', 'task': 'velocity', 'transmission': 'none'}
     """
-    ids = {}
-    for robot in ROBOTS:
-        for task in TASKS:
-            name = camel_case(robot) + camel_case(task)
-            for level in (None, *LEVELS):
-                suffix = f"-{camel_case(level)}" if level else ""
-                arguments = {"robot": robot, "task": task, "transmission": level or "exact"}
-                ids[f"ce_gym/{name}{suffix}-v0"] = arguments
-    return ids
+    return {name: made for robot in ROBOTS for name, made in ids_of(f"ce_gym/{camel_case(robot)}", robot).items()}
+
+
+def ids_of(stem: str, robot: str) -> dict[str, dict[str, str]]:
+    """Return the arguments of every id of a robot: `<stem><Task>[-<Level>]-v0`; `robot` is a name or a path."""
+    return {
+        f"{stem}{camel_case(task)}{f'-{camel_case(level)}' if level else ''}-v0": {
+            "robot": robot,
+            "task": task,
+            "transmission": level or "exact",
+        }
+        for task in TASKS
+        for level in (None, *LEVELS)
+    }
 
 
 def register_environments() -> None:
-    """Register every id with Gymnasium; harmless if done before."""
-    for name, arguments in environment_ids().items():
-        if name not in gymnasium.registry:
-            gymnasium.register(
-                name,
-                entry_point="ce_gym.envs.single:LeggedEnv",
-                vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
-                max_episode_steps=TASKS[arguments["task"]].episode_length,
-                kwargs=arguments,
-            )
+    """Register every id of ours; harmless if done before."""
+    register(environment_ids())
+
+
+def register(ids: Mapping[str, Mapping[str, str]]) -> None:
+    """Register ids with Gymnasium; harmless if done before.
+
+    Raises:
+        RobotError: If an id stands for something else already.
+    """
+    for name, arguments in ids.items():
+        if name in gymnasium.registry:
+            if dict(gymnasium.registry[name].kwargs) != arguments:
+                raise bad(arguments["robot"], "environment id", name, "an id that no other robot has; give it a `name`")
+            continue
+        gymnasium.register(
+            name,
+            entry_point="ce_gym.envs.single:LeggedEnv",
+            vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
+            max_episode_steps=TASKS[arguments["task"]].episode_length,
+            kwargs=dict(arguments),
+        )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
-from ce_gym.envs.custom import check_ready
+from ce_gym.envs.custom import missing
 from ce_gym.model import load_robot
 from ce_gym.model.mechanism import LEVELS
 
@@ -41,7 +41,7 @@ def test_mujoco_finds_the_same_mass_matrix_and_accelerations(name, tmp_path):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_it_stands_on_its_feet_and_has_what_tasks_need(name):
     robot = load_robot(name)
-    check_ready(robot)
+    assert not missing(robot)
     assert robot.total_mass == pytest.approx(ROBOTS[name][0], abs=1e-6)
     assert len(robot.motors) == len(list(robot.rotors())) == len(robot.independent) == 12
     assert all(np.isfinite(motor.torque) and np.isfinite(motor.velocity) for motor in robot.motors)
