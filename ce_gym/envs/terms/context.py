@@ -20,6 +20,15 @@ from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_v
 from ce_gym.model.mechanism import Mechanism
 
 
+def _buffer(name: str, document: str, default: SX | None = None) -> property:
+    """Return a property that is the value of a state buffer, or the default where the task has no such buffer."""
+
+    def read(s: TermContext) -> SX:
+        return s._values[name] if default is None else s._values.get(name, default)
+
+    return property(read, doc=document)
+
+
 class TermContext:
     """One robot at the end of a control step.
 
@@ -82,51 +91,26 @@ class TermContext:
             raise ValueError(f"{self.term}: keep({name!r}) of {SX(value).numel()} numbers; expected {expected}")
         self.kept[key] = ca.densify(ca.vec(SX(value)))
 
-    @property
-    def q(self) -> SX:
-        """Positions, shape (nq,)."""
-        return self._values["q"]
-
-    @property
-    def v(self) -> SX:
-        """Velocities, shape (nv,)."""
-        return self._values["v"]
-
-    @property
-    def command(self) -> SX:
-        """The command, forward and sideways velocity [m/s] and yaw rate [rad/s], shape (3,)."""
-        return self._values["command"]
-
-    @property
-    def action(self) -> SX:
-        """The action just carried out, clipped, shape (n_joints,)."""
-        return self._values["action"]
-
-    @property
-    def previous_action(self) -> SX:
-        """The action before it, shape (n_joints,)."""
-        return self._values["previous_action"]
-
-    @property
-    def torque(self) -> SX:
-        """Motor torque at each joint in the last sub-step [N m], shape (n_joints,)."""
-        return self._values["torque"]
+    q = _buffer("q", "Positions, shape (nq,).")
+    v = _buffer("v", "Velocities, shape (nv,).")
+    command = _buffer("command", "Commanded forward and sideways velocity [m/s] and yaw rate [rad/s], shape (3,).")
+    action = _buffer("action", "The action just carried out, clipped, shape (n_joints,).")
+    previous_action = _buffer("previous_action", "The action before it, shape (n_joints,).")
+    torque = _buffer("torque", "Motor torque at each joint in the last sub-step [N m], shape (n_joints,).")
+    load = _buffer("load", "Normal force on each contact in the last sub-step [N], shape (n_contacts,).", SX(0, 1))
+    scaled_parameters = _buffer(
+        "scaled_parameters", "The randomised figures of the episode, each in [-1, 1], shape (n,).", SX(0, 1)
+    )
+    terrain_level = _buffer("level", "Level of the terrain on which the episode began; 0 on flat ground.", SX(0))
+    times_grown = _buffer(
+        "grown", "How often the range of commands has grown, see `ce_gym.envs.task.curriculum`.", SX(0)
+    )
 
     @property
     def air_time(self) -> SX:
         """How long each foot had been in the air up to the previous control step [s], shape (n_feet,)."""
         self._feet  # noqa: B018  (says so if there are none)
         return self._values["air_time"]
-
-    @property
-    def load(self) -> SX:
-        """Normal force on each contact in the last sub-step [N], shape (n_contacts,)."""
-        return self._values.get("load", SX(0, 1))
-
-    @property
-    def scaled_parameters(self) -> SX:
-        """The randomised figures of the episode, each in [-1, 1], shape (n,)."""
-        return self._values.get("scaled_parameters", SX(0, 1))
 
     @property
     def phase(self) -> SX:
@@ -157,16 +141,6 @@ class TermContext:
     def base_height(self) -> SX:
         """Height of the base origin above the ground [m]."""
         return self.q[2] - self._ground[0] if self._ground.numel() else self.q[2]
-
-    @property
-    def terrain_level(self) -> SX:
-        """Level of the terrain on which the episode began; 0 on flat ground."""
-        return self._values.get("level", SX(0))
-
-    @property
-    def times_grown(self) -> SX:
-        """How often the range of commands has grown, see `ce_gym.envs.task.curriculum`."""
-        return self._values.get("grown", SX(0))
 
     @property
     def _ground(self) -> SX:
