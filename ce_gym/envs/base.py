@@ -21,6 +21,7 @@ from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
 from ce_gym.envs.runtime.symmetry import Symmetry, left_right
+from ce_gym.model.arguments import check, check_choice
 from ce_gym.sim.batch import File, Snapshot
 from ce_gym.sim.devices import Array
 
@@ -203,8 +204,7 @@ def spaces(program: TaskProgram, obs_mode: str) -> tuple[Any, Any]:
     Raises:
         ValueError: If the mode does not exist.
     """
-    if obs_mode not in ("vector", "dict"):
-        raise ValueError(f"obs_mode={obs_mode!r}; expected 'vector' or 'dict'")
+    check_choice("obs_mode", obs_mode, ("vector", "dict"))
     bound = OBSERVATION_BOUND
     policy = Box(-bound, bound, (program.observation_size,), np.float32)
     actions = Box(-1.0, 1.0, (program.n_actions,), np.float32)
@@ -241,8 +241,8 @@ def checked_seed(seed: Any) -> int:
     Raises:
         ValueError: If it is not a whole number from 0 to 2**62.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed <= 2**62:
-        raise ValueError(f"seed={seed!r}; expected a whole number from 0 to 2**62")
+    whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+    check("seed", seed, whole and 0 <= seed <= 2**62, "a whole number from 0 to 2**62")
     return int(seed)
 
 

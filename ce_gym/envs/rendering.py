@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.task.terrain_tiles import field_of
+from ce_gym.model.arguments import check_whole
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -62,8 +63,7 @@ class Screen:
         if mode is not None and mode not in RENDER_MODES:
             raise ValueError(f"render_mode={mode!r}; expected one of {', '.join(RENDER_MODES)}, or None")
         for name, value in (("width", width), ("height", height)):
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ValueError(f"{name}={value!r}; expected a whole number of pixels, at least 1")
+            check_whole(name, value, 1, " of pixels")
         self._mode, self._batch = mode, batch
         self._renderer: Renderer | None = None
         if mode is not None:

@@ -6,7 +6,7 @@ machine code comes from `ce_gym.compile`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, get_args
 
 import numpy as np
@@ -22,6 +22,7 @@ from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import OUTPUTS
 from ce_gym.model import ContactMaterial
+from ce_gym.model.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.kernels import load_step_kernel, select_contacts
@@ -32,6 +33,16 @@ from ce_gym.sim.terrain import Terrain
 
 FAILURES = Row("failures", 1, "host", dtype="int64")
 """How often a robot has diverged and been set anew, and how often it has been stepped again."""
+
+
+def _reading(name: str, document: str, scalar: bool = False) -> property:
+    """Return a property that reads a state buffer or an output; `scalar` if it is one number of each robot."""
+
+    def read(sim: Simulator) -> Array:
+        rows = sim._read(name)
+        return rows[:, 0] if scalar else rows
+
+    return property(read, doc=document)
 
 
 class Simulator:
@@ -101,20 +112,17 @@ class Simulator:
         device: str | Device = "cpu",
     ) -> None:
         self._made_with = {name: value for name, value in locals().items() if name != "self"}
-        _check("num_envs", num_envs, num_envs >= 1, "at least 1")
-        _check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
-        _check("num_threads", num_threads, num_threads >= 1, "at least 1")
-        _check("retry", retry, 0 <= retry <= 10, "between 0 and 10 halvings of the step")
-        _choice("dtype", dtype, ("float64", "float32"))
-        _choice("control", control, get_args(Control))
-        _choice("method", method, tuple(METHODS))
-        _choice("normal_law", normal_law, (None, *NORMAL_LAWS))
-        _choice("friction", friction, tuple(FRICTION))
-        _choice("motors", motors, tuple(MOTORS))
+        check_whole("num_envs", num_envs, 1)
+        check_whole("num_threads", num_threads, 1)
+        check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
+        check("retry", retry, 0 <= retry <= 10, "between 0 and 10 halvings of the step")
+        check("terrain", terrain, terrain is None or isinstance(terrain, Terrain), "a Terrain or None")
+        choices: dict[str, Iterable[object]] = {"dtype": ("float64", "float32"), "control": get_args(Control)}
+        choices |= {"method": METHODS, "friction": FRICTION, "motors": MOTORS, "normal_law": (None, *NORMAL_LAWS)}
+        for argument, known in choices.items():
+            check_choice(argument, self._made_with[argument], known)
         for name in outputs:
-            _choice("outputs", name, tuple(OUTPUTS))
-        if terrain is not None and not isinstance(terrain, Terrain):
-            _check("terrain", terrain, False, "a Terrain or None")
+            check_choice("outputs", name, OUTPUTS)
         self._device = device_named(device)
         self.device = self._device.name
         self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
@@ -171,8 +179,7 @@ class Simulator:
         chosen, rows = self._chosen(mask), {"q": to_numpy(q), "v": to_numpy(v)}
         for name, value in rows.items():
             size = self._arrays[name].shape[1]
-            if value.shape not in ((size,), (self.num_envs, size)):
-                raise ValueError(f"{name} has shape {value.shape}; expected ({size},) or ({self.num_envs}, {size})")
+            check_shape(name, value, (size,), (self.num_envs, size))
             if not (np.abs(value) <= np.finfo(self.dtype).max).all():
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
         rows |= {name: np.zeros(self._arrays[name].shape[1]) for name in ("anchor", "diverged") if name in self._arrays}
@@ -203,12 +210,10 @@ class Simulator:
         """
         n = len(self.target_names)
         rows = self._device.rows(target, self.dtype)
-        if tuple(rows.shape) not in ((n,), (self.num_envs, n)):
-            raise ValueError(f"target has shape {tuple(rows.shape)}; expected ({n},) or ({self.num_envs}, {n})")
+        check_shape("target", rows, (n,), (self.num_envs, n))
         if isinstance(rows, np.ndarray) and not np.isfinite(rows).all():
             raise ValueError(f"target holds a number that is not finite in {self.dtype}")
-        if isinstance(n_substeps, bool) or not isinstance(n_substeps, int | np.integer) or n_substeps < 0:
-            raise ValueError(f"n_substeps={n_substeps!r}; expected a whole number, at least 0")
+        check_whole("n_substeps", n_substeps, 0)
         rows = self._device.rows(rows, self.dtype, (self.num_envs, n))
         with self._section:
             self._advance({"target": rows}, n_substeps)
@@ -240,13 +245,11 @@ class Simulator:
         """
         if name not in self._columns:
             declared = ", ".join(self._columns) or "none"
-            raise ValueError(
-                f"parameter {name!r}; expected one of those declared with Simulator(..., parameters=): {declared}"
-            )
+            expected = "one of those declared with Simulator(..., parameters=)"
+            raise ValueError(f"parameter {name!r}; expected {expected}: {declared}")
         columns, chosen, new = self._columns[name], self._chosen(mask), to_numpy(value)
         size = columns.stop - columns.start
-        if new.shape not in ((), (size,), (self.num_envs, size)):
-            raise ValueError(f"{name} has shape {new.shape}; expected ({size},) or ({self.num_envs}, {size})")
+        check_shape(name, new, (), (size,), (self.num_envs, size))
         check_parameter(self.model.robot, name, new)
         with self._section:
             rows = to_numpy(self._batch.rows("parameters"))
@@ -282,15 +285,15 @@ class Simulator:
     def __deepcopy__(self, memo: dict[int, Any]) -> Simulator:
         return _remade(self._made_with, self.snapshot())  # models and terrain are never changed
 
-    @property
-    def q(self) -> Array:
-        """Positions, a copy, shape (num_envs, nq)."""
-        return self._read("q")
-
-    @property
-    def v(self) -> Array:
-        """Velocities, a copy, shape (num_envs, nv)."""
-        return self._read("v")
+    q = _reading("q", "Positions, a copy, shape (num_envs, nq).")
+    v = _reading("v", "Velocities, a copy, shape (num_envs, nv).")
+    torque = _reading("torque", "Motor torques at the joints, mean of the last sub-step [N m], shape (num_envs, nj).")
+    motor_speed = _reading("motor_speed", "Speeds of motors' rotors after a step [rad/s], shape (num_envs, n_motors).")
+    power = _reading("power", "Mechanical power of the motors at the joints after a step [W], shape (num_envs, nj).")
+    error = _reading("error", "Estimated error of the last sub-step in `v` [rad/s or m/s], shape (num_envs,).", True)
+    energy = _reading("energy", "Kinetic, potential and elastic energy after a step [J], shape (num_envs,).", True)
+    loop_gap = _reading("loop_gap", "Norm of loop residuals before the last sub-step [m, -], shape (num_envs,).", True)
+    nearness = _reading("nearness", "`Model.nearness` before the last sub-step [-], shape (num_envs,).", True)
 
     @property
     def diverged(self) -> Array:
@@ -308,51 +311,16 @@ class Simulator:
         return int(self._read("retries").sum())
 
     @property
-    def torque(self) -> Array:
-        """Motor torques at the joints, mean of the last sub-step [N m], shape (num_envs, nj)."""
-        return self._read("torque")
-
-    @property
     def contact_forces(self) -> Array:
         """Forces on the contact spheres, mean of the last sub-step, world axes [N], shape (num_envs, n_contacts, 3)."""
         if not self.contact_names:
             return self._device.rows(np.zeros((self.num_envs, 0, 3)), self.dtype)
         return self._read("contact_forces").reshape(self.num_envs, -1, 3)
 
-    @property
-    def motor_speed(self) -> Array:
-        """Speeds of the motors' rotors at the end of the last sub-step [rad/s], shape (num_envs, n_motors)."""
-        return self._read("motor_speed")
-
-    @property
-    def power(self) -> Array:
-        """Mechanical power of the motors at the joints, end of the last sub-step [W], shape (num_envs, nj)."""
-        return self._read("power")
-
-    @property
-    def error(self) -> Array:
-        """Estimated error of the last sub-step in `v`, of methods that have one [rad/s or m/s], shape (num_envs,)."""
-        return self._read("error")[:, 0]
-
-    @property
-    def energy(self) -> Array:
-        """Kinetic, potential and elastic energy at the end of the last sub-step [J], shape (num_envs,)."""
-        return self._read("energy")[:, 0]
-
-    @property
-    def loop_gap(self) -> Array:
-        """Norm of the residuals of the closed loops, start of the last sub-step [m or -], shape (num_envs,)."""
-        return self._read("loop_gap")[:, 0]
-
-    @property
-    def nearness(self) -> Array:
-        """Distance from a singularity, see `Model.nearness`, start of the last sub-step, shape (num_envs,)."""
-        return self._read("nearness")[:, 0]
-
     def _chosen(self, mask: ArrayLike | None) -> NDArray[np.bool_] | None:
         chosen = None if mask is None else to_numpy(mask).astype(bool)
-        if chosen is not None and chosen.shape != (self.num_envs,):
-            raise ValueError(f"mask has shape {chosen.shape}; expected ({self.num_envs},)")
+        if chosen is not None:
+            check_shape("mask", chosen, (self.num_envs,))
         return chosen
 
     def _resting_load(self, q: ArrayLike) -> NDArray:
@@ -376,12 +344,3 @@ def _remade(made_with: dict[str, Any], snapshot: Snapshot) -> Simulator:
     sim = Simulator(**made_with)
     sim.restore(snapshot)
     return sim
-
-
-def _choice(argument: str, value: object, choices: tuple[object, ...]) -> None:
-    _check(argument, value, value in choices, " or ".join(repr(choice) for choice in choices))
-
-
-def _check(argument: str, value: object, valid: bool, expected: str) -> None:
-    if not valid:
-        raise ValueError(f"{argument}={value!r}; expected {expected}")

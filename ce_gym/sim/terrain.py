@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ce_gym.model.arguments import check
+
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
@@ -45,9 +47,9 @@ class Terrain:
             raise ValueError(f"heights has shape {heights.shape}; expected (rows, columns), 3 or more of each")
         if not _finite(heights):
             raise ValueError("heights holds a number that is not finite")
-        _check("cell", self.cell, _positive(self.cell), "a length above 0 m")
+        check("cell", self.cell, _positive(self.cell), "a length above 0 m")
         origin = np.asarray(self.origin, dtype=float)
-        _check("origin", self.origin, origin.shape == (2,) and _finite(origin), "two finite numbers")
+        check("origin", self.origin, origin.shape == (2,) and _finite(origin), "two finite numbers")
         heights.flags.writeable = False
         object.__setattr__(self, "heights", heights)
         object.__setattr__(self, "cell", float(self.cell))
@@ -66,8 +68,8 @@ class Terrain:
             angle: Inclination [rad], below a right angle.
             heading: Direction in which it rises, from x towards y [rad].
         """
-        _check("angle", angle, abs(angle) < np.pi / 2, "less than a right angle")
-        _check("heading", heading, _finite(heading), "a finite angle")
+        check("angle", angle, abs(angle) < np.pi / 2, "less than a right angle")
+        check("heading", heading, _finite(heading), "a finite angle")
         x, y = np.meshgrid(*[np.array([-1.0, 0.0, 1.0])] * 2, indexing="ij")
         return cls(np.tan(angle) * (np.cos(heading) * x + np.sin(heading) * y), 1.0, (-1.0, -1.0))
 
@@ -81,7 +83,7 @@ class Terrain:
             cell: Distance of the heights [m].
             size: Side of the square [m].
         """
-        _check("amplitude", amplitude, _finite(amplitude) and amplitude >= 0, "a length from 0 m on")
+        check("amplitude", amplitude, _finite(amplitude) and amplitude >= 0, "a length from 0 m on")
         draw = np.random.default_rng(seed).uniform
         return cls.from_function(lambda x, _: draw(-amplitude, amplitude, x.shape), cell, size)
 
@@ -96,11 +98,11 @@ class Terrain:
             start: Where the first step rises [m].
             cell: Distance of the heights [m]; a step rises over a length of two.
         """
-        _check("rise", rise, _finite(rise), "a finite height")
-        _check("count", count, count >= 1, "at least 1")
-        _check("start", start, _finite(start), "a finite place")
-        _check("cell", cell, _positive(cell), "a length above 0 m")
-        _check("tread", tread, _finite(tread) and tread >= 2 * cell, "at least two cells")
+        check("rise", rise, _finite(rise), "a finite height")
+        check("count", count, count >= 1, "at least 1")
+        check("start", start, _finite(start), "a finite place")
+        check("cell", cell, _positive(cell), "a length above 0 m")
+        check("tread", tread, _finite(tread) and tread >= 2 * cell, "at least two cells")
         # Half a cell off, so that the first step rises about its place.
         rows = np.arange(-2, np.ceil((count - 1) * tread / cell) + 3)
         heights = rise * np.clip(np.floor((rows + 0.5) * cell / tread) + 1, 0, count)
@@ -122,8 +124,8 @@ class Terrain:
             size: Side of the square [m], at least two cells.
             centre: Place (x, y) of its middle [m].
         """
-        _check("cell", cell, _positive(cell), "a length above 0 m")
-        _check("size", size, _finite(size) and size >= 2 * cell, "at least two cells")
+        check("cell", cell, _positive(cell), "a length above 0 m")
+        check("size", size, _finite(size) and size >= 2 * cell, "at least two cells")
         half = round(size / cell) / 2 * cell
         along = np.linspace(-half, half, round(size / cell) + 1)
         x, y = np.meshgrid(centre[0] + along, centre[1] + along, indexing="ij")
@@ -171,8 +173,3 @@ def _finite(figure: ArrayLike) -> bool:
 
 def _positive(length: float) -> bool:
     return _finite(length) and length > 0
-
-
-def _check(argument: str, value: object, valid: bool, expected: str) -> None:
-    if not valid:
-        raise ValueError(f"{argument}={value!r}; expected {expected}")

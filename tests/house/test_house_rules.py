@@ -30,8 +30,8 @@ MAY_IMPORT = {
 }  # fmt: skip
 """What the modules of a folder may import from other folders."""
 LAYERS = {
-    "model": "errors table frames assets constraints description constraint_functions clusters mechanism checks"
-    " generators formats load listing",
+    "model": "arguments errors table frames assets constraints description constraint_functions clusters mechanism"
+    " checks generators formats load listing",
     "model/formats": "text_file reading placement standing rotor_rule rotor_links motors collections urdf mjcf yaml",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",

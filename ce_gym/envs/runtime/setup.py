@@ -17,6 +17,7 @@ from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.checks import checked_value, merged_rewards
 from ce_gym.envs.task.tasks import TASKS, Task
+from ce_gym.model.arguments import check, check_choice, check_whole
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
 from ce_gym.model.mechanism import LEVELS
@@ -54,11 +55,10 @@ def make_batch(
         ValueError: If there is no such device, or an argument is not one of the choices.
         RobotError: If the robot file is not valid.
     """
-    if dtype not in ("float64", "float32"):
-        raise ValueError(f"dtype={dtype!r}; expected 'float64' or 'float32'")
-    for name, value in (("num_envs", num_envs), ("num_threads", num_threads)):
-        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-            raise ValueError(f"{name}={value!r}; expected a whole number, at least 1")
+    check_choice("dtype", dtype, ("float64", "float32"))
+    check_whole("num_envs", num_envs, 1)
+    if num_threads is not None:
+        check_whole("num_threads", num_threads, 1)
     program, threads = make_program(robot, task, **arguments), num_threads or usable_cores()
     return TaskBatch(program, num_envs, dtype, device_named(device), threads, max_episode_steps)
 
@@ -93,12 +93,9 @@ def make_program(
     if not isinstance(robot, str | os.PathLike):
         given = f"the Robot {robot.name!r}" if isinstance(robot, Robot) else repr(robot)
         raise ValueError(f"robot={given}; expected the name of a robot or a path to a file")
-    if not isinstance(contact_forces, bool):
-        raise ValueError(f"contact_forces={contact_forces!r}; expected true or false")
-    if not isinstance(task, str) or task not in TASKS:
-        raise ValueError(f"task={task!r}; expected one of {', '.join(TASKS)}")
-    if transmission not in LEVELS:
-        raise ValueError(f"transmission={transmission!r}; expected one of {', '.join(LEVELS)}")
+    check("contact_forces", contact_forces, isinstance(contact_forces, bool), "true or false")
+    check("task", task, task in tuple(TASKS), f"one of {', '.join(TASKS)}")
+    check("transmission", transmission, transmission in LEVELS, f"one of {', '.join(LEVELS)}")
     model = Model(robot, transmission)
     figures = own_task(model.robot, task)
     for name, given in (("reward_weights", reward_weights), ("rewards", rewards)):

@@ -10,6 +10,7 @@ from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.envs.task.tasks import Actions
 from ce_gym.envs.task.terrain_tiles import checked_terrain
+from ce_gym.model.arguments import check, check_choice, check_whole, is_number
 
 CHOICES = {"actions": get_args(Actions), "friction": FRICTION, "motors": MOTORS}
 POSITIVE = ("action_scale", "command_period", "gait_period", "dt")
@@ -32,7 +33,7 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
         ValueError: If it is not of that kind or out of range.
     """
     if name in CHOICES:
-        _check(name, value, value in CHOICES[name], " or ".join(repr(choice) for choice in CHOICES[name]))
+        check_choice(name, value, CHOICES[name])
         return value
     if name == "terrain":
         return checked_terrain(value)
@@ -40,38 +41,37 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
         return value if isinstance(value, str) else _names(name, value)
     if name == "command_range":
         pairs = tuple(_pair(name, pair) for pair in _sequence(name, value))
-        _check(name, value, len(pairs) == 3, "three pairs (low, high) with low <= high")
+        check(name, value, len(pairs) == 3, "three pairs (low, high) with low <= high")
         return pairs
     if name == "latency":
         low, high = _pair(name, value)
-        _check(name, value, low >= 0 and low == int(low) and high == int(high), "two whole numbers, 0 or more")
+        check(name, value, low >= 0 and low == int(low) and high == int(high), "two whole numbers, 0 or more")
         return int(low), int(high)
     if name == "randomise":
-        _check(name, value, isinstance(value, Mapping), "pairs (low, high) by the name of a figure")
+        check(name, value, isinstance(value, Mapping), "pairs (low, high) by the name of a figure")
         return {str(key): _pair(f"randomise[{key!r}]", pair) for key, pair in value.items()}
     if name in TERMS:
         return _terms(name, value)
     if name in COUNTS:
-        whole = isinstance(value, int) and not isinstance(value, bool)
-        _check(name, value, whole and value >= 1, "a whole number, at least 1")
-        return value
+        check_whole(name, value, 1)
+        return int(value)
     if isinstance(old, bool):
-        _check(name, value, isinstance(value, bool), "true or false")
+        check(name, value, isinstance(value, bool), "true or false")
         return value
     if isinstance(old, Mapping):
-        _check(name, value, isinstance(value, Mapping), "numbers by name")
+        check(name, value, isinstance(value, Mapping), "numbers by name")
         for key, figure in value.items():
-            _check(f"{name}[{key!r}]", figure, number(f"{name}[{key!r}]", figure) >= 0, "0 or more")
-            _check(name, key, name != "reset_noise" or key in old, f"one of {', '.join(old)}")
+            check(f"{name}[{key!r}]", figure, number(f"{name}[{key!r}]", figure) >= 0, "0 or more")
+            check(name, key, name != "reset_noise" or key in old, f"one of {', '.join(old)}")
         return {**old, **{str(key): float(figure) for key, figure in value.items()}}
     if isinstance(old, tuple):
         return _names(name, value)
     if name == "command_curriculum":
-        _check(name, value, 0 < number(name, value) <= 1, "a share above 0 and up to 1")
+        check(name, value, 0 < number(name, value) <= 1, "a share above 0 and up to 1")
     figure, expected = number(name, value), "a positive number" if name in POSITIVE else "0 or more"
-    _check(name, value, figure > 0 or (figure == 0 and name not in POSITIVE), expected)
+    check(name, value, figure > 0 or (figure == 0 and name not in POSITIVE), expected)
     most = LARGEST.get(name, math.inf)
-    _check(name, value, figure <= most, f"at most {most:g}")
+    check(name, value, figure <= most, f"at most {most:g}")
     return figure
 
 
@@ -86,16 +86,16 @@ def merged_rewards(name: str, old: Mapping[str, Any], given: Any) -> dict[str, A
     Raises:
         ValueError: If it is nothing of the kind.
     """
-    _check(name, given, isinstance(given, Mapping), "weights, or mappings of weight and parameters, by name")
+    check(name, given, isinstance(given, Mapping), "weights, or mappings of weight and parameters, by name")
     rewards = dict(old)
     for term, value in given.items():
         before = old.get(term, {})
         before = dict(before) if isinstance(before, Mapping) else {"weight": before}
         new = before | (dict(value) if isinstance(value, Mapping) else {"weight": value})
         place = f"{name}[{term!r}]"
-        _check(place, value, "weight" in new, "a `weight`, for the task has none")
+        check(place, value, "weight" in new, "a `weight`, for the task has none")
         new["weight"] = number(place, new["weight"])
-        _check(place, value, abs(new["weight"]) <= HEAVIEST, f"a weight from -{HEAVIEST:g} to {HEAVIEST:g}")
+        check(place, value, abs(new["weight"]) <= HEAVIEST, f"a weight from -{HEAVIEST:g} to {HEAVIEST:g}")
         rewards[str(term)] = new if len(new) > 1 else new["weight"]
         if new["weight"] == 0:
             del rewards[str(term)]
@@ -107,10 +107,10 @@ def _terms(name: str, value: Any) -> Any:
     if isinstance(value, Mapping):
         terms: Any = {str(key): {} if own is None else own for key, own in value.items()}
         for key, own in terms.items():
-            _check(f"{name}[{key!r}]", own, isinstance(own, Mapping), "parameters by name")
+            check(f"{name}[{key!r}]", own, isinstance(own, Mapping), "parameters by name")
     else:
         terms = _names(name, value)
-    _check(name, value, len(terms) > 0 or name != "observations", "at least one name")
+    check(name, value, len(terms) > 0 or name != "observations", "at least one name")
     return terms
 
 
@@ -120,30 +120,24 @@ def number(name: str, value: Any) -> float:
     Raises:
         ValueError: If it is none.
     """
-    numeric = isinstance(value, int | float) and not isinstance(value, bool)
-    _check(name, value, numeric and math.isfinite(value), "a finite number")
+    check(name, value, is_number(value), "a finite number")
     return float(value)
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
     items = _sequence(name, value)
-    _check(name, value, len(items) == 2, "a pair (low, high) with low <= high")
+    check(name, value, len(items) == 2, "a pair (low, high) with low <= high")
     low, high = (number(name, item) for item in items)
-    _check(name, value, low <= high, "a pair (low, high) with low <= high")
+    check(name, value, low <= high, "a pair (low, high) with low <= high")
     return low, high
 
 
 def _names(name: str, value: Any) -> tuple[str, ...]:
     items = tuple(_sequence(name, value))
-    _check(name, value, all(isinstance(item, str) for item in items), "a list of names")
+    check(name, value, all(isinstance(item, str) for item in items), "a list of names")
     return items
 
 
 def _sequence(name: str, value: Any) -> Sequence[Any]:
-    _check(name, value, isinstance(value, Sequence) and not isinstance(value, str), "a list")
+    check(name, value, isinstance(value, Sequence) and not isinstance(value, str), "a list")
     return value
-
-
-def _check(name: str, value: Any, valid: bool, expected: str) -> None:
-    if not valid:
-        raise ValueError(f"{name}={value!r}; expected {expected}")

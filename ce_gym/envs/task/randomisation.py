@@ -10,6 +10,7 @@ import numpy as np
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.parameters import check_parameter, parameter_defaults
 from ce_gym.envs.task.tasks import RANDOMISED, Range
+from ce_gym.model.arguments import check
 from ce_gym.model.description import Robot
 
 FACTORS = ("stiffness", "kp", "kd", "motor_strength", "rotor_inertia", "ratio")
@@ -36,8 +37,7 @@ class Randomised:
         base = robot.bodies[0].name
         names = []
         for name, (low, high) in ranges.items():
-            if name.split(":")[0] not in RANDOMISED:
-                raise ValueError(f"randomise={name!r}; expected one of {', '.join(RANDOMISED)}")
+            check("randomise", name, name.split(":")[0] in RANDOMISED, f"one of {', '.join(RANDOMISED)}")
             if not low <= high:
                 raise ValueError(f"randomise[{name!r}]=({low}, {high}); expected low <= high")
             names.append(f"{name}:{base}" if name in ("added_mass", "com_shift") else name)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.model.arguments import check, is_number
 from ce_gym.sim.terrain import Terrain
 
 FIGURES = {"flat": "", "slope": "angle", "rough": "amplitude", "stairs": "rise"}
@@ -45,18 +46,16 @@ def checked_terrain(value: Any) -> dict[str, Any]:
     """
     given = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
     kind = given.pop("kind", None)
-    if kind not in OWN:
-        raise ValueError(f"terrain={value!r}; expected {', '.join(map(repr, OWN))}, or a mapping with such a `kind`")
+    check("terrain", value, kind in tuple(OWN), f"{', '.join(map(repr, OWN))}, or a mapping with such a `kind`")
     for name, figure in given.items():
-        if name not in OWN[kind]:
-            expected = f"one of {', '.join(OWN[kind])}" if OWN[kind] else "no argument"
-            raise ValueError(f"terrain[{name!r}]={figure!r}; expected {expected} for {kind!r}")
+        expected = f"one of {', '.join(OWN[kind])}" if OWN[kind] else "no argument"
+        check(f"terrain[{name!r}]", figure, name in OWN[kind], f"{expected} for {kind!r}")
         _check(name, figure)
     return {"kind": kind, **OWN[kind], **given}
 
 
 def _check(name: str, value: Any) -> None:
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    number = is_number(value)
     smallest = {"levels": 2, "columns": 2, "size": 2 * (PLATFORM + BORDER) + 1.0, "cell": 0.01, "tread": 0.1, "seed": 0}
     if name == "curriculum":
         valid, expected = isinstance(value, bool), "true or false"
@@ -66,9 +65,8 @@ def _check(name: str, value: Any) -> None:
         valid, expected = number and 0 <= value <= 1.2, "an angle from 0 to 1.2 rad"
     else:
         valid, expected = number and value >= smallest.get(name, 0.0), "a length in metres"
-    if not valid:
-        least = f", at least {smallest[name]}" if name in smallest else ""
-        raise ValueError(f"terrain[{name!r}]={value!r}; expected {expected}{least}")
+    least = f", at least {smallest[name]}" if name in smallest else ""
+    check(f"terrain[{name!r}]", value, valid, f"{expected}{least}")
 
 
 def make_field(terrain: Mapping[str, Any]) -> Terrain:

@@ -10,7 +10,6 @@ gymnasium.make("ce_gym/MiniCheetahVelocity-v0", rewards={"near_the_origin": {"we
 from __future__ import annotations
 
 import inspect
-import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from typing import Any, TypeVar
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.terms import metrics, observations, rewards, terminations
 from ce_gym.envs.terms.context import TermContext
+from ce_gym.model.arguments import is_number
 
 Function = Callable[..., SX]
 _F = TypeVar("_F", bound=Callable)
@@ -129,7 +129,7 @@ def _term(kind: str, name: str, given: Any) -> Term:
         if key not in defaults:
             expected = f"one of {', '.join(defaults)}" if defaults else "none"
             raise ValueError(f"{kind} term {name!r}: parameter {key!r}; expected {expected}")
-        if _is_number(defaults[key]) and not _is_number(value):
+        if is_number(defaults[key]) and not is_number(value):
             raise ValueError(f"{kind} term {name!r}: {key}={value!r}; expected a finite number")
     return Term(kind, name, known[name], parameters, weight)
 
@@ -138,10 +138,6 @@ def parameters_of(function: Function) -> dict[str, Any]:
     """Return the parameters of a term and their defaults."""
     _, *others = inspect.signature(function).parameters.values()
     return {parameter.name: parameter.default for parameter in others}
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def reward(function: _F) -> _F:

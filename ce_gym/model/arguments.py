@@ -1,0 +1,38 @@
+"""Checks of arguments. An error is one line with the argument, its value and what was expected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+
+def check(argument: str, value: object, valid: bool, expected: str) -> None:
+    """Raise a ValueError unless `valid`."""
+    if not valid:
+        raise ValueError(f"{argument}={value!r}; expected {expected}")
+
+
+def check_choice(argument: str, value: object, choices: Iterable[object]) -> None:
+    """Raise a ValueError unless a value is one of the choices."""
+    known = tuple(choices)
+    check(argument, value, value in known, " or ".join(map(repr, known)))
+
+
+def check_whole(argument: str, value: Any, least: int, unit: str = "") -> None:
+    """Raise a ValueError unless a value is a whole number, at least `least`."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    check(argument, value, whole and value >= least, f"a whole number{unit}, at least {least}")
+
+
+def check_shape(argument: str, value: Any, *expected: tuple[int, ...]) -> None:
+    """Raise a ValueError unless an array has one of the shapes."""
+    if tuple(value.shape) not in expected:
+        raise ValueError(f"{argument} has shape {tuple(value.shape)}; expected {' or '.join(map(str, expected))}")
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
