@@ -169,7 +169,7 @@ def report_scene(env_id: str, **arguments: Any) -> SceneReport:
         name=env_id,
         program=program,
         layers=tuple(_differences("sub-step", layers(whole))),
-        once=tuple(_once(program, whole)),
+        once=tuple(_once(program)),
         sometimes=tuple(Item("where needed", name, f.n_instructions(), f) for name, f in sometimes),
         left_out=tuple(
             Item("left out", name, step.instructions - whole.instructions, step) for name, step in left_out(whole)
@@ -274,34 +274,33 @@ def _parts_of_dynamics(step: SubStep) -> tuple[ca.Function, ca.Function]:
     return traced("kinematics", inputs, results), traced("acceleration", inputs, {"vdot": solved.vdot})
 
 
-def _once(program: TaskProgram, whole: SubStep) -> Iterator[Item]:
+def _once(program: TaskProgram) -> Iterator[Item]:
     """Build up what an environment step does around its sub-steps, one term after the other."""
     act = program.function("act")
     yield Item("action", "action", act.n_instructions(), act)
-    if late := _late_actions(program, whole):
+    if late := _late_actions(program):
         yield Item("late actions", "late actions", late, None)
     task = replace(program.task, **NO_TERMS)
-    assess = replace(program, task=task).function("assess")
+    assess = TaskProgram(program.model, task).function("assess")
     yield Item("commands and clocks", "commands and clocks", assess.n_instructions(), assess)
     steps = [(field, term) for field in TERMS for term in getattr(program.task, field)]
     for field, term in (*steps, ("noise and history", "noise and history")):
         known = field in TERMS
         before, task = assess, with_term(task, field, term, program.task) if known else program.task
-        assess = replace(program, task=task).function("assess")
+        assess = TaskProgram(program.model, task).function("assess")
         if known or assess.n_instructions() != before.n_instructions():
             yield Item(field, term, assess.n_instructions() - before.n_instructions(), assess)
 
 
-def _late_actions(program: TaskProgram, whole: SubStep) -> int:
+def _late_actions(program: TaskProgram) -> int:
     """Instructions that choose, in each sub-step of an environment step, between the last action and the new one."""
-    physics, total = {call.function.name() for call in whole.calls}, 0
-    for step in program.step_program().steps:
-        for call in step.calls if isinstance(step, Repeat) else ():
-            if isinstance(call, Call) and call.function.name() not in physics:
-                total += program.task.n_substeps * call.function.n_instructions()
-        if isinstance(step, Call) and step.function.name() == "arrived":
-            total += step.function.n_instructions()
-    return total
+    if "delay" not in program.schema:
+        return 0
+    each, last = (
+        sum(call.function.n_instructions() for call in calls_of((step,)) if isinstance(call, Call))
+        for step in program.actions.delayed((Repeat("n_substeps", ()),))
+    )
+    return program.task.n_substeps * each + last
 
 
 def with_term(task: Task, field: str, term: str, like: Task | None = None) -> Task:
@@ -331,5 +330,5 @@ def _terms_left_out(program: TaskProgram) -> Iterator[Item]:
         if change:
             changes.append(("task", name, replace(task, **change)))
     for group, name, other in changes:
-        function = replace(program, task=other).function("assess")
+        function = TaskProgram(program.model, other).function("assess")
         yield Item(group, name, function.n_instructions() - whole, function)

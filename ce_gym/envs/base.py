@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from ce_gym.compile import CriticalSection
 from ce_gym.envs.differentiable import DifferentiableEnv
 from ce_gym.envs.policy_spec import policy_spec
+from ce_gym.envs.rendering import Screen
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
 from ce_gym.envs.runtime.symmetry import Symmetry, left_right
-from ce_gym.model.arguments import check, check_choice
+from ce_gym.sim.arguments import check, check_choice
 from ce_gym.sim.batch import File, Snapshot
 from ce_gym.sim.devices import Array
 
@@ -32,14 +33,18 @@ class BaseEnv(EzPickle):
     Attributes:
         batch: The batch.
         task: Name of the task.
+        model: The robot at a transmission level.
         closed: Whether it has been closed.
     """
 
-    batch: TaskBatch
-    task: str
-    closed: bool
-    _as_dict: bool
-    _section: CriticalSection
+    closed = False
+
+    def _hold(self, batch: TaskBatch, task: str, shown_as: Mapping[str, Any]) -> None:
+        """Take a batch, and the arguments that say how it is shown."""
+        self.batch, self.task, self.model = batch, task, batch.program.model
+        self.render_mode, self._as_dict = shown_as["render_mode"], shown_as["obs_mode"] == "dict"
+        self._screen = Screen(self.render_mode, batch, width=shown_as["width"], height=shown_as["height"])
+        self._section = CriticalSection(self._title)
 
     def __getstate__(self) -> dict[str, Any]:
         own = {name: self.__dict__.get(name) for name in ("spec", "_np_random")}
@@ -132,6 +137,18 @@ class BaseEnv(EzPickle):
         if self.closed:
             raise ClosedEnvironmentError(f"{self._title}: called after close(), expected a new environment")
         return self._section
+
+    def state(self) -> dict[str, Array]:
+        """Return what a recorder needs, copies by name, one robot per row.
+
+        q (n, nq); v (n, nv); command (n, 3); torque of the motors at the joints (n, n_joints) [N m]; and, if computed,
+        contact_forces (n, n_contacts, 3) [N].
+        """
+        batch = self.batch
+        state = {name: batch.rows(name) for name in ("q", "v", "command", "torque")}
+        if batch.program.contact_forces:
+            state["contact_forces"] = batch.rows("contact_forces").reshape(batch.num_envs, -1, 3)
+        return state
 
     @property
     def dt(self) -> float:
@@ -260,15 +277,3 @@ def check_options(options: Mapping[str, Any] | None, known: tuple[str, ...] = ()
 def _brief(value: Any) -> str:
     kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
     return kind if value is not None else "None"
-
-
-def recorded_state(batch: TaskBatch) -> dict[str, Any]:
-    """Return copies of a batch's state by name, one robot per row.
-
-    q (n, nq); v (n, nv); command (n, 3); torque of the motors at the joints (n, n_joints) [N m]; and, if computed,
-    contact_forces (n, n_contacts, 3) [N].
-    """
-    state = {name: batch.rows(name) for name in ("q", "v", "command", "torque")}
-    if batch.program.contact_forces:
-        state["contact_forces"] = batch.rows("contact_forces").reshape(batch.num_envs, -1, 3)
-    return state

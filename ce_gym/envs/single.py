@@ -9,9 +9,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.compile import CriticalSection
-from ce_gym.envs.base import BaseEnv, check_options, checked_action, recorded_state, spaces
-from ce_gym.envs.rendering import RENDER_MODES, Screen
+from ce_gym.envs.base import BaseEnv, check_options, checked_action, spaces
+from ce_gym.envs.rendering import RENDER_MODES
 from ce_gym.envs.runtime.setup import make_batch
 
 
@@ -22,9 +21,6 @@ class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
     holds `diverged`, whether the simulation failed numerically: the episode is then truncated, at the last good state;
     `reward_<name>` for each reward term; and, as in Gymnasium's MuJoCo environments, `x_position`, `y_position`,
     `distance_from_origin` [m], `x_velocity` and `y_velocity` [m/s] of the base in the world.
-
-    Attributes:
-        model: The robot at a transmission level.
 
     Args:
         robot: Name of a robot that ships with the package, or a path to a robot file.
@@ -51,17 +47,10 @@ class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
     ) -> None:
         shown_as = {"obs_mode": obs_mode, "render_mode": render_mode, "width": width, "height": height}
         super().__init__(robot, task, **shown_as, **kwargs)
-        self.batch = make_batch(robot, task, num_envs=1, **kwargs)
-        self.task = task
-        self.model = self.batch.program.model
+        self._hold(make_batch(robot, task, num_envs=1, **kwargs), task, shown_as)
         self.observation_space, self.action_space = spaces(self.batch.program, obs_mode)
         self._names = [f"reward_{name}" for name in self.batch.program.reward_terms]
         self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
-        self.render_mode = render_mode
-        self._as_dict = obs_mode == "dict"
-        self._screen = Screen(render_mode, self.batch, width=width, height=height)
-        self.closed = False
-        self._section = CriticalSection(self._title)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -125,4 +114,4 @@ class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
 
     def state(self) -> dict[str, NDArray]:
         """Return what a recorder needs: q, v, command, torque and, if computed, contact_forces (n_contacts, 3)."""
-        return {name: rows[0] for name, rows in recorded_state(self.batch).items()}
+        return {name: rows[0] for name, rows in super().state().items()}

@@ -11,9 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ce_gym.compile import CriticalSection
-from ce_gym.envs.base import BaseEnv, check_options, checked_action, recorded_state, spaces
-from ce_gym.envs.rendering import RENDER_MODES, Screen
+from ce_gym.envs.base import BaseEnv, check_options, checked_action, spaces
+from ce_gym.envs.rendering import RENDER_MODES
 from ce_gym.envs.runtime.batch import Outcome
 from ce_gym.envs.runtime.setup import make_batch
 from ce_gym.envs.task.checks import checked_value
@@ -82,9 +81,8 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
             raise ValueError(f"render_mode={render_mode!r}; expected None on device {place.name!r}")
         if max_episode_steps is not None:
             checked_value("max_episode_steps", max_episode_steps, 1)
-        self.batch = make_batch(robot, task, num_envs=num_envs, device=place, **kwargs)
-        program = self.batch.program
-        self.num_envs, self.task, self.model = num_envs, task, program.model
+        self._hold(make_batch(robot, task, num_envs=num_envs, device=place, **kwargs), task, made_with)
+        program, self.num_envs = self.batch.program, num_envs
         self.max_episode_steps = max_episode_steps or program.task.episode_length
         self.batch.write("limit", self.max_episode_steps)
         self.device = getattr(self.batch.arrays["q"], "device", "cpu")
@@ -96,10 +94,6 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         self.single_observation_space, self.single_action_space = spaces(program, obs_mode)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.render_mode = render_mode
-        self._as_dict = obs_mode == "dict"
-        self._screen = Screen(render_mode, self.batch, width=width, height=height)
-        self._section = CriticalSection(self._title)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -186,10 +180,6 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
     def close_extras(self, **kwargs: Any) -> None:
         """Give back whatever rendering holds; see `gymnasium.vector.VectorEnv.close`."""
         self._screen.close()
-
-    def state(self) -> dict[str, Array]:
-        """Return what a recorder needs, one robot per row; see `recorded_state`."""
-        return recorded_state(self.batch)
 
     @property
     def elapsed_steps(self) -> Array:

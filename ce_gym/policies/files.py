@@ -37,7 +37,7 @@ REQUIRED: dict[str, type] = {
 }  # fmt: skip
 """What a record must say."""
 
-OLD_KEYS = {"contract": "policy_spec"}
+OLD_KEYS: Mapping[Any, Any] = {"contract": "policy_spec"}
 """Former keys of records, and what they are called now."""
 
 KINDS = {str: "text", dict: "a JSON object", int: "a whole number"}
@@ -177,7 +177,7 @@ def _read_onnx(file: Path) -> Policy:
 def _checked(record: Any, file: Path) -> dict[str, Any]:
     """Return a record if it has what is needed to run its policy."""
     if isinstance(record, dict):
-        record = Record({OLD_KEYS.get(key, key): value for key, value in record.items()})
+        record = Record({str(OLD_KEYS.get(key, key)): value for key, value in record.items()})
     for key, kind in REQUIRED.items():
         if not isinstance(record, dict) or key not in record:
             raise PolicyError(f"{file}: {key}: missing; expected a record written by this version of train/ppo.py")

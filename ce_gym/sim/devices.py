@@ -74,7 +74,12 @@ class Cpu:
 
     name, fuses = "cpu", False
     tiles = staticmethod(host_tiles.tiles)
-    zeros, empty = staticmethod(np.zeros), staticmethod(np.empty)
+
+    def zeros(self, shape: tuple[int, ...], dtype: str) -> NDArray:
+        return np.zeros(shape, dtype)
+
+    def empty(self, shape: tuple[int, ...], dtype: str) -> NDArray:
+        return np.empty(shape, dtype)
 
     def rows(self, values: Any, dtype: str, shape: tuple[int, ...] = ()) -> NDArray:
         array = np.asarray(values, dtype)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.model.arguments import check
+from ce_gym.sim.arguments import check
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,15 +30,15 @@ MAY_IMPORT = {
 }  # fmt: skip
 """What the modules of a folder may import from other folders."""
 LAYERS = {
-    "model": "arguments errors table frames assets constraints description constraint_functions clusters mechanism"
-    " checks generators formats load listing",
+    "model": "errors table frames assets constraints description constraint_functions clusters mechanism checks"
+    " generators formats load listing",
     "model/formats": "text_file reading placement standing rotor_rule rotor_links motors collections urdf mjcf yaml",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
     "dynamics": "algebra constraints standing recursion forces functions derivatives stepping evaluation model",
-    "sim": "tiles devices terrain placement substeps kernel_key kernels derivative_kernels schema batch pieces"
-    " simulator derivatives",
-    "envs": "terms task runtime policy_spec differentiable base rendering single vector registration custom",
+    "sim": "arguments tiles devices terrain placement substeps kernel_key kernels derivative_kernels schema batch"
+    " pieces simulator derivatives",
+    "envs": "terms task runtime policy_spec differentiable rendering base single vector registration custom",
     "export": "joint_ties mjcf_text mjcf_equalities mjcf mujoco_model mujoco_coordinates mujoco_batch mujoco_twin"
     " guesses new_robot",
     "viewer": "errors console rollouts page raytrace server feed window renderers live cli",

@@ -7,7 +7,7 @@ reset:  begin                                   only tiles with a robot to reset
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
@@ -40,7 +40,6 @@ HOST_ROWS = (
 has been seeded; whether an episode has ended and the next one has not begun."""
 
 
-@dataclass
 class TaskProgram:
     """Traces one task on one robot.
 
@@ -62,23 +61,9 @@ class TaskProgram:
         ValueError: If the robot lacks what the task needs, or the task names something that does not exist.
     """
 
-    model: Model
-    task: Task
-    contact_forces: bool = False
-    curriculum: Curriculum = field(init=False, repr=False)
-    actions: ActionMap = field(init=False, repr=False)
-    contacts: tuple[str, ...] = field(init=False, repr=False)
-    randomised: Randomised = field(init=False, repr=False)
-    ground: Ground | None = field(init=False, repr=False)
-    options: StepOptions = field(init=False, repr=False)
-    reward_terms: dict[str, Term] = field(init=False, repr=False)
-    termination_terms: dict[str, Term] = field(init=False, repr=False)
-    metric_terms: dict[str, Term] = field(init=False, repr=False)
-    observation_terms: dict[str, Term] = field(init=False, repr=False)
-    critic_terms: dict[str, Term] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        robot, task = self.model.robot, self.task
+    def __init__(self, model: Model, task: Task, contact_forces: bool = False) -> None:
+        self.model, self.task, self.contact_forces = model, task, contact_forces
+        robot = model.robot
         if not robot.floating:
             raise ValueError(f"{robot.name} has a fixed base; a task needs a robot with a floating base")
         self.curriculum = Curriculum(task)

@@ -10,7 +10,7 @@ from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.envs.task.tasks import Actions
 from ce_gym.envs.task.terrain_tiles import checked_terrain
-from ce_gym.model.arguments import check, check_choice, check_whole, is_number
+from ce_gym.sim.arguments import check, check_choice, check_whole, is_number
 
 CHOICES = {"actions": get_args(Actions), "friction": FRICTION, "motors": MOTORS}
 POSITIVE = ("action_scale", "command_period", "gait_period", "dt")

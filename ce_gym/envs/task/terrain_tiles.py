@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.arguments import check, is_number
+from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.terrain import Terrain
 
 FIGURES = {"flat": "", "slope": "angle", "rough": "amplitude", "stairs": "rise"}
@@ -45,7 +45,7 @@ def checked_terrain(value: Any) -> dict[str, Any]:
         ValueError: One line that names the argument, its value and what was expected.
     """
     given = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
-    kind = given.pop("kind", None)
+    kind: Any = given.pop("kind", None)
     check("terrain", value, kind in tuple(OWN), f"{', '.join(map(repr, OWN))}, or a mapping with such a `kind`")
     for name, figure in given.items():
         expected = f"one of {', '.join(OWN[kind])}" if OWN[kind] else "no argument"

@@ -24,7 +24,7 @@ def _buffer(name: str, document: str, default: SX | None = None) -> property:
     """Return a property that is the value of a state buffer, or the default where the task has no such buffer."""
 
     def read(s: TermContext) -> SX:
-        return s._values[name] if default is None else s._values.get(name, default)
+        return s._values[name] if default is None else s._values.get(name, SX(default))
 
     return property(read, doc=document)
 

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.terms import metrics, observations, rewards, terminations
 from ce_gym.envs.terms.context import TermContext
-from ce_gym.model.arguments import is_number
+from ce_gym.sim.arguments import is_number
 
 Function = Callable[..., SX]
 _F = TypeVar("_F", bound=Callable)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.envs.base import BaseEnv, recorded_state
+from ce_gym.envs.base import BaseEnv
 from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.model import Robot, robots
 from ce_gym.sim.terrain import Terrain
@@ -91,14 +91,14 @@ def record_lanes(
             raise ViewerError(f"lane {lane}: expected 0 to {batch.num_envs - 1}")
     field = field_of(batch.program.task.terrain)
     recorders = {lane: _recorder(native, field, label, info or {}) for lane in lanes}
-    told = None if commands is None else np.asarray(commands, float)
+    given = None if commands is None else np.asarray(commands, float)
     observation, _ = env.reset(seed=seed)
     rewards, running = np.zeros((batch.num_envs, 1 + len(batch.program.reward_terms))), set(lanes)
     for step in range(round(seconds / native.dt)):
-        if told is not None:
-            now = told[min(step, len(told) - 1)]
+        if given is not None:
+            now = given[min(step, len(given) - 1)]
             batch.write("command", np.broadcast_to(now, (batch.num_envs, 3)).astype(batch.dtype))
-        state = recorded_state(batch)
+        state = BaseEnv.state(native)  # a single environment returns no rows
         for lane in running:
             forces = state["contact_forces"][lane] if "contact_forces" in state else ()
             q, v, command, torque = (state[name][lane] for name in ("q", "v", "command", "torque"))

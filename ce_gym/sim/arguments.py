@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 
-def check(argument: str, value: object, valid: bool, expected: str) -> None:
+def check(argument: str, value: object, valid: Any, expected: str) -> None:
     """Raise a ValueError unless `valid`."""
     if not valid:
         raise ValueError(f"{argument}={value!r}; expected {expected}")
