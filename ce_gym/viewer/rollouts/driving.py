@@ -15,7 +15,7 @@ from ce_gym.viewer.rollouts.recording import Act, record_lanes
 from ce_gym.viewer.rollouts.rollout import Rollout
 
 Script = Sequence[tuple[float, tuple[float, float, float]]]
-"""Commands one after the other: for how long [s], then forward, lateral [m/s] and yaw rate [rad/s]."""
+"""Commands one after the other: for how long [s], then forward, sideways [m/s] and yaw rate [rad/s]."""
 
 SHOW: Script = (
     (1.0, (0.0, 0.0, 0.0)),

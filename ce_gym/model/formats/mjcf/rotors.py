@@ -1,8 +1,8 @@
 """The armature of a compiled MJCF file -> rotors behind gears.
 
 Armature is the reflected inertia `ratio^2 J` of a rotor. MuJoCo adds it to the diagonal of the mass matrix and knows
-nothing of the rest that a spinning rotor does: it couples to the body that carries it (terms `ratio J`) and acts as a
-gyroscope. Here every armature becomes a rotor, a thin disc about the joint axis at the joint, tied by a gear:
+nothing of the rest that a spinning rotor does: it couples to the body that carries it (terms `ratio J`) and has
+gyroscopic torque. Here every armature becomes a rotor, a thin disc about the joint axis at the joint, tied by a gear:
 
 - `coupled` reproduces MuJoCo's mass matrix, and `armature` too unless tendon armature or an equality ties several
   joints together; `none` lacks the armature;
