@@ -43,36 +43,28 @@ class SettingsError(ValueError):
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Everything that shapes learning, apart from the environment itself and the seed.
+class CommonSettings:
+    """Settings of every learner.
 
     Attributes:
         steps: Environment steps to train for, over all environments.
         num_envs: Environments stepped at once.
-        rollout: Steps of each environment between two updates.
+        rollout: Control steps of each environment between two updates.
         minibatches: Parts into which the collected steps are divided.
         epochs: Times each update goes over the collected steps.
         hidden: Sizes of the hidden layers, the same for policy and value.
         activation: Tanh, ReLU, ELU, SELU, Sigmoid or Softplus, as in `torch.nn`.
         initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
-        final_std: At the end, geometric in between; 0 lets the learner choose it on the way. Of use where robots fall
-            by the mean action, by which policies are judged, that stood with the noise of training.
+        final_std: At the end, geometric in between.
         learning_rate: Of Adam, at the start.
-        target_kl: KL divergence of one update that the learning rate is adapted to; 0 keeps the rate fixed.
         gamma: Discount per step.
-        gae_lambda: Of generalised advantage estimation.
-        clip: Clipping range of PPO's probability ratio.
-        entropy: Weight of the entropy bonus at the start.
-        final_entropy: At the end, linear in between.
+        gae_lambda: Of generalised advantage estimation, or of the critic's targets, TD(lambda).
         fall_cost: What an episode that ends as a failure takes from the reward of its last step, in the end; see
             `progress.fall_cost`. Rewards that are reported are without it.
-        value: Weight of the value loss.
-        max_grad_norm: Gradients are clipped to this norm.
+        max_grad_norm: Gradients of the networks are clipped to this norm.
         training: Arguments of the environment for training only, by which no policy is judged; those that go with the
             policy are `env_args`.
     """
-
-    folder: ClassVar[Path] = CONFIG_FOLDER
 
     steps: int
     num_envs: int
@@ -84,20 +76,38 @@ class Settings:
     initial_std: float
     final_std: float
     learning_rate: float
-    target_kl: float
     gamma: float
     gae_lambda: float
-    clip: float
-    entropy: float
-    final_entropy: float
     fall_cost: float
-    value: float
     max_grad_norm: float
     training: Mapping[str, Any]
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain data, for a record beside the policy."""
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class Settings(CommonSettings):
+    """Everything that shapes learning by PPO, apart from the environment itself and the seed.
+
+    Attributes:
+        final_std: 0 lets the learner choose it during training. Of use where robots fall by the mean action, by which
+            policies are judged, that stood with the noise of training.
+        target_kl: KL divergence of one update that the learning rate is adapted to; 0 keeps the rate fixed.
+        clip: Clipping range of PPO's probability ratio.
+        entropy: Weight of the entropy bonus at the start.
+        final_entropy: At the end, linear in between.
+        value: Weight of the value loss.
+    """
+
+    folder: ClassVar[Path] = CONFIG_FOLDER
+
+    target_kl: float
+    clip: float
+    entropy: float
+    final_entropy: float
+    value: float
 
 
 def config_file(env_id: str, folder: Path = CONFIG_FOLDER) -> Path:

@@ -17,7 +17,6 @@ import interruption  # noqa: F401
 
 import json
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,7 +28,7 @@ from job import Job, Trained
 from job import main as run_jobs
 from numpy.typing import NDArray
 from progress import RecentEpisodes, fall_cost, geometric, spread_episodes
-from settings import CONFIG_FOLDER, Activation
+from settings import CONFIG_FOLDER, CommonSettings
 
 try:
     from fast_ppo import orthogonal, train_with
@@ -45,52 +44,24 @@ F = np.float32
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Everything that shapes learning, apart from the environment's id and the seed.
+class Settings(CommonSettings):
+    """Everything that shapes learning by SHAC, apart from the environment's id and the seed.
+
+    A rollout is a window that is differentiated as a whole; minibatches and epochs are those of the critic.
 
     Attributes:
-        steps: Environment steps to train for, over all environments.
-        num_envs: Environments stepped at once.
-        rollout: Control steps of a window.
-        minibatches: Parts into which a window is divided for the critic.
-        epochs: Times the critic goes over a window.
-        hidden: Sizes of the hidden layers, the same for policy and value.
-        activation: Tanh, ReLU and so on, as in `torch.nn`; what follows the policy's last layer, too, so that Tanh
-            squashes its actions.
-        initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
-        final_std: At the end, geometric in between.
-        learning_rate: Of Adam, policy and critic, until the last part of training.
+        activation: Follows the policy's last layer, too, so that Tanh squashes its actions.
+        learning_rate: Of policy and critic, until the last part of training.
         decay: That part: a share of training, over which the rate goes down to 0.
-        gamma: Discount per step.
-        gae_lambda: Of the critic's targets, TD(lambda).
-        fall_cost: What an episode that ends as a failure takes from these targets, in the end; see
-            `progress.fall_cost`.
         target_memory: Share of the target critic that is kept in each update.
-        max_grad_norm: Gradients of the networks are clipped to this norm.
         max_adjoint: A robot's gradient is shortened to this norm between control steps.
-        training: Arguments of the environment for training only; those that go with the policy are `env_args`.
     """
 
     folder: ClassVar[Path] = CONFIG_FOLDER / "shac"
 
-    steps: int
-    num_envs: int
-    rollout: int
-    minibatches: int
-    epochs: int
-    hidden: tuple[int, ...]
-    activation: Activation
-    initial_std: float
-    final_std: float
-    learning_rate: float
     decay: float
-    gamma: float
-    gae_lambda: float
-    fall_cost: float
     target_memory: float
-    max_grad_norm: float
     max_adjoint: float
-    training: Mapping[str, Any]
 
 
 class SHAC:
