@@ -63,6 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of actions and failures")
     parser.add_argument("--interrupts", type=int, metavar="N", help="instead, interrupt N calls by Ctrl-C")
     parser.add_argument("--substeps", type=float, metavar="N", help="instead, make N random sub-steps of all robots")
+    parser.add_argument("--robot", action="append", help="robot of --substeps, may be repeated; all by default")
 
 
 def run(arguments: argparse.Namespace) -> Report:
@@ -70,7 +71,7 @@ def run(arguments: argparse.Namespace) -> Report:
     if arguments.interrupts:
         return interrupts.run(arguments.interrupts, arguments.seed)
     if arguments.substeps:
-        return substeps.run(arguments.substeps, arguments.seed)
+        return substeps.run(arguments.substeps, arguments.robot, arguments.seed)
     import ce_gym
 
     ids = arguments.env or sorted(ce_gym.environment_ids())

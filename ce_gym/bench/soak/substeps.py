@@ -8,6 +8,7 @@ is told the same, and must be the same bit for bit. All must be finite, and no o
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -100,18 +101,18 @@ class Case:
         return f"{self.robot} {self.level} {self.dtype} {self.control}"
 
 
-def all_cases() -> list[Case]:
+def all_cases(names: Iterable[str]) -> list[Case]:
     """Return a case for each robot, level, precision and kind of control; robots without gains know torques only."""
     found = []
-    for robot in robots():
+    for robot in names:
         controls = ("position", "torque") if load_robot(robot).gains.kp else ("torque",)
         found += [Case(robot, lvl, dtype, c) for lvl in LEVELS for dtype in ("float64", "float32") for c in controls]
     return found
 
 
-def run(substeps: float, seed: int = 0) -> Report:
+def run(substeps: float, names: Iterable[str] | None = None, seed: int = 0) -> Report:
     """Make `substeps` sub-steps of robots, shared among all cases; Ctrl-C reports those that are done."""
-    cases, done, left = all_cases(), list[Case](), substeps
+    cases, done, left = all_cases(names or robots()), list[Case](), substeps
     rng = np.random.default_rng(seed)
     try:
         for case in shown(cases, "robots"):
