@@ -108,7 +108,7 @@ class Simulator:
         motors: str = "ideal",
         parameters: Sequence[str] = (),
         terrain: Terrain | None = None,
-        retry: int = 4,
+        retry: int = 6,
         device: str | Device = "cpu",
     ) -> None:
         self._made_with = {name: value for name, value in locals().items() if name != "self"}

@@ -144,10 +144,10 @@ def test_a_robot_that_nothing_saves_is_given_up(model: Model):
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_light_links_under_torques_that_a_step_cannot_follow(dtype: str):
-    """Their joints would turn by radians in a step of 20 ms, and their loops not close: one step in 16 ended so."""
+    """Their joints would turn by radians in a step, and their loops not close: one step in five ended so."""
     model, n = Model("planar_leg_linkage"), 32
     largest = [model.robot.body(name).joint.torque for name in model.joint_links]
-    sims = [Simulator(model, n, 0.02, dtype, control="torque", retry=retry) for retry in (0, 4)]
+    sims = [Simulator(model, n, 0.1, dtype, control="torque", **options) for options in ({"retry": 0}, {})]
     rng, lost = np.random.default_rng(0), [0, 0]
     for _ in range(100):
         torque = rng.uniform(-1, 1, (n, 2)) * largest

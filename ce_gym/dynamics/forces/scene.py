@@ -44,7 +44,7 @@ class StepOptions:
     motors: str = "ideal"
     ground: Ground = "flat"
     parameters: tuple[str, ...] = ()
-    retry: int = 4
+    retry: int = 6
 
 
 @dataclass
