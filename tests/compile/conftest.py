@@ -15,7 +15,7 @@ _numbers = itertools.count()
 
 @pytest.fixture(scope="module", autouse=True)
 def kernel_cache(tmp_path_factory):
-    """The cache folder of this file's tests, new and empty; those of other folders share theirs with other processes."""
+    """The cache folder of this file's tests, new and empty; tests of other folders share theirs between processes."""
     before = os.environ.get("CE_GYM_CACHE_DIR")
     folder = tmp_path_factory.mktemp("kernels")
     os.environ["CE_GYM_CACHE_DIR"] = str(folder)

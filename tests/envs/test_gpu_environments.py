@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from tripod import TRIPOD
 
 from ce_gym.compile.cuda import CudaUnavailable, nvrtc
 from ce_gym.compile.cuda.host import host_compiler
@@ -19,7 +20,7 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA 
 
 
 def make(device, **options):
-    return gymnasium.make_vec(ID, num_envs=N, autoreset_mode="SameStep", device=device, **options)
+    return gymnasium.make_vec(ID, num_envs=N, robot=TRIPOD, autoreset_mode="SameStep", device=device, **options)
 
 
 def numbers(value):
@@ -125,19 +126,19 @@ def test_observations_are_left_alone_and_nan_actions_harmless():
     envs = make(Emulated())
     first, _ = envs.reset(seed=0)
     kept = first.clone()
-    action = torch.full((N, 12), torch.nan)
+    action = torch.full((N, 2), torch.nan)
     second, reward, *_ = envs.step(action)
     assert torch.equal(first, kept)
     assert bool(torch.isfinite(second).all() and torch.isfinite(reward).all())
-    with pytest.raises(ValueError, match=r"action has shape \(3, 12\); expected \(21, 12\)"):
+    with pytest.raises(ValueError, match=r"action has shape \(3, 2\); expected \(21, 2\)"):
         envs.step(action[:3])
 
 
 def test_what_a_gpu_does_not_do_is_refused():
     with pytest.raises(ValueError, match="autoreset_mode='NextStep'; expected one of 'SameStep' on device"):
-        gymnasium.make_vec(ID, num_envs=2, device=Emulated(), autoreset_mode="NextStep")
+        gymnasium.make_vec(ID, num_envs=2, robot=TRIPOD, device=Emulated(), autoreset_mode="NextStep")
     with pytest.raises(ValueError, match="render_mode='rgb_array'; expected None"):
-        gymnasium.make_vec(ID, num_envs=2, device=Emulated(), render_mode="rgb_array")
+        gymnasium.make_vec(ID, num_envs=2, robot=TRIPOD, device=Emulated(), render_mode="rgb_array")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -172,7 +173,7 @@ def test_learners_are_served_from_a_gpu():
     other = adapters[1].SB3VecEnv(ours)
     other.seed(1)
     np.testing.assert_array_equal(wrapped.get_observations()["policy"].numpy(), other.reset())
-    action, done = np.full((N, 12), 0.2, np.float32), np.zeros(N)
+    action, done = np.full((N, 2), 0.2, np.float32), np.zeros(N)
     for _ in range(3):
         obs, reward, dones, extras = wrapped.step(torch.from_numpy(action))
         rows, rewards, done, infos = other.step(action)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tripod import TRIPOD
 
 import ce_gym
 from ce_gym.compile.cuda.host import host_compiler
@@ -34,8 +35,9 @@ def assert_same(one, other):
 
 
 @needs_host_compiler
-@DTYPES
-@pytest.mark.parametrize("robot", ["mini_cheetah", "planar_leg_linkage", "six_bar", "mit_humanoid_leg"])
+@pytest.mark.parametrize(
+    ("robot", "dtype"), [(TRIPOD, "float32"), *((name, "float64") for name in (TRIPOD, "six_bar", "mit_humanoid_leg"))]
+)
 def test_the_same_numbers(robot, dtype):
     model = ce_gym.Model(robot)
     assert_same(*(stepped(model, dtype, device) for device in ("cpu", Emulated())))
@@ -44,7 +46,7 @@ def test_the_same_numbers(robot, dtype):
 @needs_host_compiler
 def test_everything_of_a_simulator():
     """Terrain, parameters, masks, readings: the same through tensors as through arrays, step after step."""
-    model = ce_gym.Model("mini_cheetah")
+    model = ce_gym.Model(TRIPOD)
     heights = np.random.default_rng(0).uniform(0, 0.03, (40, 50))
     options = {
         "terrain": ce_gym.Terrain(heights, 0.1, (-2.0, -2.5)),
@@ -55,7 +57,7 @@ def test_everything_of_a_simulator():
     rng = np.random.default_rng(1)
     sims = [ce_gym.Simulator(model, N, device=device, **options) for device in ("cpu", Emulated())]
     mask, friction = rng.random(N) > 0.5, rng.uniform(0.2, 1.0, (N, 1))
-    targets = model.standing_q[7:] + rng.uniform(-0.3, 0.3, (6, N, 12))
+    targets = model.standing_q[7:] + rng.uniform(-0.3, 0.3, (6, N, 2))
     for sim, kind in zip(sims, (np.asarray, torch.from_numpy), strict=True):
         sim.set_parameter("friction", kind(friction), kind(mask))
         for target in targets[:3]:
@@ -77,7 +79,7 @@ def test_everything_of_a_simulator():
 
 @needs_host_compiler
 def test_a_method_of_several_steps_agrees():
-    model = ce_gym.Model("mini_cheetah")
+    model = ce_gym.Model(TRIPOD)
     options = {"method": "extrapolated", "contacts": "foot", "outputs": ("error",)}
     assert_same(*(stepped(model, "float64", device, **options) for device in ("cpu", Emulated())))
 
@@ -98,7 +100,7 @@ def test_steps_in_parts_agree():
 
 @needs_host_compiler
 def test_a_diverged_robot_is_frozen_and_flagged():
-    model = ce_gym.Model("mini_cheetah")
+    model = ce_gym.Model(TRIPOD)
     for device in ("cpu", Emulated()):
         sim = ce_gym.Simulator(model, 4, device=device)
         v = np.zeros((4, model.nv))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tripod import TRIPOD
 
 from ce_gym import Model, Simulator
 from ce_gym.dynamics.stepping.parts import LARGEST_MOVE
@@ -14,7 +15,7 @@ OTHERS = np.arange(N) != BAD
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return Model("mini_cheetah")
+    return Model(TRIPOD)
 
 
 def in_the_air(model: Model, **options) -> Simulator:
@@ -30,7 +31,7 @@ def whirl(sim: Simulator, speed: float = 4500.0) -> tuple[np.ndarray, np.ndarray
     """Let the joints of one robot turn too fast for a step of 10 ms; return its state, shapes (nq,) and (nv,)."""
     v = sim.v
     v[BAD] = 0.0
-    v[BAD, 6:] = speed * np.resize([1.0, -1.0], 12)
+    v[BAD, 6:] = speed * np.array([1.0, -1.0])
     sim.set_state(sim.q, v)
     return sim.q[BAD], v[BAD]
 
@@ -108,12 +109,12 @@ def test_means_are_those_over_all_parts(model: Model):
     """The torque of a step in two halves is the mean of the two."""
     sim, halves = in_the_air(model, dt=0.01), in_the_air(model, dt=0.005, retry=0)
     for one in (sim, halves):
-        whirl(one, 70.0)
-    torques = []
+        whirl(one, 90.0)
+    torques, target = [], model.standing_q[7:] + [3.0, -3.0]  # brakes, but not with all that the motors have
     for _ in range(2):
-        halves.step(model.standing_q[7:])
+        halves.step(target)
         torques.append(halves.torque[BAD])
-    sim.step(model.standing_q[7:])
+    sim.step(target)
     assert sim.n_retried == 1
     np.testing.assert_array_equal(sim.q[BAD], halves.q[BAD])
     np.testing.assert_allclose(sim.torque[BAD], np.mean(torques, axis=0), rtol=1e-12)
@@ -134,7 +135,7 @@ def test_a_robot_that_blows_up_is_saved_by_parts(model: Model):
 
 def test_a_robot_that_nothing_saves_is_given_up(model: Model):
     sim = in_the_air(model, dt=0.01, retry=1)
-    whirl(sim)
+    whirl(sim, 9500.0)
     for _ in range(3):
         sim.step(model.standing_q[7:], 5)
     assert sim.diverged[BAD]
