@@ -49,27 +49,32 @@ class PureSteps:
     def backward(self, recorded: Any, weights: Rows) -> tuple[dict[str, NDArray], NDArray]:
         """Return gradients with respect to the state and the target, given those with respect to the state after."""
         records, before, after = recorded
-        if self.simulator.model.robot.floating:
-            weights = {**weights, "q": to_tangent(after, weights["q"])}
+        layout = self.simulator.model.robot.layout
+        weights = {**weights, "q": to_tangent(after, weights["q"], layout)}
         found, targets, _ = self.derivatives.backward(weights, records)
-        if self.simulator.model.robot.floating:
-            found["q"] = from_tangent(before, found["q"])
+        found["q"] = from_tangent(before, found["q"], layout)
         return found, sum(targets[1:], start=targets[0])
 
 
-def to_tangent(q: NDArray, gradient: NDArray) -> NDArray:
-    """Take gradients with respect to positions of a floating base, shape (n, nq), to their tangent space, (n, nv)."""
-    w, u = q[:, 3:4], q[:, 4:7]
-    scalar, vector = gradient[:, 3:4], gradient[:, 4:7]
-    turning = (w * vector - scalar * u - np.cross(u, vector)) / 2
-    return np.hstack([turning, _turned(w, -u, gradient[:, :3]), gradient[:, 7:]])
+def to_tangent(q: NDArray, gradient: NDArray, layout: Any) -> NDArray:
+    """Take gradients with respect to positions, shape (n, nq), to their tangent space, (n, nv); see `Robot.layout`."""
+    parts = []
+    for row, _ in layout.turns:
+        w, u = q[:, row : row + 1], q[:, row + 1 : row + 4]
+        scalar, vector = gradient[:, row : row + 1], gradient[:, row + 1 : row + 4]
+        parts.append((w * vector - scalar * u - np.cross(u, vector)) / 2)
+    if layout.floating:
+        parts.insert(1, _turned(q[:, 3:4], -q[:, 4:7], gradient[:, :3]))
+    return np.hstack([*parts, gradient[:, layout.joints_q :]])
 
 
-def from_tangent(q: NDArray, gradient: NDArray) -> NDArray:
+def from_tangent(q: NDArray, gradient: NDArray, layout: Any) -> NDArray:
     """Take gradients in the tangent space of positions, shape (n, nv), to one with respect to them, (n, nq)."""
-    w, u, g = q[:, 3:4], q[:, 4:7], gradient[:, :3]
-    scalar, vector = -(u * g).sum(1, keepdims=True), w * g + np.cross(u, g)
-    return np.hstack([_turned(w, u, gradient[:, 3:6]), 2 * scalar, 2 * vector, gradient[:, 6:]])
+    parts = [_turned(q[:, 3:4], q[:, 4:7], gradient[:, 3:6])] if layout.floating else []
+    for row, column in layout.turns:
+        w, u, g = q[:, row : row + 1], q[:, row + 1 : row + 4], gradient[:, column : column + 3]
+        parts += [-2 * (u * g).sum(1, keepdims=True), 2 * (w * g + np.cross(u, g))]
+    return np.hstack([*parts, gradient[:, layout.joints_v :]])
 
 
 def _turned(w: NDArray, u: NDArray, x: NDArray) -> NDArray:

@@ -101,21 +101,24 @@ def level_row(model: Model, level: str, M: Mapping[str, Array], feet: Array) -> 
         M: Mass matrices at every level, shape (n, nv, nv).
         feet: Jacobian of the heights of the feet, shape (n, n_feet, nv).
     """
-    base = model.robot.base_nv
+    base = model.robot.layout.joints_v
     (H, turn), (H_level, turn_level) = (in_flight(M[one], base) for one in ("exact", level))
     kp = dict(model.robot.gains.kp)
     springs = np.array([kp.get(name, 0.0) for name in model.joint_links])
     springs = springs if (springs > 0).all() else np.diagonal(H, axis1=1, axis2=2).mean(0)
     torque = np.abs(np.linalg.eigvals(np.linalg.solve(H, H_level - H)).real).max(-1)
     frequency = np.abs(frequencies(H_level, springs) / frequencies(H, springs) - 1).max(-1)
-    turned = np.linalg.norm((turn_level - turn)[:, :3], ord=2, axis=(1, 2)) if base else None
+    turned = np.linalg.norm((turn_level - turn)[:, :3], ord=2, axis=(1, 2)) if model.robot.floating else None
     mass = np.abs(masses(M[level], feet) / masses(M["exact"], feet) - 1).max(-1) if feet.shape[1] else None
     optional = (None if x is None else _range(x) for x in (turned, mass))
     return LevelRow(level, _range(torque), _range(frequency), *optional)
 
 
 def in_flight(M: Array, base: int) -> tuple[Array, Array]:
-    """Return the inertia of the joints with the base free (n, nj, nj), and the base's motion for theirs (n, 6, nj)."""
+    """Return the inertia of the joints with the first `base` coordinates free, and how these move with them.
+
+    Shapes (n, nj, nj) and (n, base, nj): of a floating base and of ball joints.
+    """
     if not base:
         return M, np.zeros((len(M), 0, M.shape[-1]))
     turn = -np.asarray(np.linalg.solve(M[:, :base, :base], M[:, :base, base:]), dtype=float)

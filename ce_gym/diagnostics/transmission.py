@@ -146,7 +146,8 @@ def cluster_figures(exact: Model, coupled: Model) -> tuple[ClusterFigures, ...]:
 def jacobian(model: Model) -> dict[str, Array]:
     """Return the row of `G` of every one-degree-of-freedom joint at the standing pose, by body, shape (nv,) each."""
     _, v_span = model.spanning(model.standing_q, np.eye(model.nv))  # v_span = G v, one independent velocity a row
-    return {name: v_span[:, model.robot.base_nv + i] for i, name in enumerate(model.spanning_names)}
+    rows = {name: rows for name, (_, rows) in model.robot.spanning_rows.items() if len(rows) == 1}
+    return {name: v_span[:, row] for name, (row,) in rows.items()}
 
 
 def level_errors(models: Mapping[str, Model], q: Array, v: Array, tau: Array) -> tuple[LevelError, ...]:
@@ -160,7 +161,7 @@ def level_errors(models: Mapping[str, Model], q: Array, v: Array, tau: Array) ->
     """
     exact = models["exact"]
     reference = exact.forward_dynamics(q, v, tau)
-    base = exact.robot.base_nv
+    base = exact.robot.layout.base_nv
     errors = []
     for level in LEVELS[1:]:
         error = models[level].forward_dynamics(q, v, tau) - reference

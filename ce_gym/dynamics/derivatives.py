@@ -1,8 +1,9 @@
 """Derivatives of the quantities of a mechanism: Jacobians, and products with them in forward and reverse mode.
 
 Positions are differentiated in their tangent space, in the order of `v`: base rotation, base translation, both in base
-axes, then joints. Closed loops move with the independent joints: dependent coordinates that Newton's method found are
-differentiated through its iterations, which start from the solution and so give its exact derivative.
+axes, rotations of ball joints in the axes of the bodies that turn, then the other joints. Closed loops move with the
+independent joints: dependent coordinates that Newton's method found are differentiated through its iterations, which
+start from the solution and so give its exact derivative.
 
 The Jacobians of forward dynamics follow from those of inverse dynamics,
 
@@ -24,19 +25,24 @@ from ce_gym.dynamics.algebra.spatial import SX, quaternion_product, quaternion_t
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.parameters import parameter_defaults, with_parameters
 from ce_gym.dynamics.functions import FUNCTIONS
+from ce_gym.model.coordinates import Layout
 from ce_gym.model.mechanism import Mechanism
 
 PLAIN_FIGURES, BODY_FIGURES = ("gravity", "rotor_inertia", "ratio"), ("added_mass", "com_shift")
 """Parameters that are figures of the mechanism, not of a scene: of the whole, and of each link."""
 
 
-def tangent_basis(q: SX, floating: bool) -> SX:
+def tangent_basis(q: SX, layout: Layout) -> SX:
     """Return how positions (nq,) change with their tangent, shape (nq, nv)."""
-    if not floating:
-        return SX.eye(q.numel())
-    turning = ca.horzcat(*[quaternion_product(q[3:7], ca.vertcat(0, SX.eye(3)[:, i])) / 2 for i in range(3)])
-    base = ca.blockcat([[SX(3, 3), quaternion_to_rotation(q[3:7])], [turning, SX(4, 3)]])
-    return ca.diagcat(base, SX.eye(q.numel() - 7))
+    turning = [_turning(q[i : i + 4]) for i, _ in layout.turns]
+    if layout.floating:
+        turning[0] = ca.blockcat([[SX(3, 3), quaternion_to_rotation(q[3:7])], [turning[0], SX(4, 3)]])
+    return ca.diagcat(*turning, SX.eye(layout.joints))
+
+
+def _turning(quaternion: SX) -> SX:
+    """Return how a quaternion changes with a rotation about the axes of what it turns, shape (4, 3)."""
+    return ca.horzcat(*[quaternion_product(quaternion, ca.vertcat(0, SX.eye(3)[:, i])) / 2 for i in range(3)])
 
 
 @dataclass(frozen=True)
@@ -47,18 +53,18 @@ class Quantity:
         inputs: Symbols by name, in the order of the function; positions, if there are any, are "q".
         figures: Symbols of figures by name, with the values that the robot has.
         outputs: Expressions by name.
-        floating: Whether the base floats.
+        layout: Which rows of `q` are what.
     """
 
     inputs: dict[str, SX]
     figures: dict[str, tuple[SX, np.ndarray]]
     outputs: dict[str, SX]
-    floating: bool
+    layout: Layout
 
     def along(self, name: str) -> tuple[SX, SX]:
         """Return the symbol of an input or figure, and how it changes with its tangent."""
         x = self.inputs[name] if name in self.inputs else self.figures[name][0]
-        return x, tangent_basis(x, self.floating) if name == "q" else SX.eye(x.numel())
+        return x, tangent_basis(x, self.layout) if name == "q" else SX.eye(x.numel())
 
     def function(self, name: str, given: dict[str, SX], results: list[SX]) -> ca.Function:
         """Trace expressions at the robot's own figures; a guess of dependent coordinates stays the last input."""
@@ -99,7 +105,7 @@ def make_quantity(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> Quan
     function = FUNCTIONS[name](named)
     inputs = {x: SX.sym(x, function.numel_in(i)) for i, x in enumerate(function.name_in())}
     outputs = dict(zip(function.name_out(), function.call(list(inputs.values())), strict=True))
-    return Quantity(inputs, {x: (symbols[x], defaults[x]) for x in symbols}, outputs, mechanism.robot.floating)
+    return Quantity(inputs, {x: (symbols[x], defaults[x]) for x in symbols}, outputs, mechanism.robot.layout)
 
 
 def jacobian_function(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> ca.Function:
@@ -161,4 +167,4 @@ def _forward_dynamics_jacobian(mechanism: Mechanism, wrt: tuple[str, ...]) -> ca
     at = [vdot if name == "vdot" else inputs[name] for name in inverse.inputs]
     results = ca.substitute([to_acceleration @ forces[x] for x in others], list(inverse.inputs.values()), at)
     results = [-results[others.index(x)] if x in others else to_acceleration for x in wrt]
-    return Quantity(inputs, inverse.figures, {}, mechanism.robot.floating).function("jacobian", {}, results)
+    return Quantity(inputs, inverse.figures, {}, mechanism.robot.layout).function("jacobian", {}, results)

@@ -43,20 +43,17 @@ class Evaluator:
     @property
     def nv(self) -> int:
         """Number of independent velocities, six for a floating base included."""
-        return self.robot.base_nv + len(self.robot.independent)
+        return self.robot.layout.nv
 
     @property
     def nq(self) -> int:
         """Number of position coordinates, seven for a floating base included."""
-        return self.robot.base_nq + len(self.robot.independent)
+        return self.robot.layout.nq
 
     @cached_property
     def standing_q(self) -> Array:
         """The standing pose, upright at the origin, shape (nq,)."""
-        angles = dict(self.robot.pose.joints)
-        joints = [angles.get(name, 0.0) for name in self.robot.independent]
-        base = [0.0, 0.0, self.robot.pose.height, 1.0, 0.0, 0.0, 0.0] if self.robot.floating else []
-        return np.array(base + joints)
+        return np.array(self.robot.standing_q)
 
     def casadi_function(self, name: str) -> ca.Function:
         """Return a quantity as a CasADi SX function of column vectors.
@@ -150,7 +147,8 @@ class Evaluator:
     def forward_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> tuple[Array, Array, Array]:
         """Return how `forward_dynamics` changes with `q`, `v` and `tau`, each of shape (..., nv, nv).
 
-        `q` in its tangent space: a rotation of the base, a translation of it, both in base axes, then the joints.
+        `q` in its tangent space: a rotation of the base, a translation of it, both in base axes, rotations of ball
+        joints, then the other joints.
         The last is the inverse of the mass matrix.
         """
         inputs = ("q", "v", "tau")

@@ -36,8 +36,8 @@ from ce_gym.model.mechanism import Mechanism
 
 def state_symbols(mechanism: Mechanism) -> tuple[SX, SX, SX]:
     """Return fresh symbols for positions (nq,), velocities (nv,) and guesses of dependent positions (n_guess,)."""
-    robot = mechanism.robot
-    q, v = SX.sym("q", robot.base_nq + len(robot.independent)), SX.sym("v", robot.base_nv + len(robot.independent))
+    layout = mechanism.robot.layout
+    q, v = SX.sym("q", layout.nq), SX.sym("v", layout.nv)
     return q, v, SX.sym("guess", len(reference_guess(mechanism)))
 
 
@@ -98,8 +98,8 @@ def _spanning(mechanism: Mechanism) -> ca.Function:
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
     positions, velocities = spanning_coordinates(mechanism, kinematics)
     robot = mechanism.robot
-    q_span = ca.vertcat(*_base(q, robot.base_nq), *[positions[name] for name in robot.joints])
-    v_span = ca.vertcat(*_base(v, robot.base_nv), *[velocities[name] for name in robot.joints])
+    q_span = ca.vertcat(*_base(q, robot.layout.base_nq), *[positions[name] for name in robot.joints])
+    v_span = ca.vertcat(*_base(v, robot.layout.base_nv), *[velocities[name] for name in robot.joints])
     return _function("spanning", guess, {"q": q, "v": v}, {"q_span": q_span, "v_span": v_span})
 
 
@@ -113,7 +113,7 @@ def _spanning_acceleration(mechanism: Mechanism) -> ca.Function:
             qdd = coordinates.G @ vdot[rows] + coordinates.g
             accelerations |= {name: qdd[i] for name, i in coordinates.index.items()}
     robot = mechanism.robot
-    spanning = ca.vertcat(*_base(vdot, robot.base_nv), *[accelerations[name] for name in robot.joints])
+    spanning = ca.vertcat(*_base(vdot, robot.layout.base_nv), *[accelerations[name] for name in robot.joints])
     return _function("spanning_acceleration", guess, {"q": q, "v": v, "vdot": vdot}, {"vdot_span": spanning})
 
 
@@ -121,19 +121,20 @@ def _spanning_jacobian(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     _, velocities = spanning_coordinates(mechanism, outward_velocity_pass(mechanism, q, v, guess))
     robot = mechanism.robot
-    G = ca.jacobian(ca.vertcat(*_base(v, robot.base_nv), *[velocities[name] for name in robot.joints]), v)
+    G = ca.jacobian(ca.vertcat(*_base(v, robot.layout.base_nv), *[velocities[name] for name in robot.joints]), v)
     return _function("spanning_jacobian", guess, {"q": q}, {"G": G})
 
 
 def _implicit_constraint(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    order, base = mechanism.robot.joints, mechanism.robot.base_nv
-    jacobians, biases = [SX(0, base + len(order))], [SX(0, 1)]
+    columns = {name: list(rows) for name, (_, rows) in mechanism.robot.spanning_rows.items()}
+    count = sum(map(len, columns.values()))
+    jacobians, biases = [SX(0, count)], [SX(0, 1)]
     for cluster, closure, coordinates in zip(
         mechanism.tree.clusters, closures(mechanism), kinematics.coordinates, strict=True
     ):
-        if coordinates is None:
+        if coordinates is None or not cluster.constraints:
             continue
         at, speed = SX.sym("q", len(cluster.bodies)), SX.sym("qd", len(cluster.bodies))
         phi = constant(linear_rows(cluster)[0]) @ at
@@ -142,8 +143,8 @@ def _implicit_constraint(mechanism: Mechanism) -> ca.Function:
         K = ca.jacobian(phi, at)
         rows = ca.Function("rows", [at, speed], [K, -ca.jtimes(K @ speed, at, speed)])
         here, bias = rows(coordinates.q, coordinates.qd)
-        spread = SX(here.shape[0], base + len(order))
-        spread[:, [base + order.index(name) for name in cluster.bodies]] = here
+        spread = SX(here.shape[0], count)
+        spread[:, [column for name in cluster.bodies for column in columns[name]]] = here
         jacobians.append(spread)
         biases.append(bias)
     outputs = {"K": ca.vertcat(*jacobians), "k": ca.vertcat(*biases)}

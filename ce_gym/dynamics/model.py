@@ -26,9 +26,10 @@ Array = NDArray[np.float64]
 class Model(Evaluator):
     """The dynamics of one robot at one transmission level.
 
-    `q = [base position (3) [m], base quaternion wxyz (4), independent joint positions]`,
-    `v = [base angular (3) [rad/s], base linear (3) [m/s], joint velocities]`, both base velocities in the base frame;
-    a fixed base has only the joints. `vdot` is the time derivative of `v`, component by component.
+    `q = [base position (3) [m], base quaternion wxyz (4), quaternion of each ball joint (4), independent joint
+    positions]`, `v = [base angular (3) [rad/s], base linear (3) [m/s], angular velocity of each ball joint (3) [rad/s],
+    joint velocities]`, both base velocities in the base frame, those of ball joints against the parent in the axes of
+    the body that turns; a fixed base has only the joints. `vdot` is the time derivative of `v`, component by component.
 
     Args:
         robot: A description, the name of a robot that ships with the package, or a path to a robot file.
@@ -149,7 +150,8 @@ class Model(Evaluator):
     def spanning(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Return positions and velocities of every joint, rotors included, in the order of `robot.bodies`.
 
-        A floating base comes first, with 7 positions and 6 velocities: shapes (..., nq_span) and (..., nv_span).
+        A floating base has 7 positions and 6 velocities, a ball joint 4 and 3: shapes (..., nq_span) and
+        (..., nv_span). `robot.spanning_rows` has the rows of each joint.
         """
         q_span, v_span = self._evaluate("spanning", q, v)
         return q_span[..., 0], v_span[..., 0]
@@ -166,12 +168,11 @@ class Model(Evaluator):
                 another way than the robot's reference pose is assembled.
         """
         q_span, v_span = np.asarray(q_span, dtype=float), np.asarray(v_span, dtype=float)
-        base = (self.robot.base_nq, self.robot.base_nv)
-        joints = [self.spanning_names.index(name) for name in self.joint_links]
-        q = q_span[..., [*range(base[0]), *(base[0] + i for i in joints)]]
-        v = v_span[..., [*range(base[1]), *(base[1] + i for i in joints)]]
-        expected = self.spanning(q, v)
-        turned = np.exp(1j * (expected[0] - q_span)[..., base[0] :]) - 1  # whole turns do not matter
+        span = self.robot.spanning_rows
+        q = q_span[..., [row for name in self.robot.rows for row in span[name][0]]]
+        v = v_span[..., [row for name in self.robot.rows for row in span[name][1]]]
+        expected, angles = self.spanning(q, v), [rows[0] for rows, _ in span.values() if len(rows) == 1]
+        turned = np.exp(1j * (expected[0] - q_span)[..., angles]) - 1  # whole turns do not matter
         for name, error in (("q_span", turned), ("v_span", expected[1] - v_span)):
             if error.size and np.abs(error).max() > 1e-6:
                 raise ValueError(f"{name} misses the constraints of {self.robot.name} by {np.abs(error).max():.2g}")
@@ -240,7 +241,7 @@ class Model(Evaluator):
             if name not in self.spanning_names:
                 raise ValueError(f"actuated {name!r}: expected the name of a body with a joint of {self.robot.name}")
         G = self._evaluate("spanning_jacobian", q)[0]
-        return G[..., [self.robot.base_nv + self.spanning_names.index(name) for name in chosen], :]
+        return G[..., [row for name in chosen for row in self.robot.spanning_rows[name][1]], :]
 
     def body_poses(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return where all bodies are, in the order of `body_names`.

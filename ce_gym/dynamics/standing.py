@@ -15,7 +15,8 @@ from ce_gym.dynamics.constraints.closure import Closure, closures
 from ce_gym.dynamics.constraints.cluster_constraints import linear_solution
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.errors import RobotError, bad
-from ce_gym.model.mechanism import Mechanism, Spin, skew
+from ce_gym.model.frames import rotation_matrix
+from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, skew
 
 Array = NDArray[np.float64]
 
@@ -32,8 +33,8 @@ class Standing:
     """A mechanism in its standing pose.
 
     Attributes:
-        q: Joint coordinates by body [rad or m], a floating base's left out.
-        G: Rows of the constraint Jacobian by body, shape (nv,) each.
+        q: Joint coordinates by body [rad or m], a floating base's and ball joints' left out.
+        G: Rows of the constraint Jacobian by body, shape (nv,) each; not of those joints.
         R: Rotations, body to world, by body.
         p: Origins in the world [m], by body.
         J: Spatial velocities in body axes for unit independent velocities, shape (6, nv), by body.
@@ -70,7 +71,9 @@ def check_standing(mechanism: Mechanism) -> None:
 
 
 def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:
-    names = [*["the floating base"] * mechanism.robot.base_nv, *mechanism.robot.independent]
+    joints = mechanism.robot.rows.items()
+    free = mechanism.robot.layout.base_nv  # rows of the base come first
+    names = ["the floating base" if row < free else name for name, (_, rows) in joints for row in rows]
     scale = np.sqrt(np.diag(M).clip(1e-300))
     if np.isfinite(M).all():
         values, vectors = np.linalg.eigh(M / scale[:, None] / scale)
@@ -88,8 +91,7 @@ def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:
 
 def standing_pose(mechanism: Mechanism) -> Standing:
     """Place all bodies of a mechanism in its standing pose, base to tip."""
-    base, joints = mechanism.robot.base_nv, mechanism.robot.independent
-    nv, column = base + len(joints), {name: base + i for i, name in enumerate(joints)}
+    rows, nv = {name: list(rows) for name, (_, rows) in mechanism.robot.rows.items()}, mechanism.robot.layout.nv
     standing = Standing({}, {}, {None: np.eye(3)}, {None: np.zeros(3)}, {None: np.zeros((6, nv))})
     for cluster, closure in zip(mechanism.tree.clusters, closures(mechanism), strict=True):
         first = cluster.bodies[0]
@@ -97,10 +99,13 @@ def standing_pose(mechanism: Mechanism) -> Standing:
             standing.R[first], standing.p[first] = np.eye(3), np.array([0.0, 0.0, mechanism.robot.pose.height])
             standing.J[first] = np.eye(6, nv)
             continue
+        if not cluster.independent:
+            _place_ball(standing, mechanism, first, np.eye(nv)[rows[first]])
+            continue
         q, G = _coordinates(mechanism, cluster, closure)
         for i, name in enumerate(cluster.bodies):
             standing.q[name], standing.G[name] = float(q[i]), np.zeros(nv)
-            standing.G[name][[column[joint] for joint in cluster.independent]] = G[i]
+            standing.G[name][[row for joint in cluster.independent for row in rows[joint]]] = G[i]
         for body in mechanism.moving(cluster):
             _place(standing, mechanism, body.name)
     return standing
@@ -119,15 +124,26 @@ def _coordinates(mechanism: Mechanism, cluster: Cluster, closure: Closure | None
 
 def _place(standing: Standing, mechanism: Mechanism, name: str) -> None:
     """Place one body, its parent being placed."""
-    body, parent = mechanism.bodies[name], mechanism.bodies[name].parent
-    axis, q = body.axis, standing.q[name]
-    turn, slide = body.joint.turn, body.joint.slide
-    position, rotation = body.position + body.rotation @ axis * (slide * q), body.rotation @ turned(axis, turn * q)
-    standing.R[name] = standing.R[parent] @ rotation
-    standing.p[name] = standing.p[parent] + standing.R[parent] @ position
+    body, q = mechanism.bodies[name], standing.q[name]
+    axis, turn, slide = body.axis, body.joint.turn, body.joint.slide
+    _attach(standing, body, axis * (slide * q), turned(axis, turn * q))
+    standing.J[name] += np.outer(np.concatenate([turn * axis, slide * axis]), standing.G[name])
+
+
+def _place_ball(standing: Standing, mechanism: Mechanism, name: str, rows: Array) -> None:
+    """Place the body of a ball joint, given its rows of the identity, shape (3, nv)."""
+    quaternion = dict(mechanism.robot.pose.balls).get(name, (1.0, 0.0, 0.0, 0.0))
+    _attach(standing, mechanism.bodies[name], np.zeros(3), rotation_matrix(np.array(quaternion)))
+    standing.J[name][:3] += rows
+
+
+def _attach(standing: Standing, body: MovingBody, shift: Array, turn: Array) -> None:
+    """Place a body whose joint has moved it by a shift and turned it, and let it move with its parent."""
+    position, rotation, parent = body.position + body.rotation @ shift, body.rotation @ turn, body.parent
+    standing.R[body.name] = standing.R[parent] @ rotation
+    standing.p[body.name] = standing.p[parent] + standing.R[parent] @ position
     w, v = standing.J[parent][:3], standing.J[parent][3:]
-    carried = np.vstack([rotation.T @ w, rotation.T @ (v - skew(position) @ w)])
-    standing.J[name] = carried + np.outer(np.concatenate([turn * axis, slide * axis]), standing.G[name])
+    standing.J[body.name] = np.vstack([rotation.T @ w, rotation.T @ (v - skew(position) @ w)])
 
 
 def turned(axis: Array, angle: float) -> Array:

@@ -30,9 +30,10 @@ MEANINGS = {
 """What an action means, by its kind."""
 
 COORDINATES = {
-    "q": "base position in the world (3) [m], base quaternion w x y z, body to world (4), joints in the order of "
-    "`joints` [rad]",
-    "v": "angular (3) [rad/s] and linear velocity (3) [m/s] of the base in the base frame, joints [rad/s]",
+    "q": "base position in the world (3) [m], base quaternion w x y z, body to world (4), quaternions of "
+    "ball joints, child to parent (4 each), joints in the order of `joints` [rad]",
+    "v": "angular (3) [rad/s] and linear velocity (3) [m/s] of the base in the base frame, angular "
+    "velocities of ball joints in the axes of what they turn (3 each), joints [rad/s]",
     "command": "forward and sideways velocity in the base frame [m/s], yaw rate [rad/s]",
     "action": "the action before this observation, after clipping",
 }

@@ -38,7 +38,7 @@ def joint_ties(mechanism: Mechanism) -> dict[str, Tie]:
     """
     ties: dict[str, Tie] = {}
     for cluster, closure in zip(mechanism.tree.clusters, closures(mechanism), strict=True):
-        if mechanism.robot.body(cluster.bodies[0]).joint.type == "free":
+        if mechanism.robot.body(cluster.bodies[0]).joint.nv > 1:
             continue
         B, q0 = linear_solution(cluster) if closure is None else (closure.assembly.B, closure.assembly.q0)
         unknown = () if closure is None else closure.assembly.unknown

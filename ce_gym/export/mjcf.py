@@ -137,11 +137,14 @@ def _add_body(
     if moving.joint.type == "free":
         ET.SubElement(element, "freejoint", name=body.name)
     else:
-        joint = ET.SubElement(
-            element, "joint", name=body.name, type=MJCF_JOINTS[body.joint.type], axis=text(moving.axis)
-        )
-        if math.isfinite(body.joint.position[0]) or math.isfinite(body.joint.position[1]):
-            joint.set("range", text(np.clip(body.joint.position, -NO_LIMIT, NO_LIMIT)))
+        joint = ET.SubElement(element, "joint", name=body.name, type=MJCF_JOINTS[body.joint.type])
+        lower, upper = body.joint.position
+        if body.joint.type == "ball":
+            lower = 0.0 if math.isfinite(upper) else lower
+        else:
+            joint.set("axis", text(moving.axis))
+        if math.isfinite(lower) or math.isfinite(upper):
+            joint.set("range", text(np.clip((lower, upper), -NO_LIMIT, NO_LIMIT)))
         for key, value in (
             ("ref", ref),
             ("damping", body.joint.damping),
@@ -218,10 +221,11 @@ def _add_actuators(root: ET.Element, robot: Robot) -> None:
 def _add_standing_pose(root: ET.Element, robot: Robot, standing: Mapping[str, float]) -> None:
     """Write the standing pose as a keyframe; MuJoCo orders coordinates depth first."""
     qpos: list[float] = []
+    turned = {name: robot.standing_q[rows.start : rows.stop] for name, (rows, _) in robot.rows.items()}
     for element in root.iter("body"):
         name = element.get("name", "")
-        if robot.body(name).joint.type == "free":
-            qpos += [0.0, 0.0, robot.pose.height, 1.0, 0.0, 0.0, 0.0]
+        if robot.body(name).joint.nv > 1:
+            qpos += turned[name]
         else:
             qpos.append(standing[name])
     key = ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="stand", qpos=text(qpos))

@@ -37,7 +37,7 @@ from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 Array = NDArray[np.float64]
 
-MJCF_JOINTS = {"revolute": "hinge", "prismatic": "slide"}
+MJCF_JOINTS = {"revolute": "hinge", "prismatic": "slide", "ball": "ball"}
 """Types of joints in MJCF."""
 HINGE_SPAN = 0.1
 """Distance between the two points at which a hinge that closes a loop is held [m]: about the width of a bearing."""

@@ -2,8 +2,8 @@
 """The change from our coordinates to MuJoCo's.
 
 MuJoCo's velocities are [base linear in the world, base angular in the base, joints depth first]; ours are [base
-angular, base linear, independent joints], base velocities in the base frame. (MuJoCo's compiled modules carry no types,
-hence the line above.)
+angular, base linear, ball joints, independent joints], base velocities in the base frame. (MuJoCo's
+compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ce_gym.export.joint_ties import joint_ties
 from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.coordinates import Layout
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
 from ce_gym.model.frames import rotation_matrix
@@ -29,14 +30,18 @@ class Coordinates:
     """The change from our coordinates to MuJoCo's, for one compiled model.
 
     Attributes:
-        floating: Whether the base is free.
-        to_positions: MuJoCo's joint positions for ours, shape (n_mujoco_joints, n_independent).
-        offset: Its constant part [rad or m], shape (n_mujoco_joints,).
+        layout: Which rows of our coordinates are what.
+        to_positions: MuJoCo's positions of joints with one coordinate for ours, shape (n, n_independent).
+        offset: Its constant part [rad or m], shape (n,).
+        scalars: Rows of these in `qpos` and in `qvel`, shape (n,) each.
+        balls: First rows of ball joints in `qpos` and in `qvel`, in our order.
     """
 
-    floating: bool
+    layout: Layout
     to_positions: Array
     offset: Array
+    scalars: tuple[list[int], list[int]]
+    balls: tuple[tuple[int, int], ...]
 
     @classmethod
     def of(cls, model: mujoco.MjModel, robot: Robot) -> Coordinates:
@@ -48,32 +53,48 @@ class Coordinates:
         loops = [tie.name for tie in robot.constraints if not isinstance(tie, LinearConstraint)]
         if loops:
             raise RobotError(f"{robot.name}: constraint {loops[0]!r}: expected only linear ones for this comparison")
-        names = [model.joint(i).name for i in range(model.njnt)]
-        if robot.floating:
-            names = names[1:]
         ties = joint_ties(build_mechanism(robot))
+        at = {model.joint(i).name: (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])) for i in range(model.njnt)}
+        names = [name for name in at if name in ties]
         matrix = np.array([[ties[name].ratios.get(y, 0.0) for y in robot.independent] for name in names])
-        return cls(robot.floating, matrix, np.array([ties[name].offset for name in names]))
+        scalars = [at[name][0] for name in names], [at[name][1] for name in names]
+        return cls(
+            layout=robot.layout,
+            to_positions=matrix.reshape(len(names), len(robot.independent)),
+            offset=np.array([ties[name].offset for name in names]),
+            scalars=scalars,
+            balls=tuple(at[name] for name in robot.balls),
+        )
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Sizes of `qpos` and `qvel`."""
+        first = self.layout
+        return first.joints_q + len(self.offset), first.joints_v + len(self.offset)
 
     def positions(self, q: Array) -> Array:
         """Return MuJoCo's qpos for one configuration of ours, shape (nq,)."""
-        base = 7 if self.floating else 0
-        return np.concatenate([q[:base], self.to_positions @ q[base:] + self.offset])
+        qpos, base = np.zeros(self.sizes[0]), self.layout.base_nq
+        qpos[:base] = q[:base]
+        for (theirs, _), (ours, _) in zip(self.balls, self.layout.ball_turns, strict=True):
+            qpos[theirs : theirs + 4] = q[ours : ours + 4]
+        qpos[self.scalars[0]] = self.to_positions @ q[self.layout.joints_q :] + self.offset
+        return qpos
 
     def velocity_map(self, q: Array) -> Array:
         """Return the matrix T of qvel = T v, shape (nv_mujoco, nv)."""
-        if not self.floating:
-            return self.to_positions
-        n, m = self.to_positions.shape
-        matrix = np.zeros((6 + n, 6 + m))
-        matrix[0:3, 3:6] = rotation_matrix(q[3:7])
-        matrix[3:6, 0:3] = np.eye(3)
-        matrix[6:, 6:] = self.to_positions
+        matrix = np.zeros((self.sizes[1], self.layout.nv))
+        if self.layout.floating:
+            matrix[0:3, 3:6] = rotation_matrix(q[3:7])
+            matrix[3:6, 0:3] = np.eye(3)
+        for (_, theirs), (_, ours) in zip(self.balls, self.layout.ball_turns, strict=True):
+            matrix[theirs : theirs + 3, ours : ours + 3] = np.eye(3)
+        matrix[self.scalars[1], self.layout.joints_v :] = self.to_positions
         return matrix
 
     def velocity_product(self, q: Array, v: Array) -> Array:
         """Return Tdot v, shape (nv_mujoco,): MuJoCo's linear velocity is in world axes."""
-        product = np.zeros(len(self.offset) + (6 if self.floating else 0))
-        if self.floating:
+        product = np.zeros(self.sizes[1])
+        if self.layout.floating:
             product[0:3] = rotation_matrix(q[3:7]) @ np.cross(v[0:3], v[3:6])
         return product

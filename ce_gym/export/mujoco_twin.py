@@ -48,9 +48,12 @@ class MujocoTwin:
         self.model = compiled(robot, level, Settings(TIMESTEPS[level], solimp=impedance))
         self._coordinates = Coordinates.of(self.model, robot)
         self._batch = Batch(self.model, num_envs)
-        joints = [self.model.joint(name) for name in robot.independent]
-        self._positions = [*range(7), *(int(joint.qposadr[0]) for joint in joints)]
-        self._velocities = [int(joint.dofadr[0]) for joint in joints]
+        names = [*robot.balls, *robot.independent]
+        at = [(int(self.model.joint(name).qposadr[0]), int(self.model.joint(name).dofadr[0])) for name in names]
+        sizes = [(len(rows), len(speeds)) for rows, speeds in (robot.rows[name] for name in names)]
+        placed = list(zip(at, sizes, strict=True))
+        self._positions = [*range(7), *(p + i for (p, _), (n, _) in placed for i in range(n))]
+        self._velocities = [d + i for (_, d), (_, n) in placed for i in range(n)]
         self.diverged = np.zeros(num_envs, bool)
 
     def start(self, q: Array, v: Array) -> None:

@@ -3,8 +3,15 @@
 from ce_gym.model.assets import assets_folder, robots
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
-from ce_gym.model.constraint_functions import constraint_function, register_constraint
-from ce_gym.model.constraints import Constraint, FunctionConstraint, LinearConstraint, LoopConstraint, RodConstraint
+from ce_gym.model.constraints import (
+    Constraint,
+    FunctionConstraint,
+    LinearConstraint,
+    LoopConstraint,
+    RodConstraint,
+    constraint_function,
+    register_constraint,
+)
 from ce_gym.model.description import (
     Body,
     ContactMaterial,
@@ -18,6 +25,7 @@ from ce_gym.model.description import (
     Shape,
 )
 from ce_gym.model.errors import InertiaWarning, LossyImportWarning, RobotError
+from ce_gym.model.formats.hinges import coincident_hinges
 from ce_gym.model.frames import IDENTITY, ZERO, Mat3, Placement, Vec3
 from ce_gym.model.load import load_robot
 
@@ -50,6 +58,7 @@ __all__ = [
     "assets_folder",
     "check_robot",
     "cluster_tree",
+    "coincident_hinges",
     "constraint_function",
     "load_robot",
     "register_constraint",

@@ -37,7 +37,7 @@ class Cluster:
         bodies: Names, parents before children.
         constraints: The ties among them.
         independent: Those of the bodies whose joint coordinates are independent, in the robot's order; empty for the
-            cluster of a floating base.
+            cluster of a floating base or of a ball joint.
         parent: Index of the parent cluster; None is the world.
         output_body: Body of the parent cluster that all base bodies of this cluster are attached to; None is the world.
     """
@@ -95,7 +95,7 @@ def cluster_tree(robot: Robot) -> ClusterTree:
     """Group the bodies of `robot` into clusters.
 
     Raises:
-        RobotError: A constraint reaches across a free joint.
+        RobotError: A constraint reaches across a free joint or a ball joint.
     """
     parents = {body.name: body.parent for body in robot.bodies}
     spans = [_constraint_span(constraint, parents, robot) for constraint in robot.constraints]
@@ -160,10 +160,12 @@ def _cluster(
     index_of: dict[str, int],
 ) -> Cluster:
     members = [body for body in robot.bodies if body.name in group]
-    free = [body.name for body in members if body.joint.type == "free"]
+    free = [body for body in members if body.joint.nv > 1]
     if free and ties:
         names = ", ".join(constraint.name for constraint in ties)
-        expected = f"a tie that does not reach across the free joint of {free[0]}"
+        expected = f"a tie that does not reach across the {free[0].joint.type} joint of {free[0].name}"
+        if free[0].joint.type == "ball":
+            expected += ", which in a loop is three revolute joints (ce_gym.model.coincident_hinges)"
         raise bad(robot.source or robot.name, f"constraint {names}", tuple(group), expected)
     output = parents[group[0]]
     return Cluster(

@@ -1,10 +1,16 @@
-"""What ties joint coordinates or bodies together: the kinds of constraints, frozen data."""
+"""What ties joint coordinates or bodies together: the kinds of constraints, frozen data.
+
+Functions that users register are known here by name. A description holds the name only, so that it stays plain data;
+the dynamics calls the functions with CasADi expressions.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
+from ce_gym.model.errors import RobotError
 from ce_gym.model.frames import ORIGIN, Placement, Vec3
 
 
@@ -123,3 +129,31 @@ class FunctionConstraint(Constraint):
     def bodies(self) -> tuple[str, ...]:
         """Names of the bodies whose joint coordinates the constraint ties together."""
         return (*self.dependent, *self.arguments)
+
+
+ConstraintFunction = Callable[[Sequence[Any]], Sequence[Any]]
+
+_functions: dict[str, ConstraintFunction] = {}
+
+
+def register_constraint(name: str, function: ConstraintFunction) -> None:
+    """Make a function available to `FunctionConstraint` under a name.
+
+    Args:
+        name: The name; registering it again with another function replaces it for models built later.
+        function: Takes a sequence of joint coordinates (CasADi SX scalars) [rad or m] and returns a sequence of
+            expressions of them: residuals `phi` that vanish, or coordinates `gamma` of dependent joints.
+    """
+    _functions[name] = function
+
+
+def constraint_function(name: str) -> ConstraintFunction:
+    """Return the function registered under `name`.
+
+    Raises:
+        RobotError: There is none.
+    """
+    if name not in _functions:
+        known = ", ".join(sorted(_functions)) or "there are none"
+        raise RobotError(f"constraint function {name!r}: expected a registered function ({known}); register_constraint")
+    return _functions[name]

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ce_gym.model.constraints import Constraint
+from ce_gym.model.coordinates import SIZES, Layout, placed
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
 
 
@@ -36,25 +37,37 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Joint:
-    """The tree joint between a body and its parent: free, or with one coordinate, a screw motion along its axis.
+    """The tree joint between a body and its parent: free, a ball, or a screw motion along an axis, of one coordinate.
 
     Attributes:
-        type: "free" (six degrees of freedom, only against the world), "revolute" or "prismatic".
-        axis: Unit axis in the body frame; for "revolute" positive is right-handed. Ignored by "free".
-        position: Lower and upper limit [rad or m]; infinite where there is none.
+        type: "free" (six degrees of freedom, only against the world), "ball" (three, and no actuator), "revolute" or
+            "prismatic".
+        axis: Unit axis in the body frame; for "revolute" positive is right-handed. Ignored by "free" and "ball".
+        position: Lower and upper limit [rad or m]; infinite where there is none. The upper one of a ball joint is how
+            far it turns about whichever axis; it has no lower one.
         torque: Largest actuator effort at the joint [N m or N].
         velocity: Largest speed the actuator reaches [rad/s or m/s].
         damping: Viscous friction at the joint [N m s/rad or N s/m].
         friction: Dry friction at the joint [N m or N].
     """
 
-    type: Literal["free", "revolute", "prismatic"]
+    type: Literal["free", "ball", "revolute", "prismatic"]
     axis: Vec3 = (0.0, 0.0, 1.0)
     position: tuple[float, float] = (-float("inf"), float("inf"))
     torque: float = float("inf")
     velocity: float = float("inf")
     damping: float = 0.0
     friction: float = 0.0
+
+    @property
+    def nq(self) -> int:
+        """Number of positions."""
+        return SIZES[self.type][0]
+
+    @property
+    def nv(self) -> int:
+        """Number of velocities."""
+        return SIZES[self.type][1]
 
     @property
     def turn(self) -> float:
@@ -178,10 +191,12 @@ class Pose:
     Attributes:
         height: Height of the base origin above flat ground [m]; ignored by a fixed base.
         joints: Pairs (body, angle) for independent joints; those not named are zero [rad or m].
+        balls: Pairs (body, unit quaternion wxyz) for ball joints; those not named are not turned.
     """
 
     height: float = 0.0
     joints: tuple[tuple[str, float], ...] = ()
+    balls: tuple[tuple[str, tuple[float, float, float, float]], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -253,14 +268,34 @@ class Robot:
         return bool(self.bodies) and self.bodies[0].joint.type == "free"
 
     @property
-    def base_nq(self) -> int:
-        """Number of position coordinates of the base, 7 if it is floating (position and quaternion) or none."""
-        return 7 if self.floating else 0
+    def balls(self) -> tuple[str, ...]:
+        """The body that each ball joint moves."""
+        return tuple(body.name for body in self.bodies if body.joint.type == "ball")
 
     @property
-    def base_nv(self) -> int:
-        """Number of velocities of the base."""
-        return 6 if self.floating else 0
+    def layout(self) -> Layout:
+        """Which rows of `q` and `v` are what."""
+        return Layout(self.floating, len(self.balls), len(self.independent))
+
+    @property
+    def rows(self) -> dict[str, tuple[range, range]]:
+        """Rows in `q` and in `v` of each joint that has some, by the body it moves, in their order."""
+        base = [self.bodies[0].name] if self.floating else []
+        types = {body.name: body.joint.type for body in self.bodies}
+        return placed([(name, types[name]) for name in (*base, *self.balls, *self.independent) if name in types])
+
+    @property
+    def spanning_rows(self) -> dict[str, tuple[range, range]]:
+        """Rows of each joint among the positions and the velocities of all joints, in the order of bodies."""
+        return placed([(body.name, body.joint.type) for body in self.bodies])
+
+    @property
+    def standing_q(self) -> tuple[float, ...]:
+        """Positions of the standing pose, upright at the origin, shape (nq,)."""
+        base = [0.0, 0.0, self.pose.height, 1.0, 0.0, 0.0, 0.0] if self.floating else []
+        turned, angles = dict(self.pose.balls), dict(self.pose.joints)
+        balls = [x for name in self.balls for x in turned.get(name, (1.0, 0.0, 0.0, 0.0))]
+        return (*base, *balls, *(angles.get(name, 0.0) for name in self.independent))
 
     @property
     def joints(self) -> tuple[str, ...]:

@@ -81,9 +81,8 @@ class StepDerivatives:
         self.simulator, self._records = simulator, list[Record]()
         self._keep_every = keep_every
         primal = primal_function(simulator.model.mechanism, simulator.options)
-        floating = simulator.model.robot.floating
         self._parts = state_parts(primal)
-        self.state_sizes = {n: size - (1 if n == "q" and floating else 0) for n, size in self._parts.items()}
+        self.state_sizes = {n: simulator.model.nv if n == "q" else size for n, size in self._parts.items()}
         others = {n: primal.numel_in(n) for n in ("target", "parameters") if n in primal.name_in()}
         ends = np.cumsum([0, *self.state_sizes.values(), *others.values()])
         names = [*self.state_sizes, *others]

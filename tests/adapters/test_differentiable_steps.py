@@ -20,17 +20,21 @@ def test_gradients_of_coordinates_are_those_of_the_tangent_space():
 
     from ce_gym.adapters.pure_steps import from_tangent, to_tangent
     from ce_gym.dynamics.derivatives import tangent_basis
+    from ce_gym.model.coordinates import Layout
 
-    rng, symbol = np.random.default_rng(1), ca.SX.sym("q", 9)
-    q, tangent = rng.normal(size=(4, 9)), rng.normal(size=(4, 8))
-    q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
-    basis = ca.Function("basis", [symbol], [tangent_basis(symbol, True)])
-    gradient = from_tangent(q, tangent)
+    layout = Layout(floating=True, balls=1, joints=2)
+    rng, symbol = np.random.default_rng(1), ca.SX.sym("q", layout.nq)
+    q, tangent = rng.normal(size=(4, layout.nq)), rng.normal(size=(4, layout.nv))
+    for i, _ in layout.turns:
+        q[:, i : i + 4] /= np.linalg.norm(q[:, i : i + 4], axis=1, keepdims=True)
+    basis = ca.Function("basis", [symbol], [tangent_basis(symbol, layout)])
+    gradient = from_tangent(q, tangent, layout)
     for row in range(4):
         here = np.array(basis(q[row]))
         np.testing.assert_allclose(here.T @ gradient[row], tangent[row], atol=1e-12)
-        np.testing.assert_allclose(to_tangent(q[[row]], gradient[[row]])[0], tangent[row], atol=1e-12)
-    np.testing.assert_allclose((gradient[:, 3:7] * q[:, 3:7]).sum(1), 0, atol=1e-12)
+        np.testing.assert_allclose(to_tangent(q[[row]], gradient[[row]], layout)[0], tangent[row], atol=1e-12)
+    for i, _ in layout.turns:
+        np.testing.assert_allclose((gradient[:, i : i + 4] * q[:, i : i + 4]).sum(1), 0, atol=1e-12)
 
 
 def test_torch_gradcheck():

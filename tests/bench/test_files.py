@@ -23,7 +23,13 @@ MJCF = f"""<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint/>{LINK}
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "hopper.xml").write_text(MJCF)
-    (tmp_path / "balls.xml").write_text(MJCF.replace('type="slide" axis="0 0 1"', 'type="ball"'))
+    ball = MJCF.replace('type="slide" axis="0 0 1"', 'type="ball" pos="0.05 0 0.1"').replace(
+        '0 0 0"/></k', '0 0 1 0 0 0"/></k'
+    )
+    (tmp_path / "balls.xml").write_text(ball)
+    (tmp_path / "two.xml").write_text(
+        MJCF.replace("</worldbody>", f'<body name="b"><freejoint/>{LINK}</body></worldbody>')
+    )
     (tmp_path / "scene.xml").write_text('<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
     shutil.copy(ROOT / "tests" / "data" / "own_robot" / "pup.urdf", tmp_path)
     return tmp_path
@@ -32,11 +38,13 @@ def folder(tmp_path):
 @pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
 def test_the_table(folder, monkeypatch):
     rows = {path.name: files.row(path, folder) for path in files.files(folder)}
-    assert set(rows) == {"hopper.xml", "balls.xml", "pup.urdf"}, "a scene without a robot is no robot"
-    for name, joints in (("hopper.xml", 3), ("pup.urdf", 8)):
+    assert set(rows) == {"hopper.xml", "balls.xml", "two.xml", "pup.urdf"}, "a scene without a robot is no robot"
+    for name, joints in (("hopper.xml", 3), ("balls.xml", 2), ("pup.urdf", 8)):
         assert rows[name][1:3] == ("same", joints)
         assert all(isinstance(x, float) and x <= files.BAR for x in rows[name][4:7])
-    assert rows["balls.xml"][1] == "joint 'c' type is 'ball': expected hinge, slide or free"
+    assert (
+        rows["two.xml"][1] == "bodies that move freely is ('trunk', 'b'): expected one robot, so at most one free joint"
+    )
     load = files.load_robot
 
     def heavier(path):

@@ -23,9 +23,10 @@ class Peer:
         self.velocities, self.positions = [], []
         for body in robot.bodies:
             joint = self.model.joints[self.joints[body.name]]
-            swap = (3, 4, 5, 0, 1, 2) if joint.nv == 6 else (0,)  # [linear; angular] there
+            swap = {6: (3, 4, 5, 0, 1, 2), 3: (0, 1, 2), 1: (0,)}[joint.nv]  # [linear; angular] there
+            turn = {7: (0, 1, 2, 6, 3, 4, 5), 4: (3, 0, 1, 2), 1: (0,)}[joint.nq]  # and quaternions (x, y, z, w)
             self.velocities += [joint.idx_v + i for i in swap]
-            self.positions += [joint.idx_q + i for i in ((0, 1, 2, 6, 3, 4, 5) if joint.nq == 7 else (0,))]
+            self.positions += [joint.idx_q + i for i in turn]
 
     def _add_children(self, parent: str | None) -> None:
         for body in (b for b in self.robot.bodies if b.parent == parent):
@@ -40,6 +41,8 @@ class Peer:
     def _joint(self, body: Body) -> object:
         if body.joint.type == "free":
             return self.pin.JointModelFreeFlyer()
+        if body.joint.type == "ball":
+            return self.pin.JointModelSpherical()
         kind = "Revolute" if body.joint.type == "revolute" else "Prismatic"
         return getattr(self.pin, f"JointModel{kind}Unaligned")(np.array(body.joint.axis))
 

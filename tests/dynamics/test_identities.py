@@ -15,7 +15,7 @@ from ce_gym.model.mechanism import LEVELS
 def move(model: Model, q: np.ndarray, v: np.ndarray, vdot: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Half a step of velocity, a step of position, half a step of velocity: second order, for finite differences."""
     symbols = [SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("a", model.nv)]
-    q1, _ = advance(symbols[0], symbols[1], SX(model.nv, 1), dt, model.robot.floating)
+    q1, _ = advance(symbols[0], symbols[1], SX(model.nv, 1), dt, model.robot.layout)
     step = ca.Function("step", symbols[:2], [q1])
     return step(q, v).full().ravel(), v + dt * vdot
 

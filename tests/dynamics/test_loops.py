@@ -72,7 +72,7 @@ def test_power_balance(model: Model, level: str):
     vdot = model.forward_dynamics(q, v, tau)
     symbols = SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("dt")
     move = ca.Function(
-        "move", symbols, [advance(symbols[0], symbols[1], SX(model.nv, 1), symbols[2], model.robot.floating)[0]]
+        "move", symbols, [advance(symbols[0], symbols[1], SX(model.nv, 1), symbols[2], model.robot.layout)[0]]
     )
     h = 1e-6
     energies = [sum(model.energy(move(q, v, dt).full().ravel(), v + dt * vdot)) for dt in (h, -h)]
@@ -122,7 +122,7 @@ def test_wrench_is_the_force_it_says(model: Model):
     i, h, force = model.body_names.index(body), 1e-6, np.array([1.0, -2.0, 3.0])
     symbols = SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("dt")
     move = ca.Function(
-        "move", symbols, [advance(symbols[0], symbols[1], SX(model.nv, 1), symbols[2], model.robot.floating)[0]]
+        "move", symbols, [advance(symbols[0], symbols[1], SX(model.nv, 1), symbols[2], model.robot.layout)[0]]
     )
     points = [model.body_poses(move(q, v, dt).full().ravel())[0][i] for dt in (h, -h)]
     at = model.body_poses(q)[0][i]

@@ -102,7 +102,6 @@ MJCF = {
     "damping": (mjcf(body(inside='<joint damping="-3"/>')), ["damping", "-3.0", "0 or more"]),
     "armature below 0": (mjcf(body(inside='<joint armature="-3"/>')), ["armature", "-3.0", "0 or more"]),
     "armature nan": (mjcf(body(inside='<joint armature="nan"/>')), ["armature", "'nan'", "finite"]),
-    "ball": (mjcf(body(inside='<joint name="hip" type="ball"/>')), ["joint 'hip' type", "'ball'", "hinge, slide"]),
     "two robots": (
         mjcf(body("a", "<freejoint/>") + body("b", "<freejoint/>")),
         ["bodies that move freely", "('a', 'b')", "one robot"],

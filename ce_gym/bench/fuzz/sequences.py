@@ -93,7 +93,7 @@ class Simulators(Beside):
 
     def step(self, rng: np.random.Generator) -> None:
         """Step with targets of each robot's own."""
-        joints = self.model.standing_q[self.model.robot.base_nq :]
+        joints = self.model.standing_q[self.model.robot.layout.joints_q :]
         targets, n = joints + rng.normal(0, 0.3, (N, len(joints))), int(rng.integers(4))
         self.batch.step(targets, n)
         for i, one in self.alone.items():
@@ -110,7 +110,7 @@ class Simulators(Beside):
         """Set the states of some."""
         chosen, v = self.some(rng), speed * rng.normal(1.0, 0.1, (N, self.model.nv))
         q = np.tile(self.model.standing_q, (N, 1))
-        q[:, self.model.robot.base_nq :] += rng.uniform(-0.05, 0.05, (N, len(self.model.robot.independent)))
+        q[:, self.model.robot.layout.joints_q :] += rng.uniform(-0.05, 0.05, (N, len(self.model.robot.independent)))
         self.batch.set_state(q, v, chosen)
         for i in filter(chosen.__getitem__, WATCHED):
             self.alone[i].set_state(q[i], v[i])

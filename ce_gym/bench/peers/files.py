@@ -89,10 +89,10 @@ def _state(model: Model) -> tuple[Array, Array, Array]:
     """Return a random state and torque; a floating base is turned and moves."""
     rng, robot = np.random.default_rng(0), model.robot
     q = model.standing_q.copy()
-    q[robot.base_nq :] += rng.uniform(-0.3, 0.3, len(robot.independent))
-    if robot.floating:
-        q[3:7] = rng.normal(size=4)
-        q[3:7] /= np.linalg.norm(q[3:7])
+    q[robot.layout.joints_q :] += rng.uniform(-0.3, 0.3, len(robot.independent))
+    for row, _ in robot.layout.turns:
+        q[row : row + 4] = rng.normal(size=4)
+        q[row : row + 4] /= np.linalg.norm(q[row : row + 4])
     return q, rng.uniform(-1, 1, model.nv), rng.uniform(-5, 5, model.nv)
 
 
@@ -100,17 +100,16 @@ def _mujoco(path: Path, robot: Robot, q: Array, v: Array, tau: Array) -> Dynamic
     import mujoco
 
     mj = mujoco.MjModel.from_xml_path(str(path))
-    data, free = mujoco.MjData(mj), robot.base_nv
-    names = [_mujoco_name(mj, j) for j in range(mj.njnt) if mj.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
-    order = [robot.independent.index(name) for name in names]
-    rotation = np.zeros(9)
+    data, free, rotation = mujoco.MjData(mj), robot.layout.base_nv, np.zeros(9)
     mujoco.mju_quat2Mat(rotation, q[3:7] if free else np.array([1.0, 0.0, 0.0, 0.0]))
     to_theirs = np.zeros((mj.nv, mj.nv))  # their velocity of ours: [linear in the world, angular in the body, joints]
+    data.qpos[: robot.layout.base_nq] = q[: robot.layout.base_nq]
     if free:
         to_theirs[:3, 3:6], to_theirs[3:6, :3] = rotation.reshape(3, 3), np.eye(3)
-    to_theirs[range(free, mj.nv), [free + i for i in order]] = 1.0
-    joints = q[robot.base_nq :][order]
-    data.qpos[:] = np.concatenate([q[: robot.base_nq], joints])
+    for j in range(1 if free else 0, mj.njnt):
+        (rows, speeds), at, dof = robot.rows[_mujoco_name(mj, j)], mj.jnt_qposadr[j], mj.jnt_dofadr[j]
+        data.qpos[at : at + len(rows)] = q[rows.start : rows.stop]
+        to_theirs[dof + np.arange(len(speeds)), speeds] = 1.0
     data.qvel[:] = to_theirs @ v
     mujoco.mj_forward(mj, data)
     M = np.zeros((mj.nv, mj.nv))
@@ -143,9 +142,9 @@ def _pinocchio(path: Path, robot: Robot, q: Array, v: Array, tau: Array) -> Dyna
         theirs[:7] = [*q[:3], *q[4:7], q[3]]
     for i, name in enumerate(robot.independent):
         joint = model.joints[model.frames[model.getFrameId(name, pin.FrameType.BODY)].parentJoint]
-        angle = q[robot.base_nq + i]
+        angle = q[robot.layout.joints_q + i]
         theirs[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
-        to_theirs[joint.idx_v, robot.base_nv + i] = 1.0
+        to_theirs[joint.idx_v, robot.layout.joints_v + i] = 1.0
     M = pin.crba(model, data, theirs)
     M = np.triu(M) + np.triu(M, 1).T
     acceleration = to_theirs.T @ pin.aba(model, data, theirs, to_theirs @ v, to_theirs @ tau)

@@ -1,8 +1,8 @@
 """Semi-implicit update of positions and velocities from accelerations.
 
 Velocities first, then positions with the new velocities. The base's linear momentum is integrated in the world frame,
-so that free flight is a straight line whatever the spin; its orientation moves by the exponential map and the
-quaternion is scaled back to unit length.
+so that free flight is a straight line whatever the spin. Orientations, its own and those of ball joints, move by the
+exponential map, and quaternions are scaled back to unit length.
 """
 
 from __future__ import annotations
@@ -10,22 +10,20 @@ from __future__ import annotations
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_product, quaternion_to_rotation
+from ce_gym.model.coordinates import Layout
 
 
-def advance(q: SX, v: SX, vdot: SX, dt: float, floating: bool) -> tuple[SX, SX]:
+def advance(q: SX, v: SX, vdot: SX, dt: float, layout: Layout) -> tuple[SX, SX]:
     """Return positions (nq,) and velocities (nv,) after a step of length `dt` [s] with constant acceleration."""
-    if not floating:
-        v_next = v + dt * vdot
-        return q + dt * v_next, v_next
-    position, quaternion, w, u = q[:3], q[3:7], v[:3], v[3:6]
-    R = quaternion_to_rotation(quaternion)
-    w_next = w + dt * vdot[:3]
-    u_world = R @ (u + dt * (vdot[3:6] + cross(w, u)))
-    yd_next = v[6:] + dt * vdot[6:]
-    quaternion_next = turned_by(quaternion, w_next * dt)
-    u_next = quaternion_to_rotation(quaternion_next).T @ u_world
-    q_next = ca.vertcat(position + dt * u_world, quaternion_next, q[7:] + dt * yd_next)
-    return q_next, ca.vertcat(w_next, u_next, yd_next)
+    v_next = v + dt * vdot
+    turned = [turned_by(q[i : i + 4], v_next[j : j + 3] * dt) for i, j in layout.turns]
+    y_next = q[layout.joints_q :] + dt * v_next[layout.joints_v :]
+    if not layout.floating:
+        return ca.vertcat(*turned, y_next), v_next
+    w, u = v[:3], v[3:6]
+    u_world = quaternion_to_rotation(q[3:7]) @ (u + dt * (vdot[3:6] + cross(w, u)))
+    v_next[3:6] = quaternion_to_rotation(turned[0]).T @ u_world
+    return ca.vertcat(q[:3] + dt * u_world, *turned, y_next), v_next
 
 
 def turned_by(quaternion: SX, rotation: SX) -> SX:
@@ -45,3 +43,10 @@ def between(a: SX, b: SX) -> SX:
     relative = quaternion_product(ca.vertcat(a[0], -a[1:]), b)
     sine = ca.if_else(relative[0] < 0, -1, 1) * relative[1:]
     return 2 * sine * (1 + ca.sumsqr(sine) / 6)
+
+
+def rotation_vector(quaternion: SX) -> SX:
+    """Return the rotation vector [rad] of a unit quaternion, at most half a turn long; shape (3,)."""
+    w, u = quaternion[0], quaternion[1:]
+    sine = ca.sqrt(ca.sumsqr(u) + 1e-24)  # never zero, so that the quotient stays finite
+    return 2 * ca.atan2(sine, ca.fabs(w)) / sine * ca.if_else(w < 0, -1, 1) * u

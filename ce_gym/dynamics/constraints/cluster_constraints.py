@@ -12,6 +12,7 @@ linear; closure.py does the others.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -45,20 +46,30 @@ class ClusterCoordinates:
     """The coordinates of one cluster at one state.
 
     Attributes:
-        index: Row of each body in the spanning quantities, by name.
-        q: Spanning positions, shape (n,).
+        index: Row of each body in the spanning quantities, by name; the three rows of a ball joint.
+        q: Spanning positions, shape (n,); a quaternion for a ball joint.
         qd: Spanning velocities, shape (n,).
         G: Constraint Jacobian, shape (n, d).
         g: Velocity-product acceleration of the constraint, shape (n,).
         loop: What closed loops add; None if all constraints are linear.
     """
 
-    index: dict[str, int]
+    index: dict[str, Any]
     q: SX
     qd: SX
     G: SX
     g: SX
     loop: LoopState | None = None
+
+    def position(self, body: str) -> SX:
+        """Return the position of the joint that moves a body, a number or a quaternion."""
+        row = self.index[body]
+        return self.q[row] if isinstance(row, int) else self.q
+
+
+def ball_coordinates(cluster: Cluster, quaternion: SX, w: SX) -> ClusterCoordinates:
+    """Return the coordinates of a ball joint, which is a cluster of its own."""
+    return ClusterCoordinates({cluster.bodies[0]: [0, 1, 2]}, quaternion, w, SX.eye(3), SX(3, 1))
 
 
 def cluster_coordinates(cluster: Cluster, y: SX, yd: SX) -> ClusterCoordinates:

@@ -14,8 +14,14 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, axis_rotation
-from ce_gym.model.constraint_functions import constraint_function
-from ce_gym.model.constraints import Constraint, FunctionConstraint, LinearConstraint, LoopConstraint, RodConstraint
+from ce_gym.model.constraints import (
+    Constraint,
+    FunctionConstraint,
+    LinearConstraint,
+    LoopConstraint,
+    RodConstraint,
+    constraint_function,
+)
 from ce_gym.model.description import Body, Robot
 from ce_gym.model.errors import RobotError, shown
 from ce_gym.model.frames import Placement, Vec3

@@ -105,7 +105,7 @@ class Actuated:
 
 def actuated_clusters(mechanism: Mechanism, kinematics: Kinematics) -> list[Actuated]:
     """Return the clusters with motors."""
-    first = 6 if mechanism.robot.floating else 0
+    first = mechanism.robot.layout.joints_v
     found = []
     for cluster, rows, coordinates in zip(
         mechanism.tree.clusters, kinematics.rows, kinematics.coordinates, strict=True

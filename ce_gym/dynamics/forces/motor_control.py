@@ -129,11 +129,9 @@ def standing_motors(mechanism: Mechanism) -> dict[str, tuple[float, NDArray[np.f
         For each rotor with a motor its angle [rad], its speed for unit velocities of the joints of its cluster, shape
         (d,), and the speeds of those joints for unit speed of it alone, shape (d,).
     """
-    robot, first = mechanism.robot, 7 if mechanism.robot.floating else 0
-    pose = dict(robot.pose.joints)
-    q = np.array([*[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0][:first], *(pose.get(name, 0.0) for name in robot.independent)])
+    q, still = SX(ca.DM(mechanism.robot.standing_q)), SX(mechanism.robot.layout.nv, 1)
     mechanism = replace(mechanism, ratio=None)
-    kinematics = outward_velocity_pass(mechanism, SX(q), SX(len(q) - (1 if robot.floating else 0), 1))
+    kinematics = outward_velocity_pass(mechanism, q, still)
     found = {}
     for cluster in actuated_clusters(mechanism, kinematics):
         W, angles = np.array(ca.evalf(cluster.W)), np.array(ca.evalf(cluster.angles))[:, 0]

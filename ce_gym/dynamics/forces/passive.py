@@ -6,7 +6,8 @@ import math
 
 import casadi as ca
 
-from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.integration import rotation_vector
+from ce_gym.dynamics.algebra.spatial import SX, mirrored
 from ce_gym.dynamics.forces.law import JointForce
 from ce_gym.model.description import Robot
 
@@ -15,7 +16,7 @@ LIMIT_FREQUENCY = 2 * math.pi * 20.0
 
 
 def passive_forces(robot: Robot, y: SX, yd: SX, dt: float) -> JointForce:
-    """Return viscous friction and stops of all independent joints."""
+    """Return viscous friction and stops of all independent joints with one coordinate."""
     total = [_viscous_damping(yd[i], robot.body(name).joint.damping, dt) for i, name in enumerate(robot.independent)]
     for i, name in enumerate(robot.independent):
         stiffness, damping = limit_stiffness(robot, name)
@@ -23,6 +24,27 @@ def passive_forces(robot: Robot, y: SX, yd: SX, dt: float) -> JointForce:
         total[i] = total[i][0] + tau, total[i][1] + slope
     tau, slopes = ca.vertcat(SX(0, 1), *[t for t, _ in total]), ca.vertcat(SX(0, 1), *[s for _, s in total])
     return JointForce(tau, ca.diag(slopes))
+
+
+def ball_forces(robot: Robot, q: SX, v: SX, dt: float) -> JointForce:
+    """Return viscous friction and stops of all ball joints, at positions (nq,) and velocities (nv,).
+
+    The stop is a spring along the axis about which the joint is turned, where the angle is beyond the limit: the rate
+    of that angle is the velocity along this axis.
+    """
+    taus, slopes = [SX(0, 1)], []
+    for name, (i, j) in zip(robot.balls, robot.layout.ball_turns, strict=True):
+        joint, w = robot.body(name).joint, v[j : j + 3]
+        tau, slope = SX(-joint.damping * w), dt * joint.damping * SX.eye(3)
+        if not math.isinf(joint.position[1]):
+            turned = rotation_vector(q[i : i + 4])
+            angle = ca.sqrt(ca.sumsqr(turned) + 1e-24)  # never zero, so that the axis stays finite
+            axis, limits = turned / angle, (-math.inf, joint.position[1])
+            push, slope_along = _stop(angle, ca.dot(axis, w), limits, *limit_stiffness(robot, name), dt)
+            tau, slope = tau + push * axis, slope + slope_along * mirrored(axis @ axis.T)
+        taus.append(tau)
+        slopes.append(slope)
+    return JointForce(ca.vertcat(*taus), ca.diagcat(SX(0, 0), *slopes))
 
 
 def limit_stiffness(robot: Robot, name: str) -> tuple[float, float]:

@@ -115,9 +115,8 @@ def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:
 
 def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
     """Return the sizes of the parts of a state that are there."""
-    joints, floating = len(mechanism.robot.independent), mechanism.robot.floating
-    n = len(options.contacts)
-    sizes = {"q": joints + (7 if floating else 0), "v": joints + (6 if floating else 0), "load": n}
+    layout, n = mechanism.robot.layout, len(options.contacts)
+    sizes = {"q": layout.nq, "v": layout.nv, "load": n}
     sizes |= {"anchor": 2 * n if options.material.bristle > 0 else 0, "dependent": len(reference_guess(mechanism))}
     return {name: size for name, size in sizes.items() if size}
 

@@ -197,7 +197,7 @@ def outward_acceleration_pass(
         for body in mechanism.moving(cluster):
             state = kinematics.bodies[body.name]
             from_parent = a_handle if body.name == handle else state.X.motion(_parent_acceleration(body, a, gravity))
-            a[body.name] = from_parent + state.S * qdd[coordinates.index[body.name]] + state.c
+            a[body.name] = from_parent + state.S @ qdd[coordinates.index[body.name]] + state.c
     return vdot, a
 
 
@@ -218,7 +218,7 @@ def _handle_body(mechanism: Mechanism, cluster: Cluster, spins: tuple[Spin, ...]
     """
     moving = mechanism.moving(cluster)
     roots = [body for body in moving if body.parent == cluster.output_body]
-    if len(roots) != 1 or roots[0].joint.type != "revolute":
+    if len(roots) != 1 or roots[0].joint.type not in ("revolute", "ball"):
         return None
     axis = roots[0].rotation @ roots[0].axis
     on_output = [spin for spin in spins if spin.carrier == cluster.output_body]
@@ -246,7 +246,7 @@ class _Condenser:
         self.coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         self.moving = mechanism.moving(self.cluster)
         self.inside = {body.name: body for body in self.moving}
-        self.n = len(self.coordinates.index)
+        self.n = self.coordinates.qd.numel()
 
     def condense(self, IA: dict[str, SX], pA: dict[str, SX]) -> _Condensed:
         """Return the cluster as its output body feels it, given articulated inertias and bias forces of its bodies."""
@@ -259,6 +259,7 @@ class _Condenser:
         for body in reversed(self.moving):
             i = index[body.name]
             F[:, i], H[:, i] = self._to_handle(body, composite[body.name] @ self.states[body.name].S)
+            H[i, i] = ca.triu(H[i, i])  # of the three columns of a ball joint; the rest is one column each
             force, torques = self._to_handle(body, pA[body.name] + IA[body.name] @ zeta[body.name])
             force_at_handle, bias = force_at_handle + force, bias + torques
             in_parent = self._transform(body).inertia_to_parent(composite[body.name])
@@ -280,16 +281,16 @@ class _Condenser:
         zeta: dict[str, SX] = {}
         for body in self.moving:
             state, i = self.states[body.name], self.coordinates.index[body.name]
-            zeta[body.name] = state.c + state.S * self.coordinates.g[i]
+            zeta[body.name] = state.c + state.S @ self.coordinates.g[i]
             if body.parent in self.inside:
                 zeta[body.name] += state.X.motion(zeta[body.parent])
         return zeta
 
     def _to_handle(self, body: MovingBody, force: SX) -> tuple[SX, SX]:
-        """Carry a force on a body inwards to the handle; also return what each joint on the way feels, shape (n,)."""
-        torques = SX(self.n, 1)
+        """Carry forces (6, m) on a body inwards to the handle; also return what each joint on the way feels, (n, m)."""
+        torques = SX(self.n, force.shape[1])
         while True:
-            torques[self.coordinates.index[body.name]] = self.states[body.name].S.T @ force
+            torques[self.coordinates.index[body.name], :] = self.states[body.name].S.T @ force
             force = self._transform(body).force_to_parent(force)
             if body.parent not in self.inside:
                 return force, torques

@@ -52,7 +52,7 @@ def outward_acceleration(mechanism: Mechanism, kinematics: Kinematics, vdot: SX)
         for body in mechanism.moving(cluster):
             state = kinematics.bodies[body.name]
             from_parent = state.X.motion(a[body.parent] if body.parent is not None else world)
-            a[body.name] = from_parent + state.S * qdd[k][coordinates.index[body.name]] + state.c
+            a[body.name] = from_parent + state.S @ qdd[k][coordinates.index[body.name]] + state.c
     return a, qdd
 
 
@@ -76,7 +76,7 @@ def inward_force_pass(
             tau[rows] = f[cluster.bodies[0]]
             continue
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
-        spanning = SX(len(coordinates.index), 1)
+        spanning = SX(coordinates.qd.numel(), 1)
         if mechanism.level == "exact":
             for spin in mechanism.spins[k]:
                 row, J = coordinates.index[spin.rotor], spin.inertia
@@ -133,7 +133,7 @@ def force_on_coordinates(mechanism: Mechanism, kinematics: Kinematics, f: dict[s
             tau[rows] = f[cluster.bodies[0]]
             continue
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
-        spanning = SX(len(coordinates.index), 1)
+        spanning = SX(coordinates.qd.numel(), 1)
         _to_parents(mechanism, kinematics, k, f, spanning)
         tau[rows] = coordinates.G.T @ spanning
     return tau

@@ -92,5 +92,5 @@ def spanning_coordinates(mechanism: Mechanism, kinematics: Kinematics) -> tuple[
         if coordinates is None or is_free(mechanism, cluster):
             continue
         for name, i in coordinates.index.items():
-            positions[name], velocities[name] = coordinates.q[i], coordinates.qd[i]
+            positions[name], velocities[name] = coordinates.position(name), coordinates.qd[i]
     return positions, velocities

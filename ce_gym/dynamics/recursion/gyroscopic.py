@@ -7,6 +7,10 @@ with J the inertia of the robot in its standing pose about its centre of mass, f
 `w+^T J w+ = w+^T J w`: its energy never grows, whatever the step length. A robot in another pose keeps the difference
 explicit; J needs to be right only within a factor of two, as in any method that takes a part of its derivative.
 
+*Ball joints.* The same happens to a body on a ball joint. Its articulated inertia must stay symmetric, so the implicit
+part is found beforehand, for the body and what it carries frozen into one rigid body, with J its inertia about the
+joint: `(J - dt skew(J w)) dw = dt (J w) x w` gives `dw`, and `J dw / dt` takes the place of `(J w) x w`.
+
 *The joints.* Their Coriolis forces stay explicit; what those make of a turn by `a = dt w` within a step grows with a^2.
 Joints carried by a body that turns so are damped at a rate `4 a^4 / dt`, implicitly: at 10 rad/s and 5 ms 0.005/s,
 which is less than any joint's own friction and far below the error of the step; where a step turns the body by half a
@@ -22,7 +26,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX, cross, skew, solve_positive_definite
-from ce_gym.dynamics.recursion.kinematics import constant, is_free, outward_velocity_pass
+from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
 
 TURNING_DAMPING = 4.0
@@ -49,17 +53,31 @@ class TurningDamping:
 
 def frozen_inertia(mechanism: Mechanism) -> SX:
     """Return the inertia of a floating robot in its standing pose about its centre of mass, base axes, (3, 3)."""
+    base = frozen_inertias(mechanism)[next(iter(mechanism.bodies))]
+    return base[:3, :3] - base[:3, 3:] @ base[:3, 3:].T / base[5, 5]
+
+
+def frozen_inertias(mechanism: Mechanism) -> dict[str, SX]:
+    """Return the inertia of each body and what it carries in the standing pose, about its origin, body axes, (6, 6)."""
     robot = mechanism.robot
-    pose = dict(robot.pose.joints)
-    q = ca.DM([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *(pose.get(name, 0.0) for name in robot.independent)])
-    kinematics = outward_velocity_pass(mechanism, SX(q), SX(6 + len(robot.independent), 1))
+    kinematics = outward_velocity_pass(mechanism, SX(ca.DM(robot.standing_q)), SX(robot.layout.nv, 1))
     total = {name: constant(body.inertia) for name, body in mechanism.bodies.items()}
     for name in reversed(mechanism.bodies):
         parent = mechanism.bodies[name].parent
         if parent is not None:
             total[parent] = total[parent] + kinematics.bodies[name].X.inertia_to_parent(total[name])
-    base = total[next(iter(mechanism.bodies))]
-    return base[:3, :3] - base[:3, 3:] @ base[:3, 3:].T / base[5, 5]
+    return total
+
+
+def steadying_couples(mechanism: Mechanism, kinematics: Kinematics, dt: float) -> dict[str, SX]:
+    """Return the couple on the body of each ball joint that makes its gyroscopic terms implicit, body axes [N m]."""
+    couples, total = {}, frozen_inertias(mechanism) if mechanism.robot.balls else {}
+    for name in mechanism.robot.balls:
+        J, w = total[name][:3, :3], kinematics.bodies[name].v[:3]
+        momentum = J @ w
+        left = cross(momentum, w)
+        couples[name] = J @ _solve_three(J - dt * skew(momentum), left) - left
+    return couples
 
 
 def turning_momentum(mechanism: Mechanism, v: SX, dt: float) -> SX | None:

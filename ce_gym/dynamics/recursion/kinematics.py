@@ -1,7 +1,7 @@
 """Where the bodies of a mechanism are and how they move: the outward velocity pass.
 
-Coordinates: `q = [base position, base quaternion wxyz, y]`, `v = [base angular, base linear (base frame), yd]`; a
-fixed base has only `y` and `yd`. `y` are the independent coordinates in the robot's order.
+Coordinates are those of `ce_gym.model.coordinates`. A ball joint is a cluster of its own, whose position is a
+quaternion and whose velocity is that of its body against the parent, in the body's axes.
 
 Accelerations of bodies are classical everywhere in this room: [angular; that of the material point at the origin], not
 Featherstone's spatial ones, from which they differ by `[0; w x v_origin]` (2008, section 2.11). Both transform by `X`,
@@ -25,6 +25,7 @@ from ce_gym.dynamics.algebra.spatial import (
 from ce_gym.dynamics.constraints.closure import closures, reference_guess
 from ce_gym.dynamics.constraints.cluster_constraints import (
     ClusterCoordinates,
+    ball_coordinates,
     cluster_coordinates,
     geared,
     loop_coordinates,
@@ -39,7 +40,7 @@ class BodyState:
 
     Attributes:
         X: Motion transform from its parent body.
-        S: Motion subspace of its own joint, shape (6, 1); (6, 6) for a free base.
+        S: Motion subspace of its own joint, shape (6, 1); (6, 3) for a ball joint, (6, 6) for a free base.
         v: Spatial velocity in body coordinates, shape (6,).
         c: Velocity-product acceleration, centripetal and Coriolis, of the step from its parent, `a = X a_parent + S qdd
             + c`, shape (6,). Constraint terms `S g` not included.
@@ -82,11 +83,13 @@ class Kinematics:
 
 def independent_rows(mechanism: Mechanism) -> list[list[int]]:
     """Return, for each cluster, the rows of `v` (and of tau) that are its own."""
-    row = {name: mechanism.robot.base_nv + i for i, name in enumerate(mechanism.robot.independent)}
-    return [
-        list(range(6)) if is_free(mechanism, cluster) else [row[name] for name in cluster.independent]
-        for cluster in mechanism.tree.clusters
-    ]
+    rows = mechanism.robot.rows
+    return [[row for name in moved_by(cluster) for row in rows[name][1]] for cluster in mechanism.tree.clusters]
+
+
+def moved_by(cluster: Cluster) -> tuple[str, ...]:
+    """Return the joints of a cluster that have rows in `q` and `v`: the independent ones, or a free or ball joint."""
+    return cluster.independent or cluster.bodies
 
 
 def is_free(mechanism: Mechanism, cluster: Cluster) -> bool:
@@ -107,28 +110,31 @@ def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None =
     guess = SX(reference_guess(mechanism)) if guess is None else guess
     used = 0
     kinematics = Kinematics(rows=independent_rows(mechanism))
-    position_offset = mechanism.robot.base_nq - mechanism.robot.base_nv
+    positions = mechanism.robot.rows
     for k in mechanism.tree.base_to_tip():
         cluster, rows = mechanism.tree.clusters[k], kinematics.rows[k]
         if is_free(mechanism, cluster):
             kinematics.coordinates.append(None)
             kinematics.bodies[cluster.bodies[0]] = _free_base(q, v)
             continue
-        y, yd = q[[row + position_offset for row in rows]], v[rows]
+        y, yd = q[[row for name in moved_by(cluster) for row in positions[name][0]]], v[rows]
         closure = closures(mechanism)[k]
-        if closure is None:
+        if not cluster.independent:
+            coordinates = ball_coordinates(cluster, y, yd)
+        elif closure is None:
             coordinates = cluster_coordinates(cluster, y, yd)
         else:
             first, used = used, used + len(closure.guessed)
             coordinates = loop_coordinates(cluster, closure, y, yd, guess[first:used])
-        if mechanism.ratio is not None:
+        if mechanism.ratio is not None and cluster.independent:
             rotors = [name for name in cluster.bodies if mechanism.robot.body(name).kind == "rotor"]
             coordinates = geared(coordinates, rotors, mechanism.ratio)
         kinematics.coordinates.append(coordinates)
         for body in mechanism.moving(cluster):
             i = coordinates.index[body.name]
             parent = kinematics.bodies[body.parent] if body.parent is not None else None
-            kinematics.bodies[body.name] = _outward(body, parent, coordinates.q[i], coordinates.qd[i], coordinates.g[i])
+            at = coordinates.position(body.name)
+            kinematics.bodies[body.name] = _outward(body, parent, at, coordinates.qd[i], coordinates.g[i])
     return kinematics
 
 
@@ -141,15 +147,18 @@ def _outward(body: MovingBody, parent: BodyState | None, q: SX, qd: SX, g: SX) -
     X, S = joint_transform(body, q)
     still = SX(6, 1)
     R, p, v, a = (parent.R, parent.p, parent.v, parent.drift) if parent else (SX.eye(3), SX(3, 1), still, still)
-    vJ = S * qd
+    vJ = S @ qd
     velocity = X.motion(v) + vJ
     centripetal = X.E @ cross(v[:3], cross(v[:3], X.p))
     c = ca.vertcat(cross(velocity[:3], vJ[:3]), centripetal + 2 * cross(velocity[:3], vJ[3:]))
-    return BodyState(X=X, S=S, v=velocity, c=c, drift=X.motion(a) + S * g + c, R=R @ X.E.T, p=p + R @ X.p)
+    return BodyState(X=X, S=S, v=velocity, c=c, drift=X.motion(a) + S @ g + c, R=R @ X.E.T, p=p + R @ X.p)
 
 
 def joint_transform(body: MovingBody, q: SX) -> tuple[Transform, SX]:
-    """Return a one-degree-of-freedom joint's transform from the parent body, and its motion subspace (6, 1)."""
+    """Return the transform of a joint with one coordinate or a quaternion, and its motion subspace (6, 1) or (6, 3)."""
+    if body.joint.type == "ball":
+        E = quaternion_to_rotation(q).T @ constant(body.rotation.T)
+        return Transform(E, constant(body.position)), constant(np.eye(6, 3))
     turn, slide = body.joint.turn, body.joint.slide
     axis, E, p, still = constant(body.axis), constant(body.rotation.T), constant(body.position), SX(3, 1)
     if slide:

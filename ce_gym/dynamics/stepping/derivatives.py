@@ -17,6 +17,7 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.step import iterate_size, iterations_needed
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
+from ce_gym.model.coordinates import Layout
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -48,17 +49,17 @@ def adjoint_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[
         ended the step has been met; where `active` is 0 nothing changes; `owed` is the gradient to the iterate, if
         there is one.
     """
-    primal, floating = primal_function(mechanism, options, outputs), mechanism.robot.floating
+    primal, layout = primal_function(mechanism, options, outputs), mechanism.robot.layout
     inputs = {name: SX.sym(name, primal.numel_in(i)) for i, name in enumerate(primal.name_in())}
     after = dict(zip(primal.name_out(), primal.call(list(inputs.values())), strict=True))
     weights = {
-        f"w_{name}": SX.sym(f"w_{name}", size - (1 if name == "q" and floating else 0))
+        f"w_{name}": SX.sym(f"w_{name}", layout.nv if name == "q" else size)
         for name, size in state_parts(primal).items()
     }
     weights |= {f"w_{name}": SX.sym(f"w_{name}", primal.numel_out(name)) for name in outputs}
     pending, active = SX.sym("pending"), SX.sym("active")
     last = ca.logic_and(pending, active)
-    seeds = [ca.if_else(last, _ambient(name, after, weights[f"w_{name}"], floating), 0) for name in state_parts(primal)]
+    seeds = [ca.if_else(last, _ambient(name, after, weights[f"w_{name}"], layout), 0) for name in state_parts(primal)]
     seeds += [ca.if_else(last, weights[f"w_{name}"], 0) for name in outputs]
     results = [*(after[f"{name}_next"] for name in state_parts(primal)), *(after[name] for name in outputs)]
     owed = SX.sym("owed", inputs["iterate"].numel() if "iterate" in inputs else 0)
@@ -70,7 +71,7 @@ def adjoint_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[
     gradient = ca.jtimes(ca.vertcat(*results), ca.vertcat(*[inputs[x] for x in wrt]), ca.vertcat(*seeds), True)
     ends = [sum(inputs[x].numel() for x in wrt[:i]) for i in range(len(wrt) + 1)]
     parts = dict(zip(wrt, ca.vertsplit(gradient, ends), strict=True))
-    parts["q"] = tangent_basis(inputs["q"], floating).T @ parts["q"]
+    parts["q"] = tangent_basis(inputs["q"], layout).T @ parts["q"]
     back = parts.pop("iterate", SX(0, 1))
     whole = ca.vertcat(*parts.values())
     sums = SX.sym("sums", whole.numel())
@@ -88,9 +89,11 @@ def state_parts(primal: ca.Function) -> dict[str, int]:
     return {name: primal.numel_in(name) for name in names}
 
 
-def _ambient(name: str, after: dict[str, SX], weights: SX, floating: bool) -> SX:
+def _ambient(name: str, after: dict[str, SX], weights: SX, layout: Layout) -> SX:
     """Return weights of coordinates that give the same for every motion as weights of their tangent."""
-    if name != "q" or not floating:
+    if name != "q" or not layout.turns:
         return weights
-    scale = ca.vertcat(4 * SX.ones(3), SX.ones(weights.numel() - 3))  # a rotation moves the quaternion by half of it
-    return tangent_basis(after["q_next"], floating) @ (scale * weights)
+    scale = SX.ones(layout.nv)  # a rotation moves the quaternion by half of it
+    for _, row in layout.turns:
+        scale[row : row + 3] = 4
+    return tangent_basis(after["q_next"], layout) @ (scale * weights)

@@ -9,6 +9,7 @@ import math
 
 import casadi as ca
 
+from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.motor_control import motor_springs
 from ce_gym.dynamics.forces.passive import limit_stiffness
@@ -44,7 +45,12 @@ def contact_energy(scene: Scene, state: State) -> SX:
 def joint_energy(scene: Scene, state: State, target: SX) -> SX:
     """Return the energy of the stops of the joints, and of position control [J]."""
     robot, total = scene.mechanism.robot, SX(0)
-    y = state.q[state.q.numel() - len(robot.independent) :]
+    y = state.q[robot.layout.joints_q :]
+    for name, (row, _) in zip(robot.balls, robot.layout.ball_turns, strict=True):
+        furthest = robot.body(name).joint.position[1]
+        if math.isfinite(furthest):
+            beyond = ca.fmax(ca.norm_2(rotation_vector(state.q[row : row + 4])) - furthest, 0)
+            total += limit_stiffness(robot, name)[0] * beyond**2 / 2
     for i, name in enumerate(robot.independent):
         low, high = robot.body(name).joint.position
         beyond = (ca.fmax(low - y[i], 0) if math.isfinite(low) else 0) + (

@@ -54,7 +54,7 @@ class Equation:
 
     def __init__(self, mechanism: Mechanism, options: StepOptions) -> None:
         self.given = given = Given(mechanism, options, follows=True)
-        self.mechanism, self.floating = given.scene.mechanism, mechanism.robot.floating
+        self.mechanism, self.layout = given.scene.mechanism, mechanism.robot.layout
         self.iterate = SX.sym("iterate", iterate_size(mechanism, options))
         self.vdot = SX.sym("vdot", given.state.v.numel())
         self.acting = acting_forces(given.scene, given.state, given.target, given.dt, self.iterate)
@@ -95,7 +95,7 @@ class Equation:
 
     def to_own_axes(self, group: list[Direction], columns: SX) -> SX:
         """Take columns along positions of the base from the axes of the world to its own."""
-        if self.floating and ("q", 3) in group:
+        if self.layout.floating and ("q", 3) in group:
             columns[:, 3:6] = columns[:, 3:6] @ quaternion_to_rotation(self.wrt["q"][3:7])
         return columns
 
@@ -117,8 +117,8 @@ class Equation:
         columns = []
         for name, i in group:
             parts = {name: SX(value.numel(), 1) for name, value in self.wrt.items()}
-            basis = tangent_basis(self.wrt["q"], self.floating) if name == "q" else SX.eye(parts[name].numel())
-            if self.floating and name == "q":
+            basis = tangent_basis(self.wrt["q"], self.layout) if name == "q" else SX.eye(parts[name].numel())
+            if self.layout.floating and name == "q":
                 basis[:3, 3:6] = SX.eye(3)
             parts[name] = basis[:, i]
             columns.append(ca.vertcat(*parts.values()))
@@ -160,7 +160,7 @@ class Equation:
     @cached_property
     def articulated(self) -> dict[int, SX]:
         """Inertias of clusters on the way of the recursion, without what acts on their joints, shape (d, d) each."""
-        return self.inertias(on_bodies(self.acting.contacts, self.acting.gravity))
+        return self.inertias(on_bodies(self.acting.contacts, self.acting.gravity, {}))
 
     def inertias(self, external: dict[str, BodyTerms]) -> dict[int, SX]:
         """Return such inertias where something else acts on bodies."""
@@ -185,6 +185,8 @@ class Equation:
         """What the equation of motion lacks without contacts, shape (nv,), given inertias of clusters."""
         acting, kinematics = self.acting, self.acting.kinematics
         f = net_forces(self.mechanism, kinematics, self.a)
+        for name, couple in acting.couples.items():
+            f[name] = f[name] - ca.vertcat(couple, SX(3, 1))
         left = inward_force_pass(self.mechanism, kinematics, self.a, f, self.qdd)
         left += acting.joints.slope @ self.vdot - acting.joints.tau
         momentum = turning_momentum(self.mechanism, self.given.state.v, self.given.dt)
@@ -225,9 +227,9 @@ class Equation:
     def tangent_after(self, columns: SX) -> SX:
         """Take changes of positions after the step to their tangent space."""
         nq = columns.size1() - self.nv
-        tangent = tangent_basis(self.end_values[:nq], self.floating).T
-        if self.floating:  # its rows of rotation have length 1/2
-            tangent[:3, :] *= 4
+        tangent = tangent_basis(self.end_values[:nq], self.layout).T
+        for _, row in self.layout.turns:  # rows of rotations have length 1/2
+            tangent[row : row + 3, :] *= 4
         return ca.sparsify(ca.vertcat(tangent @ columns[:nq, :], columns[nq:, :]))
 
 

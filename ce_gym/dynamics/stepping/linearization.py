@@ -35,7 +35,7 @@ class Linearization(Equation):
     @cached_property
     def groups(self) -> list[list[Direction]]:
         """Directions, those together that share work."""
-        base = 6 if self.floating else 0
+        base = self.layout.base_nv
         groups = [[(name, i) for i in range(base)] for name in ("q", "v") if base]
         for start in range(base, self.nv, 3):
             groups.append([(name, i) for name in ("q", "v") for i in range(start, min(start + 3, self.nv))])

@@ -14,6 +14,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.integration import between, turned_by
 from ce_gym.dynamics.algebra.spatial import SX, quaternion_to_rotation
 from ce_gym.dynamics.forces.scene import State
+from ce_gym.model.coordinates import Layout
 
 AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "contact_forces")
 """Outputs that belong to the start of a step, or are means over it; the others belong to its end."""
@@ -110,7 +111,7 @@ class Plan:
         return self.end.means if output in MEANS else self.end.weights
 
 
-def combined(plan: Plan, ends: Mapping[str, State], floating: bool) -> State:
+def combined(plan: Plan, ends: Mapping[str, State], layout: Layout) -> State:
     """Return the state after a step, given the states at the ends of its stages; of a plan whose `end` is `Ends`."""
     assert isinstance(plan.end, Ends)
     weights, last = plan.end.weights, ends[plan.stages[-1].name]
@@ -118,10 +119,11 @@ def combined(plan: Plan, ends: Mapping[str, State], floating: bool) -> State:
         return last
     q = sum((weight * ends[name].q for name, weight in weights.items()), SX(0))
     v = sum((weight * ends[name].v for name, weight in weights.items()), SX(0))
-    if floating:
-        others = [(weight, ends[name].q[3:7]) for name, weight in weights.items() if ends[name] is not last]
-        turned = sum((-weight * between(other, last.q[3:7]) for weight, other in others), SX(0))
-        q[3:7] = turned_by(last.q[3:7], turned)
+    for i, _ in layout.turns:
+        others = [(weight, ends[name].q[i : i + 4]) for name, weight in weights.items() if ends[name] is not last]
+        turned = sum((-weight * between(other, last.q[i : i + 4]) for weight, other in others), SX(0))
+        q[i : i + 4] = turned_by(last.q[i : i + 4], turned)
+    if layout.floating:
         world = [w * (quaternion_to_rotation(ends[s].q[3:7]) @ ends[s].v[3:6]) for s, w in weights.items()]
         v[3:6] = quaternion_to_rotation(q[3:7]).T @ sum(world, SX(0))
     return State(q, v, last.load, last.anchor, last.dependent)

@@ -26,7 +26,7 @@ from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.law import JointForce, Motion
 from ce_gym.dynamics.forces.motor_control import Motors
 from ce_gym.dynamics.forces.normal import normal_law
-from ce_gym.dynamics.forces.passive import passive_forces
+from ce_gym.dynamics.forces.passive import ball_forces, passive_forces
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
 from ce_gym.dynamics.recursion.ce_aba import (
@@ -37,7 +37,7 @@ from ce_gym.dynamics.recursion.ce_aba import (
     outward_acceleration_pass,
 )
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
-from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, turning_momentum
+from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, steadying_couples, turning_momentum
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.model.description import ContactSphere
 from ce_gym.model.mechanism import Mechanism
@@ -76,8 +76,7 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
     """
     mechanism, acting = scene.mechanism, acting_forces(scene, state, target, dt, iterate)
     kinematics, contacts, gravity = acting.kinematics, acting.contacts, acting.gravity
-    external = on_bodies(contacts, gravity)
-    at_once = isinstance(dt, float) and dt == 0  # the acceleration of the moment
+    external, at_once = on_bodies(contacts, gravity, acting.couples), is_moment(dt)
     turning = None if at_once else TurningDamping(state.v, dt)
     momentum = None if at_once else turning_momentum(mechanism, state.v, dt)
     articulation = inward_inertia_pass(mechanism, kinematics, acting.joints, external, turning)
@@ -95,6 +94,7 @@ class Acting:
         motors: What the motors deliver to the joints.
         friction: Dry friction of the joints, one or none.
         joints: Those and what the joints do by themselves.
+        couples: What steadies the bodies of ball joints, body axes [N m], shape (3,) each, by name.
         gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
     """
 
@@ -103,6 +103,7 @@ class Acting:
     motors: SaturatedForce
     friction: list[SaturatedForce]
     joints: JointTerms
+    couples: dict[str, SX]
     gravity: dict[str, SX]
 
     def solved(self, vdot: SX, a: dict[str, SX]) -> Solved:
@@ -113,8 +114,8 @@ class Acting:
 
 def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Acting:
     """Linearise all forces about an iterate; arguments as for `solve`."""
-    mechanism, n = scene.mechanism, len(scene.mechanism.robot.independent)
-    y, yd = state.q[state.q.shape[0] - n :], state.v[state.v.shape[0] - n :]
+    mechanism, layout = scene.mechanism, scene.mechanism.robot.layout
+    y, yd = state.q[layout.joints_q :], state.v[layout.joints_v :]
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
 
     laws, driven = touching(scene, kinematics, state, dt), Motors(scene, kinematics, y, yd, target, dt)
@@ -124,10 +125,17 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     rubbing = JointFriction(mechanism, kinematics, yd, dt)
     friction = [rubbing.linearise(of_friction)] if rubbing.size else []
 
+    of_balls = ball_forces(mechanism.robot, state.q, state.v, dt)
     forces = sum(friction, motors + passive_forces(mechanism.robot, y, yd, dt))
-    joints = on_coordinates(mechanism, forces)
+    joints = on_coordinates(mechanism, of_balls, forces)
+    couples = {} if is_moment(dt) else steadying_couples(mechanism, kinematics, dt)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    return Acting(kinematics, contacts, motors, friction, joints, gravity)
+    return Acting(kinematics, contacts, motors, friction, joints, couples, gravity)
+
+
+def is_moment(dt: SX | float) -> bool:
+    """Whether a step has no length: what is asked for is the acceleration of the moment."""
+    return isinstance(dt, float) and dt == 0
 
 
 @dataclass
@@ -163,7 +171,7 @@ def iteration(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
 def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) -> Stepped:
     """Return what a step leaves behind whose acceleration is known; arguments as for `solve`."""
     kinematics, motion, motors = solved.kinematics, solved.motion, solved.motors
-    q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.floating)
+    q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.layout)
     saturated = [motors, *solved.friction]
     for row, held in [pair for force in saturated for pair in force.held.items()]:  # such a joint does not move at all
         place = q.numel() - motors.tau.numel() + row
@@ -251,15 +259,16 @@ def looked_up_from(scene: Scene, kinematics: Kinematics) -> Scene:
     return replace(scene, looked_up=contact_places(scene.mechanism, scene.options, kinematics))
 
 
-def on_coordinates(mechanism: Mechanism, force: JointForce) -> JointTerms:
-    """Take a force on the independent joints to the coordinates of `v`; the base has none."""
-    base = 6 if mechanism.robot.floating else 0
-    return JointTerms(ca.vertcat(SX(base, 1), force.tau), ca.diagcat(SX(base, base), force.slope))
+def on_coordinates(mechanism: Mechanism, of_balls: JointForce, force: JointForce) -> JointTerms:
+    """Take forces on ball joints and on joints with one coordinate to the coordinates of `v`; the base has none."""
+    base = mechanism.robot.layout.base_nv
+    tau, slope = ca.vertcat(SX(base, 1), of_balls.tau, force.tau), (SX(base, base), of_balls.slope, force.slope)
+    return JointTerms(tau, ca.diagcat(*slope))
 
 
-def on_bodies(contacts: list[LinearContact], gravity: dict[str, SX]) -> dict[str, BodyTerms]:
-    """Sum the contacts of each body."""
-    terms: dict[str, BodyTerms] = {}
+def on_bodies(contacts: list[LinearContact], gravity: dict[str, SX], couples: dict[str, SX]) -> dict[str, BodyTerms]:
+    """Sum the contacts of each body, and the couple on it."""
+    terms = {name: BodyTerms(SX(6, 6), ca.vertcat(couple, SX(3, 1))) for name, couple in couples.items()}
     for contact in contacts:
         new, old = contact.body_terms(gravity[contact.body]), terms.get(contact.body)
         terms[contact.body] = BodyTerms(old.inertia + new.inertia, old.force + new.force) if old else new

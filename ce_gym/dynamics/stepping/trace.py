@@ -89,14 +89,14 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
     flags = {"diverged": SX.sym("diverged")} | {f"{name}_diverged": SX.sym(name) for name in ends}
     given = dict(before.items()) | flags
     given |= {f"{stage}_{name}": value for stage, end in ends.items() for name, value in end.items()}
-    after = combined(plan, ends, mechanism.robot.floating)
+    after = combined(plan, ends, mechanism.robot.layout)
     sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
     results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in before.items()}
     results["diverged_next"] = ca.if_else(sane, 0, 1)
     for name, size in outputs.items():
         if name in ("error", MOVED):
-            dt, joints = SX.sym("dt"), len(mechanism.robot.independent)
-            results[name] = furthest(after.v, joints, dt) if name == MOVED else error_estimate(plan, ends)
+            dt, base = SX.sym("dt"), mechanism.robot.layout.base_nv
+            results[name] = furthest(after.v, base, dt) if name == MOVED else error_estimate(plan, ends)
             given["dt"] = dt
             continue
         told = {stage: SX.sym(name, size) for stage in plan.shares(name)}
@@ -167,11 +167,11 @@ class Given:
         return ca.vec(weighted(shares, {part: self._of(parts[part], name) for part in shares}))
 
     def _of(self, stepped: Stepped, name: str) -> SX:
-        n = len(self.mechanism.robot.independent)
-        yd = stepped.state.v[stepped.state.v.numel() - n :]
+        layout = self.mechanism.robot.layout
+        yd = stepped.state.v[layout.joints_v :]
         kinematics = stepped.solved.kinematics
         if name == MOVED:
-            return furthest(stepped.state.v, n, self.dt)
+            return furthest(stepped.state.v, layout.base_nv, self.dt)
         if name == "motor_speed":
             return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
         if name == "power":
@@ -190,9 +190,9 @@ def weighted(weights: Mapping[str, float], values: Mapping[str, SX]) -> SX:
     return sum((weight * values[name] for name, weight in weights.items()), SX(0))
 
 
-def furthest(v: SX, joints: int, dt: SX | float) -> SX:
-    """Return how far the fastest of the last `joints` among velocities (nv,) moves in a step [rad or m]."""
-    return dt * ca.norm_inf(ca.vertcat(v[v.numel() - joints :], 0))
+def furthest(v: SX, base: int, dt: SX | float) -> SX:
+    """Return how far the fastest joint moves in a step at velocities (nv,), the first `base` left out [rad or m]."""
+    return dt * ca.norm_inf(ca.vertcat(v[base:], 0))
 
 
 def loops_close(mechanism: Mechanism, before: Kinematics, after: State) -> SX:

@@ -1,8 +1,8 @@
 """A plan as one expression: every stage with all the iterations it may need, one after the other.
 
-Explicit stages work on positions and on the momentum of the base in the world. The unit quaternion is advanced in the
-four-dimensional space around it, by a vector field that keeps its length, and scaled back at the end of the step, which
-does not lower the order.
+Explicit stages work on positions and on the momentum of the base in the world. Unit quaternions are advanced in the
+four-dimensional space around them, by a vector field that keeps their length, and scaled back at the end of the step,
+which does not lower the order.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ce_gym.dynamics.stepping.step import (
     looked_up_from,
     stacked,
 )
+from ce_gym.model.coordinates import Layout
 from ce_gym.model.frames import added
 
 
@@ -41,10 +42,10 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
         What each stage left, by its name, and the step as a whole as `AFTER`.
     """
     parts: dict[str, Stepped] = {}
-    floating = scene.mechanism.robot.floating
+    layout = scene.mechanism.robot.layout
     for stage in plan.stages:
         if isinstance(stage.start, Rates):
-            start = _moved(stage.start, before, list(parts.values()), dt, floating)
+            start = _moved(stage.start, before, list(parts.values()), dt, layout)
         else:
             start = parts[stage.start].state if stage.start else before
         if parts and stage.start and not scene.looked_up.numel():  # the ground is known as it is around the start
@@ -53,21 +54,21 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
         parts[stage.name] = iterated(scene, start, target, length, stage.iterations)
     first = parts[plan.stages[0].name]
     if isinstance(plan.end, Rates):
-        after = replace(_moved(plan.end, before, list(parts.values()), dt, floating), load=first.state.load)
+        after = replace(_moved(plan.end, before, list(parts.values()), dt, layout), load=first.state.load)
     else:
-        after = combined(plan, {name: part.state for name, part in parts.items()}, floating)
+        after = combined(plan, {name: part.state for name, part in parts.items()}, layout)
     error = error_estimate(plan, {name: part.state for name, part in parts.items()})
     return parts | {AFTER: replace(first, state=after, error=error)}
 
 
-def _moved(rates: Rates, before: State, parts: list[Stepped], dt: float, floating: bool) -> State:
+def _moved(rates: Rates, before: State, parts: list[Stepped], dt: float, layout: Layout) -> State:
     """Return the state before a step, moved along rates of its stages."""
     terms = [
-        weight * _rate(part.before, part.solved, floating)
+        weight * _rate(part.before, part.solved, layout)
         for weight, part in zip(rates.weights, parts, strict=False)
         if weight
     ]
-    moved = _from_flat(_flat(before, floating) + dt * sum(terms, SX(0)), before, floating)
+    moved = _from_flat(_flat(before, layout) + dt * sum(terms, SX(0)), before, layout)
     if rates.weights:
         first = parts[0].solved
         moved.dependent = guessed_coordinates(first.kinematics, first.vdot, dt * added(rates.weights))
@@ -85,33 +86,34 @@ def iterated(scene: Scene, state: State, target: SX, dt: float, most: int) -> St
     return iteration(scene, state, target, dt, iterate)
 
 
-def _flat(state: State, floating: bool) -> SX:
+def _flat(state: State, layout: Layout) -> SX:
     """Stack positions, velocities with the base's linear one in the world, and anchors."""
     v = state.v
-    if floating:
+    if layout.floating:
         v = ca.vertcat(v[:3], quaternion_to_rotation(state.q[3:7]) @ v[3:6], v[6:])
     return ca.vertcat(state.q, v, state.anchor)
 
 
-def _from_flat(flat: SX, like: State, floating: bool) -> State:
+def _from_flat(flat: SX, like: State, layout: Layout) -> State:
     q, v, anchor = ca.vertsplit(flat, [0, like.q.numel(), like.q.numel() + like.v.numel(), flat.numel()])
-    if floating:
-        quaternion = q[3:7] / ca.norm_2(q[3:7])
-        q = ca.vertcat(q[:3], quaternion, q[7:])
-        v = ca.vertcat(v[:3], quaternion_to_rotation(quaternion).T @ v[3:6], v[6:])
+    for i, _ in layout.turns:
+        q[i : i + 4] = q[i : i + 4] / ca.norm_2(q[i : i + 4])
+    if layout.floating:
+        v = ca.vertcat(v[:3], quaternion_to_rotation(q[3:7]).T @ v[3:6], v[6:])
     return State(q=q, v=v, load=like.load, anchor=anchor, dependent=like.dependent)
 
 
-def _rate(state: State, solved: Solved, floating: bool) -> SX:
+def _rate(state: State, solved: Solved, layout: Layout) -> SX:
     """Time derivative of what `_flat` stacks."""
     q, v, vdot = state.q, state.v, solved.vdot
     slides = [
         ca.if_else(c.normal_slope > 0, (solved.kinematics.bodies[c.body].R @ c.sliding)[:2], 0) for c in solved.contacts
     ]
     anchor = stacked(slides) if state.anchor.numel() else state.anchor
-    if not floating:
-        return ca.vertcat(v, vdot, anchor)
+    turning = [quaternion_product(q[i : i + 4], ca.vertcat(0, v[j : j + 3])) / 2 for i, j in layout.turns]
+    joints = ca.vertcat(*turning, v[layout.joints_v :])
+    if not layout.floating:
+        return ca.vertcat(joints, vdot, anchor)
     R, w, u = quaternion_to_rotation(q[3:7]), v[:3], v[3:6]
-    turning = quaternion_product(q[3:7], ca.vertcat(0, w)) / 2
     u_world = R @ (vdot[3:6] + cross(w, u))
-    return ca.vertcat(R @ u, turning, v[6:], vdot[:3], u_world, vdot[6:], anchor)
+    return ca.vertcat(R @ u, joints, vdot[:3], u_world, vdot[6:], anchor)

@@ -157,7 +157,7 @@ class ControlStepGradient:
         gradient = ca.jtimes(results, ca.vertcat(*wrt.values()), seeds, True)
         ends = [sum(value.numel() for value in list(wrt.values())[:i]) for i in range(len(wrt) + 1)]
         found = dict(zip(wrt, ca.vertsplit(gradient, ends), strict=True))
-        found["q"] = tangent_basis(x["q"], True).T @ found["q"]
+        found["q"] = tangent_basis(x["q"], self.task.model.robot.layout).T @ found["q"]
         sizes = self.carried | {"torque": self.primal.numel_out("torque"), "clipped": self.task.n_actions}
         total = {name: found.get(name, SX(ca.DM.zeros(size))) for name, size in sizes.items()}
         total |= {name: total[name] + w[name] for name in self.carried if name not in y}

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.compile import Call
+from ce_gym.dynamics.algebra.integration import turned_by
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.envs.task.commands import Commands
@@ -193,9 +194,15 @@ class Stages:
         """Positions near the standing pose, heading anywhere."""
         standing = self.model.standing_q
         half_yaw = sampler.uniform(-np.pi / 2, np.pi / 2)
-        noise = sampler.symmetric(len(standing) - 7, self.task.reset_noise["joint_position"])
+        layout = self.model.robot.layout
+        noise = sampler.symmetric(layout.nv - layout.base_nv, self.task.reset_noise["joint_position"])
         heading = ca.vertcat(ca.cos(half_yaw), 0, 0, ca.sin(half_yaw))
-        return ca.densify(ca.vertcat(standing[:3], heading, standing[7:] + noise))
+        balls = [
+            turned_by(SX(ca.DM(standing[row : row + 4])), noise[3 * i : 3 * i + 3])
+            for i, (row, _) in enumerate(layout.ball_turns)
+        ]
+        joints = standing[layout.joints_q :] + noise[3 * layout.balls :]
+        return ca.densify(ca.vertcat(standing[:3], heading, *balls, joints))
 
     def _starting_velocity(self, sampler: Sampler) -> SX:
         """Velocities near rest."""

@@ -122,9 +122,11 @@ def paired_joints(model: Model) -> SignedPermutation | None:
     """Return which independent joint is the reflection of which, and whether it turns the same way; None if one lacks.
 
     A rotation by an angle about an axis is, reflected, one by the same angle about minus the reflected axis; a shift is
-    one along the reflected axis.
+    one along the reflected axis. There is none for robots with ball joints.
     """
     robot, bodies = model.robot, model.mechanism.bodies
+    if robot.balls:
+        return None
     positions, rotations = model.body_poses(model.standing_q)
     row = {name: i for i, name in enumerate(model.body_names)}
     names = robot.independent

@@ -46,7 +46,7 @@ class Ground:
         Args:
             dependent: Length of the state `dependent`; 0 if there is none.
         """
-        q = SX.sym("q", len(self.mechanism.robot.independent) + 7)
+        q = SX.sym("q", self.mechanism.robot.layout.nq)
         given = {"q": q} | ({"dependent": SX.sym("dependent", dependent)} if dependent else {})
         at = ca.horzcat(q[:2], sphere_centres(self.mechanism, given)[:2, :])
         places = traced("seen_places", given, {"seen_places": ca.vec(at)})
@@ -73,7 +73,7 @@ class Ground:
 def sphere_centres(mechanism: Mechanism, state: Mapping[str, SX]) -> SX:
     """Return where the contact spheres of a robot are [m], shape (3, n_spheres); `dependent` is used if it is there."""
     q, spheres = state["q"], mechanism.robot.contacts
-    at_rest = SX(len(mechanism.robot.independent) + 6, 1)
+    at_rest = SX(mechanism.robot.layout.nv, 1)
     bodies = outward_velocity_pass(mechanism, q, at_rest, state.get("dependent")).bodies
     points = [bodies[s.body].point_position(constant(np.array(s.position))) for s in spheres]
     return ca.horzcat(SX(3, 0), *points)

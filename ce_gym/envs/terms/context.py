@@ -13,7 +13,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.integration import rotation_vector
+from ce_gym.dynamics.algebra.spatial import SX, quaternion_product
 from ce_gym.dynamics.forces.ground import above as over_ground
 from ce_gym.dynamics.recursion.derived import spanning_coordinates
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
@@ -126,6 +127,22 @@ class TermContext:
     def joint_velocities(self) -> SX:
         """Independent joint velocities [rad/s], shape (n_joints,)."""
         return self.v[self.v.shape[0] - self._n_joints :]
+
+    @property
+    def ball_rotations(self) -> SX:
+        """Rotation vector of each ball joint from its standing pose, axes of what it turns [rad], shape (3 n_balls,)."""
+        robot, found = self.mechanism.robot, [SX(0, 1)]
+        for row, _ in robot.layout.ball_turns:
+            w, x, y, z = robot.standing_q[row : row + 4]
+            back = SX(ca.DM([w, -x, -y, -z]))
+            found.append(rotation_vector(quaternion_product(back, self.q[row : row + 4])))
+        return ca.vertcat(*found)
+
+    @property
+    def ball_velocities(self) -> SX:
+        """Angular velocity of each ball joint, in the axes of what it turns [rad/s], shape (3 n_balls,)."""
+        layout = self.mechanism.robot.layout
+        return self.v[layout.base_nv : layout.joints_v] if layout.balls else SX(0, 1)
 
     @property
     def base_angular_velocity(self) -> SX:

@@ -42,6 +42,16 @@ def joint_velocities(s: TermContext, scale: float = 0.05) -> SX:
     return scale * s.joint_velocities
 
 
+def ball_rotations(s: TermContext) -> SX:
+    """Rotation vector of each ball joint from its standing pose [rad], shape (3 n_balls,)."""
+    return s.ball_rotations
+
+
+def ball_velocities(s: TermContext, scale: float = 0.05) -> SX:
+    """Angular velocity of each ball joint, times `scale`, 0.05 [rad/s], shape (3 n_balls,)."""
+    return scale * s.ball_velocities
+
+
 def last_action(s: TermContext) -> SX:
     """The action just carried out, shape (n_joints,)."""
     return s.action

@@ -10,7 +10,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ce_gym.model.description import SCREWS, Body, Joint
+from ce_gym.model.coordinates import SIZES
+from ce_gym.model.description import Body, Joint
 from ce_gym.model.errors import bad
 
 RELATIVE_TOLERANCE = 1e-9
@@ -40,8 +41,12 @@ def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
 
 
 def _check_joint(file: str, where: str, joint: Joint) -> None:
-    if joint.type not in SCREWS:
-        raise bad(file, f"{where} joint type", joint.type, f"one of free, {', '.join(SCREWS)}")
+    if joint.type not in SIZES:
+        raise bad(file, f"{where} joint type", joint.type, f"one of {', '.join(SIZES)}")
+    if joint.type == "ball" and joint.friction:
+        raise bad(file, f"{where} joint friction", joint.friction, "0, because ball joints have no dry friction")
+    if joint.type == "ball" and not (joint.position[0] == -math.inf and joint.position[1] > 0.0):
+        raise bad(file, f"{where} joint limits", joint.position, "no lower one, and an angle above 0 [rad]")
     if len(joint.axis) != 3 or not math.isclose(math.hypot(*joint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
         raise bad(file, f"{where} joint axis", joint.axis, "a unit axis")
     lower, upper = joint.position
@@ -88,6 +93,10 @@ def moves_inertia(body: Body) -> bool:
     inertia, axis = np.array(body.inertial.inertia), np.array(body.joint.axis)
     if body.joint.type == "free":
         return bool(body.inertial.mass > 0.0 and np.linalg.matrix_rank(inertia) == 3)
+    if body.joint.type == "ball":
+        com = np.array(body.inertial.com)
+        about_joint = inertia + body.inertial.mass * (com @ com * np.eye(3) - np.outer(com, com))
+        return bool(np.linalg.matrix_rank(about_joint, hermitian=True) == 3)
     offset = np.cross(axis, np.array(body.inertial.com))
     turned = axis @ inertia @ axis + body.inertial.mass * (offset @ offset)
     return bool(body.joint.turn**2 * turned + body.joint.slide**2 * body.inertial.mass > 0.0)

@@ -11,8 +11,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ce_gym.model.checks.body import LARGEST_FIGURE, RELATIVE_TOLERANCE, check_finite
-from ce_gym.model.constraint_functions import constraint_function
-from ce_gym.model.constraints import Constraint, FunctionConstraint, LinearConstraint, LoopConstraint, RodConstraint
+from ce_gym.model.constraints import (
+    Constraint,
+    FunctionConstraint,
+    LinearConstraint,
+    LoopConstraint,
+    RodConstraint,
+    constraint_function,
+)
 from ce_gym.model.description import Body, Robot
 from ce_gym.model.errors import RobotError, bad, unknown
 
@@ -34,7 +40,7 @@ def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
 def _check_joints(constraint: Constraint, names: Mapping[str, Body], key: str, file: str) -> None:
     """Check the bodies of a constraint that ties joint coordinates."""
     for body in constraint.bodies:
-        if names[body].joint.type == "free":
+        if names[body].joint.nv > 1:
             raise bad(file, key, body, "a body whose joint has one degree of freedom")
     if len(set(constraint.bodies)) < 2 or len(set(constraint.bodies)) < len(constraint.bodies):
         raise bad(file, key, constraint.bodies, "at least two different bodies, each once")

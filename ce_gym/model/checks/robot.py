@@ -14,6 +14,7 @@ from functools import cache
 import numpy as np
 
 from ce_gym.model.checks.body import (
+    RELATIVE_TOLERANCE,
     check_body,
     check_finite,
     check_not_negative,
@@ -102,6 +103,8 @@ def _check_tree(robot: Robot, file: str) -> None:
             raise bad(file, "body name", body.name, "a name that no other body has")
         if body.parent is not None and body.parent not in seen:
             raise unknown(file, f"{body.kind} {body.name!r} parent", body.parent, seen, "a body listed before it")
+        if body.joint.type == "ball" and body.kind == "rotor":
+            raise bad(file, f"rotor {body.name!r} joint type", "ball", "a joint about one axis")
         if body.joint.type == "free" and (seen or body.parent is not None):
             raise bad(
                 file, f"{body.kind} {body.name!r} joint type", "free", "free only for the first body, on the world"
@@ -116,13 +119,13 @@ def _check_constraints(robot: Robot, file: str) -> None:
 
 
 def _check_independent(robot: Robot, file: str) -> None:
-    names = [body.name for body in robot.bodies if body.joint.type != "free"]
+    names = [body.name for body in robot.bodies if body.joint.nv == 1]
     for joint in robot.independent:
         if joint not in names:
             raise unknown(file, "independent", joint, names, "the name of a body whose joint has one degree of freedom")
     _check_unique(file, "independent", robot.independent)
     for cluster in cluster_tree(robot).clusters:
-        if cluster.linear and robot.body(cluster.bodies[0]).joint.type != "free":
+        if cluster.linear and robot.body(cluster.bodies[0]).joint.nv == 1:
             _check_determined(cluster, file)  # others are solved to be checked: a Model does
 
 
@@ -191,6 +194,12 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
     check_finite(file, "pose.height", (robot.pose.height,))
     check_finite(file, "gravity", robot.gravity)
     _check_joint_values(robot, file, "pose.joints", robot.pose.joints)
+    _check_unique(file, "pose.balls", [name for name, _ in robot.pose.balls])
+    for name, quaternion in robot.pose.balls:
+        if name not in robot.balls:
+            raise unknown(file, "pose.balls", name, robot.balls, "the name of a body on a ball joint")
+        if not math.isclose(math.hypot(*quaternion), 1.0, rel_tol=RELATIVE_TOLERANCE):
+            raise bad(file, f"pose.balls.{name}", quaternion, "a quaternion (w, x, y, z) of length 1")
     _check_within_limits(robot, file)
     _check_assembly(robot, file)
     for key, pairs in (("gains.kp", robot.gains.kp), ("gains.kd", robot.gains.kd)):
@@ -212,7 +221,7 @@ def _check_within_limits(robot: Robot, file: str) -> None:
 
 
 def _check_assembly(robot: Robot, file: str) -> None:
-    dependent = [b.name for b in robot.bodies if b.joint.type != "free" and b.name not in robot.independent]
+    dependent = [b.name for b in robot.bodies if b.joint.nv == 1 and b.name not in robot.independent]
     _check_unique(file, "assembly", [joint for joint, _ in robot.assembly])
     for joint, value in robot.assembly:
         if joint not in dependent:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ce_gym.model.coordinates import Layout
 
 Array = NDArray[np.float64]
 
@@ -63,20 +66,20 @@ class History:
         return self._moments[-1]
 
 
-def between(before: Moment, after: Moment, time: float) -> tuple[Array, ...]:
-    """Return positions of the robots at a time between two moments, linear but for the length of quaternions.
-
-    The robots' bases are free: `q = [position (3), quaternion (4), joints]`.
-    """
+def between(before: Moment, after: Moment, time: float, layouts: Iterable[Layout]) -> tuple[Array, ...]:
+    """Return positions of the robots at a time between two moments, linear but for the length of quaternions."""
     length = after.time - before.time
     share = 0.0 if length <= 0 else float(np.clip((time - before.time) / length, 0.0, 1.0))
-    return tuple(_blend(a, b, share) for a, b in zip(before.poses, after.poses, strict=True))
+    poses = zip(before.poses, after.poses, layouts, strict=True)
+    return tuple(_blend(a, b, share, layout) for a, b, layout in poses)
 
 
-def _blend(a: Array, b: Array, share: float) -> Array:
-    toward = b.copy()
-    if a[3:7] @ b[3:7] < 0:  # the same orientation
-        toward[3:7] *= -1
+def _blend(a: Array, b: Array, share: float, layout: Layout) -> Array:
+    toward, quaternions = b.copy(), [slice(row, row + 4) for row, _ in layout.turns]
+    for part in quaternions:
+        if a[part] @ b[part] < 0:  # the same orientation
+            toward[part] *= -1
     blended = (1 - share) * a + share * toward
-    blended[3:7] /= np.linalg.norm(blended[3:7])
+    for part in quaternions:
+        blended[part] /= np.linalg.norm(blended[part])
     return blended

@@ -116,7 +116,7 @@ class Session:
     def poses(self) -> tuple[Array, ...]:
         """Return the positions to show, shape (nq,) each; at most one control step old."""
         shown = self.time if self.paused else self.time - self.dt
-        return between(*self._history.around(shown), shown)
+        return between(*self._history.around(shown), shown, [robot.model.robot.layout for robot in self.robots])
 
     # Commands and disturbances.
 

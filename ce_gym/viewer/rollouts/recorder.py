@@ -95,7 +95,7 @@ class Recorder:
     def _ground(self, q: Array, v: Array) -> Terrain | None:
         if self._terrain is None:
             return None
-        floats = q.shape[1] == v.shape[1] + 1  # of a base that moves, the quaternion has one number more
+        floats = q.shape[1] > v.shape[1]  # of a base that moves, the quaternion has one number more
         return around(self._terrain, q[:, :2] if floats else np.zeros((1, 2)))
 
 

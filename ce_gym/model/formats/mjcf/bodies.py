@@ -14,6 +14,7 @@ import numpy as np
 
 from ce_gym.model.description import Body, Inertial, Joint, Shape
 from ce_gym.model.errors import bad
+from ce_gym.model.formats.hinges import coincident_hinges
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement, rotation
 from ce_gym.model.formats.placement import compose, mat3, merge_inertials, transform_inertial, vec3
 from ce_gym.model.formats.rotor_links import FixedLink
@@ -29,13 +30,16 @@ class MjcfTree:
     Attributes:
         bodies: Parents before children, a free base first.
         frames: For each of MuJoCo's bodies, the body (None: the world) that carries its frame, and the pose in it.
-        moved_by: The body that each of MuJoCo's joints moves, by joint index; joints that are locked have none.
+        moved_by: The body that each of MuJoCo's joints moves, by joint index; joints that are locked have none, nor
+            ball joints that have become hinges.
+        hinged: The bodies of the three hinges that such a ball joint has become, by joint index.
         fixed: Bodies without a joint that were asked for to be kept apart, by name.
     """
 
     bodies: list[Body] = field(default_factory=list)
     frames: list[tuple[str | None, Placement]] = field(default_factory=lambda: [(None, Placement())])
     moved_by: dict[int, str] = field(default_factory=dict)
+    hinged: dict[int, tuple[Body, Body, Body]] = field(default_factory=dict)
     fixed: dict[str, FixedLink] = field(default_factory=dict)
 
     def fresh(self, name: str) -> str:
@@ -51,20 +55,23 @@ class MjcfTree:
         return next(b.parent for b in self.bodies if b.name == body)
 
 
-def read_bodies(source: MjcfSource, locked: Mapping[int, float], apart: Collection[str] = ()) -> MjcfTree:
+def read_bodies(
+    source: MjcfSource, locked: Mapping[int, float], hinged: Mapping[int, Vec3], apart: Collection[str] = ()
+) -> MjcfTree:
     """Read the tree of bodies.
 
     Args:
         source: The compiled file.
         locked: Coordinates [rad or m] of joints that an equality holds still, by joint index: they become welds.
+        hinged: Axes of spin of ball joints that become hinges, by joint index.
         apart: Names of bodies to keep apart if they have no joint; others mean nothing.
 
     Raises:
-        RobotError: Nothing moves, or a joint has several degrees of freedom and is not that of the base.
+        RobotError: Nothing moves, or several bodies move freely.
     """
     tree, model = MjcfTree(), source.model
     for index in range(1, model.nbody):
-        _add_body(source, tree, index, locked, apart)
+        _add_body(source, tree, index, locked, hinged, apart)
     if not tree.bodies:
         raise bad(source.file, "bodies", (), "at least one body that moves")
     _report_forces(source)
@@ -76,7 +83,12 @@ def read_bodies(source: MjcfSource, locked: Mapping[int, float], apart: Collecti
 
 
 def _add_body(
-    source: MjcfSource, tree: MjcfTree, index: int, locked: Mapping[int, float], apart: Collection[str]
+    source: MjcfSource,
+    tree: MjcfTree,
+    index: int,
+    locked: Mapping[int, float],
+    hinged: Mapping[int, Vec3],
+    apart: Collection[str],
 ) -> None:
     model = source.model
     name = source.name("body", index)
@@ -90,8 +102,13 @@ def _add_body(
             frame = compose(frame, _motion(source, j, locked[j]))
             continue
         link = tree.fresh(name if j == moving[-1] else source.name("joint", j))
-        tree.bodies.append(_moved_body(source, j, link, carrier, frame))
-        tree.moved_by[j] = link
+        moved = _moved_body(source, j, link, carrier, frame)
+        if j in hinged:
+            tree.hinged[j] = coincident_hinges(_at_reference(source, j, moved), hinged[j])
+            tree.bodies += tree.hinged[j]
+        else:
+            tree.bodies.append(moved)
+            tree.moved_by[j] = link
         carrier, frame = link, _after(source, j)
     tree.frames.append((carrier, frame))
     if name in apart and not joints:
@@ -123,20 +140,33 @@ def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, fram
     nothing = Inertial(0.0, ZERO, (ZERO, ZERO, ZERO))
     if kind == kinds.mjJNT_FREE:
         return Body(name, "link", None, Placement(), Joint("free"), nothing)
-    if kind == kinds.mjJNT_BALL:
-        raise bad(source.file, f"joint {source.name('joint', j)!r} type", "ball", "hinge, slide or free")
     dof = model.jnt_dofadr[j]
+    damping = float(model.dof_damping[dof])
+    if kind == kinds.mjJNT_BALL:
+        furthest = float(model.jnt_range[j][1]) if model.jnt_limited[j] else np.inf
+        pivot = compose(frame, Placement(_pivot(source, j)))
+        return Body(name, "link", carrier, pivot, Joint("ball", position=(-np.inf, furthest), damping=damping), nothing)
     limits = model.jnt_range[j] if model.jnt_limited[j] else _UNLIMITED
     joint = Joint(
         type="revolute" if kind == kinds.mjJNT_HINGE else "prismatic",
         axis=_axis(source, j),
         position=(float(limits[0]), float(limits[1])),
-        damping=float(model.dof_damping[dof]),
+        damping=damping,
         friction=float(model.dof_frictionloss[dof]),
     )
     at_zero = compose(frame, _motion(source, j, 0.0))
     pivot = compose(at_zero, Placement(_pivot(source, j)))
     return Body(name, "link", carrier, pivot, joint, nothing)
+
+
+def _at_reference(source: MjcfSource, j: int, body: Body) -> Body:
+    """Return the body of a ball joint that is to become hinges, turned as it is in the reference pose, their zero."""
+    model = source.model
+    if model.jnt_limited[j]:
+        source.leave_out("limit of ball joint {}, which is part of a loop", source.name("joint", j))
+    address = model.jnt_qposadr[j]
+    turned = placement(np.zeros(3), source.data.qpos[address : address + 4])
+    return replace(body, placement=compose(body.placement, turned))
 
 
 def _after(source: MjcfSource, j: int) -> Placement:
@@ -145,9 +175,10 @@ def _after(source: MjcfSource, j: int) -> Placement:
 
 
 def _pivot(source: MjcfSource, j: int) -> Vec3:
-    """The point of MuJoCo's body that is the origin of ours [m]: where a hinge's axis passes."""
-    hinge = source.model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_HINGE
-    return vec3(source.model.jnt_pos[j]) if hinge else ZERO
+    """The point of MuJoCo's body that is the origin of ours [m]: where a hinge's axis passes, the centre of a ball."""
+    kinds = source.mujoco.mjtJoint
+    turns = int(source.model.jnt_type[j]) in (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_BALL))
+    return vec3(source.model.jnt_pos[j]) if turns else ZERO
 
 
 def _axis(source: MjcfSource, j: int) -> Vec3:
@@ -170,13 +201,14 @@ def _motion(source: MjcfSource, j: int, coordinate: float) -> Placement:
 
 def _report_forces(source: MjcfSource) -> None:
     """Note passive forces of joints and bodies that a robot cannot have."""
-    model = source.model
+    model, kinds = source.model, source.mujoco.mjtJoint
     bent = np.atleast_1d(getattr(model, "dof_dampingpoly", np.zeros(model.nv)))
     for j in range(model.njnt):
-        dof, free = model.jnt_dofadr[j], model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE
-        if free and np.any(model.dof_frictionloss[dof : dof + 6]):
+        dof, count = model.jnt_dofadr[j], {int(kinds.mjJNT_FREE): 6, int(kinds.mjJNT_BALL): 3}
+        dofs = slice(dof, dof + count.get(int(model.jnt_type[j]), 1))
+        if dofs.stop > dof + 1 and np.any(model.dof_frictionloss[dofs]):
             source.leave_out("dry friction of joint {}", source.name("joint", j))
-        if np.any(bent[dof : dof + (6 if free else 1)]):
+        if np.any(bent[dofs]):
             source.leave_out("nonlinear damping of joint {}", source.name("joint", j))
         if model.jnt_stiffness[j] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[j]):
             source.leave_out("spring of joint {}", source.name("joint", j))

@@ -68,7 +68,7 @@ def choose_independent(source: MjcfSource, tree: MjcfTree, rotors: Collection[st
 
     The dependent joints are found by elimination in the Jacobian of all equalities at the reference pose, as many as it
     has rank: those of `rotors` before others, then what a joint equality names first (MuJoCo's own dependent joint),
-    then joints without an actuator, then driven ones.
+    then hinges that were a ball joint, then joints without an actuator, then driven ones.
 
     Args:
         source: The compiled file.
@@ -78,18 +78,32 @@ def choose_independent(source: MjcfSource, tree: MjcfTree, rotors: Collection[st
     model, kinds = source.model, source.mujoco.mjtEq
     driven = {int(model.actuator_trnid[a][0]) for a in range(model.nu) if drives_joint(source, a)}
     named = {int(model.eq_obj1id[i]) for i in _active(source) if model.eq_type[i] == kinds.mjEQ_JOINT}
-    free = source.mujoco.mjtJoint.mjJNT_FREE
-    joints = [j for j in sorted(tree.moved_by) if model.jnt_type[j] != free]
-    order = {j: (tree.moved_by[j] not in rotors, j not in named, j in driven) for j in joints}
-    columns = _equality_jacobian(source)[:, [model.jnt_dofadr[j] for j in joints]]
+    jacobian, joints = _equality_jacobian(source), _scalar_joints(source, tree)
+    order = [(body not in rotors, j not in named, j not in tree.hinged, j in driven) for j, body, _ in joints]
+    columns = np.array([jacobian[:, dofs] @ axis for _, _, (dofs, axis) in joints]).reshape(len(joints), -1).T
     dependent: set[int] = set()
-    for group in sorted(set(order.values())):
-        while (pivot := _largest(columns, [i for i, j in enumerate(joints) if order[j] == group])) is not None:
-            dependent.add(joints[pivot])
+    for group in sorted(set(order)):
+        while (pivot := _largest(columns, [i for i, key in enumerate(order) if key == group])) is not None:
+            dependent.add(pivot)
             unit = columns[:, pivot] / np.linalg.norm(columns[:, pivot])
             columns = columns - np.outer(unit, unit @ columns)
             columns[:, pivot] = 0.0
-    return tuple(tree.moved_by[j] for j in joints if j not in dependent)
+    return tuple(body for i, (_, body, _) in enumerate(joints) if i not in dependent)
+
+
+def _scalar_joints(source: MjcfSource, tree: MjcfTree) -> list[tuple[int, str, tuple[slice, NDArray[np.float64]]]]:
+    """Return joint index and body of each joint with one coordinate, and how MuJoCo's velocities follow from its own.
+
+    The last is the rows of its joint and the entries there, at the reference pose.
+    """
+    model, kinds, found = source.model, source.mujoco.mjtJoint, []
+    for j in sorted({*tree.moved_by, *tree.hinged}):
+        first = int(model.jnt_dofadr[j])
+        if j in tree.hinged:
+            found += [(j, b.name, (slice(first, first + 3), np.array(b.joint.axis))) for b in tree.hinged[j]]
+        elif model.jnt_type[j] != kinds.mjJNT_FREE and model.jnt_type[j] != kinds.mjJNT_BALL:
+            found.append((j, tree.moved_by[j], (slice(first, first + 1), np.ones(1))))
+    return found
 
 
 def _largest(columns: NDArray[np.float64], among: list[int]) -> int | None:

@@ -2,7 +2,8 @@
 
 | in the file                      | in the robot                                                                   |
 |----------------------------------|--------------------------------------------------------------------------------|
-| bodies, hinge, slide, free joint | bodies (`bodies.py`)                                                           |
+| bodies, joints                   | bodies (`bodies.py`)                                                           |
+| a ball joint inside a loop       | three hinges, zero in the reference pose (`balls.py`)                          |
 | equalities                       | exact constraints (`equalities.py`)                                            |
 | armature                         | rotors behind gears (`rotors.py`)                                              |
 | geoms                            | contact spheres, and shapes to draw (`contacts.py`)                            |
@@ -26,11 +27,12 @@ from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.description import Pose, Robot
 from ce_gym.model.errors import LossyImportWarning, bad, unknown
 from ce_gym.model.formats.mjcf.actuators import read_actuators
+from ce_gym.model.formats.mjcf.balls import balls_in_loops
 from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, shapes
 from ce_gym.model.formats.mjcf.contacts import read_contacts
 from ce_gym.model.formats.mjcf.equalities import choose_independent, locked_joints, read_constraints
 from ce_gym.model.formats.mjcf.rotors import add_rotors
-from ce_gym.model.formats.mjcf.source import MjcfSource, read_mjcf, summary
+from ce_gym.model.formats.mjcf.source import MjcfSource, quaternion, read_mjcf, summary
 from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink
@@ -79,7 +81,7 @@ def read_robot(
     """
     source = read_mjcf(path)
     locked = locked_joints(source)
-    tree = read_bodies(source, locked, apart)
+    tree = read_bodies(source, locked, balls_in_loops(source), apart)
     constraints = read_constraints(source, tree, locked)
     spinning = [
         body.name for body in with_rotors(tree.bodies, constraints, tree.moved_by.values()) if body.kind == "rotor"
@@ -146,7 +148,7 @@ def _pose(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...], lowe
         lowest: Height of the lowest contact sphere's underside [m].
     """
     model, qpos = source.model, source.data.qpos
-    height, angles = 0.0, {}
+    height, angles, balls = 0.0, {}, []
     limits = {body.name: body.joint.position for body in tree.bodies}
     for j, body in tree.moved_by.items():
         address = model.jnt_qposadr[j]
@@ -160,13 +162,16 @@ def _pose(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...], lowe
                 source.leave_out("the height of the base in the reference pose ({} m)", f"{height:g}, under ground")
                 height -= lowest
             continue
+        if model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_BALL:
+            balls.append((body, quaternion(qpos[address : address + 4])))
+            continue
         angles[body] = float(qpos[address])
         allowed = min(max(angles[body], limits[body][0]), limits[body][1])
         if body in independent and abs(allowed - angles[body]) > 1e-6:
             source.leave_out("the angle in the reference pose, beyond its limits, of {}", body)
             angles[body] = allowed
     dependent = tuple((body, angle) for body, angle in angles.items() if body not in independent)
-    return Pose(height, tuple((body, angles[body]) for body in independent)), dependent
+    return Pose(height, tuple((body, angles.get(body, 0.0)) for body in independent), tuple(balls)), dependent
 
 
 def _report_world(source: MjcfSource) -> None:

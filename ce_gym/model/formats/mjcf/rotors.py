@@ -143,11 +143,13 @@ def _known_ratios(source: MjcfSource, tree: MjcfTree) -> dict[int, float]:
 def _joint_armatures(source: MjcfSource, tree: MjcfTree, ratios: Mapping[int, float]) -> list[_Armature]:
     model = source.model
     found = []
-    for j, body in tree.moved_by.items():
+    kinds, several = source.mujoco.mjtJoint, tree.moved_by | dict.fromkeys(tree.hinged, "")
+    for j, body in several.items():
         reflected = float(model.dof_armature[model.jnt_dofadr[j]])
-        if model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE:
+        what = {int(kinds.mjJNT_FREE): "free", int(kinds.mjJNT_BALL): "ball"}.get(int(model.jnt_type[j]))
+        if what is not None:
             if reflected:
-                source.leave_out("armature of the free joint {}", source.name("joint", j))
+                source.leave_out(f"armature of the {what} joint {{}}", source.name("joint", j))
         elif reflected:
             found.append(_Armature(body, {j: 1.0}, reflected, ratios.get(j)))
     return found

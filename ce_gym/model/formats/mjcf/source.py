@@ -161,6 +161,12 @@ def placement(position: NDArray[np.float64], quaternion: NDArray[np.float64]) ->
     return Placement(vec3(position), exact_right_angles(rotation(quaternion)))
 
 
+def quaternion(values: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Return a quaternion (w, x, y, z) of MuJoCo's with length 1."""
+    w, x, y, z = (float(value) for value in values / np.linalg.norm(values))
+    return (w, x, y, z)
+
+
 def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation matrix, shape (3, 3), of a quaternion (w, x, y, z) of any length but 0."""
     return rotation_matrix(np.asarray(quaternion) / np.linalg.norm(quaternion))

@@ -67,4 +67,4 @@ def names_in(section: Section, key: str) -> tuple[str, ...]:
 def _not_tied(bodies: tuple[Body, ...], constraints: tuple[LinearConstraint, ...]) -> tuple[str, ...]:
     """Return the joints that no <mimic> solves for."""
     solved = {constraint.bodies[0] for constraint in constraints}
-    return tuple(body.name for body in bodies if body.joint.type != "free" and body.name not in solved)
+    return tuple(body.name for body in bodies if body.joint.nv == 1 and body.name not in solved)

@@ -1,0 +1,81 @@
+"""Where the coordinates of joints are in `q` and `v`: joints that turn freely have a quaternion, so `nq` is not `nv`.
+
+    q = [base position, base quaternion, quaternions of ball joints, joints with one coordinate]
+    v = [base angular, base linear, angular velocities of ball joints, joints with one coordinate]
+
+Quaternions are (w, x, y, z), child to parent. Angular velocities are in the axes of the body that turns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+SIZES: dict[str, tuple[int, int]] = {"free": (7, 6), "ball": (4, 3), "revolute": (1, 1), "prismatic": (1, 1)}
+"""Number of positions and of velocities of each type of joint."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which rows of `q` and `v` are what.
+
+    Attributes:
+        floating: Whether the base is free.
+        balls: Number of ball joints.
+        joints: Number of independent joints with one coordinate.
+    """
+
+    floating: bool
+    balls: int
+    joints: int
+
+    @property
+    def base_nq(self) -> int:
+        """Number of positions of the base, 7 if it is floating (position and quaternion) or none."""
+        return SIZES["free"][0] if self.floating else 0
+
+    @property
+    def base_nv(self) -> int:
+        """Number of velocities of the base."""
+        return SIZES["free"][1] if self.floating else 0
+
+    @property
+    def joints_q(self) -> int:
+        """First row of `q` of joints with one coordinate."""
+        return self.base_nq + SIZES["ball"][0] * self.balls
+
+    @property
+    def joints_v(self) -> int:
+        """First row of `v` of joints with one coordinate."""
+        return self.base_nv + SIZES["ball"][1] * self.balls
+
+    @property
+    def nq(self) -> int:
+        """Number of positions."""
+        return self.joints_q + self.joints
+
+    @property
+    def nv(self) -> int:
+        """Number of velocities."""
+        return self.joints_v + self.joints
+
+    @property
+    def ball_turns(self) -> tuple[tuple[int, int], ...]:
+        """First rows in `q` and in `v` of each ball joint."""
+        (nq, nv), first_q, first_v = SIZES["ball"], self.base_nq, self.base_nv
+        return tuple((first_q + nq * i, first_v + nv * i) for i in range(self.balls))
+
+    @property
+    def turns(self) -> tuple[tuple[int, int], ...]:
+        """First rows in `q` of each quaternion, the base's first, and in `v` of its angular velocity."""
+        return (((3, 0),) if self.floating else ()) + self.ball_turns
+
+
+def placed(joints: Iterable[tuple[str, str]]) -> dict[str, tuple[range, range]]:
+    """Return the rows in `q` and in `v` of joints one after the other, given as pairs (name, type)."""
+    rows, first_q, first_v = {}, 0, 0
+    for name, kind in joints:
+        nq, nv = SIZES[kind]
+        rows[name] = range(first_q, first_q + nq), range(first_v, first_v + nv)
+        first_q, first_v = first_q + nq, first_v + nv
+    return rows
