@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-SIZES: dict[str, tuple[int, int]] = {"free": (7, 6), "ball": (4, 3), "revolute": (1, 1), "prismatic": (1, 1)}
-"""Number of positions and of velocities of each type of joint."""
+SIZES: dict[str, tuple[int, int]] = {"free": (7, 6), "ball": (4, 3)}
+"""Number of positions and of velocities of types of joints; all others have one of each."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,16 @@ class Layout:
         return (((3, 0),) if self.floating else ()) + self.ball_turns
 
 
+def sizes(kind: str) -> tuple[int, int]:
+    """Return the number of positions and of velocities of a type of joint."""
+    return SIZES.get(kind, (1, 1))
+
+
 def placed(joints: Iterable[tuple[str, str]]) -> dict[str, tuple[range, range]]:
     """Return the rows in `q` and in `v` of joints one after the other, given as pairs (name, type)."""
     rows, first_q, first_v = {}, 0, 0
     for name, kind in joints:
-        nq, nv = SIZES[kind]
+        nq, nv = sizes(kind)
         rows[name] = range(first_q, first_q + nq), range(first_v, first_v + nv)
         first_q, first_v = first_q + nq, first_v + nv
     return rows

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ce_gym.model.constraints import Constraint
-from ce_gym.model.coordinates import SIZES, Layout, placed
+from ce_gym.model.coordinates import Layout, placed, sizes
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
 
 
@@ -62,12 +62,12 @@ class Joint:
     @property
     def nq(self) -> int:
         """Number of positions."""
-        return SIZES[self.type][0]
+        return sizes(self.type)[0]
 
     @property
     def nv(self) -> int:
         """Number of velocities."""
-        return SIZES[self.type][1]
+        return sizes(self.type)[1]
 
     @property
     def turn(self) -> float:

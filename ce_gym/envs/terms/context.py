@@ -130,7 +130,7 @@ class TermContext:
 
     @property
     def ball_rotations(self) -> SX:
-        """Rotation vector of each ball joint from its standing pose, axes of what it turns [rad], shape (3 n_balls,)."""
+        """Rotation vector of each ball joint from its standing pose, axes of what it turns [rad], (3 n_balls,)."""
         robot, found = self.mechanism.robot, [SX(0, 1)]
         for row, _ in robot.layout.ball_turns:
             w, x, y, z = robot.standing_q[row : row + 4]

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ce_gym.model.coordinates import SIZES
-from ce_gym.model.description import Body, Joint
+from ce_gym.model.description import SCREWS, Body, Joint
 from ce_gym.model.errors import bad
 
 RELATIVE_TOLERANCE = 1e-9
@@ -41,8 +41,8 @@ def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
 
 
 def _check_joint(file: str, where: str, joint: Joint) -> None:
-    if joint.type not in SIZES:
-        raise bad(file, f"{where} joint type", joint.type, f"one of {', '.join(SIZES)}")
+    if joint.type not in (*SIZES, *SCREWS):
+        raise bad(file, f"{where} joint type", joint.type, f"one of {', '.join((*SIZES, *SCREWS))}")
     if joint.type == "ball" and joint.friction:
         raise bad(file, f"{where} joint friction", joint.friction, "0, because ball joints have no dry friction")
     if joint.type == "ball" and not (joint.position[0] == -math.inf and joint.position[1] > 0.0):
