@@ -149,6 +149,8 @@ def _add_body(
             ("ref", ref),
             ("damping", body.joint.damping),
             ("frictionloss", body.joint.friction),
+            ("stiffness", body.joint.stiffness),
+            ("springref", body.joint.springref),
             ("armature", armature.get(moving.name, 0.0)),
         ):
             if value:

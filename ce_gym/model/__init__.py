@@ -12,6 +12,7 @@ from ce_gym.model.constraints import (
     constraint_function,
     register_constraint,
 )
+from ce_gym.model.coordinates import Layout
 from ce_gym.model.description import (
     Body,
     ContactMaterial,
@@ -43,6 +44,7 @@ __all__ = [
     "InertiaWarning",
     "Inertial",
     "Joint",
+    "Layout",
     "LinearConstraint",
     "LoopConstraint",
     "LossyImportWarning",

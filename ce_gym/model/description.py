@@ -49,6 +49,8 @@ class Joint:
         velocity: Largest speed the actuator reaches [rad/s or m/s].
         damping: Viscous friction at the joint [N m s/rad or N s/m].
         friction: Dry friction at the joint [N m or N].
+        stiffness: Of a spring at the joint [N m/rad or N/m].
+        springref: Where that spring is relaxed [rad or m]; that of a ball joint is where it is not turned.
     """
 
     type: Literal["free", "ball", "revolute", "prismatic"]
@@ -58,6 +60,8 @@ class Joint:
     velocity: float = float("inf")
     damping: float = 0.0
     friction: float = 0.0
+    stiffness: float = 0.0
+    springref: float = 0.0
 
     @property
     def nq(self) -> int:

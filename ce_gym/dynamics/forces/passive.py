@@ -1,4 +1,4 @@
-"""Viscous friction and stops of the joints, taken one step ahead."""
+"""Viscous friction, stops and springs of the joints, taken one step ahead."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import casadi as ca
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX, mirrored
 from ce_gym.dynamics.forces.law import JointForce
-from ce_gym.model.description import Robot
+from ce_gym.dynamics.recursion.kinematics import Kinematics
+from ce_gym.model.description import Joint, Robot
+from ce_gym.model.mechanism import Mechanism
 
 LIMIT_FREQUENCY = 2 * math.pi * 20.0
 """Stiffness over damping of a soft joint limit [1/s]; the stop relaxes in the inverse of it, 8 ms."""
@@ -27,7 +29,7 @@ def passive_forces(robot: Robot, y: SX, yd: SX, dt: float) -> JointForce:
 
 
 def ball_forces(robot: Robot, q: SX, v: SX, dt: float) -> JointForce:
-    """Return viscous friction and stops of all ball joints, at positions (nq,) and velocities (nv,).
+    """Return viscous friction, stops and springs of all ball joints, at positions (nq,) and velocities (nv,).
 
     The stop is a spring along the axis about which the joint is turned, where the angle is beyond the limit: the rate
     of that angle is the velocity along this axis.
@@ -36,8 +38,10 @@ def ball_forces(robot: Robot, q: SX, v: SX, dt: float) -> JointForce:
     for name, (i, j) in zip(robot.balls, robot.layout.ball_turns, strict=True):
         joint, w = robot.body(name).joint, v[j : j + 3]
         tau, slope = SX(-joint.damping * w), dt * joint.damping * SX.eye(3)
+        turned = rotation_vector(q[i : i + 4])
+        if joint.stiffness:  # a turn by dt w changes the rotation vector by about as much
+            tau, slope = tau - joint.stiffness * (turned + dt * w), slope + dt**2 * joint.stiffness * SX.eye(3)
         if not math.isinf(joint.position[1]):
-            turned = rotation_vector(q[i : i + 4])
             angle = ca.sqrt(ca.sumsqr(turned) + 1e-24)  # never zero, so that the axis stays finite
             axis, limits = turned / angle, (-math.inf, joint.position[1])
             push, slope_along = _stop(angle, ca.dot(axis, w), limits, *limit_stiffness(robot, name), dt)
@@ -45,6 +49,29 @@ def ball_forces(robot: Robot, q: SX, v: SX, dt: float) -> JointForce:
         taus.append(tau)
         slopes.append(slope)
     return JointForce(ca.vertcat(*taus), ca.diagcat(SX(0, 0), *slopes))
+
+
+def sprung_joints(mechanism: Mechanism) -> list[tuple[int, Joint, str]]:
+    """Return joints with one coordinate that have springs: index of the cluster, the joint, the body it moves."""
+    robot, clusters = mechanism.robot, mechanism.tree.clusters
+    every = [(k, robot.body(name).joint, name) for k, cluster in enumerate(clusters) for name in cluster.bodies]
+    return [one for one in every if one[1].nv == 1 and one[1].stiffness]
+
+
+def springs(mechanism: Mechanism, kinematics: Kinematics, dt: float) -> list[JointForce]:
+    """Return the springs of joints with one coordinate as forces on the independent ones, dependent joints included.
+
+    With `W` its row of the constraint Jacobian a joint moves at `W yd`, and its spring is `W^T tau` to those.
+    """
+    found, layout = [], mechanism.robot.layout
+    for k, joint, name in sprung_joints(mechanism):
+        coordinates = kinematics.coordinates[k]
+        assert coordinates is not None
+        way, row = SX(1, layout.joints), coordinates.index[name]
+        way[[row - layout.joints_v for row in kinematics.rows[k]]] = coordinates.G[row, :]
+        stretch = coordinates.q[row] + dt * coordinates.qd[row] - joint.springref
+        found.append(JointForce(-joint.stiffness * stretch * way.T, dt**2 * joint.stiffness * (way.T @ way)))
+    return found
 
 
 def limit_stiffness(robot: Robot, name: str) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.motor_control import motor_springs
-from ce_gym.dynamics.forces.passive import limit_stiffness
+from ce_gym.dynamics.forces.passive import limit_stiffness, sprung_joints
 from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.recursion.derived import kinetic_and_potential
 from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
@@ -22,8 +22,8 @@ from ce_gym.dynamics.stepping.step import touching
 def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
     """Return kinetic, potential and elastic energy [J].
 
-    Elastic are the springs and bristles of contacts, stops of joints, and position control, the last as if motors had
-    no limits.
+    Elastic are the springs and bristles of contacts, stops and springs of joints, and position control, the last as if
+    motors had no limits.
 
     Args:
         scene: The robot and what surrounds it.
@@ -31,7 +31,8 @@ def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
         target: Targets, or torques, which have no energy, shape (n_targets,), see `target_names`.
     """
     kinetic, potential = kinetic_and_potential(scene.mechanism, state.q, state.v, state.dependent)
-    return kinetic + potential + contact_energy(scene, state) + joint_energy(scene, state, target)
+    total = kinetic + potential + contact_energy(scene, state) + joint_energy(scene, state, target)
+    return total + spring_energy(scene, state)
 
 
 def contact_energy(scene: Scene, state: State) -> SX:
@@ -42,14 +43,27 @@ def contact_energy(scene: Scene, state: State) -> SX:
     return sum((k * ca.fmax(t.depth, 0) ** 2 + k_t * ca.sumsqr(t.anchor) for t in touches), SX(0)) / 2
 
 
+def spring_energy(scene: Scene, state: State) -> SX:
+    """Return the energy of the springs of joints with one coordinate [J]."""
+    total, sprung = SX(0), sprung_joints(scene.mechanism)
+    if sprung:
+        kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
+        for k, joint, name in sprung:
+            coordinates = kinematics.coordinates[k]
+            assert coordinates is not None
+            total += joint.stiffness * (coordinates.position(name) - joint.springref) ** 2 / 2
+    return total
+
+
 def joint_energy(scene: Scene, state: State, target: SX) -> SX:
     """Return the energy of the stops of the joints, and of position control [J]."""
     robot, total = scene.mechanism.robot, SX(0)
     y = state.q[robot.layout.joints_q :]
     for name, (row, _) in zip(robot.balls, robot.layout.ball_turns, strict=True):
-        furthest = robot.body(name).joint.position[1]
-        if math.isfinite(furthest):
-            beyond = ca.fmax(ca.norm_2(rotation_vector(state.q[row : row + 4])) - furthest, 0)
+        joint, turned = robot.body(name).joint, rotation_vector(state.q[row : row + 4])
+        total += joint.stiffness * ca.sumsqr(turned) / 2
+        if math.isfinite(joint.position[1]):
+            beyond = ca.fmax(ca.norm_2(turned) - joint.position[1], 0)
             total += limit_stiffness(robot, name)[0] * beyond**2 / 2
     for i, name in enumerate(robot.independent):
         low, high = robot.body(name).joint.position

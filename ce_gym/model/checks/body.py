@@ -57,6 +57,8 @@ def _check_joint(file: str, where: str, joint: Joint) -> None:
             raise bad(file, f"{where} joint {name}", value, "0 or more")
     check_not_negative(file, f"{where} joint damping", joint.damping)
     check_not_negative(file, f"{where} joint friction", joint.friction)
+    check_not_negative(file, f"{where} joint stiffness", joint.stiffness)
+    check_finite(file, f"{where} joint springref", (joint.springref,))
 
 
 def check_finite(file: str, key: str, values: Iterable[float]) -> None:

@@ -23,7 +23,8 @@ def coincident_hinges(body: Body, along: Vec3) -> tuple[Body, Body, Body]:
     """Return three bodies on revolute joints in place of one on a ball joint.
 
     The body keeps its name, which is that of its spin; the massless ones before it are `NAME_swing_1` and
-    `NAME_swing_2`. Each joint has the damping of the ball joint, which is right near zero; there are no limits.
+    `NAME_swing_2`. Each joint has the damping of the ball joint, which is right near zero; there are no limits,
+    springs or dry friction.
 
     Args:
         body: On a ball joint.

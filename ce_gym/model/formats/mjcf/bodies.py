@@ -145,7 +145,8 @@ def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, fram
     if kind == kinds.mjJNT_BALL:
         furthest = float(model.jnt_range[j][1]) if model.jnt_limited[j] else np.inf
         pivot = compose(frame, Placement(_pivot(source, j)))
-        return Body(name, "link", carrier, pivot, Joint("ball", position=(-np.inf, furthest), damping=damping), nothing)
+        ball = Joint("ball", position=(-np.inf, furthest), damping=damping, stiffness=float(model.jnt_stiffness[j]))
+        return Body(name, "link", carrier, pivot, ball, nothing)
     limits = model.jnt_range[j] if model.jnt_limited[j] else _UNLIMITED
     joint = Joint(
         type="revolute" if kind == kinds.mjJNT_HINGE else "prismatic",
@@ -153,6 +154,8 @@ def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, fram
         position=(float(limits[0]), float(limits[1])),
         damping=damping,
         friction=float(model.dof_frictionloss[dof]),
+        stiffness=float(model.jnt_stiffness[j]),
+        springref=float(model.qpos_spring[model.jnt_qposadr[j]]) if model.jnt_stiffness[j] else 0.0,
     )
     at_zero = compose(frame, _motion(source, j, 0.0))
     pivot = compose(at_zero, Placement(_pivot(source, j)))
@@ -164,6 +167,8 @@ def _at_reference(source: MjcfSource, j: int, body: Body) -> Body:
     model = source.model
     if model.jnt_limited[j]:
         source.leave_out("limit of ball joint {}, which is part of a loop", source.name("joint", j))
+    if model.jnt_stiffness[j]:
+        source.leave_out("spring of ball joint {}, which is part of a loop", source.name("joint", j))
     address = model.jnt_qposadr[j]
     turned = placement(np.zeros(3), source.data.qpos[address : address + 4])
     return replace(body, placement=compose(body.placement, turned))
@@ -210,8 +215,10 @@ def _report_forces(source: MjcfSource) -> None:
             source.leave_out("dry friction of joint {}", source.name("joint", j))
         if np.any(bent[dofs]):
             source.leave_out("nonlinear damping of joint {}", source.name("joint", j))
-        if model.jnt_stiffness[j] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[j]):
+        if model.jnt_stiffness[j] and model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE:
             source.leave_out("spring of joint {}", source.name("joint", j))
+        if np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[j]):
+            source.leave_out("nonlinear part of the spring of joint {}", source.name("joint", j))
     for i in range(1, model.nbody):
         if model.body_gravcomp[i]:
             source.leave_out("gravity compensation of body {}", source.name("body", i))

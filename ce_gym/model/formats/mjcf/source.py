@@ -31,7 +31,7 @@ _FIGURES = (
     *("jnt_pos", "jnt_axis", "jnt_range", "qpos0", "site_pos", "site_quat"),
     *("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rgba"),
     *("actuator_gear", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
-    *("dof_armature", "dof_damping", "dof_frictionloss", "eq_data", "tendon_length0"),
+    *("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness", "qpos_spring", "eq_data", "tendon_length0"),
 )
 _LIMITS = ("jnt_range", "actuator_forcerange")
 
