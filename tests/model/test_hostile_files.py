@@ -216,8 +216,10 @@ def test_too_many_bodies():
 
 def test_a_summary_of_what_is_left_out_is_short(write):
     pytest.importorskip("mujoco")
-    joints = "".join(body(f"b{i}", f'<joint name="j{i}" stiffness="2"/>') for i in range(40))
-    with pytest.warns(UserWarning, match="left out: spring of joint j0, j1, j2 and 37 more") as caught:
+    joints = "".join(body(f"b{i}", f'<joint name="j{i}" stiffness="2 1"/>') for i in range(40))
+    with pytest.warns(
+        UserWarning, match="left out: nonlinear part of the spring of joint j0, j1, j2 and 37 more"
+    ) as caught:
         robot = load_robot(write(mjcf(joints)))
     messages = [str(w.message) for w in caught]
     assert len(messages) == 1

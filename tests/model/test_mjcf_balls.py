@@ -31,6 +31,7 @@ FOUR_BAR = (
     f'<joint name="ball" type="ball"/>{lump(0.5)}</body></body>'
     f'<body name="rocker" pos=".6 .1 0"><joint name="rocker" axis=".1 1 0"/>{lump()}</body>'
 )
+ROUNDED = '<keyframe><key qpos="0.3 0.002 1 0.001 0 0 0.001"/></keyframe></mujoco>'
 PIN = '<connect name="pin" body1="rod" body2="rocker" anchor=".62 .07 .1"/>'
 
 
@@ -118,6 +119,15 @@ def test_a_rod_with_balls_at_both_ends_closes_a_loop(write):
         q, v = np.array([0.3, 2.0]) * rng.uniform(-1, 1, 2), rng.uniform(-1, 1, 2)
         assert beside.compare(q, v, rng.uniform(-1, 1, 2)) < 1e-12
         assert beside.model.loop_gap(q) < 1e-12
+
+
+def test_the_gap_of_a_rounded_pose_moves_no_joint_that_the_loop_does_not(write):
+    """The joint that carries the loop stays independent, and the spring before the hinge without one."""
+    turret = f'<body name="turret"><joint name="turret" axis="0 0 1"/>{lump()}{FOUR_BAR}</body>'
+    sprung = turret.replace('name="rocker" axis', 'name="rocker" stiffness="5" axis')
+    for file, independent in ((turret, ("turret", "crank", "rod")), (sprung, ("turret", "rod", "rocker"))):
+        text = mjcf(file, equality=PIN).replace("</mujoco>", ROUNDED)
+        assert load_robot(write(text)).independent == independent
 
 
 def test_balls_are_written(tmp_path):

@@ -129,7 +129,7 @@ def test_physics_that_the_file_switches_off(write):
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        (mjcf(CHAIN.replace('name="a"', 'name="a" stiffness="3"')), "spring of joint a"),
+        (mjcf(CHAIN.replace('name="a"', 'name="a" stiffness="3 1"')), "nonlinear part of the spring of joint a"),
         (
             f"<mujoco>{GEOMS}</mujoco>".replace("<freejoint/>", '<joint name="f" type="free" frictionloss="3"/>'),
             "friction of joint f",

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ce_gym.model import LinearConstraint, Shape, load_robot
+from ce_gym.model import LinearConstraint, RobotError, Shape, load_robot
 from ce_gym.model.formats.placement import rotation_from_rpy
 from ce_gym.model.formats.urdf.tree import read_urdf
 
@@ -62,6 +62,21 @@ def test_dry_friction_of_joints_is_the_urdf_s_where_the_yaml_is_silent(write_rob
         for given in ("0.2", "{shank: 0.4}", "{'*': 0.1, thigh: 0.5}")
     ]
     assert frictions == [[0.2, 0.2, 0.0], [0.0, 0.4, 0.0], [0.5, 0.1, 0.0]]
+
+
+def test_springs_of_joints(write_robot):
+    springs = "joint_stiffness: {shank: 300}\njoint_springref: {shank: 1.2}\ngains:"
+    robot = load_robot(write_robot(("gains:", springs)))
+    assert [(robot.body(n).joint.stiffness, robot.body(n).joint.springref) for n in ("thigh", "shank")] == [
+        (0.0, 0.0),
+        (300.0, 1.2),
+    ]
+    for given, words in (
+        ("{shank: -1}", "stiffness is -1.0: expected 0 or more"),
+        ("{toe: 1}", "'toe': expected a link"),
+    ):
+        with pytest.raises(RobotError, match=words):
+            load_robot(write_robot(("gains:", f"joint_stiffness: {given}\ngains:")))
 
 
 def test_contact_on_a_welded_link_moves_to_the_body_that_carries_it(write_robot):

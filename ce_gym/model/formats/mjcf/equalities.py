@@ -27,6 +27,9 @@ from ce_gym.model.frames import Placement, Vec3, added
 RANK_TOLERANCE = 1e-8
 """Relative size of a row or column of a constraint Jacobian that counts as zero."""
 
+CLOSING_STEPS, LARGEST_STEP = 8, 0.1
+"""How often a reference pose is moved to close its loops, and how far joints may be from there [rad or m]."""
+
 WELD_AXES: tuple[Vec3, Vec3] = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 
 Form = tuple[dict[int, float], float]  # coefficients of joint coordinates by joint index, and a constant [rad or m]
@@ -68,7 +71,7 @@ def choose_independent(source: MjcfSource, tree: MjcfTree, rotors: Collection[st
 
     The dependent joints are found by elimination in the Jacobian of all equalities at the reference pose, as many as it
     has rank: those of `rotors` before others, then what a joint equality names first (MuJoCo's own dependent joint),
-    then hinges that were a ball joint, then joints without an actuator, then driven ones.
+    then hinges that were a ball joint, then joints without a spring, and of either those without an actuator first.
 
     Args:
         source: The compiled file.
@@ -79,8 +82,12 @@ def choose_independent(source: MjcfSource, tree: MjcfTree, rotors: Collection[st
     driven = {int(model.actuator_trnid[a][0]) for a in range(model.nu) if drives_joint(source, a)}
     named = {int(model.eq_obj1id[i]) for i in _active(source) if model.eq_type[i] == kinds.mjEQ_JOINT}
     jacobian, joints = _equality_jacobian(source), _scalar_joints(source, tree)
-    order = [(body not in rotors, j not in named, j not in tree.hinged, j in driven) for j, body, _ in joints]
-    columns = np.array([jacobian[:, dofs] @ axis for _, _, (dofs, axis) in joints]).reshape(len(joints), -1).T
+    order = [
+        (body not in rotors, j not in named, j not in tree.hinged, model.jnt_stiffness[j] > 0.0, j in driven)
+        for j, body, _ in joints
+    ]
+    moved = [jacobian[:, dofs] @ axis for _, _, (dofs, axis) in joints]
+    columns = np.array(moved).reshape(len(joints), len(jacobian)).T
     dependent: set[int] = set()
     for group in sorted(set(order)):
         while (pivot := _largest(columns, [i for i, key in enumerate(order) if key == group])) is not None:
@@ -113,15 +120,33 @@ def _largest(columns: NDArray[np.float64], among: list[int]) -> int | None:
 
 
 def _equality_jacobian(source: MjcfSource) -> NDArray[np.float64]:
-    """Return the Jacobian of the active equalities at the reference pose, rows of length 1, shape (n, nv)."""
+    """Return the Jacobian of the active equalities at the reference pose, rows of length 1, shape (n, nv).
+
+    A pose that was rounded is closed first: a gap makes joints that equalities do not move look as if they did.
+    """
+    start = source.data.qpos.copy()
+    rows, gap = _equality_rows(source)
+    for _ in range(CLOSING_STEPS):
+        step = -np.linalg.lstsq(rows, gap, rcond=1e-6)[0] if len(rows) else np.zeros(0)
+        if not 0.0 < np.abs(step).max(initial=0.0) < LARGEST_STEP:
+            break
+        source.mujoco.mj_integratePos(source.model, source.data.qpos, step, 1.0)
+        rows, gap = _equality_rows(source)
+    source.data.qpos[:] = start
+    source.forward()
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > RANK_TOLERANCE)
+
+
+def _equality_rows(source: MjcfSource) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the Jacobian (n, nv) and the residuals (n,) of the active equalities at `source.data.qpos`."""
     mujoco, model, data = source.mujoco, source.model, source.data
     sparse = model.opt.jacobian
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     source.forward()
     model.opt.jacobian = sparse
-    rows = data.efc_J.reshape(-1, model.nv)[: data.nefc][data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > RANK_TOLERANCE)
+    chosen = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    return data.efc_J.reshape(-1, model.nv)[: data.nefc][chosen], data.efc_pos[chosen].copy()
 
 
 def drives_joint(source: MjcfSource, actuator: int) -> bool:

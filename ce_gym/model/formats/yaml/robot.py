@@ -23,10 +23,11 @@ from ce_gym.model.formats.yaml.constraints import frame_named, read_constraints
 from ce_gym.model.formats.yaml.links import read_links
 from ce_gym.model.formats.yaml.rotors import add_rotors, read_motors
 
+_JOINT_FIGURES = {"joint_friction": "friction", "joint_stiffness": "stiffness", "joint_springref": "springref"}
 _KEYS = (
     *("name", "urdf", "mjcf", "base", "sources", "notes", "kept_inertia", "gravity", "gears"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
-    "joint_friction",
+    *_JOINT_FIGURES,
 )
 
 
@@ -38,7 +39,7 @@ def robot_from_yaml(path: Path) -> Robot:
     file.texts("sources")  # for readers of the file; only its form is checked
     library, motors = read_motors(file.section("motors"))
     bodies, gears = add_rotors(file.section("rotors"), links, library)
-    bodies = _with_friction(file, bodies)
+    bodies = _with_joint_figures(file, bodies)
     ties = (*gears, *read_constraints(file, bodies, links.frames))
     independent = _independent(file, below, ties)
     robot = replace(
@@ -68,17 +69,19 @@ def robot_from_yaml(path: Path) -> Robot:
     return robot
 
 
-def _with_friction(file: Section, bodies: tuple[Body, ...]) -> tuple[Body, ...]:
-    """Return bodies whose joints have the dry friction that the YAML gives them; it says nothing about rotors."""
-    joints = tuple(body.name for body in bodies if body.kind == "link" and body.joint.type != "free")
-    given = dict(_for_each(file, "joint_friction", joints)) if "joint_friction" in file else {}
-    for name in given:
-        if name not in joints:
-            raise unknown(file.file, "joint_friction", name, joints, "a link with a joint")
-    return tuple(
-        replace(body, joint=replace(body.joint, friction=given[body.name])) if body.name in given else body
-        for body in bodies
-    )
+def _with_joint_figures(file: Section, bodies: tuple[Body, ...]) -> tuple[Body, ...]:
+    """Return bodies whose joints have the friction and springs that the YAML gives them; it says nothing of rotors."""
+    joints = tuple(body.name for body in bodies if body.kind == "link" and body.joint.nv == 1)
+    for key, figure in _JOINT_FIGURES.items():
+        given = dict(_for_each(file, key, joints)) if key in file else {}
+        for name in given:
+            if name not in joints:
+                raise unknown(file.file, key, name, joints, "a link with a joint about or along one axis")
+        bodies = tuple(
+            replace(body, joint=replace(body.joint, **{figure: given[body.name]})) if body.name in given else body
+            for body in bodies
+        )
+    return bodies
 
 
 def _independent(file: Section, below: Robot, ties: tuple[Constraint, ...]) -> tuple[str, ...]:
