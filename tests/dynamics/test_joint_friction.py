@@ -100,6 +100,25 @@ def test_sliding_joints_accelerate_as_mujoco_s():
         np.testing.assert_allclose((after - v) / 1e-7, data.qacc, rtol=1e-4)
 
 
+def test_no_joint_of_many_takes_more_than_it_has():
+    """Six joints that stick, slip, let go and reverse under random torques; what friction took, by inverse dynamics."""
+    axes = [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.6, 0.8, 0.0)] * 2
+    names = [f"link{i}" for i in range(6)]
+    bodies = [link(name, names[i - 1] if i else None, (0.2, 0.0, 0.0), axes[i]) for i, name in enumerate(names)]
+    most = dict.fromkeys(names, 0.5)
+    robot = rubbing(Robot("chain", tuple(bodies), independent=tuple(names), gravity=(0, 0, 0)), most)
+    model, step, rng = Model(robot), stepper(robot), np.random.default_rng(0)
+    q, v, dt, stuck, slid = np.zeros(6), np.zeros(6), 0.002, 0, 0
+    for _ in range(400):
+        tau = rng.normal(0, 0.6, 6)
+        moved, after = step(q, v, tau, dt)
+        taken = tau - model.inverse_dynamics(q, v, (after - v) / dt)
+        assert np.abs(taken).max() <= 0.5 * 1.02
+        stuck, slid = stuck + (moved == q).sum(), slid + (np.abs(taken) > 0.5 * 0.98).sum()
+        q, v = moved, after
+    assert min(stuck, slid) > 200
+
+
 def test_a_falling_arm_moves_and_rests_as_mujoco_s():
     """A fall that friction ends. MuJoCo's friction creeps where it should stick; made as hard as it goes, little."""
     mujoco = pytest.importorskip("mujoco")

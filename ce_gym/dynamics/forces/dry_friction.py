@@ -20,6 +20,11 @@ from ce_gym.model.mechanism import Mechanism
 
 STICK_SPEED = 1e-4
 """Speed at which dry friction that sticks carries its full torque [rad/s or m/s]."""
+STICK_ITERATIONS = 8
+"""How many iterations of a step joints may ask for after the first until which of them stick is settled.
+
+If it is not by then, as in one step of a thousand of long chains, each has the torque that was expected, up to its own.
+"""
 TINY = 1e-18
 """Of the square of how far a joint moves for a unit of the independent ones; one that does not move rubs nothing."""
 
@@ -87,18 +92,19 @@ class JointFriction:
 
     def linearise(self, iterate: SX) -> SaturatedForce:
         """Linearise about an iterate, shape (size,)."""
-        n = self.yd.numel()
-        force = SaturatedForce(SX(n, 1), SX(n, n), iterate.numel())
+        n, last = self.yd.numel(), iterate[-1] > STICK_ITERATIONS - 0.5
+        force = SaturatedForce(SX(n, 1), SX(n, n), iterate.numel(), count=iterate[-1] + 1)
         for cluster in rubbing_clusters(self.mechanism):
             for name, (friction, own) in self._torques(cluster).items():
                 way, place = SX(1, n), len(force.limited)
                 way[cluster.rows] = own
                 one = dry_friction(friction, way @ self.yd, way, self.dt, iterate, place)
                 force.limited[place] = one
-                force.tau += way.T @ one.given
-                force.slope += way.T @ ca.if_else(one.free, self.dt * friction / STICK_SPEED, 0) @ way
+                sticks = ca.logic_and(one.free, ca.logic_not(last))
+                force.tau += way.T @ ca.if_else(last, ca.fmax(-friction, ca.fmin(friction, one.expected)), one.given)
+                force.slope += way.T @ ca.if_else(sticks, self.dt * friction / STICK_SPEED, 0) @ way
                 if name in self.mechanism.robot.independent:
-                    force.held[self.mechanism.robot.independent.index(name)] = one.free
+                    force.held[self.mechanism.robot.independent.index(name)] = sticks
         return force
 
     def _torques(self, cluster: Rubbing) -> dict[str, tuple[SX, SX]]:

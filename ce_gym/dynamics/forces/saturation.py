@@ -86,14 +86,16 @@ class SaturatedForce(JointForce):
     """A force on joints that is made of torques kept within limits: a `LinearForce`.
 
     Attributes:
-        size: Of its iterate: the expected torques, and 1 once there is an iterate.
+        size: Of its iterate: the expected torques, and last `count`.
         limited: The torques that are kept within limits, at their places in the iterate.
         held: Rows of `y` that dry friction holds, each with 1 if it does, else 0.
+        count: Above 0, which says that there is an iterate.
     """
 
     size: int
     limited: dict[int, Saturation] = field(default_factory=dict)
     held: dict[int, SX] = field(default_factory=dict)
+    count: SX | int = 1
 
     def check(self, motion: Motion) -> SX:
         """Return 1 if a torque is not where it was taken to be among its limits; else 0."""
@@ -112,5 +114,5 @@ class SaturatedForce(JointForce):
             if one.answers:
                 iterate[place] = one.after(motion.ydd).expected
         if self.size:
-            iterate[-1] = 1
+            iterate[-1] = self.count
         return iterate

@@ -10,7 +10,8 @@ sparse as the tree of joints, and is factorised once, tips first, which fills no
 with respect to where contacts are and how they move are shared by all directions. The damping of joints on turning
 bodies contains inertias that clusters have on the way of the recursion; these change as found in reverse mode.
 
-An iteration passes on to the next what velocities gained in it: that is another direction of the next one.
+An iteration passes on to the next what velocities gained in it: that is another direction of the next one. (Torques of
+dry friction that the iterations do not settle, see dry_friction.py, count as constant.)
 
 Source: Carpentier, Mansard, "Analytical Derivatives of Rigid Body Dynamics Algorithms", RSS 2018, for inverse dynamics;
 Featherstone 2008, section 6.5, for the factorisation.

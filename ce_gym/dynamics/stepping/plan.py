@@ -70,7 +70,7 @@ class Stage:
     name: str
     start: str | Rates = ""
     length: float = 1.0
-    iterations: int = 4
+    iterations: int = 8
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.actuation import limit_count
 from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground
-from ce_gym.dynamics.forces.dry_friction import JointFriction, friction_count
+from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.law import JointForce, Motion
 from ce_gym.dynamics.forces.motor_control import Motors
@@ -190,9 +190,11 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
     for force in saturated:
         unconverged = ca.logic_or(force.check(motion), unconverged)
     of_contacts = stacked([c.next_iterate(motion) for c in solved.contacts])
-    # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of torques are fixed
+    # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of motors are fixed
     # points by themselves.
     of_contacts = ca.if_else(unconverged, of_contacts, iterate[: of_contacts.numel()])
+    of_friction = stacked([force.next_iterate(motion) for force in solved.friction])
+    of_friction = ca.if_else(unconverged, of_friction, iterate[iterate.numel() - of_friction.numel() :])
     return Stepped(
         state=after,
         before=state,
@@ -200,7 +202,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         torque=motors.tau - motors.slope @ motion.ydd,
         contact_forces=ca.horzcat(SX(3, 0), *[R @ c.force_after(gain) for R, c, gain in contacts]),
         unconverged=unconverged,
-        iterate=ca.vertcat(of_contacts, *[force.next_iterate(motion) for force in saturated]),
+        iterate=ca.vertcat(of_contacts, motors.next_iterate(motion), of_friction),
         error=SX(0),
     )
 
@@ -208,8 +210,8 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
 def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many iterations of a step may follow the first."""
     contacts = FRICTION[options.friction].iterations if options.contacts else 0
-    limited = limit_count(mechanism, options) + friction_count(mechanism)
-    return max(contacts, ITERATIONS if limited else 0)
+    limited = ITERATIONS if limit_count(mechanism, options) else 0
+    return max(contacts, limited, STICK_ITERATIONS if friction_count(mechanism) else 0)
 
 
 def first_iterate(scene: Scene) -> SX:
