@@ -94,8 +94,11 @@ class ControlStepGradient:
     def _forwards(self) -> list[Step]:
         act = self.task.function("act")
         steps: list[Step] = [Call(act, ("action_in",), ("clipped", "target"))]
-        ones = ca.Function("ones", [], [SX.ones(1)])
-        steps += [Call(ones, (), (f"active@{k}.0",)) for k in range(self.substeps)]
+        # iterations that are skipped leave alone whether the next one is needed: what another tile left must not say so
+        flags = ca.Function("flags", [], [SX.ones(1)] + [SX(ca.DM.zeros(1))] * self.iterations)
+        steps += [
+            Call(flags, (), tuple(f"active@{k}.{i}" for i in range(self.iterations + 1))) for k in range(self.substeps)
+        ]
         for k in range(self.substeps):
             if "iterate" in self.primal.name_in():
                 zeros = ca.Function("zeros", [], [SX(ca.DM.zeros(self.primal.numel_in("iterate")))])
