@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import complex_step
 import numpy as np
 import pytest
 from linkages import rod_leg, spatial_four_bar
+from tripod import TRIPOD
 
 from ce_gym.dynamics import Model
 from ce_gym.model import Robot
 from ce_gym.model.mechanism import LEVELS
 
-SMALL = ["planar_leg_linkage", "mit_humanoid_leg", rod_leg(), spatial_four_bar()]
-CASES = [(robot, level) for robot in SMALL for level in LEVELS] + [("mini_cheetah", "exact"), ("tello", "exact")]
+EXACT = [TRIPOD, "tello", "planar_leg_linkage", rod_leg(), spatial_four_bar()]
+CASES = [("mit_humanoid_leg", level) for level in LEVELS] + [(robot, "exact") for robot in EXACT]
 
 
 def near_standing(model: Model, count: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -36,7 +39,7 @@ def by_complex_steps(model: Model, name: str, *state: np.ndarray) -> list[np.nda
     return [complex_step.jacobian(function, arguments, i, along)[0] for i, along in enumerate(directions)]
 
 
-@pytest.mark.parametrize(("robot", "level"), CASES, ids=lambda x: x if isinstance(x, str) else x.name)
+@pytest.mark.parametrize(("robot", "level"), CASES, ids=lambda x: Path(x).stem if isinstance(x, str) else x.name)
 def test_against_complex_steps(robot: str | Robot, level: str):
     model = Model(robot, level)
     state = near_standing(model)
@@ -50,7 +53,7 @@ def test_against_complex_steps(robot: str | Robot, level: str):
                 assert_close(ours[i], theirs)
 
 
-@pytest.mark.parametrize("robot", ["mini_cheetah", spatial_four_bar()], ids=["mini_cheetah", "spatial_four_bar"])
+@pytest.mark.parametrize("robot", [TRIPOD, spatial_four_bar()], ids=["tripod", "spatial_four_bar"])
 def test_identities(robot: str | Robot):
     model = Model(robot)
     q, v, tau = near_standing(model)
@@ -80,7 +83,7 @@ def test_products_are_the_jacobian_s():
 
 
 def test_energy_s_gradient_is_gravity_and_momentum():
-    model = Model("tello")
+    model = Model("mit_humanoid_leg")
     q, v, _ = near_standing(model)
     jacobian = model.derivatives("energy", ("q", "v")).jacobian(q, v)
     gravity = model.bias_force(q, np.zeros_like(v))
@@ -90,7 +93,7 @@ def test_energy_s_gradient_is_gravity_and_momentum():
 
 @pytest.mark.parametrize(
     ("name", "figure", "size"),
-    [("mini_cheetah", "rotor_inertia", 1), ("mini_cheetah", "ratio", 1), ("planar_leg_linkage", "gravity", 3)],
+    [(TRIPOD, "rotor_inertia", 1), (TRIPOD, "ratio", 1), ("planar_leg_linkage", "gravity", 3)],
 )
 def test_figures_against_changed_robots(name: str, figure: str, size: int):
     """Gravity enters linearly, rotors through J r^2: what a robot with another figure does, by Richardson's rule."""

@@ -18,6 +18,7 @@ from settings import SettingsError, config_file, load_settings
 from shac import SHAC, Settings, train
 from test_fast_ppo import parameters
 from test_networks import close, make_network, run
+from tripod import TRIPOD
 
 from ce_gym.policies import PolicyError, load_policy
 
@@ -29,7 +30,7 @@ F = np.float32
 
 def job(out, steps=4 * 64, settings=(), **changes):
     chosen = load_settings(config_file(ROBOT, Settings.folder), [*SMALL, *PLAIN, f"steps={steps}", *settings], Settings)
-    return Job(ROBOT, chosen, out, **({"env_kwargs": {"dtype": "float64"}} | changes))
+    return Job(ROBOT, chosen, out, **({"env_kwargs": {"dtype": "float64", "robot": TRIPOD}} | changes))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -69,7 +70,7 @@ class Window:
 
 
 def test_the_gradient_of_a_window_is_that_of_differences(tmp_path, monkeypatch):
-    envs = gymnasium.make_vec(ROBOT, num_envs=16, autoreset_mode="SameStep", only_positive=True)
+    envs = gymnasium.make_vec(ROBOT, robot=TRIPOD, num_envs=16, autoreset_mode="SameStep", only_positive=True)
     learner = SHAC(envs, job(tmp_path))
     for _ in range(3):
         learner.iterate()
@@ -106,18 +107,18 @@ def test_interrupted_and_resumed_is_as_if_it_never_stopped(tmp_path, monkeypatch
     assert words[:2] == ["python", "train/shac.py"]
     (again,) = jobs(parser().parse_args(words[2:]), "-shac", Settings)
     assert json.loads(json.dumps(asdict(again.settings))) == record["settings"]
-    with pytest.raises(PolicyError, match=r"has layers \[48, 16, 12, 12\], Tanh; expected \[48, 8, 12, 12\]"):
+    with pytest.raises(PolicyError, match=r"has layers \[18, 16, 2, 2\], Tanh; expected \[18, 8, 2, 2\]"):
         train(job(tmp_path / "other", settings=["hidden=[8]"], resume=part.policy))
 
 
 def test_the_policy_squashes_its_actions(tmp_path):
     trained = train(job(tmp_path, 64))
-    seen = 100 * np.random.default_rng(0).standard_normal((50, 48)).astype(F)
+    seen = 100 * np.random.default_rng(0).standard_normal((50, 18)).astype(F)
     actions = load_policy(trained.policy).predict(seen)[0]
     assert np.abs(actions).max() <= 1.0
     assert not np.isin(np.abs(actions), 1.0).all()
     *_, (identity, bias) = trained.model.act.layers
-    np.testing.assert_array_equal(identity, np.eye(12))
+    np.testing.assert_array_equal(identity, np.eye(2))
     assert not bias.any()
 
 
