@@ -7,7 +7,7 @@ them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,11 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import aligned_zeros
+from ce_gym.dynamics.algebra.batched import evaluate
 from ce_gym.dynamics.stepping.derivatives import primal_function, state_parts
 from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.parts import mending_function
+from ce_gym.dynamics.stepping.plan import MOVED
 from ce_gym.sim.derivative_kernels import load_gradient_kernel, load_linearization_kernel
+from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.simulator import Simulator
-from ce_gym.sim.substeps import TIMES
+from ce_gym.sim.substeps import DT, TIMES
+from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
 
 @dataclass
@@ -48,8 +53,9 @@ class StepDerivatives:
     then the joints. What was decided in a step (touching, sticking, slipping, a limit that acts) is differentiated as
     decided, through all iterations of the step.
 
-    On terrain the ground under a contact is the plane that the step found there. A robot that made a sub-step in parts
-    (see `Simulator`) passes nothing on to what was before, like one that diverged.
+    On terrain the ground under a contact is the plane that the step found there. Of a sub-step that a robot made in
+    parts (see `Simulator`), `backward` goes through the parts; their lengths are decided. `gradient` and `linearize`
+    are of a whole one.
 
     Args:
         simulator: Whose steps; on the CPU.
@@ -87,7 +93,6 @@ class StepDerivatives:
         ends = np.cumsum([0, *self.state_sizes.values(), *others.values()])
         names = [*self.state_sizes, *others]
         self._columns = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(names)}
-        self._kernel = load_gradient_kernel(simulator.model, simulator.options, simulator.dtype)
 
     @property
     def n_recorded(self) -> int:
@@ -152,7 +157,8 @@ class StepDerivatives:
             for (arrays, target), parts in zip(reversed(self._states(record)), reversed(record.in_parts), strict=True):
                 found = self._gradient(arrays, target, now)
                 if parts is not None:
-                    found = {name: np.where(parts[:, None], 0.0, value) for name, value in found.items()}
+                    for name, rows in self._through_parts(arrays, target, now, parts).items():
+                        found[name][parts] = rows
                 now = {name: found[name] for name in self.state_sizes}
                 targets.append(found.get("target", none))
                 parameters = parameters + found["parameters"] if parameters.size else found.get("parameters", none)
@@ -206,6 +212,26 @@ class StepDerivatives:
                 B[:, row] = found["target"]
         return A, B
 
+    def _through_parts(
+        self, arrays: Mapping[str, NDArray], target: NDArray, weights: Mapping[str, NDArray], chosen: NDArray
+    ) -> dict[str, NDArray]:
+        """Return the gradient of a sub-step of those robots that made it in parts."""
+        rows = {name: read_rows(array, self.simulator.num_envs)[chosen] for name, array in arrays.items()}
+        target, now = target[chosen], {name: value[chosen] for name, value in weights.items()}
+        others = {name: np.zeros((len(target), self._size(name))) for name in self._columns if name not in now}
+        for part in reversed(_parts_of(self.simulator, rows, target)):
+            found, taken = self._gradient(part.arrays, target, now), part.taken[:, None]
+            now = {name: np.where(taken, found[name], value) for name, value in now.items()}
+            others = {name: value + np.where(taken, found[name], 0.0) for name, value in others.items()}
+        return now | others
+
+    def _size(self, name: str) -> int:
+        return self._columns[name].stop - self._columns[name].start
+
+    @cached_property
+    def _kernel(self) -> Any:
+        return load_gradient_kernel(self.simulator.model, self.simulator.options, self.simulator.dtype)
+
     @cached_property
     def _forward_kernel(self) -> Any:
         return load_linearization_kernel(self.simulator.model, self.simulator.options, self.simulator.dtype)
@@ -234,11 +260,11 @@ class StepDerivatives:
     def _gradient(
         self, arrays: Mapping[str, NDArray], target: NDArray, weights: Mapping[str, NDArray]
     ) -> dict[str, NDArray]:
-        simulator = self.simulator
-        sums = np.zeros((simulator.num_envs, max(end.stop for end in self._columns.values())))
+        simulator, n = self.simulator, len(target)
+        sums = np.zeros((n, max(end.stop for end in self._columns.values())))
         given = {f"w_{name}": np.ascontiguousarray(value) for name, value in weights.items()}
         every = {**arrays, **given, **simulator._batch.tables, "target": target, "sums": sums}
-        self._kernel(every, simulator.num_envs, num_threads=simulator.num_threads)
+        self._kernel(every, n, num_threads=simulator.num_threads)
         return {name: sums[:, columns] for name, columns in self._columns.items()}
 
     def _is_as_left(self, record: Record) -> bool:
@@ -275,3 +301,56 @@ def _aligned_copy(array: NDArray) -> NDArray:
     copy = aligned_zeros(array.shape, array.dtype.name)
     copy[...] = array
     return copy
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part of a sub-step, tried by some robots.
+
+    Attributes:
+        arrays: State before it, in tiles, with its length as `DT`.
+        taken: Which robots went on from its end, shape (n,).
+    """
+
+    arrays: dict[str, NDArray]
+    taken: NDArray[np.bool_]
+
+
+def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray) -> list[_Part]:
+    """Make a sub-step of some robots again, as its kernel does (`ce_gym.dynamics.stepping.parts`).
+
+    Args:
+        simulator: Whose robots.
+        rows: State before the sub-step by name, a robot in each row.
+        target: Shape (n, n_targets).
+    """
+    model, options, dtype = simulator.model, simulator.options, simulator.dtype
+    kernel = load_step_kernel(model, replace(options, retry=0), (), dtype)
+    mend, n = mending_function(model.mechanism, options, {}, {}), len(target)
+    dt, known = rows[DT], {**rows, "retries": np.zeros((n, 1))}
+    state = {name: known[name] for name in kernel.buffers if name in known}
+    progress = {"part": np.ones((n, 1)), "left": np.ones((n, 1))}
+    parts: list[_Part] = []
+    while (progress["part"] > 0).any():
+        length = progress["part"] * dt
+        before = _in_tiles(state | {DT: length}, dtype)
+        after = _in_tiles(state | {DT: length}, dtype)
+        kernel(after | simulator._batch.tables | {"target": target}, n, {TIMES: 1})
+        tried = {f"tried_{name}": read_rows(array, n) for name, array in after.items()}
+        joints = tried["tried_v"][:, model.robot.layout.base_nv :]
+        tried[f"tried_{MOVED}"] = length * np.abs(joints).max(axis=1, initial=0.0, keepdims=True)
+        given = state | tried | progress | {DT: dt}
+        found = [one[..., 0] for one in evaluate(mend, [given[name] for name in mend.name_in()])]
+        left = dict(zip(mend.name_out(), found, strict=True))
+        parts.append(_Part(before, (left["left_next"] < progress["left"])[:, 0]))
+        state |= {name: left[f"tried_{name}_next"] for name in state if f"tried_{name}_next" in left}
+        progress = {name: left[f"{name}_next"] for name in progress}
+    return parts
+
+
+def _in_tiles(rows: Mapping[str, NDArray], dtype: str) -> dict[str, NDArray]:
+    """Return rows of robots as tiles."""
+    arrays = {name: tiles(len(value), value.shape[1], dtype) for name, value in rows.items()}
+    for name, value in rows.items():
+        write_rows(arrays[name], value)
+    return arrays

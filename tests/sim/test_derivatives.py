@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tripod import TRIPOD
 
 from ce_gym import Model, Simulator, StepDerivatives, Terrain
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot, load_robot
 from ce_gym.sim.tiles import read_rows, write_rows
 
-STEP = 1e-6
+STEP = 2e-7
 
 
 def moved(q: np.ndarray, tangent: np.ndarray) -> np.ndarray:
@@ -70,24 +71,24 @@ class Differences:
             self.sim._arrays[name][...] = array
 
 
-def quadruped(n: int = 24, **options) -> tuple[Simulator, np.ndarray]:
+def dropped(n: int = 24) -> tuple[Simulator, np.ndarray]:
     """Robots that stand, slide, and fly, some time after a drop, and targets that not all motors can follow."""
-    model = Model("mini_cheetah")
-    sim = Simulator(model, n, contacts="foot", outputs=(), **options)
+    model = Model(TRIPOD)
+    sim = Simulator(model, n, contacts="foot", outputs=())
     rng = np.random.default_rng(5)
     q = np.tile(model.standing_q, (n, 1)) + rng.normal(0, 0.05, (n, model.nq)) * (np.arange(model.nq) > 6)
-    q[:, 2] += np.linspace(-0.01, 0.2, n)
+    q[:, 2] += np.linspace(-0.01, 0.05, n)
     v = rng.normal(0, 0.5, (n, model.nv))
     sim.set_state(q, v)
-    target = model.standing_q[7:] + rng.normal(0, 0.3, (n, 12))
+    target = model.standing_q[7:] + rng.normal(0, 0.3, (n, 2))
     sim.step(target, 4)
     return sim, target
 
 
-def standing(n: int = 9, **options) -> tuple[Simulator, np.ndarray]:
-    """Robots that all stand and sway, a little different from each other."""
+def standing(n: int = 9) -> tuple[Simulator, np.ndarray]:
+    """Robots of many joints that all stand and sway, a little different from each other."""
     model, rng = Model("mini_cheetah"), np.random.default_rng(7)
-    sim = Simulator(model, n, contacts="foot", outputs=("contact_forces",), **options)
+    sim = Simulator(model, n, contacts="foot")
     target = model.standing_q[7:] + rng.normal(0, 0.05, (n, 12))
     sim.step(target, 100)
     sim.set_state(sim.q, sim.v + rng.normal(0, 0.02, (n, model.nv)))  # as if it had just been pushed
@@ -106,17 +107,20 @@ def test_linearize_a_fixed_leg():
     sim, rng = Simulator(model, 5), np.random.default_rng(0)
     sim.set_state(model.standing_q + rng.normal(0, 0.1, (5, 2)), rng.normal(0, 1, (5, 2)))
     A, B = StepDerivatives(sim).linearize(model.standing_q)
-    differences = Differences(sim, model.standing_q)
-    theirs = [differences.column(part, i) for part in ("q", "v", "target") for i in range(2)]
-    assert errors(np.concatenate([A, B], axis=2), np.stack(theirs, axis=2)).max() < 1e-8
+    assert errors(np.concatenate([A, B], axis=2), columns(sim, model.standing_q)).max() < 1e-8
 
 
-def test_linearize_a_quadruped_through_contact_and_all_iterations():
-    sim, target = quadruped()
+def columns(sim: Simulator, target: np.ndarray) -> np.ndarray:
+    """[A, B] by differences."""
+    differences, nv = Differences(sim, target), sim.model.nv
+    sizes = {"q": nv, "v": nv, "target": target.shape[-1]}
+    return np.stack([differences.column(part, i) for part, n in sizes.items() for i in range(n)], axis=2)
+
+
+def test_linearize_through_contact_and_all_iterations():
+    sim, target = dropped()
     A, B = StepDerivatives(sim).linearize(target)
-    differences = Differences(sim, target)
-    theirs = [differences.column(part, i) for part, n in (("q", 18), ("v", 18), ("target", 12)) for i in range(n)]
-    assert errors(np.concatenate([A, B], axis=2), np.stack(theirs, axis=2)).max() < 1e-6
+    assert errors(np.concatenate([A, B], axis=2), columns(sim, target)).max() < 1e-6
 
 
 def test_linearize_robots_that_stand():
@@ -125,9 +129,7 @@ def test_linearize_robots_that_stand():
     assert (sim.contact_forces[:, :, 2].sum(1) > 0.5 * weight).all()
     assert (sim.contact_forces[:, :, 2] > 0.02 * weight).sum(1).min() >= 3
     A, B = StepDerivatives(sim).linearize(target)
-    differences = Differences(sim, target)
-    theirs = [differences.column(part, i) for part, n in (("q", 18), ("v", 18), ("target", 12)) for i in range(n)]
-    assert errors(np.concatenate([A, B], axis=2), np.stack(theirs, axis=2)).max() < 1e-6
+    assert errors(np.concatenate([A, B], axis=2), columns(sim, target)).max() < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -149,29 +151,36 @@ def test_linearize_gives_the_rows_of_the_reverse_mode(robot: str, options: dict)
 
 
 def test_backward_through_steps_in_contact():
-    sim, target = quadruped()
-    derivatives, rng = StepDerivatives(sim), np.random.default_rng(1)
-    weights = {name: rng.normal(size=(sim.num_envs, 18)) for name in ("q", "v")}
-    differences = Differences(sim, target, n_substeps=5)
-    both = np.hstack([weights["q"], weights["v"]])
-    theirs = {
-        (part, i): (differences.column(part, i) * both).sum(1)
-        for part, n in (("q", 18), ("v", 18), ("load", 4), ("target", 12))
-        for i in range(n)
-    }
-    differences.restore()
+    sim, target = dropped()
+    derivatives, rng, nv = StepDerivatives(sim), np.random.default_rng(1), sim.model.nv
+    weights = {name: rng.normal(size=(sim.num_envs, nv)) for name in ("q", "v")}
+    sizes = {"q": nv, "v": nv, "load": 3, "target": 2}
+    theirs, center = weighted_differences(sim, target, weights, sizes, 5)
     derivatives.step(target, 5)
     assert derivatives.n_recorded == 5
-    np.testing.assert_array_equal(sim.q, differences.center[0])
+    np.testing.assert_array_equal(sim.q, center[0])
+    start = derivatives._records[0].arrays["load"]
     state, targets, _ = derivatives.backward(weights)
     ours = state | {"target": sum(targets)}
-    for part, n in (("q", 18), ("v", 18), ("target", 12)):
-        expected = np.stack([theirs[part, i] for i in range(n)], axis=1)
-        assert errors(ours[part], expected).max() < 1e-5, part
-    carried = read_rows(differences.start["load"], sim.num_envs) > 1.0  # a load of zero is where its effect has a kink
+    for part in ("q", "v", "target"):
+        assert errors(ours[part], theirs[part]).max() < 1e-5, part
+    carried = read_rows(start, sim.num_envs) > 1.0  # a load of zero is where its effect has a kink
     assert carried.sum() > 4
-    expected = np.stack([theirs["load", i] for i in range(4)], axis=1)
+    expected = theirs["load"]
     assert np.abs(ours["load"] - expected)[carried].max() < 1e-5 * np.abs(expected[carried]).max()
+
+
+def weighted_differences(
+    sim: Simulator, target: np.ndarray, weights: dict[str, np.ndarray], sizes: dict[str, int], n_substeps: int = 1
+) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """The gradient of a weighted sum of the state after some sub-steps by differences, and that state."""
+    differences, both = Differences(sim, target, n_substeps), np.hstack([weights["q"], weights["v"]])
+    found = {
+        part: np.stack([(differences.column(part, i) * both).sum(1) for i in range(n)], axis=1)
+        for part, n in sizes.items()
+    }
+    differences.restore()
+    return found, differences.center
 
 
 def test_dry_friction_of_joints_that_stick_and_slip():
@@ -234,23 +243,25 @@ def test_gradient_to_parameters():
         assert abs(ours[0, i] - expected) < 1e-6 * abs(expected)
 
 
-def test_steps_in_parts_pass_nothing_on():
-    """A robot that is too fast for its step makes it in parts, which are not differentiated; its neighbour is."""
-    model = Model("planar_leg_linkage")
-    sim = Simulator(model, 2, 0.01)
-    derivatives = StepDerivatives(sim)
-    v = np.zeros((2, model.nv))
-    v[1] = 120.0
+def test_gradients_go_through_parts_of_a_step():
+    """Robots too fast for their step make it in parts of different lengths; their neighbour makes a whole one."""
+    model, rng = Model("planar_leg_linkage"), np.random.default_rng(4)
+    sim, target = Simulator(model, 4, 0.01, parameters=("kp",)), np.tile(model.standing_q, (4, 1))
+    v = np.zeros((4, model.nv))
+    v[1:] = [[120.0, 120.0], [60.0, 60.0], [-80.0, 80.0]]
     sim.set_state(model.standing_q, v)
-    derivatives.step(model.standing_q)
-    assert sim.n_retried == 1
+    weights = {name: rng.normal(size=(4, model.nv)) for name in ("q", "v")}
+    theirs, _ = weighted_differences(sim, target, weights, dict.fromkeys(("q", "v", "target", "parameters"), 2), 2)
+    derivatives = StepDerivatives(sim)
+    derivatives.step(target, 2)
+    assert sim.n_retried >= 3
     assert not sim.diverged.any()
-    found, (target,), _ = derivatives.backward({"v": np.ones((2, model.nv))})
-    assert found["v"][0].any()
-    assert target[0].any()
-    for name in ("q", "v"):
-        assert not found[name][1].any()
-    assert not target[1].any()
+    parts = derivatives._records[0].in_parts[0]
+    assert parts is not None
+    assert parts.tolist() == [False, True, True, True]
+    found, targets, gains = derivatives.backward(weights)
+    for name, ours in (found | {"target": sum(targets), "parameters": gains}).items():
+        np.testing.assert_allclose(ours, theirs[name], rtol=0, atol=1e-6 * np.abs(theirs[name]).max())
 
 
 def sliding_block(**options) -> Simulator:
