@@ -122,14 +122,18 @@ def report_transmissions(model: Model, states: int = 200, seed: int = 0) -> Tran
         states: Number of random states to compare the levels in; zero leaves that out.
         seed: Seed of the random states.
     """
-    models = {level: Model(model.robot, level) for level in LEVELS}
+    return report_levels({level: Model(model.robot, level) for level in LEVELS}, states, seed)
+
+
+def report_levels(models: Mapping[str, Model], states: int = 200, seed: int = 0) -> TransmissionReport:
+    """Work out the transmission report of a robot from its models at all levels; see `report_transmissions`."""
     clusters = cluster_figures(models["exact"], models["coupled"])
     turned = {joint for cluster in clusters for joint in cluster.joints}
     q, v, tau = random_states(models["exact"], states if clusters else 0, np.random.default_rng(seed))
     return TransmissionReport(
-        robot=model.robot.name,
+        robot=models["exact"].robot.name,
         clusters=clusters,
-        without_rotors=tuple(joint for joint in model.joint_links if joint not in turned),
+        without_rotors=tuple(joint for joint in models["exact"].joint_links if joint not in turned),
         errors=level_errors(models, q, v, tau) if len(q) else (),
         states=len(q),
     )

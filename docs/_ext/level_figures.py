@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from drawing import line_chart
 from environment_page import percent, table, title
-from robot_page import report_of, shipped
+from robot_page import models_of, report_of, shipped
 
 from ce_gym import Model, robots
 from ce_gym.bench.paper.tracking import FREQUENCY, STEP, sinusoid
@@ -42,10 +42,10 @@ def acceleration_figures() -> str:
     """Return, for each robot with rotors, the median error of joint accelerations and the cost of each level."""
     rows = []
     for name in robots():
-        robot, report = shipped(name), report_of(name)
+        report = report_of(name)
         if report.errors:
             medians = [percent(error.joints.median) for error in report.errors]
-            counts = [Model(robot, level).n_instructions("forward_dynamics") for level in LEVELS]
+            counts = [model.n_instructions("forward_dynamics") for model in models_of(name).values()]
             cost = [f"{count / counts[2]:.3f}" for count in counts]
             rows.append((f"[{title(name)}](generated/robots/{name}.md)", *medians, *cost))
     columns = ("robot", *(f"error, `{level}`" for level in LEVELS[1:]), *(f"cost, `{level}`" for level in LEVELS))

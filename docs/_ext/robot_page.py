@@ -17,11 +17,12 @@ from environment_page import percent, table, title
 from numpy.typing import NDArray
 
 from ce_gym import InertiaWarning, Model, Robot, load_robot
-from ce_gym.diagnostics.transmission import TransmissionReport, report_transmissions
+from ce_gym.diagnostics.transmission import TransmissionReport, report_levels
 from ce_gym.diagnostics.transmission_text import DROPPED
 from ce_gym.envs.registration import ROBOTS
 from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.formats.reading import read_yaml
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.viewer import ViewerError
 
 ROUNDING = 1e-12
@@ -37,15 +38,21 @@ def shipped(name: str) -> Robot:
 
 
 @cache
+def models_of(name: str) -> dict[str, Model]:
+    """Return a robot's model at each level, which trace what several pages count and evaluate once."""
+    return {level: Model(shipped(name), level) for level in LEVELS}
+
+
+@cache
 def report_of(name: str) -> TransmissionReport:
     """Return the transmission report of a robot that ships with the package, as `python -m ce_gym inspect` has it."""
-    return report_transmissions(Model(shipped(name)))
+    return report_levels(models_of(name))
 
 
 def robot_page(name: str, folder: Path) -> str:
     """Return the page of one robot as Markdown, and write its picture into the folder."""
     robot, report = shipped(name), report_of(name)
-    model = Model(robot)
+    model = models_of(name)["exact"]
     parts = [
         f"# {title(name)}",
         picture(model, folder / f"{name}.png", folder),

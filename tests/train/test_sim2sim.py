@@ -12,6 +12,7 @@ from job import Job
 from ppo import train
 from settings import config_file, load_settings
 from sim2sim import MujocoWorld, OurWorld, course, main, play, table, verdicts
+from tripod import TRIPOD
 
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
@@ -66,11 +67,11 @@ def test_both_fly_alike(level):
 
 
 def test_a_history_is_kept_newest_first():
-    made, _, obs = world("armature", history=3)
+    made, _, obs = world("armature", robot=TRIPOD, history=3)
     size = obs.shape[1] // 3
-    first = made.step(np.zeros((3, 12), np.float32), np.zeros((3, 3)))[0]
+    first = made.step(np.zeros((3, 2), np.float32), np.zeros((3, 3)))[0]
     np.testing.assert_array_equal(first[:, size:], obs[:, : 2 * size])
-    second = made.step(np.zeros((3, 12), np.float32), np.zeros((3, 3)))[0]
+    second = made.step(np.zeros((3, 2), np.float32), np.zeros((3, 3)))[0]
     np.testing.assert_array_equal(second[:, size : 2 * size], first[:, :size])
     np.testing.assert_array_equal(second[:, 2 * size :], obs[:, :size])
 
@@ -179,7 +180,7 @@ def test_mistakes_are_one_line(tmp_path, capsys):
     with pytest.raises(ValueError, match="expected one of armature, exact"):
         MujocoTwin(ce_gym.load_robot("mini_cheetah"), "none", 1)
     with pytest.raises(ValueError, match="expected 'joint_pd'"):
-        world("armature", actions="joint_torque")
+        world("armature", robot=TRIPOD, actions="joint_torque")
 
 
 def test_without_mujoco_it_says_what_to_install(monkeypatch, capsys):
