@@ -59,7 +59,7 @@ class Ours:
         return path
 
     def _starts(self) -> dict[str, Array]:
-        """Rows of every state array at the start: robots differ a little, or they would all need the same iterations."""
+        """Rows of every state array at the start: robots differ a little, or all would need the same iterations."""
         model, scene = self.model, self.scene
         base = 7 if scene.robot.floating else 0
         q = np.tile(scene.q, (self.num_envs, 1))
