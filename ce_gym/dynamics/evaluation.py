@@ -195,7 +195,7 @@ class Derivatives:
     """Derivatives of one quantity; made by `Model.derivatives`.
 
     Positions are differentiated in their tangent space: a rotation of the base, a translation of it, both in base axes,
-    then the joints. Figures of the robot are differentiated at the values that it has.
+    rotations of ball joints, then the other joints. Figures of the robot are differentiated at the values that it has.
 
     Args:
         evaluator: Of the mechanism.

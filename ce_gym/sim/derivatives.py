@@ -50,8 +50,8 @@ class StepDerivatives:
     """Derivatives of the steps of a simulator, in reverse mode.
 
     Positions are differentiated in their tangent space: a rotation of the base, a translation of it, both in base axes,
-    then the joints. What was decided in a step (touching, sticking, slipping, a limit that acts) is differentiated as
-    decided, through all iterations of the step.
+    rotations of ball joints, then the other joints. What was decided in a step (touching, sticking, slipping, a limit
+    that acts) is differentiated as decided, through all iterations of the step.
 
     On terrain the ground under a contact is the plane that the step found there. Of a sub-step that a robot made in
     parts (see `Simulator`), `backward` goes through the parts; their lengths are decided. `gradient` and `linearize`

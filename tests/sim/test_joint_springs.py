@@ -53,6 +53,18 @@ def test_a_dependent_joint_has_its_spring():
     assert sim.q[0, 0] == pytest.approx(0.2 + 0.1 * np.cos(frequency * time), abs=1e-9)
 
 
+def test_a_dependent_joint_is_damped():
+    """Geared three to one, the friction of the fast wheel is felt nine times over."""
+    damping, time = 0.02, 0.5
+    gear = LinearConstraint("gear", (("fast", 1.0), ("slow", -3.0)))
+    robot = Robot("damped", (wheel("slow"), wheel("fast", damping=damping)), (gear,), independent=("slow",))
+    model = ce_gym.Model(robot)
+    sim = ce_gym.Simulator(model, dt=0.01, method="rk8", control="torque", contacts=(), outputs=())
+    sim.set_state([0.0], [2.0])
+    sim.step(np.zeros(1), round(time / 0.01))
+    assert sim.v[0, 0] == pytest.approx(2.0 * np.exp(-9 * damping / (10 * INERTIA) * time), rel=1e-9)
+
+
 def test_a_ball_joint_has_a_spring():
     robot = Robot("ball", (wheel("ball", type="ball", stiffness=STIFFNESS),))
     time, frequency, axis = 0.7, np.sqrt(STIFFNESS / INERTIA), np.array([0.6, 0.0, 0.8])

@@ -51,26 +51,34 @@ def ball_forces(robot: Robot, q: SX, v: SX, dt: float) -> JointForce:
     return JointForce(ca.vertcat(*taus), ca.diagcat(SX(0, 0), *slopes))
 
 
-def sprung_joints(mechanism: Mechanism) -> list[tuple[int, Joint, str]]:
-    """Return joints with one coordinate that have springs: index of the cluster, the joint, the body it moves."""
-    robot, clusters = mechanism.robot, mechanism.tree.clusters
-    every = [(k, robot.body(name).joint, name) for k, cluster in enumerate(clusters) for name in cluster.bodies]
-    return [one for one in every if one[1].nv == 1 and one[1].stiffness]
+def yielding_joints(mechanism: Mechanism) -> list[tuple[int, Joint, str]]:
+    """Return joints with one coordinate that have springs, and dependent ones that are damped.
+
+    Each with the index of its cluster and the name of the body it moves; damping of others is in `passive_forces`.
+    """
+    robot, found = mechanism.robot, []
+    for k, cluster in enumerate(mechanism.tree.clusters):
+        for name in cluster.bodies:
+            joint = robot.body(name).joint
+            if joint.nv == 1 and (joint.stiffness or (joint.damping and name not in robot.independent)):
+                found.append((k, joint, name))
+    return found
 
 
-def springs(mechanism: Mechanism, kinematics: Kinematics, dt: float) -> list[JointForce]:
-    """Return the springs of joints with one coordinate as forces on the independent ones, dependent joints included.
+def yielding_forces(mechanism: Mechanism, kinematics: Kinematics, dt: float) -> list[JointForce]:
+    """Return springs of joints with one coordinate, and viscous friction of dependent ones, on the independent joints.
 
-    With `W` its row of the constraint Jacobian a joint moves at `W yd`, and its spring is `W^T tau` to those.
+    With `W` its row of the constraint Jacobian a joint moves at `W yd`, and its torque is `W^T tau` to those.
     """
     found, layout = [], mechanism.robot.layout
-    for k, joint, name in sprung_joints(mechanism):
+    for k, joint, name in yielding_joints(mechanism):
         coordinates = kinematics.coordinates[k]
         assert coordinates is not None
         way, row = SX(1, layout.joints), coordinates.index[name]
         way[[row - layout.joints_v for row in kinematics.rows[k]]] = coordinates.G[row, :]
-        stretch = coordinates.q[row] + dt * coordinates.qd[row] - joint.springref
-        found.append(JointForce(-joint.stiffness * stretch * way.T, dt**2 * joint.stiffness * (way.T @ way)))
+        damping = (0.0 if name in mechanism.robot.independent else joint.damping) + dt * joint.stiffness
+        tau = -joint.stiffness * (coordinates.q[row] - joint.springref) - damping * coordinates.qd[row]
+        found.append(JointForce(tau * way.T, dt * damping * (way.T @ way)))
     return found
 
 

@@ -12,7 +12,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.motor_control import motor_springs
-from ce_gym.dynamics.forces.passive import limit_stiffness, sprung_joints
+from ce_gym.dynamics.forces.passive import limit_stiffness, yielding_joints
 from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.recursion.derived import kinetic_and_potential
 from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
@@ -45,10 +45,10 @@ def contact_energy(scene: Scene, state: State) -> SX:
 
 def spring_energy(scene: Scene, state: State) -> SX:
     """Return the energy of the springs of joints with one coordinate [J]."""
-    total, sprung = SX(0), sprung_joints(scene.mechanism)
-    if sprung:
+    total, yielding = SX(0), yielding_joints(scene.mechanism)
+    if yielding:
         kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
-        for k, joint, name in sprung:
+        for k, joint, name in yielding:
             coordinates = kinematics.coordinates[k]
             assert coordinates is not None
             total += joint.stiffness * (coordinates.position(name) - joint.springref) ** 2 / 2

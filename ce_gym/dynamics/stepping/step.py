@@ -26,7 +26,7 @@ from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.law import JointForce, Motion
 from ce_gym.dynamics.forces.motor_control import Motors
 from ce_gym.dynamics.forces.normal import normal_law
-from ce_gym.dynamics.forces.passive import ball_forces, passive_forces, springs
+from ce_gym.dynamics.forces.passive import ball_forces, passive_forces, yielding_forces
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
 from ce_gym.dynamics.recursion.ce_aba import (
@@ -126,7 +126,7 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     friction = [rubbing.linearise(of_friction)] if rubbing.size else []
 
     of_balls = ball_forces(mechanism.robot, state.q, state.v, dt)
-    more = [*friction, *springs(mechanism, kinematics, dt)]
+    more = [*friction, *yielding_forces(mechanism, kinematics, dt)]
     of_joints = sum(more, motors + passive_forces(mechanism.robot, y, yd, dt))
     joints = on_coordinates(mechanism, of_balls, of_joints)
     couples = {} if is_moment(dt) else steadying_couples(mechanism, kinematics, dt)
