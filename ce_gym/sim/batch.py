@@ -61,7 +61,7 @@ class Batch:
     def _array(self, row: Row) -> Array:
         if not row.dtype:
             return self.place.tiles(self.num_envs, row.size, self.dtype)
-        shape = (self.num_envs, row.size) if row.size > 1 else (self.num_envs,)
+        shape = (self.num_envs, row.size) if row.size else (self.num_envs,)
         return self.place.zeros(shape, row.dtype)
 
     def rows(self, name: str) -> Array:
@@ -73,7 +73,7 @@ class Batch:
 
         Args:
             name: Of the buffer.
-            values: Shape (num_envs, size) or what broadcasts to it; (num_envs,) for a plain buffer of size 1.
+            values: Shape (num_envs, size) or what broadcasts to it; (num_envs,) for a plain buffer of size 0.
             mask: Which robots, bool, shape (num_envs,); all of them if None.
         """
         self.place.write(self.arrays[name], values, mask)

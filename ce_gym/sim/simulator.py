@@ -31,7 +31,7 @@ from ce_gym.sim.placement import Placement
 from ce_gym.sim.schema import Row, physics_rows
 from ce_gym.sim.terrain import Terrain
 
-FAILURES = Row("failures", 1, "host", dtype="int64")
+FAILURES = Row("failures", 0, "host", dtype="int64")
 """How often a robot has diverged and been set anew, and how often it has been stepped again."""
 
 

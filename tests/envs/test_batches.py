@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+from tripod import TRIPOD
 
 import ce_gym  # noqa: F401 - registers the environments
 
@@ -34,6 +35,14 @@ def test_same_seed_same_rollout_whatever_the_batch(mode: str):
         envs = gymnasium.make_vec(VELOCITY, num_envs=n, num_threads=threads, autoreset_mode=mode)
         for ours, theirs in zip(rollout(envs, actions[:, :n], seed=10), whole, strict=True):
             np.testing.assert_array_equal(ours, theirs[:n])
+
+
+def test_an_observation_may_be_one_number():
+    arguments = {"robot": TRIPOD, "observations": ["base_height"]}
+    envs, single = gymnasium.make_vec(VELOCITY, num_envs=3, **arguments), gymnasium.make(VELOCITY, **arguments)
+    for observation, *_ in (envs.reset(seed=4), envs.step(envs.action_space.sample())):
+        assert observation.shape == (3, 1)
+    assert single.reset(seed=4)[0].shape == (1,)
 
 
 def test_single_environment_is_lane_zero():

@@ -31,10 +31,10 @@ from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
 HOST_ROWS = (
     Row("limit", 1, "host", np.inf),
-    Row("keys", 1, "host", dtype="int64"),
-    Row("counters", 1, "host", dtype="int64"),
-    Row("seeded", 1, "host", dtype="bool"),
-    Row("finished", 1, "host", dtype="bool"),
+    Row("keys", 0, "host", dtype="int64"),
+    Row("counters", 0, "host", dtype="int64"),
+    Row("seeded", 0, "host", dtype="bool"),
+    Row("finished", 0, "host", dtype="bool"),
 )
 """Control steps until time is up; the key of the random stream, its bits, and how often the stream was used; whether it
 has been seeded; whether an episode has ended and the next one has not begun."""
