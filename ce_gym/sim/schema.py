@@ -32,7 +32,7 @@ class Row:
             reward, observation, termination or metric with memory), "host" (Python only; no reset touches it) or
             "scene" (nobody: how it is stepped, and no part of a snapshot).
         reset: With what a robot begins, a number or shape (size,).
-        dtype: Of a plain array, shape (num_envs, size), or (num_envs,) for size 0; "" for one in the lanes of the kernels.
+        dtype: Of a plain array, shape (num_envs, size), or (num_envs,) for size 0; "" for one in lanes.
     """
 
     name: str
