@@ -101,6 +101,8 @@ def load(robot: Robot) -> Peer:
     Raises:
         RobotError: If the robot has something that Pinocchio's forward dynamics does not.
     """
+    if robot.balls:
+        raise RobotError(f"{robot.name}: ball joint of {robot.balls[0]!r}: expected none for this comparison")
     mechanism = build_mechanism(robot, "armature", eliminate=False)
     ties = joint_ties(mechanism)
     for constraint in robot.constraints:
