@@ -16,7 +16,7 @@ import ce_gym
 from ce_gym.policies import PolicyError, load_policy, locate_policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
-SMALL = ["num_envs=32", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]", "steps=1000"]
+SMALL = ["num_envs=32", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]", "steps=1000", "training={}"]
 
 
 @pytest.fixture(scope="module")

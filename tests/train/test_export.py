@@ -25,7 +25,7 @@ pytest.importorskip("onnxruntime")
 from export import main  # noqa: E402
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
-SMALL = ["num_envs=16", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]"]
+SMALL = ["num_envs=16", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]", "training={}"]
 
 
 def trained_policy(out: Path, *settings: str, env=ID, **env_kwargs) -> Path:

@@ -27,7 +27,7 @@ from settings import SettingsError, config_file, load_settings
 from ce_gym.policies import PolicyError, load_policy
 
 SMALL = ["num_envs=64", "rollout=16", "hidden=[16]", "epochs=4", "minibatches=2", "learning_rate=1e-2", "target_kl=0"]
-SMALL += ["gamma=0.9"]
+SMALL += ["gamma=0.9", "training={}"]
 FAST = ["--episodes", "8", "--threads", "1", "--set", *SMALL]
 ROBOT = "ce_gym/MiniCheetahVelocity-v0"
 

@@ -12,7 +12,7 @@ import ce_gym
 from ce_gym.envs.vector import LeggedVectorEnv
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
-SMALL = ["num_envs=8", "rollout=16", "minibatches=2", "epochs=1", "hidden=[8, 4]"]
+SMALL = ["num_envs=8", "rollout=16", "minibatches=2", "epochs=1", "hidden=[8, 4]", "training={}"]
 
 
 @pytest.mark.slow

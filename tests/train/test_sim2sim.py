@@ -159,7 +159,8 @@ BLANK = {"forward_error": 0.0, "lateral_error": 0.0, "episode_length": 1.0}
 
 
 def test_the_program_compares_four_simulations(tmp_path, capsys):
-    settings = load_settings(config_file(ROBOT_ENV), ["num_envs=16", "rollout=8", "steps=300", "minibatches=2"])
+    small = ["num_envs=16", "rollout=8", "steps=300", "minibatches=2", "training={}"]
+    settings = load_settings(config_file(ROBOT_ENV), small)
     policy = train(Job(ROBOT_ENV, settings, tmp_path, env_kwargs={}, tensorboard=False)).policy
     capsys.readouterr()
     arguments = [str(policy), "--episodes", "2", "--seconds", "0.2", "--json"]
