@@ -16,37 +16,20 @@ import interruption  # noqa: F401
 
 # isort: split
 
-import io
 import json
 import time
-import zipfile
-import zlib
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 from console import say_missing
-from gymnasium.vector import AutoresetMode, VectorEnv
-from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
+from gymnasium.vector import VectorEnv
+from job import Job, Trained
 from job import main as run_jobs
 from numpy.typing import NDArray
-from progress import (
-    Curve,
-    Log,
-    ProgressBar,
-    RecentEpisodes,
-    StopInOrder,
-    adapted_rate,
-    fall_cost,
-    geometric,
-    linear,
-    read_curve,
-    spread_episodes,
-)
-from run_folder import going_on, make_folder, save_somewhere, write_whole
+from progress import RecentEpisodes, adapted_rate, fall_cost, geometric, linear, spread_episodes
+from run_learner import run_learner
 
 try:
     from loops import adam, advantages_of, drawn
@@ -59,12 +42,13 @@ try:
         make_work,
         outputs,
         parameter_count,
+        start_layers,
     )
 except ModuleNotFoundError as error:
     raise SystemExit(say_missing("fast_ppo.py", error)) from None
 
 import ce_gym  # noqa: F401  (registers the environments)
-from ce_gym.policies import Actor, Policy, PolicyError, locate_policy, write_npz
+from ce_gym.policies import Actor
 
 SHARES = 8
 """Parts of a minibatch that threads work on. Fixed, so that results do not depend on the number of threads."""
@@ -124,9 +108,7 @@ class FastPPO:
         """Orthogonal weights, small ones at the end of the actor, as usual for PPO; biases are zero."""
         actor, log_std, critic = self.parts(self.theta)
         for vector, sizes, last in ((actor, self.actor_sizes, 0.01), (critic, self.critic_sizes, 1.0)):
-            layers = layers_of(vector, sizes)
-            for i, (weight, _) in enumerate(layers):
-                weight[:] = (last if i == len(layers) - 1 else 2**0.5) * orthogonal(self.rng, weight.shape)
+            start_layers(vector, sizes, last, self.rng)
         log_std[:] = np.log(self.settings.initial_std)
 
     def _views(self, observations: Any) -> list[NDArray[np.float32]]:
@@ -287,113 +269,13 @@ class FastPPO:
             self.episodes.restore(facts["episodes"], state["episodes"])
 
 
-def orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """A random matrix with orthonormal rows or columns, whichever are fewer."""
-    q, r = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))
-    q = q * np.sign(np.diag(r))
-    return (q if shape[0] >= shape[1] else q.T).astype(F)
-
-
 def train(job: Job) -> Trained:
     """Train, and save the policy even if Ctrl-C ends training early.
 
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
-    return train_with(FastPPO, job, "fast_ppo")
-
-
-def train_with(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str) -> Trained:
-    """Train with a learner that has the methods of `FastPPO`.
-
-    Args:
-        kind: Makes the learner.
-        job: The training run.
-        name: Of the learner's file.
-
-    Raises:
-        PolicyError: If the policy to resume does not fit the environment or the settings.
-    """
-    make_folder(job.out)
-    options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
-    mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **job.settings.training}
-    envs = gymnasium.make_vec(job.env_id, num_envs=job.settings.num_envs, vectorization_mode=mode, **options)
-    try:
-        learner = kind(envs, job)
-        if job.resume:
-            resume(learner, job.resume)
-        return _learn(learner, job, name)
-    finally:
-        envs.close()
-
-
-def _learn(learner: Any, job: Job, name: str) -> Trained:
-    """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
-    s, native = job.settings, acting_environment(job, learner.envs.unwrapped)
-    start, clock = time.perf_counter(), Clock()
-    curve = Curve(job.out / "curve.csv", _earlier(job.resume), learner.steps)
-    bar, log = ProgressBar(s.steps, learner.steps), Log(job.out / "progress.csv")
-
-    def record(finished: bool = False) -> dict[str, Any]:
-        written = make_record(job, native, learner.steps, clock, ("numba",))
-        return written | {"learner": name, "finished": finished, "shares": bar.shares}
-
-    every = max(s.steps // CHECKPOINTS, 1)
-    with StopInOrder(job.seconds) as stop:
-        while learner.steps < s.steps and not stop.due:
-            before = learner.steps // every
-            figures, means = learner.iterate(), learner.episodes.means()
-            curve.add(learner.steps, means)
-            log.add(learner.steps, time.perf_counter() - start, means, figures)
-            bar.advance(learner.steps)
-            bar.describe(means, learner.step_seconds, learner.collect_seconds)
-            if learner.steps // every > before and learner.steps < s.steps:
-                with going_on():
-                    save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
-        bar.close()
-    written = record(finished=not stop.interrupted)
-    policy = save_somewhere(lambda folder: save(learner, written, folder / "policy"), job.out)
-    return Trained(Policy(learner.actor(), written), written, policy, stop.interrupted)
-
-
-def save(learner: Any, record: dict[str, Any], path: Path) -> Path:
-    """Write `path`.npz, .json and .learner.npz, all or none, and return the path of the policy.
-
-    Raises:
-        OSError: If they cannot be written.
-    """
-    state, policy = io.BytesIO(), io.BytesIO()
-    np.savez(state, allow_pickle=False, **learner.state())
-    write_npz(learner.actor(), record, policy)
-    text = json.dumps(record, indent=2) + "\n"
-    files = {".learner.npz": state.getvalue(), ".json": text.encode(), ".npz": policy.getvalue()}
-    write_whole({path.with_name(path.name + kind): data for kind, data in files.items()})
-    return path.with_name(f"{path.name}.npz")
-
-
-def resume(learner: Any, policy: Path) -> None:
-    """Let a learner go on from a policy.
-
-    Raises:
-        PolicyError: If what it was trained by is missing, damaged or of another network.
-    """
-    file = _learner_file(policy)
-    try:
-        with np.load(file, allow_pickle=False) as arrays:
-            learner.restore({name: arrays[name] for name in arrays.files})
-    except FileNotFoundError:
-        raise PolicyError(f"{file}: no such file; expected what its learner writes beside a policy") from None
-    except (OSError, LookupError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise PolicyError(f"{file}: cannot be gone on from: {' '.join(str(error).split())[:200]}") from None
-
-
-def _learner_file(policy: Path) -> Path:
-    return locate_policy(policy).with_suffix(".learner.npz")
-
-
-def _earlier(policy: Path | None) -> list[dict[str, float]]:
-    """The learning curve of the policy gone on from."""
-    return read_curve(locate_policy(policy).parent / "curve.csv") if policy else []
+    return run_learner(FastPPO, job, "fast_ppo")
 
 
 def main(argv: list[str] | None = None) -> int:

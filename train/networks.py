@@ -381,6 +381,15 @@ def layers_of(theta: np.ndarray, sizes) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
+def start_layers(vector: np.ndarray, sizes, last: float, rng: np.random.Generator) -> None:
+    """Give the layers in a vector orthogonal weights, those of the last one times `last`; biases stay as they are."""
+    layers = layers_of(vector, sizes)
+    for i, (weight, _) in enumerate(layers):
+        q, r = np.linalg.qr(rng.standard_normal((max(weight.shape), min(weight.shape))))
+        q = (q * np.sign(np.diag(r))).astype(np.float32)
+        weight[:] = (last if i == len(layers) - 1 else 2**0.5) * (q if weight.shape[0] >= weight.shape[1] else q.T)
+
+
 def make_work(sizes) -> tuple[np.ndarray, ...]:
     """Return buffers for one thread and networks no larger than `sizes`."""
     widths = [padded(size) for size in sizes]

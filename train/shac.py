@@ -28,12 +28,12 @@ from job import Job, Trained
 from job import main as run_jobs
 from numpy.typing import NDArray
 from progress import RecentEpisodes, fall_cost, geometric, spread_episodes
+from run_learner import run_learner
 from settings import CONFIG_FOLDER, CommonSettings
 
 try:
-    from fast_ppo import orthogonal, train_with
     from loops import adam, advantages_of
-    from networks import KINDS, critic_gradient, layers_of, make_work, outputs, padded, parameter_count
+    from networks import KINDS, critic_gradient, layers_of, make_work, outputs, padded, parameter_count, start_layers
     from pathwise import back_through
 except ModuleNotFoundError as error:
     raise SystemExit(say_missing("shac.py", error)) from None
@@ -107,9 +107,7 @@ class SHAC:
     def _start_parameters(self) -> None:
         """Orthogonal weights, small ones where actions come from; biases are zero."""
         for theta, sizes, last in ((self.policy, self.actor_sizes[:-1], 0.1), (self.value, self.critic_sizes, 1.0)):
-            layers = layers_of(theta, sizes)
-            for i, (weight, _) in enumerate(layers):
-                weight[:] = (last if i == len(layers) - 1 else 2**0.5) * orthogonal(self.rng, weight.shape)
+            start_layers(theta, sizes, last, self.rng)
         layers_of(self.policy, self.actor_sizes)[-1][0][:] = np.eye(self.n_actions)
 
     def iterate(self) -> dict[str, float]:
@@ -243,8 +241,8 @@ class SHAC:
 
 
 def train(job: Job) -> Trained:
-    """Train, and save the policy even if Ctrl-C ends training early; see `fast_ppo.train`."""
-    return train_with(SHAC, job, "shac")
+    """Train, and save the policy even if Ctrl-C ends training early; see `run_learner`."""
+    return run_learner(SHAC, job, "shac")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,0 +1,118 @@
+"""A training run of a learner over plain arrays, such as `fast_ppo.FastPPO`: from its environments to its files.
+
+A learner has `iterate`, `actor`, `state` and `restore`, and the attributes `steps`, `episodes`, `envs`, `step_seconds`
+and `collect_seconds`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
+from progress import Curve, Log, ProgressBar, StopInOrder, read_curve
+from run_folder import going_on, make_folder, save_somewhere, write_whole
+
+from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
+
+
+def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str) -> Trained:
+    """Train with a learner, and save the policy even if Ctrl-C ends training early.
+
+    Args:
+        kind: Makes the learner.
+        job: The training run.
+        name: Of the learner's file.
+
+    Raises:
+        PolicyError: If the policy to resume does not fit the environment or the settings.
+    """
+    make_folder(job.out)
+    options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
+    mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **job.settings.training}
+    envs = gymnasium.make_vec(job.env_id, num_envs=job.settings.num_envs, vectorization_mode=mode, **options)
+    try:
+        learner = kind(envs, job)
+        if job.resume:
+            resume(learner, job.resume)
+        return _learn(learner, job, name)
+    finally:
+        envs.close()
+
+
+def _learn(learner: Any, job: Job, name: str) -> Trained:
+    """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
+    s, native = job.settings, acting_environment(job, learner.envs.unwrapped)
+    start, clock = time.perf_counter(), Clock()
+    curve = Curve(job.out / "curve.csv", _earlier(job.resume), learner.steps)
+    bar, log = ProgressBar(s.steps, learner.steps), Log(job.out / "progress.csv")
+
+    def record(finished: bool = False) -> dict[str, Any]:
+        written = make_record(job, native, learner.steps, clock, ("numba",))
+        return written | {"learner": name, "finished": finished, "shares": bar.shares}
+
+    every = max(s.steps // CHECKPOINTS, 1)
+    with StopInOrder(job.seconds) as stop:
+        while learner.steps < s.steps and not stop.due:
+            before = learner.steps // every
+            figures, means = learner.iterate(), learner.episodes.means()
+            curve.add(learner.steps, means)
+            log.add(learner.steps, time.perf_counter() - start, means, figures)
+            bar.advance(learner.steps)
+            bar.describe(means, learner.step_seconds, learner.collect_seconds)
+            if learner.steps // every > before and learner.steps < s.steps:
+                with going_on():
+                    save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
+        bar.close()
+    written = record(finished=not stop.interrupted)
+    policy = save_somewhere(lambda folder: save(learner, written, folder / "policy"), job.out)
+    return Trained(Policy(learner.actor(), written), written, policy, stop.interrupted)
+
+
+def save(learner: Any, record: dict[str, Any], path: Path) -> Path:
+    """Write `path`.npz, .json and .learner.npz, all or none, and return the path of the policy.
+
+    Raises:
+        OSError: If they cannot be written.
+    """
+    state, policy = io.BytesIO(), io.BytesIO()
+    np.savez(state, allow_pickle=False, **learner.state())
+    write_npz(learner.actor(), record, policy)
+    text = json.dumps(record, indent=2) + "\n"
+    files = {".learner.npz": state.getvalue(), ".json": text.encode(), ".npz": policy.getvalue()}
+    write_whole({path.with_name(path.name + kind): data for kind, data in files.items()})
+    return path.with_name(f"{path.name}.npz")
+
+
+def resume(learner: Any, policy: Path) -> None:
+    """Let a learner go on from a policy.
+
+    Raises:
+        PolicyError: If what it was trained by is missing, damaged or of another network.
+    """
+    file = _learner_file(policy)
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            learner.restore({name: arrays[name] for name in arrays.files})
+    except FileNotFoundError:
+        raise PolicyError(f"{file}: no such file; expected what its learner writes beside a policy") from None
+    except (OSError, LookupError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise PolicyError(f"{file}: cannot be gone on from: {' '.join(str(error).split())[:200]}") from None
+
+
+def _learner_file(policy: Path) -> Path:
+    return locate_policy(policy).with_suffix(".learner.npz")
+
+
+def _earlier(policy: Path | None) -> list[dict[str, float]]:
+    """The learning curve of the policy gone on from."""
+    return read_curve(locate_policy(policy).parent / "curve.csv") if policy else []
