@@ -220,19 +220,14 @@ def left_out(whole: SubStep) -> Iterator[tuple[str, SubStep]]:
     for group in dict.fromkeys(contact.group for contact in robot.contacts):
         wanted = tuple(dict.fromkeys((*options.contacts, *select_contacts(robot, group))))
         changes[f"contacts of group {group!r}"] = {"contacts": select_contacts(robot, wanted)}
-    for friction in FRICTION:
-        changes[f"friction={friction!r} instead"] = {"friction": friction}
-    for method in METHODS:
-        changes[f"method={method!r} instead"] = {"method": method}
-    if robot.motors:
-        changes["motors='limited'"] = {"motors": "limited"}
-    changes["ground='field'"] = {"ground": "field"}
+    changes |= {f"friction={friction!r} instead": {"friction": friction} for friction in FRICTION}
+    changes |= {f"method={method!r} instead": {"method": method} for method in METHODS}
+    changes |= {"motors='limited'": {"motors": "limited"}} if robot.motors else {}
+    changes |= {"ground='field'": {"ground": "field"}}
     if options.material.dissipation is None:
         changes["dissipation of the material"] = {"material": replace(options.material, dissipation=1.0)}
-    for name in PARAMETERS:
-        name = name.replace("BODY", robot.bodies[0].name)
-        known = tuple(dict.fromkeys((*options.parameters, name)))
-        changes[f"parameter {name!r}"] = {"parameters": known}
+    for name in (name.replace("BODY", robot.bodies[0].name) for name in PARAMETERS):
+        changes[f"parameter {name!r}"] = {"parameters": tuple(dict.fromkeys((*options.parameters, name)))}
     for name, change in changes.items():
         if any(getattr(options, key) != value for key, value in change.items()):
             yield name, replace(whole, options=replace(options, **change))

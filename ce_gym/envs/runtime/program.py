@@ -162,11 +162,6 @@ class TaskProgram:
         """Length of each block of one observation of the policy, by name, in order."""
         return {name: self.probe.sizes[name] for name in self.observation_terms}
 
-    @property
-    def critic_sizes(self) -> dict[str, int]:
-        """Length of each block of an observation of the critic: the policy's blocks and the privileged ones."""
-        return self.probe.sizes
-
     @cached_property
     def observation_size(self) -> int:
         """Length of the policy's observation, history included."""
@@ -174,8 +169,8 @@ class TaskProgram:
 
     @cached_property
     def critic_size(self) -> int:
-        """Length of the critic's observation; 0 if the task gives it none of its own."""
-        return sum(self.critic_sizes.values()) if self.task.critic else 0
+        """Length of the critic's observation, the policy's blocks included; 0 if it has none of its own."""
+        return sum(self.probe.sizes.values()) if self.task.critic else 0
 
     def look(self) -> ca.Function:
         """Return the state buffers that are looked at -> each block of an observation, `failed`.

@@ -26,8 +26,7 @@ class Randomised:
 
     Attributes:
         parameters: Names of the parameters of the dynamics.
-        size: Length of their values, stacked.
-        n_draws: Numbers in [0, 1) that they are made of, one for each value.
+        n_draws: Numbers in [0, 1) that they are made of, one for each of their values, stacked.
 
     Raises:
         ValueError: If a name does not exist or a range is none.
@@ -50,10 +49,10 @@ class Randomised:
             except ValueError as problem:
                 expected = str(problem).split("; ")[-1]
                 raise ValueError(f"randomise[{given!r}]=({bounds[0]}, {bounds[1]}); {expected}") from None
-        self.size = self.n_draws = sum(len(default) for default in self._defaults)
+        self.n_draws = sum(len(default) for default in self._defaults)
 
     def values(self, draw: SX) -> SX:
-        """Return the parameters' values, stacked, for numbers in [0, 1), shape (size,)."""
+        """Return the parameters' values, stacked, for numbers in [0, 1), shape (n_draws,)."""
         values, first = [SX(0, 1)], 0
         for name, (low, high), default in zip(self.parameters, self._ranges, self._defaults, strict=True):
             value = low + (high - low) * draw[first : first + len(default)]
