@@ -1,4 +1,4 @@
-"""What happens beside learning, as callbacks of Stable-Baselines3: each does one thing, by way of progress.py."""
+"""Callbacks of Stable-Baselines3 for the learning curve, the progress bar and schedules; see progress.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the judging programs have in common on the command line: results as text and JSON, errors in one line."""
+"""Command lines of the programs that judge policies: results as text and JSON, errors in one line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Table = list[list[str]]
 
 
 def run(program: str, work: Callable[[], int]) -> int:
-    """Do the work of a program and return its exit code: 2 after a mistake that a user can mend, told in one line.
+    """Do the work of a program and return its exit code: 2 after an error of the user, which is reported in one line.
 
     130 after Ctrl-C.
     """
@@ -69,7 +69,7 @@ def said(error: OSError) -> str:
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that tells mistakes in one line."""
+    """An argument parser that reports an error in one line."""
 
     def error(self, message: str) -> NoReturn:
         """Print one line and leave with exit code 2."""

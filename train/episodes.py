@@ -1,4 +1,4 @@
-"""Whole episodes of a policy's mean action, side by side, and what they come to.
+"""Whole episodes of a policy's mean action in parallel, and their statistics.
 
 Every environment of a batch plays exactly one episode, so that short episodes do not count more often than long ones.
 Uses public names of ce_gym only, and no name of a robot or task.

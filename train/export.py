@@ -1,4 +1,4 @@
-"""Write a trained policy as ONNX, with all that somebody must know to run it elsewhere.
+"""Write a trained policy as ONNX, with all that is needed to run it elsewhere.
 
 The network takes observations `obs` (n, n_obs) and returns clipped mean actions `actions` (n, n_actions). The metadata
 of the file holds the record of the policy with its specification: joint order, default pose, meaning of actions,

@@ -1,4 +1,4 @@
-"""Training runs, whoever learns: what the command line asks for, what is written beside a policy, what is said.
+"""A training run of any learner: its command line, the record of the policy, its messages.
 
 A learner is a program that has `train(job) -> Trained`; `main` here does all else.
 """
@@ -109,7 +109,7 @@ def acting_environment(job: Job, native: Any) -> Any:
 
 
 def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple[str, ...]) -> dict[str, Any]:
-    """Return what somebody needs to know to use or repeat a policy.
+    """Return the record of a policy: what is needed to use it and to repeat its training.
 
     Args:
         job: The training run.
@@ -158,8 +158,8 @@ def resumed_record(job: Job) -> dict[str, Any]:
     wanted, found = json.loads(json.dumps(asdict(job.settings))), _settings_of(record)
     for key in NETWORK:
         if found.get(key) != wanted[key]:
-            told = f"trained with {found.get(key)}, asked for {wanted[key]}"
-            raise PolicyError(f"{file}: {key}: {told}; expected the same to go on")
+            both = f"trained with {found.get(key)}, asked for {wanted[key]}"
+            raise PolicyError(f"{file}: {key}: {both}; expected the same to go on")
     if type(record.get("steps")) is not int or record["steps"] < 0:
         raise PolicyError(f"{file}: steps: {record.get('steps')!r}; expected the steps that it was trained for")
     return record
@@ -174,7 +174,7 @@ def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
 def jobs(args: argparse.Namespace, folder: str = "", settings: type = Settings) -> list[Job]:
     """The training runs a command line asks for; `folder` ends the names of folders that it does not give.
 
-    `settings` is the learner's dataclass, whose attribute `folder` says where its files lie.
+    `settings` is the learner's dataclass; its attribute `folder` is the folder of its files.
 
     Raises:
         ValueError: If the command line, a settings file or a policy cannot be used.
@@ -269,7 +269,7 @@ def main(
     folder: str = "",
     settings: type = Settings,
 ) -> int:
-    """Train every seed asked for, evaluate each policy, and say where it lies.
+    """Train every seed, evaluate each policy, and print its path.
 
     Args:
         program: Name of the learner's file, for messages.

@@ -2,7 +2,7 @@
 
 Stable-Baselines3 leaves threads to torch, which splits every single matrix product and waits after each; on networks of
 this size that gains a third, and loses nearly everything as soon as another program wants a core. Here a thread
-computes the gradient of its share from beginning to end, and the shares are added in a fixed order: one meeting per
+computes the gradient of its share from beginning to end, and the shares are added in a fixed order: one barrier per
 minibatch, and the same result bit for bit on any number of threads.
 """
 

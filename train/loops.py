@@ -1,4 +1,4 @@
-"""What PPO does beside its networks, as compiled loops: drawing actions, advantages, Adam. Knows numbers only."""
+"""Compiled loops of PPO apart from its networks: sampling of actions, advantages, Adam."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What short-horizon actor-critic does beside its networks' own loops: the way back through a network to what it saw.
+"""Reverse mode of a network with respect to its weights and its input, for short-horizon actor-critic.
 
 Knows numbers only; layouts are those of `networks.py`.
 """

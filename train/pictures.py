@@ -1,4 +1,4 @@
-"""Pictures of what was judged: errors and falls from level to level, and how learning went."""
+"""Figures: errors and falls by transmission level, and the learning curve."""
 
 from __future__ import annotations
 

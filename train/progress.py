@@ -1,4 +1,4 @@
-"""What happens beside learning, whoever learns: the curve, the progress bar, schedules, stopping in good order."""
+"""What all learners share: the learning curve, the progress bar, schedules, orderly interruption."""
 
 from __future__ import annotations
 

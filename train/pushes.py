@@ -1,6 +1,6 @@
 """How hard a walking robot can be pushed, and from where: the share that keeps on its feet.
 
-A push is a change of the base's horizontal velocity at a stroke, as the environment's own pushes are. Robots of one
+A push is an instantaneous change of the base's horizontal velocity, like the environment's own pushes. Robots of one
 cell of the grid are pushed at different moments of their gait. Uses public names of ce_gym only, and no name of a
 robot or task.
 """

@@ -184,7 +184,7 @@ def _work(args: argparse.Namespace) -> int:
 
 
 def _record(native: Any, env_id: str, kwargs: dict[str, Any], s: Settings, steps: int) -> dict[str, Any]:
-    """What somebody needs to know to use this policy."""
+    """The record of the policy."""
     return {
         "env": env_id,
         "env_kwargs": {key: value for key, value in kwargs.items() if key != "num_threads"},

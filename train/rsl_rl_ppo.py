@@ -84,7 +84,7 @@ def actor_of(runner: OnPolicyRunner, activation: str) -> Actor:
 
 
 def record_of(envs: RslRlVecEnv, env_id: str, env_kwargs: dict[str, Any], settings: Settings) -> dict[str, Any]:
-    """What somebody needs to know to use this policy."""
+    """The record of the policy."""
     native: Any = envs.envs.unwrapped
     return {
         "env": env_id,

@@ -1,4 +1,4 @@
-"""The folder of a training run: files are whole or not there, and a full disk does not end training."""
+"""The folder of a training run: files are written whole or not at all, and a full disk does not end training."""
 
 from __future__ import annotations
 

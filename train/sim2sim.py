@@ -1,4 +1,4 @@
-"""Let a policy act in MuJoCo as it is: does it walk on physics that it was not trained on?
+"""Evaluate a policy in MuJoCo, unchanged: does it walk on physics that it was not trained on?
 
 The robot is exported as MJCF at two levels, with armature and with every rotor a body on a stiff equality; it starts
 in the same states, has the same gains and limits, and gets the same random commands as in our own simulation beside it.
@@ -196,7 +196,7 @@ def compare(
     Raises:
         ModuleNotFoundError: MuJoCo is not installed.
     """
-    import ce_gym.export.mujoco_twin  # noqa: F401  # where MuJoCo is missing: told before our own simulation, not after
+    import ce_gym.export.mujoco_twin  # noqa: F401  # fails before our own simulation if MuJoCo is missing
 
     record, results = policy.record, {}
     seed = weights_seed(policy) if seed is None else seed

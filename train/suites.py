@@ -1,4 +1,4 @@
-"""What a policy is judged on besides its own task, and the seed of all of it, which nobody chose.
+"""Suites of commands and pushes on which policies are judged, and the seed, which follows from the weights.
 
 Suites: commands that jump, standing, turning in place, going backwards, pushes.
 One kernel serves all suites: commands and pushes are given from outside. Uses public names of ce_gym only, and no name

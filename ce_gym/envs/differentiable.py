@@ -59,8 +59,8 @@ class DifferentiableEnv:
         largest: A robot's carried gradient is shortened to this norm between control steps; infinity leaves it alone.
 
     Attributes:
-        not_smooth: What is not smooth among the terms, by kind and name: "no gradient" of those that only tell cases
-            apart, "jumps" where a case is decided by the motion, "kinks" where a slope changes.
+        not_smooth: What is not smooth among the terms, by kind and name: "no gradient" of those that only distinguish
+            cases, "jumps" where a case is decided by the motion, "kinks" where a slope changes.
 
     Raises:
         ValueError: If such an environment cannot be differentiated.

@@ -1,4 +1,4 @@
-"""The specification of a policy: all that somebody must know to run it on another simulator or on a robot.
+"""The specification of a policy: all that is needed to run it on another simulator or on a robot.
 
 Plain data, so that it can be written beside a policy or into its file. Nothing is said here that is written elsewhere:
 where the numbers of an observation come from is read off the traced terms.

@@ -59,8 +59,8 @@ class StepDerivatives:
 
     Args:
         simulator: Whose steps; on the CPU.
-        keep_every: The state is kept before every so manieth recorded sub-step; those between are made again on the way
-            back, which costs a step each.
+        keep_every: Every how many recorded sub-steps the state is kept; those between are recomputed on the way back,
+            which costs a step each.
 
     Attributes:
         state_sizes: Of the tangent of each part of a state.

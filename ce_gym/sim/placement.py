@@ -1,4 +1,4 @@
-"""How the contact spheres of a robot are placed above the ground."""
+"""Contact spheres of a robot above the ground: depths, and the lift that a pose needs."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """A batch of environments without Gymnasium: the state of a task's robots on a device, stepped and reset by kernels.
 
 Single and vector environments are thin over this, so that a lane of a batch and an environment of its own are the same
-numbers, bit for bit. On a GPU a control step and the resets that follow are one launch, for a look from the host would
-cost as much as the physics; on the CPU they are two kernels.
+numbers, bit for bit. On a GPU a control step and the resets that follow are one launch, because a look from the host
+would cost as much as the physics; on the CPU they are two kernels.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ class TaskBatch(Batch):
 
     def restore(self, snapshot: Snapshot | File) -> None:
         """Continue from a snapshot; see `Batch.restore`."""
-        self.arrays["observation"] = self.place.copy(self.arrays["observation"])  # somebody may hold the old one
+        self.arrays["observation"] = self.place.copy(self.arrays["observation"])  # a caller may hold the old one
         super().restore(snapshot)
 
     def _run(self, kernel: Any, given: dict[str, Array], repeats: Mapping[str, int] | None = None) -> None:

@@ -2,7 +2,7 @@
 
 Joints are paired by geometry: in the standing pose, the reflection of a joint's axis in the plane between left and
 right is the axis of its partner. What that does to observations is found by looking at reflected states through the
-task's own terms, so that terms of users count too; and that the dynamics commute with it is tried, not believed.
+task's own terms, so that terms of users count too; and that the dynamics commute with it is checked numerically.
 """
 
 from __future__ import annotations

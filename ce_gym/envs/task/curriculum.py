@@ -49,7 +49,7 @@ class Curriculum:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """Metrics that tell how far robots have come."""
+        """Metrics of how far robots have come."""
         return ("terrain_level",) * self.on_field + ("times_grown",) * self.widening
 
     def followed(self, s: TermContext, state: dict[str, SX]) -> dict[str, SX]:
