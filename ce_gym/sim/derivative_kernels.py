@@ -114,7 +114,7 @@ class _Columns:
         self.linear, self.chained = linear, n > 1 and bool(linear.local)
         self.columns = [f"column{i}" for i in range(len(linear.directions))]
         self.changes = [linear.change_function(group) for group in linear.groups]
-        self.attempt, self.solve = linear.attempt_function(), linear.solve_function()
+        self.iterate, self.solve = linear.iteration_function(), linear.solve_function()
         self.drift = [linear.drift_function()] if linear.turned else []
         self.presses = {g: press for g, group in enumerate(linear.groups) if (press := linear.press_function(group))}
         self.pressed_drift = [linear.pressed_drift_function()] if linear.local and self.drift else []
@@ -139,7 +139,7 @@ class _Columns:
         passes = k > 0 and self.chained
         steps = [call(_copy(self.linear.iterate.numel()), copied="iterate", original="tried_iterate")] if k else []
         steps += [call(_copy(self.linear.nv), copied="vdot_before", original="vdot")] if passes else []
-        steps += [call(self.attempt), *map(call, self.drift)]
+        steps += [call(self.iterate), *map(call, self.drift)]
         steps += [_call(function, names, "contact_acts") for function in self.pressed_drift]
         steps += [call(self.gains, vdot="vdot_before")] if passes else []
         column = iter(self.columns)

@@ -56,7 +56,7 @@ class Linearization(Equation):
     def _factor(self) -> ca.Sparsity:
         return self.implicit().sparsity()
 
-    def attempt_function(self) -> ca.Function:
+    def iteration_function(self) -> ca.Function:
         """Trace an iteration, and of its derivative what all directions share.
 
         Returns:
@@ -76,7 +76,7 @@ class Linearization(Equation):
         }
         left |= {"contact_acts": acts(self.acting.contacts)} if self.local else {}
         left |= {"forces": ca.vec(forces), "slopes": ca.vertcat(SX(0, 1), *map(packed, slopes))}
-        return traced("attempt", {name: x for name, x in self.inputs.items() if name != "vdot"}, there(left))
+        return traced("iteration", {name: x for name, x in self.inputs.items() if name != "vdot"}, there(left))
 
     def drift_function(self) -> ca.Function:
         """Trace how the damping of joints on turning bodies changes because the inertias in it do, without contacts.
