@@ -32,7 +32,7 @@ def make_steps(
     Args:
         simulator: What makes the steps, of the same precision as the arrays; its state is overwritten.
         n_substeps: How many sub-steps are made at a time, with the same target.
-        keep_every: The state is kept before every so manieth sub-step, see `ce_gym.StepDerivatives`.
+        keep_every: Every how many sub-steps the state is kept, see `ce_gym.StepDerivatives`.
 
     Raises:
         ValueError: If the simulator's steps cannot be differentiated.

@@ -1,8 +1,8 @@
 """Stable-Baselines3's `VecEnv` over a native Gymnasium `VectorEnv`, without processes and without copies.
 
-Stable-Baselines3 wants one information dictionary per environment and step. Building thousands of them costs more than
-the physics, so every running environment shares one empty dictionary, and only those whose episode has just ended get
-one of their own.
+Stable-Baselines3 expects one information dictionary per environment and step. Building thousands of them costs more
+than the physics, so every running environment shares one empty dictionary, and only those whose episode has just ended
+get one of their own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 _RUNNING: dict[str, Any] = {}
-"""What every environment reports in the middle of an episode. Shared: nobody may write to it."""
+"""What every environment reports in the middle of an episode. Shared: it must not be written to."""
 
 
 class SB3VecEnv(VecEnv):

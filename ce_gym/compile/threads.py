@@ -43,7 +43,7 @@ class MemoryPool:
 def run_chunks(work: Callable[[int, int], None], count: int, num_threads: int) -> None:
     """Call `work(first, end)` on contiguous parts of range(count), one part per thread, the first in this one.
 
-    When this returns or raises nobody works any more: Ctrl-C waits for that, and parts that no thread has begun by the
+    When this returns or raises, no part is running: Ctrl-C waits for that. Parts that no thread has begun by the
     time this one is free, since all are busy with other calls, are done by this one.
     """
     num_threads = min(num_threads, count)

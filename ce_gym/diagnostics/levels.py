@@ -1,4 +1,4 @@
-"""What each simplified level gets wrong of one robot, from its mass matrices alone: the row of a robot of one's own.
+"""What each simplified level gets wrong of one robot, from its mass matrices alone: the row of any robot.
 
 All errors are relative to the exact level, in random poses near the standing one. With the base free, what counts for
 the joints is their inertia in flight, `H = M_jj - M_jb M_bb^-1 M_bj`; a fixed base has `H = M`.

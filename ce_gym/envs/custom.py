@@ -1,4 +1,4 @@
-"""Environments of a robot of one's own, under ids of its own.
+"""Environments of a user's own robot, under ids of its own.
 
     ids = ce_gym.register_robot("my_robot.yaml")
     env = gymnasium.make("ce_gym/MyRobotVelocity-Armature-v0")

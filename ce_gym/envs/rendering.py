@@ -1,7 +1,7 @@
 """What `render` shows: environments ask for a render mode, the top of the package says where its renderer is.
 
-The rooms that draw lie above this one, so this file does not know them: `use_renderers` is told the name of a module
-that has a function for each render mode, and that module is imported when an environment is made with one.
+The packages that draw depend on this one, so this file cannot import them: `use_renderers` registers the name of a
+module with a function for each render mode, which is imported when an environment is made with a render mode.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Screen:
         return tuple(picture for picture in pictures if picture is not None)
 
     def refresh(self) -> None:
-        """Show the new state to whoever watches; Gymnasium wants "human" to draw by itself."""
+        """Show the new state in mode "human", which Gymnasium expects to draw by itself."""
         if self._mode == "human":
             self.frames()
 

@@ -44,12 +44,8 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         max_episode_steps: Control steps until time is up; the task's own if None.
         autoreset_mode: When a finished environment starts again: "NextStep" (Gymnasium's default), "SameStep" or
             "Disabled", see `gymnasium.vector.AutoresetMode`.
-        robot: Name of a robot that ships with the package, or a path to a robot file.
-        task: Name of a task.
-        obs_mode: "vector", or "dict" for `{"policy": ..., "critic": ...}`, where the critic may see more.
+        robot, task, obs_mode, width, height: See `LeggedEnv`.
         render_mode: None; "rgb_array", for a picture of every environment; or "human", for a live page of the first.
-        width: Of a picture [pixels].
-        height: Of a picture [pixels].
         **kwargs: See `ce_gym.envs.runtime.setup.make_batch`.
 
     Raises:
@@ -136,7 +132,7 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         return self._shown(outcome.observation), outcome.reward, outcome.terminated, outcome.truncated, infos
 
     def _advance(self, rows: Array) -> tuple[Outcome, dict[str, Any]]:
-        """Step with actions, shape (num_envs, n_actions), and reset whom it is time for."""
+        """Step with actions, shape (num_envs, n_actions), and reset finished environments as the mode says."""
         batch, same_step = self.batch, self.autoreset_mode == AutoresetMode.SAME_STEP
         ignored = None
         if not same_step and batch.arrays["finished"].any():

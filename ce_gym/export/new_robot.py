@@ -1,4 +1,4 @@
-"""`python -m ce_gym new`: a commented YAML file for a robot of one's own, guesses marked."""
+"""`python -m ce_gym new`: a commented YAML file for a user's own robot, guesses marked."""
 
 from __future__ import annotations
 

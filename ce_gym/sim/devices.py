@@ -22,7 +22,7 @@ Build = Callable[[], Sequence[Program]]
 
 
 class Device(Protocol):
-    """What is asked of a place where robots live.
+    """What a device offers.
 
     Attributes:
         name: "cpu", "cuda", "cuda:1" and so on.

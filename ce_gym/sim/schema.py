@@ -30,7 +30,7 @@ class Row:
         size: Numbers that one robot has there; 0 for a plain array of one number for each robot.
         writer: Who changes it: "physics" (the sub-steps), "task" (what an environment does around them), "term" (a
             reward, observation, termination or metric with memory), "host" (Python only; no reset touches it) or
-            "scene" (nobody: how it is stepped, and no part of a snapshot).
+            "scene" (constant: how it is stepped, and no part of a snapshot).
         reset: With what a robot begins, a number or shape (size,).
         dtype: Of a plain array, shape (num_envs, size), or (num_envs,) for size 0; "" for one in lanes.
     """

@@ -201,7 +201,7 @@ class Simulator:
         Args:
             target: Positions [rad] or torques [N m], shape (num_envs, n) or (n,), in the order of `target_names`:
                 that of `model.joint_links` unless the motors are controlled.
-                On a GPU nobody looks whether they are finite, for that would need waiting.
+                On a GPU they are not checked for NaN, because that would need waiting.
             n_substeps: Number of sub-steps of length `dt`; 0 does nothing.
 
         Raises:

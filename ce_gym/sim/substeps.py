@@ -44,15 +44,15 @@ def substeps(
     staged = any(min(stage.iterations, most) for stage in plan.stages)
     asked = (*outputs, MOVED) if plan.single or not staged else tuple(name for name in outputs if name != "error")
     function = (iteration_function if staged else step_function)(mechanism, options, asked)
-    told = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
-    if len(told) < len(outputs):
-        return substeps(mechanism, options, tuple(told))
+    kept = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
+    if len(kept) < len(outputs):
+        return substeps(mechanism, options, tuple(kept))
     sizes = {name: function.numel_in(name) for name in function.name_in() if name not in ("iterate", "ground")}
-    sizes |= {"retries": 1, **told} | ({FRAME: 3} if "ground" in function.name_in() else {})
+    sizes |= {"retries": 1, **kept} | ({FRAME: 3} if "ground" in function.name_in() else {})
     fractions = {TRIED: 1.0} | ({_own(plan, stage): stage.length for stage in plan.stages} if staged else {})
-    each = _staged(mechanism, options, function, told | {MOVED: 1}) if staged else _whole(mechanism, options, function)
+    each = _staged(mechanism, options, function, kept | {MOVED: 1}) if staged else _whole(mechanism, options, function)
     buffers, try_part = each
-    begin, take = beginning_function(fractions), _take_part(mechanism, options, told, fractions)
+    begin, take = beginning_function(fractions), _take_part(mechanism, options, kept, fractions)
     started = tuple(begin.name_out())
     buffers += [Buffer(name, 1, "scratch") for name in started]
     return sizes, buffers, (Repeat(TIMES, (Call(begin, (DT,), started), While("unfinished", (*try_part, *take)))),)

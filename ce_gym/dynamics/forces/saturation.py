@@ -1,8 +1,8 @@
 """A torque kept within limits, of a joint or of a motor, linearly implicit in the step.
 
-Within its limits it is what is asked for; at a limit it is the limit, and answers to accelerations only as the limit
-does. Which of the three it is depends on the acceleration, and that on it. The first iteration goes by what is asked
-for at zero acceleration, further ones by the torque that the iteration before predicts for the end of the step. It
+Within the limits the torque is the commanded one; at a limit it is the limit, and depends on accelerations only as the
+limit does. Which of the three it is depends on the acceleration, and vice versa. The first iteration decides by the
+command at zero acceleration, further ones by the torque that the iteration before predicts for the end of the step. It
 matters on light links: deciding saturation at zero acceleration applies an excessive impulse there.
 """
 
@@ -24,8 +24,8 @@ class Saturation:
     """A torque that is kept within limits.
 
     Attributes:
-        asked: What is asked for at zero acceleration [N m or N], and how it answers: `tau - slope @ ydd`.
-        high, low: Limits likewise; a torque-speed line answers to accelerations too.
+        asked: The commanded torque `tau - slope @ ydd` [N m or N], linear in the acceleration.
+        high, low: Limits likewise; those of a torque-speed line depend on the acceleration, too.
         expected: The torque [N m or N] whose place among the limits is the active set.
     """
 
@@ -57,7 +57,7 @@ class Saturation:
 
     @property
     def free(self) -> SX:
-        """1 if what is asked for is given, else 0."""
+        """1 if the torque is the commanded one, else 0."""
         return ca.logic_not(ca.logic_or(self.at_high, self.at_low))
 
     @property

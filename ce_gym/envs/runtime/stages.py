@@ -215,7 +215,7 @@ class Stages:
         return ca.fmod(clock, max(round(period / self.program.control_dt), 1)) < 0.5
 
     def _pushed(self, v: SX, clock: SX, sampler: Sampler) -> SX:
-        """Now and then change the horizontal velocity of the base, as seen from it, at a stroke."""
+        """Change the horizontal velocity of the base, in its frame, once in a push period."""
         push = ca.vertcat(SX(3, 1), sampler.symmetric(2, self.task.push_speed), SX(v.numel() - 5, 1))
         return v + ca.if_else(self._every(self.task.push_period, clock), ca.densify(push), 0)
 

@@ -11,7 +11,7 @@ from ce_gym.envs.task.sampling import Sampler
 from ce_gym.envs.task.tasks import Task
 
 HEADING_GAIN = 0.5
-"""Commanded yaw rate for each radian between a robot and the heading it shall have [1/s]."""
+"""Commanded yaw rate for each radian of heading error [1/s]."""
 
 
 class Commands:
@@ -26,7 +26,7 @@ class Commands:
         self.task, self.curriculum = task, curriculum
 
     def new(self, sampler: Sampler, grown: SX | None) -> dict[str, SX]:
-        """Return a command within the range that the robot has come to, or to stand still; and a heading."""
+        """Return a command within the robot's present range, or to stand still; and a heading."""
         standing = sampler.unit() < self.task.standing_fraction
         moving = sampler.within(self.task.command_range)
         moving = moving if grown is None else self.curriculum.share(grown) * moving

@@ -84,5 +84,5 @@ class Curriculum:
         return ca.fmax(0, ca.fmin(most, state["grown"] + change))
 
     def share(self, grown: SX) -> SX:
-        """Return the share of the range of commands that a robot has come to."""
+        """Return the share of the range of commands that a robot gets."""
         return ca.fmin(1, self.task.command_curriculum + WIDER * grown)

@@ -123,7 +123,7 @@ def ctrl(s: TermContext) -> SX:
 
 
 def gait(s: TermContext) -> SX:
-    """How many feet are on the ground and off it when the gait's clock wants them, minus those that are not.
+    """How many feet are on the ground and off it as the gait's clock demands, minus those that are not.
 
     Feet take turns: the first half of the cycle belongs to every second one. While no motion is commanded all stand.
     """
@@ -133,7 +133,7 @@ def gait(s: TermContext) -> SX:
 
 
 def swing_height(s: TermContext, height: float = 0.06, offsets: Sequence[float] = (0.0, 0.5)) -> SX:
-    """Distances of feet from the heights that the gait's clock wants, squared [m^2].
+    """Distances of feet from the heights that the gait's clock demands, squared [m^2].
 
     A foot swings during half of the cycle, up to `height` [m] and down again; `offsets` are shares of the cycle by
     which feet are ahead, the first one again after the last. While no motion is commanded all stand.

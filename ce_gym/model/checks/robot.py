@@ -1,4 +1,4 @@
-"""Is this robot possible? Checks of finished descriptions, whoever made them.
+"""Checks of complete robot descriptions, from files or from code.
 
 Each check raises a `RobotError` of one line for the first thing that is wrong.
 """
