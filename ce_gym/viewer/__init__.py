@@ -1,11 +1,12 @@
-"""Recorded rollouts, shown as one HTML file or as a page served on the loopback interface.
+"""Recorded rollouts, shown as one HTML file, as a page served on the loopback interface, or as a video.
 
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0", contact_forces=True)
     rollout = record(env, lambda observation: env.action_space.sample(), seconds=5.0)
     rollout.save("walk.npz")
     write_html(Rollout.load("walk.npz"), "walk.html")
+    write_video(Rollout.load("walk.npz"), "walk.gif")
 
-meshcat is needed only when something is drawn.
+meshcat is needed only for pages, embreex and imageio-ffmpeg only for videos.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from ce_gym.viewer.rollouts.recording import record, record_lanes
     from ce_gym.viewer.rollouts.rollout import Rollout, RolloutError
     from ce_gym.viewer.server import show
+    from ce_gym.viewer.video import write_video
 
 __all__ = [
     "SHOW",
@@ -36,6 +38,7 @@ __all__ = [
     "show",
     "walk",
     "write_html",
+    "write_video",
 ]
 
 _HOMES = {
@@ -52,6 +55,7 @@ _HOMES = {
     "ViewerError": "errors",
     "show": "server",
     "write_html": "page.html",
+    "write_video": "video",
 }
 
 

@@ -22,8 +22,8 @@ def add_view_command(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "view",
         help="show recorded rollouts and policies in a browser",
-        description="Show recorded rollouts, or what policies do: write one self-contained HTML file (default), or "
-        "serve\nthe page on this machine until Ctrl-C.",
+        description="Show recorded rollouts, or what policies do: write one self-contained HTML file (default) or a "
+        "video, or\nserve the page on this machine until Ctrl-C.",
         epilog=examples(
             "view walk.npz", "view exact.npz armature.npz --overlay", "view walk.npz --plot 'torque of FL_knee' reward"
         ),
@@ -47,6 +47,7 @@ def add_play_command(subparsers: Any) -> None:
         epilog=examples(
             "play mini_cheetah_velocity",
             "play mit_humanoid_velocity --transmission exact none",
+            "play mini_cheetah_velocity --video walk.gif --size 400 300",
             "play demo --robots 16 --command 5 0.8 0 0 --command 5 0.5 0 1",
         ),
     )
@@ -88,6 +89,15 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     target = parser.add_mutually_exclusive_group()
     target.add_argument("--html", type=Path, metavar="FILE", help=f"HTML file to write (default: {default})")
     target.add_argument("--live", action="store_true", help="serve the page on this machine's loopback until Ctrl-C")
+    target.add_argument("--video", type=Path, metavar="FILE", help="a video of one robot: FILE.mp4, .webm or .gif")
+    parser.add_argument(
+        "--size",
+        type=_at_least_one,
+        nargs=2,
+        default=(640, 480),
+        metavar=("WIDTH", "HEIGHT"),
+        help="of the video [pixels] (default 640 480)",
+    )
     parser.add_argument(
         "--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot beside the robot at first"
     )
@@ -102,6 +112,7 @@ def view(args: argparse.Namespace) -> int:
     from ce_gym.viewer.rollouts.driving import walk
     from ce_gym.viewer.rollouts.rollout import Rollout
 
+    _check_target(args, len(args.rollouts))
     policies = [find_policy(path) for path in args.rollouts]
     rollouts = [
         walk(p, env=args.env, **dict(args.env_args))[0] if p else Rollout.load(path)
@@ -114,11 +125,10 @@ def view(args: argparse.Namespace) -> int:
 def play(args: argparse.Namespace) -> int:
     """Run `play`; return its exit code."""
     from ce_gym.viewer.errors import ViewerError
-    from ce_gym.viewer.page.html import meshcat_code
     from ce_gym.viewer.rollouts.driving import SHOW, walk
 
     file = locate_policy(args.policy)
-    meshcat_code()  # fails before the simulation if meshcat is missing
+    _check_target(args, args.robots * max(len(args.transmission), 1))
     if args.robots > 1 and len(args.transmission) > 1:
         raise ViewerError(f"--robots {args.robots}: expected 1, or one level of --transmission")
     script = [(time, (x, y, turn)) for time, x, y, turn in args.command] if args.command else SHOW
@@ -136,14 +146,36 @@ def play(args: argparse.Namespace) -> int:
     return _present(rollouts, args, page, overlay=len(levels) > 1)
 
 
+def _check_target(args: argparse.Namespace, robots: int) -> None:
+    """See whether what is asked for can be made: that is told before all else, not after the simulation.
+
+    Raises:
+        ViewerError: A package is missing, or a video of several robots is asked for.
+    """
+    from ce_gym.viewer.errors import ViewerError
+    from ce_gym.viewer.page.html import meshcat_code
+
+    if not args.video:
+        meshcat_code()
+        return
+    from ce_gym.viewer.video import check_video
+
+    check_video(args.video, tuple(args.size))
+    if robots > 1:
+        raise ViewerError(f"--video with {robots} robots: expected one, on one level of --transmission")
+
+
 def _page_of(policy: Path) -> Path:
     return Path(f"{policy.resolve().parent.name}.html")
 
 
 def _present(rollouts: Sequence[Rollout], args: argparse.Namespace, default: Path, *, overlay: bool) -> int:
-    """Write or serve the page of rollouts as asked for; return the exit code."""
-    from ce_gym.viewer import show, write_html
+    """Write or serve the page of rollouts, or write their video, as asked for; return the exit code."""
+    from ce_gym.viewer import show, write_html, write_video
 
+    if args.video:
+        print(write_video(rollouts[0], args.video, size=tuple(args.size)))
+        return 0
     options: dict[str, Any] = {"title": args.title, "spacing": 0.0 if overlay else None, "plot": args.plot}
     may_open = args.open and has_display()
     if args.live:

@@ -1,4 +1,4 @@
-"""Command-line parsers: help texts keep their line breaks, errors are one line."""
+"""Command-line parsers whose errors are one line, and a progress bar."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import argparse
 import io
 import os
 import sys
-from typing import Any, NoReturn
+from collections.abc import Collection, Iterator
+from typing import Any, NoReturn, TypeVar
+
+T = TypeVar("T")
 
 
 class Parser(argparse.ArgumentParser):
@@ -38,3 +41,12 @@ def has_display() -> bool:
     if sys.platform in ("win32", "darwin"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def shown(items: Collection[T], what: str) -> Iterator[T]:
+    """Iterate over items with a progress bar on stderr, if that is a terminal and tqdm is installed."""
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return iter(items)
+    return iter(tqdm(items, what, leave=False, disable=None, dynamic_ncols=True))

@@ -14,4 +14,11 @@ class ViewerError(RuntimeError):
     @classmethod
     def missing_embreex(cls) -> ViewerError:
         """Return the error for a missing embreex, with the command that installs it."""
-        return cls('render_mode="rgb_array" needs embreex, which is not installed: pip install "ce_gym[video]"')
+        return cls(
+            'pictures (render_mode="rgb_array") need embreex, which is not installed: pip install "ce_gym[video]"'
+        )
+
+    @classmethod
+    def missing_ffmpeg(cls) -> ViewerError:
+        """Return the error for a missing imageio-ffmpeg, with the command that installs it."""
+        return cls('videos need imageio-ffmpeg, which is not installed: pip install "ce_gym[video]"')

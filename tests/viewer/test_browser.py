@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import csv
+import io
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -192,19 +195,100 @@ def test_without_following_the_robot_walks_away(at_rest: Chromium) -> None:
     assert at_rest.run(place) < -0.2
 
 
+def choose(browser: Chromium, number: int, signal: str) -> None:
+    """Choose a signal in the row of that number, counted from the top of all plots."""
+    row = f"document.querySelectorAll('.plot select')[{number}]"
+    browser.run(f"(select => {{ select.value = '{signal}'; select.onchange(); }})({row})")
+
+
+def shown(browser: Chromium) -> list[list[str]]:
+    """What each plot shows."""
+    rows = "[...plot.querySelectorAll('select')].map(select => select.value)"
+    return browser.run(f"[...document.querySelectorAll('.plot')].map(plot => {rows})")
+
+
 def test_plots_show_both_and_move_time(at_rest: Chromium) -> None:
-    at_rest.run("redraw()")
     at_rest.settle()
-    chosen = at_rest.run("[...document.querySelectorAll('.plot select')].map(select => select.value)")
-    assert chosen[0] == "forward speed [m/s]"
-    assert chosen[1].startswith("torque of ")
-    assert chosen[2] == "reward"
-    values = at_rest.run("[...document.querySelectorAll('.plot:nth-child(3) .values span')].map(s => s.textContent)")
+    (first,), (second,), (third,) = shown(at_rest)
+    assert first == "forward speed [m/s]"
+    assert second.startswith("torque of ")
+    assert third == "reward"
+    values = at_rest.run(
+        "[...document.querySelectorAll('.plot:nth-child(3) .values span span')].map(s => s.textContent)"
+    )
     np.testing.assert_allclose([float(value) for value in values], np.sin(1.0), atol=1e-3)
-    box = at_rest.run("document.querySelector('.plot svg').getBoundingClientRect().toJSON()")
+    box = at_rest.run("document.querySelector('.plot canvas').getBoundingClientRect().toJSON()")
+    left, width = box["x"] + at_rest.run("MARGIN.left"), box["width"] - at_rest.run("MARGIN.left + MARGIN.right")
     middle = box["y"] + box["height"] / 2
-    at_rest.drag((box["x"] + 5, middle), (box["x"] + 0.75 * box["width"], middle))
+    at_rest.drag((left + 5, middle), (left + 0.75 * width, middle))
     assert at_rest.run("animator.time") == pytest.approx(0.75 * SECONDS, abs=0.05)
+
+
+def test_a_plot_takes_several_signals_and_leaves_files(at_rest: Chromium, twins: list[Rollout], tmp_path: Path) -> None:
+    before = shown(at_rest)
+    click(at_rest, ".plot .signal button")
+    choose(at_rest, 1, "reward")
+    assert shown(at_rest) == [["forward speed [m/s]", "reward"], *before[1:]]
+    colors = at_rest.run(
+        "[...document.querySelectorAll('.plot:first-child .values span[title]')].map(s => s.style.color)"
+    )
+    assert len(colors) == 5  # two robots and the command, two robots
+    assert len(set(colors)) == 3
+    table = list(csv.DictReader(at_rest.run("plots.csv()").splitlines()))
+    assert [row["source"] for row in table] == [name for name in ("exact", "armature") for _ in range(201)]
+    rewards = [float(row["reward"]) for row in table]
+    np.testing.assert_allclose(rewards, np.concatenate([twin.signals[:, 0] for twin in twins]), atol=1e-6)
+    np.testing.assert_allclose([float(row["forward speed [m/s], commanded"]) for row in table], 0.3, atol=1e-6)
+    url = at_rest.run("plots.png()")
+    image = np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB"), int)
+    assert image.shape[1] == 1800
+    for color in ((0x21, 0xA6, 0x59), (0x1F, 0x29, 0x33), (0xD9, 0x48, 0x0F)):
+        assert (np.abs(image - color).max(-1) < 30).sum() > 200, color
+    click(at_rest, ".plot .signal button[title^=Remove]")
+    choose(at_rest, 0, "forward speed [m/s]")
+    assert shown(at_rest) == before
+
+
+def test_ticks_are_round_numbers_in_sight(at_rest: Chromium) -> None:
+    """In every range: 3 to 12 of them, evenly spaced, each told apart from the next by its label."""
+    for low, high in ((0, 4), (0.31, 0.34), (-12.7, 3.4), (0, 2.4e7), (-1e-6, 1e-6), (3, 3.001)):
+        values = at_rest.run(f"ticks({low}, {high}, 6).values")
+        labels = at_rest.run(f"(({{ values, step }}) => values.map(v => label(v, step)))(ticks({low}, {high}, 6))")
+        assert 3 <= len(values) <= 12
+        assert min(values) >= low - 1e-9
+        assert max(values) <= high * (1 + 1e-9)
+        step = values[1] - values[0]
+        assert f"{step:.0e}"[0] in "125"
+        np.testing.assert_allclose(np.diff(values), step, rtol=1e-3)
+        assert len(set(labels)) == len(labels)
+
+
+def test_zoom_shows_a_part_with_the_present_in_it(at_rest: Chromium) -> None:
+    axis = """(draw => { const kept = drawGraph; let told;
+        drawGraph = (context, box, plot) => { told = [plot.from, plot.to]; kept(context, box, plot); };
+        draw(); drawGraph = kept; return told; })(() => { plots.redraw(); plots.move(animator.time); })"""
+    assert at_rest.run(axis) == [0, SECONDS]
+    click(at_rest, '.tools button[title^="See less"]')
+    start, end = at_rest.run(axis)
+    assert end - start == pytest.approx(SECONDS / 1.6)
+    assert start < 1.0 < end
+    at_rest.run("seek(3.9)")
+    start, end = at_rest.run(axis)
+    assert start < 3.9 <= end
+    click(at_rest, '.tools button[title^="See more"]')
+    assert at_rest.run(axis) == [0, SECONDS]
+
+
+def test_the_ghost_keeps_its_colour_in_x_ray(at_rest: Chromium) -> None:
+    opacities = """(index => { const found = []; node(`/world/${index}`).object.traverse(object => {
+        if (object.isMesh && /^link_\\d+$/.test(object.parent.name)) found.push(object.material.opacity); });
+        return [...new Set(found)]; })"""
+    ghost = at_rest.run(f"{opacities}(1)")
+    click(at_rest, "#xray")
+    robot, after = at_rest.run(f"{opacities}(0)"), at_rest.run(f"{opacities}(1)")
+    click(at_rest, "#xray")
+    assert after == ghost
+    assert max(robot) == pytest.approx(0.3)
 
 
 def test_the_address_says_what_to_show(file: Path) -> None:
@@ -212,15 +296,26 @@ def test_the_address_says_what_to_show(file: Path) -> None:
         browser.until("animator.time === 2.5")
         assert not browser.run("animator.playing")
         assert browser.run("find('torque').checked && !find('charts').checked")
-        assert browser.run("find('plots').style.visibility") == "hidden"
+        assert browser.run("find('plots').style.display") == "none"
         assert browser.errors == []
 
 
-def test_the_live_page_is_the_same(twins: list[Rollout]) -> None:
-    with closing(PageServer(page(twins[:1]))) as server, Chromium(server.url, size=(600, 500)) as browser:
+def test_the_live_page_is_the_same_and_a_narrow_window_keeps_all(twins: list[Rollout]) -> None:
+    with closing(PageServer(page(twins[:1]))) as server, Chromium(server.url, size=(500, 800)) as browser:
         browser.until("animator.time > 0.1")
         assert browser.errors == []
         assert all(asked.startswith((server.url, "data:")) for asked in browser.requests)
+        boxes = browser.run(
+            "Object.fromEntries(['about', 'plots', 'bar', 'charts'].map(id => "
+            "[id, find(id).getBoundingClientRect().toJSON()]))"
+        )
+        width, height = browser.run("[innerWidth, innerHeight]")
+    for name, box in boxes.items():
+        assert box["width"] > 0, name
+        assert 0 <= box["left"] <= box["right"] <= width, name
+        assert 0 <= box["top"] <= box["bottom"] <= height, name
+    assert boxes["about"]["bottom"] < boxes["plots"]["top"]
+    assert boxes["plots"]["bottom"] <= boxes["bar"]["top"]
 
 
 @pytest.fixture(scope="module")

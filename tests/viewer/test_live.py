@@ -33,6 +33,16 @@ def session(robot: LiveRobot) -> Session:
     return Session([robot])
 
 
+def test_arguments_of_the_environment_are_taken(monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(ViewerError, match="smell"):
+        Setup(policy=POLICY, kwargs={"smell": 1}).robots()
+    monkeypatch.setattr("ce_gym.viewer.live.setup.LiveRobot", lambda env_id, act, **kwargs: kwargs)
+    setup = named(POLICY, kwargs={"action_scale": 0.1, "transmission": "none"}, ghost="coupled")
+    assert [robot["transmission"] for robot in setup.robots()] == ["none", "coupled"]
+    assert [robot["action_scale"] for robot in setup.robots()] == [0.1, 0.1]
+    assert setup.changed({"policy": ""}).kwargs == setup.kwargs
+
+
 def ask(session: Session, **message: Any) -> None:
     request_of(message)(session)
 
@@ -223,6 +233,8 @@ def test_setups_say_what_is_wrong():
         Setup()
     with pytest.raises(ViewerError, match="transmission='belt'; expected one of exact"):
         Setup(policy=POLICY, transmission="belt")
+    with pytest.raises(ViewerError, match="push_period: expected an argument that the page does not choose itself"):
+        Setup(policy=POLICY, kwargs={"push_period": 1.0})
     assert named("ce_gym/MiniCheetahVelocity-v0").env_id
     assert named(POLICY).policy == POLICY
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from ce_gym.bench.accuracy.coulomb import PUSHES, distance_table
 from ce_gym.bench.accuracy.curves import OUR_STEPS, PEER_STEPS, Comparison, Measured, comparisons, measure
 from ce_gym.bench.accuracy.scenarios import SCENES
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table, cell_text
+from ce_gym.viewer.console import shown
 
 REQUIRED = 20.0
 """How many times as long as ours MuJoCo has to take at every error that both reach."""

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.sim.derivatives import StepDerivatives
 from ce_gym.sim.simulator import Simulator
+from ce_gym.viewer.console import shown
 
 STARTS, POINTS = 8, 129
 """Different robots, and places x of each, up to four times the width either way."""

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.bench.digests.cases import KINDS, Case, cases
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.model import robots
+from ce_gym.viewer.console import shown
 
 SAMPLES = 16
 """Numbers of an array that are recorded as they are."""

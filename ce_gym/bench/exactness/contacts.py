@@ -24,11 +24,11 @@ from ce_gym.bench.exactness.protocol import (
 )
 from ce_gym.bench.exactness.scaling import scaled
 from ce_gym.bench.exactness.tables import table
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement
 from ce_gym.dynamics.model import Model
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim.simulator import Simulator
+from ce_gym.viewer.console import shown
 
 COLUMNS = (
     "robot", "level", "ratio", "inertia", "stiffness [N/m]", "impulse [N s]", "rigid limit [N s]", "over rigid",

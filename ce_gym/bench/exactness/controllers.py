@@ -14,11 +14,11 @@ from ce_gym.bench.exactness.legs.stable_gain import largest_bandwidth
 from ce_gym.bench.exactness.mechanisms import leg_on_stand
 from ce_gym.bench.exactness.protocol import BANDWIDTHS, LEGS, Leg
 from ce_gym.bench.exactness.tables import spread, table
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.paper.tracking import FREQUENCY, PUBLISHED
 from ce_gym.dynamics.model import Model
 from ce_gym.model.mechanism import LEVELS
+from ce_gym.viewer.console import shown
 
 CONTROLLERS = ("joints", "foot")
 TRACKING = (

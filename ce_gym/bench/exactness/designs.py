@@ -22,9 +22,9 @@ from ce_gym.bench.exactness.protocol import (
     Array,
 )
 from ce_gym.bench.exactness.tables import spread, table
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report
 from ce_gym.model.mechanism import LEVELS
+from ce_gym.viewer.console import shown
 
 OBJECTIVES = {"jump [m]": 1.0, "landing [N]": -1.0, "transport [-]": -1.0}
 """What a design is chosen for, and whether more (1) or less (-1) is better."""

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device, to_numpy
+from ce_gym.viewer.console import shown
 
 BOUND = {"float64": 1e-11, "float32": 1e-5}
 """Largest difference allowed, relative to a robot's largest position or velocity, or to 1. There should be none."""

@@ -13,7 +13,6 @@ from typing import Any
 
 from ce_gym.bench.gpu import agreement as gpu_agreement
 from ce_gym.bench.gpu import speed as gpu_speed
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.compile.cuda import CudaUnavailable, nvrtc
 from ce_gym.compile.cuda.source import BLOCK, emit_source
@@ -24,6 +23,7 @@ from ce_gym.model import robots
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device, Emulated, device_named
+from ce_gym.viewer.console import shown
 
 DTYPES = ("float32", "float64")
 ARCHITECTURES = ("sm_80", "sm_90")

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from ce_gym.bench.measure.progress import shown
+from ce_gym.viewer.console import shown
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot
+from ce_gym.viewer.console import shown
 
 Array = NDArray[np.float64]
 Dynamics = tuple[float, Array, Array]  # total mass [kg], mass matrix, acceleration, both in our coordinates

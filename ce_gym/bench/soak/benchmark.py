@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.bench.soak import interrupts, substeps
 from ce_gym.compile.system import open_files, resident_memory
+from ce_gym.viewer.console import shown
 
 NUM_ENVS = 64
 """Robots in a batch."""

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.viewer.console import shown
 
 ROBOT, ENVIRONMENT = "mini_cheetah", "ce_gym/MiniCheetahVelocity-v0"
 NUM_ENVS = 200

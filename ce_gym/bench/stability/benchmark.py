@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.stability import grid
 from ce_gym.bench.stability import plots as stability_plots
@@ -21,6 +20,7 @@ from ce_gym.bench.stability.cases import CASES
 from ce_gym.dynamics.model import Model
 from ce_gym.model import load_robot
 from ce_gym.model.mechanism import LEVELS
+from ce_gym.viewer.console import shown
 
 ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1")
 PATIENCE, COLLAPSE, STANDING, FUZZ = 120.0, 3.0, 600.0, 1_000_000

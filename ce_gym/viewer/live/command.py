@@ -9,7 +9,7 @@ import webbrowser
 from pathlib import Path
 from typing import Any
 
-from ce_gym.policies import WHERE
+from ce_gym.policies import WHERE, add_env_arguments
 from ce_gym.viewer.console import examples, has_display
 
 
@@ -24,11 +24,11 @@ def add_live_command(subparsers: Any) -> None:
         epilog=examples(
             "live mini_cheetah_velocity",
             "live mit_humanoid_velocity --ghost armature",
-            "live my_module:ce_gym/MyRobotVelocity-v0",
+            "live my_module:ce_gym/MyRobotVelocity-v0 --env-arg terrain=stairs",
         ),
     )
     parser.add_argument("name", metavar="NAME", help=f"{WHERE}; or the id of an environment, whose pose is held")
-    parser.add_argument("--env", metavar="ID", default="", help="environment to act in (default: as trained)")
+    add_env_arguments(parser)
     parser.add_argument("--transmission", metavar="LEVEL", default="", help="level to begin with (default: as trained)")
     parser.add_argument("--ghost", metavar="LEVEL", default="", help="level of a ghost beside it (default: none)")
     parser.add_argument("--terrain", metavar="KIND", default="", help="ground to begin with (default: as trained)")
@@ -45,7 +45,8 @@ def live(args: argparse.Namespace) -> int:
     from ce_gym.viewer.page.html import meshcat_code
 
     meshcat_code()  # fails at once if meshcat is missing
-    setup = named(args.name, args.env, transmission=args.transmission, ghost=args.ghost, terrain=args.terrain)
+    options = {name: getattr(args, name) for name in ("transmission", "ghost", "terrain")}
+    setup = named(args.name, args.env or "", kwargs=dict(args.env_args), **options)
     with contextlib.suppress(KeyboardInterrupt), serving(setup, args.folder) as url:
         print(f"live at {url} (Ctrl-C to stop)", flush=True)
         if args.open and has_display():

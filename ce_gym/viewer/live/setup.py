@@ -9,7 +9,7 @@ from typing import Any
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.policies import environment_of, find_policy, load_policy, shipped_policies
 from ce_gym.viewer.errors import ViewerError
-from ce_gym.viewer.live.robot import Act, LiveRobot
+from ce_gym.viewer.live.robot import UNDISTURBED, Act, LiveRobot
 
 GROUNDS: Mapping[str, Mapping[str, Any]] = {
     "flat": {"kind": "flat"},
@@ -28,10 +28,10 @@ class Setup:
         transmission: Level of the robot; the policy's own if "".
         ghost: Level of its ghost, "" for no ghost.
         terrain: Kind of the ground; the policy's own if "".
-        kwargs: Further arguments of the environment.
+        kwargs: Further arguments of the environment, which replace the policy's own.
 
     Raises:
-        ViewerError: There is neither a policy nor an environment.
+        ViewerError: There is neither a policy nor an environment, or a figure is unknown or not to be chosen.
     """
 
     policy: str = ""
@@ -47,6 +47,9 @@ class Setup:
         for name, known in (("transmission", LEVELS), ("ghost", LEVELS), ("terrain", tuple(GROUNDS))):
             if getattr(self, name) not in ("", *known):
                 raise ViewerError(f"{name}={getattr(self, name)!r}; expected one of {', '.join(known)}")
+        for name in self.kwargs:
+            if name in UNDISTURBED or name == "randomise":
+                raise ViewerError(f"{name}: expected an argument that the page does not choose itself, as it does this")
 
     def changed(self, changes: Mapping[str, str]) -> Setup:
         """Return the setup with some attributes replaced; another policy brings its own environment, none keeps it."""

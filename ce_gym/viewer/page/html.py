@@ -58,7 +58,8 @@ def page(
         title,
         legend=_legend(runs),
         belts=source("belts.js"),
-        plots=source("plots.js"),
+        plotstyle=source("plots.css"),
+        plots=plots_code(),
         player=source("player.js"),
         commands=json.dumps(commands),
         data=_data(runs, plot, ghosts=spacing == 0),
@@ -83,6 +84,11 @@ def meshcat_code() -> str:
     if spec is None or spec.origin is None:
         raise ViewerError.missing_meshcat()
     return Path(spec.origin).with_name("viewer").joinpath("dist", "main.min.js").read_text(encoding="utf-8")
+
+
+def plots_code() -> str:
+    """Return the code of plots."""
+    return source("graph.js") + source("plots.js")
 
 
 def source(name: str) -> str:

@@ -1,8 +1,12 @@
 // The controls of the page. Expects commands, data, FRAME and HORIZON, meshcat's viewer,
-// ground.js, belts.js and plots.js.
+// ground.js, belts.js, graph.js and plots.js.
 
 const find = id => document.getElementById(id);
-const robots = unpackRobots(data.robots);
+const unpacked = packed => Object.fromEntries(Object.entries(packed).map(([k, v]) => [k, numbers(v, Float32Array)]));
+const robots = data.robots.map(robot => ({
+  ...robot, times: numbers(robot.times, Float32Array), signals: unpacked(robot.signals),
+  commanded: unpacked(robot.commanded), effort: numbers(robot.effort, Uint8Array),
+}));
 
 let viewer;
 try {
@@ -46,8 +50,12 @@ function follow(on) {
   animator.actions[0].setEffectiveWeight(on ? 1 : 0);
   animator.mixer.update(0);
 }
+// Ghosts stay as they are, in their own colour: of two robots that both were transparent nobody could tell which is which.
+const ghostly = new Set();
+robots.forEach((robot, i) => { if (robot.ghost) node(`/world/${i}`).object.traverse(object => ghostly.add(object)); });
 function xray(on) {
   viewer.scene.traverse(object => {
+    if (ghostly.has(object)) return;
     if (object.name === "inside") object.visible = on;
     if (!object.isMesh || !/^link_\d+$/.test(object.parent.name)) return;
     const material = object.material;
@@ -84,7 +92,7 @@ function torque(on) {
 }
 if (!painted.length) find("torque").parentElement.style.display = "none";
 
-const switches = { follow, xray, torque, charts: on => { find("plots").style.visibility = on ? "visible" : "hidden"; } };
+const switches = { follow, xray, torque, charts: on => { find("plots").style.display = on ? "" : "none"; } };
 for (const [id, change] of Object.entries(switches)) {
   find(id).onchange = event => { change(event.target.checked); viewer.set_dirty(); };
 }
@@ -94,10 +102,11 @@ for (const box of document.querySelectorAll("#about input")) {
     viewer.set_dirty();
   };
 }
-let drawn = null;  // the time that the plots show
-const redraw = () => { drawn = null; };
-const plots = data.chosen.map(name => makePlot(find("plots"), robots, name, animator.duration, seek, redraw));
-if (!plots.length) for (const hidden of [find("plots"), find("charts").parentElement]) hidden.style.display = "none";
+const few = window.innerWidth <= 820 ? 1 : data.chosen.length;  // where there is little room
+const plots = makePlots(find("plots"), robots, data.chosen.slice(0, few), {
+  span: [0, animator.duration], unit: "s", seek, file: document.title,
+});
+if (!data.chosen.length) for (const hidden of [find("plots"), find("charts").parentElement]) hidden.style.display = "none";
 
 // The address may say what to show: #t=4.2&xray&torque&charts=0 opens the page paused there.
 for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
@@ -115,8 +124,7 @@ function refresh() {
   if (document.activeElement !== find("time") || animator.playing) find("time").value = animator.time;
   find("clock").value = animator.time.toFixed(2) + " / " + animator.duration.toFixed(2) + " s";
   if (find("torque").checked) { paint(animator.time); viewer.set_dirty(); }
-  if (drawn !== animator.time) for (const move of plots) move(animator.time);
-  drawn = animator.time;
+  plots.move(animator.time);
   requestAnimationFrame(refresh);
 }
 refresh();

@@ -1,96 +1,195 @@
-// Plots beside the scene: each shows one signal of every robot, what was commanded and what the robot allows, with a
-// line at the present time. The wheel zooms into time around that line. Knows nothing of the scene.
+// Plots beside a scene: each shows some signals of every source (a robot, a run) over time, or over whatever `unit` says,
+// and their values at the present moment. All share one view of time. Expects graph.js; knows nothing of scenes.
 
-let zoom = 1;  // of all plots: how much shorter the time shown is than the whole
-
-function numbers(text, kind) {
-  return new kind(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
-}
-
-// Last frame at or before a time.
-function frameAt(times, time) {
-  let low = 0, high = times.length - 1;
-  while (low < high) {
-    const middle = (low + high + 1) >> 1;
-    if (times[middle] <= time + 1e-6) low = middle; else high = middle - 1;
-  }
-  return low;
-}
-
-function unpackRobots(robots) {
-  const all = packed => Object.fromEntries(Object.entries(packed).map(([k, v]) => [k, numbers(v, Float32Array)]));
-  return robots.map(robot => ({
-    ...robot, times: numbers(robot.times, Float32Array), signals: all(robot.signals),
-    commanded: all(robot.commanded), effort: numbers(robot.effort, Uint8Array),
-  }));
-}
+const COLORS = ["#1f2933", "#d9480f", "#1c7ed6", "#2b8a3e", "#9c36b5", "#c2255c"];  // of several signals in one plot
+const COMMANDED = "#21a659", DASHED = [6, 3], TALL = 118;
 
 function element(tag, parent, attributes = {}) {
-  const svg = tag === "svg" || parent.namespaceURI.endsWith("svg");
-  const made = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+  const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
   parent.appendChild(made);
   return made;
 }
 
-// One plot; returns what moves its line to a time. It asks for that by `redraw` where nothing else has changed.
-function makePlot(parent, robots, name, duration, seek, redraw) {
-  const box = element("div", parent, { class: "plot" });
-  const select = element("select", box, { "aria-label": "Signal" });
-  for (const known of [...new Set(robots.flatMap(robot => Object.keys(robot.signals)))]) {
-    element("option", select, { value: known }).textContent = known;
-  }
-  const graph = element("div", box, { class: "graph" });
-  const svg = element("svg", graph, { preserveAspectRatio: "none" });
-  const top = element("div", graph, { class: "end" }), bottom = element("div", graph, { class: "end low" });
-  const values = element("div", box, { class: "values" });
-  let lines = [], now, shown = 0;  // shown: when the time shown begins [s]
+// Leaves a file with the browser.
+function download(name, url) {
+  const link = document.createElement("a");
+  Object.assign(link, { href: url, download: name });
+  link.click();
+}
 
-  function show(signal) {
-    lines = robots.filter(robot => signal in robot.signals)
-      .map(robot => ({ color: robot.color, times: robot.times, values: robot.signals[signal] }));
-    const told = robots.find(robot => signal in robot.commanded);
-    let [low, high] = [0, 0];
-    for (const line of lines) for (const value of line.values) { low = Math.min(low, value); high = Math.max(high, value); }
-    if (high === low) high = low + 1;
-    const limit = robots.map(robot => robot.limits[signal]).find(value => value !== undefined);
-    const room = 0.06 * (high - low);
-    const y = value => 100 - 100 * (value - low + room) / (high - low + 2 * room);
-    const path = (times, numbers) => "M" + Array.from(numbers, (v, i) => `${times[i].toFixed(3)},${y(v).toFixed(2)}`).join("L");
-    svg.replaceChildren();
-    const straight = value => element("path", svg, { d: `M0,${y(value)}H${duration}`, stroke: "#cbd2d9" });
-    straight(0);
-    for (const value of [limit, -limit]) if (value > low && value < high) straight(value).setAttribute("stroke-dasharray", "4 3");
-    if (told) element("path", svg, { d: path(told.times, told.commanded[signal]), stroke: "#21a659", "stroke-dasharray": "5 3" });
-    for (const line of [...lines].reverse()) element("path", svg, { d: path(line.times, line.values), stroke: line.color });
-    now = element("path", svg, { class: "now" });
-    top.textContent = high.toPrecision(3);
-    bottom.textContent = low.toPrecision(3);
+// Panel of plots.
+//   sources: {name, color, times, signals, commanded, limits}, see charts.py; names: the signal of each plot at first;
+//   span: first and last time; seek: is called with a time that was pointed at, or null where time cannot be chosen.
+function makePlots(parent, sources, names, { span, unit, seek, file }) {
+  let view = [...span], now = seek ? span[0] : null, drawn = "";
+  const plots = [], redraw = () => { drawn = ""; };
+  const tools = element("div", parent, { class: "tools" }), list = element("div", parent, { class: "plotlist" });
+
+  const known = () => [...new Set(sources.flatMap(source => Object.keys(source.signals)))];
+  function curvesOf(signals) {
+    return signals.flatMap((signal, k) => {
+      const told = sources.find(source => signal in source.commanded);
+      const curves = sources.filter(source => signal in source.signals).map((source, i) => ({
+        signal, name: source.name, times: source.times, values: source.signals[signal],
+        color: signals.length > 1 ? COLORS[k % COLORS.length] : source.color, dash: signals.length > 1 && i ? DASHED : [],
+      }));
+      const command = { signal, name: "commanded", color: COMMANDED, dash: [4, 3] };
+      return told ? [...curves, { ...command, times: told.times, values: told.commanded[signal] }] : curves;
+    });
+  }
+  function contentOf(plot) {
+    const curves = curvesOf(plot.signals), range = rangeOf(curves.map(curve => curve.values));
+    const largest = plot.signals.map(signal => sources.map(source => source.limits[signal]).find(Number.isFinite));
+    const limits = plot.signals.length > 1 ? [] : largest.flatMap(limit => limit ? [limit, -limit] : []);
+    return { curves, range, limits: limits.filter(value => value > range[0] && value < range[1]) };
   }
 
-  function drag(event) {
-    if (event.type === "pointerdown") svg.setPointerCapture(event.pointerId);
-    if (!svg.hasPointerCapture(event.pointerId)) return;
-    const area = svg.getBoundingClientRect();
-    seek(Math.max(0, Math.min(duration, shown + duration / zoom * (event.clientX - area.left) / area.width)));
-  }
-  svg.onwheel = event => {
-    event.preventDefault();
-    zoom = Math.max(1, Math.min(duration / 0.2, zoom * (event.deltaY < 0 ? 1.25 : 0.8)));
+  // Rows of a plot: a signal to choose, the values of its curves now.
+  function fill(plot) {
+    plot.rows.replaceChildren();
+    plot.content = contentOf(plot);
+    plot.signals.forEach((signal, k) => {
+      const row = element("div", plot.rows, { class: "signal" });
+      const select = element("select", row, { "aria-label": "Signal" });
+      for (const name of known()) element("option", select, { value: name }).textContent = name;
+      select.value = signal;
+      select.onchange = () => { plot.signals[k] = select.value; fill(plot); };
+      const button = (text, title, act) => {
+        const made = element("button", row, { title, "aria-label": title });
+        made.textContent = text;
+        made.onclick = () => { act(); made.blur(); };
+      };
+      if (k === plot.signals.length - 1) button("+", "Another signal in this plot", () => { plot.signals.push(signal); fill(plot); });
+      button("×", "Remove this signal", () => { plot.signals.splice(k, 1); plot.signals.length ? fill(plot) : remove(plot); });
+      const values = element("div", plot.rows, { class: "values" });
+      for (const curve of plot.content.curves.filter(one => one.signal === signal)) {
+        const text = element("span", values, { title: curve.name, style: `color: ${curve.color}` });
+        element("i", text, { class: curve.dash.length ? "dashed" : "" });
+        curve.text = element("span", text);
+      }
+    });
     redraw();
-  };
-  svg.onpointerdown = svg.onpointermove = drag;
-  select.onchange = () => { show(select.value); redraw(); };
-  select.value = name;
-  show(name);
+  }
+  function remove(plot) {
+    plots.splice(plots.indexOf(plot), 1);
+    plot.box.remove();
+  }
+  function add(signal) {
+    const box = element("div", list, { class: "plot" });
+    const plot = { box, rows: element("div", box), canvas: element("canvas", box), signals: [signal] };
+    plots.push(plot);
+    point(plot.canvas);
+    fill(plot);
+  }
 
-  return time => {
-    const width = duration / zoom;
-    shown = Math.max(0, Math.min(duration - width, time - width / 2));
-    svg.setAttribute("viewBox", `${shown} 0 ${width} 100`);
-    now.setAttribute("d", `M${time},0V100`);
-    const texts = lines.map(line => line.values[frameAt(line.times, time)].toPrecision(3));
-    values.replaceChildren();
-    texts.forEach((text, i) => { element("span", values, { style: "color:" + lines[i].color }).textContent = text; });
+  // Pointing: drag moves through time, the wheel zooms about the pointer.
+  function timeAt(canvas, event) {
+    const area = canvas.getBoundingClientRect(), width = area.width - MARGIN.left - MARGIN.right;
+    const share = Math.max(0, Math.min(1, (event.clientX - area.left - MARGIN.left) / width));
+    return view[0] + share * (view[1] - view[0]);
+  }
+  function point(canvas) {
+    canvas.onpointerdown = canvas.onpointermove = event => {
+      if (event.type === "pointerdown") canvas.setPointerCapture(event.pointerId);
+      if (!seek) { now = timeAt(canvas, event); return; }
+      if (canvas.hasPointerCapture(event.pointerId)) seek(timeAt(canvas, event));
+    };
+    canvas.onpointerleave = () => { if (!seek) now = null; };
+    canvas.onwheel = event => {
+      event.preventDefault();
+      event.deltaX && !event.deltaY ? pan(event.deltaX / 500) : zoom(event.deltaY < 0 ? 1.25 : 0.8, timeAt(canvas, event));
+    };
+  }
+  function zoom(factor, about = now ?? (view[0] + view[1]) / 2) {
+    const width = Math.max((span[1] - span[0]) / 1000, Math.min(span[1] - span[0], (view[1] - view[0]) / factor));
+    const share = (about - view[0]) / (view[1] - view[0]);
+    show(about - share * width, width);
+  }
+  function pan(share) { show(view[0] + share * (view[1] - view[0]), view[1] - view[0]); }
+  function show(from, width) {
+    const first = Math.max(span[0], Math.min(span[1] - width, from));
+    view = [first, first + width];
+    redraw();
+  }
+
+  // Drawing.
+  function paint(context, box, plot) {
+    drawGraph(context, box, { ...plot.content, from: view[0], to: view[1], now, unit });
+  }
+  function draw() {
+    for (const plot of plots) {
+      const width = plot.canvas.clientWidth, ratio = window.devicePixelRatio || 1, context = plot.canvas.getContext("2d");
+      if (!width) continue;
+      Object.assign(plot.canvas, { width: width * ratio, height: TALL * ratio });
+      context.scale(ratio, ratio);
+      paint(context, { x: 0, y: 0, width, height: TALL }, plot);
+      for (const { text, times, values } of plot.content.curves) {
+        const at = now === null ? times.length - 1 : frameAt(times, now);
+        text.textContent = at >= 0 ? values[at].toPrecision(3) : "";
+      }
+    }
+  }
+  function move(time) {
+    if (time !== null) now = time;
+    if (time !== null && (now < view[0] || now > view[1])) show(now - 0.05 * (view[1] - view[0]), view[1] - view[0]);
+    const wanted = [now, parent.clientWidth, ...view].join();
+    if (wanted !== drawn) draw();
+    drawn = wanted;
+  }
+
+  // Files: all frames of the signals that are shown; the plots as they are, with a legend.
+  function csv() {
+    const columns = [...new Set(plots.flatMap(plot => plot.signals))], quoted = text => `"${String(text).replaceAll('"', '""')}"`;
+    const rows = [["source", `time [${unit}]`, ...columns, ...columns.map(name => `${name}, commanded`)].map(quoted).join()];
+    for (const source of sources) {
+      const arrays = [...columns.map(name => source.signals[name]), ...columns.map(name => source.commanded[name])];
+      source.times.forEach((time, i) => rows.push([quoted(source.name), time, ...arrays.map(values => values?.[i] ?? "")].join()));
+    }
+    return rows.join("\n") + "\n";
+  }
+  function png(width = 900, height = 260) {
+    const canvas = document.createElement("canvas"), context = canvas.getContext("2d"), line = 18;
+    const tall = plot => height + line * plot.content.curves.length;
+    Object.assign(canvas, { width: 2 * width, height: 2 * plots.reduce((sum, plot) => sum + tall(plot), 10) });
+    context.scale(2, 2);
+    context.fillStyle = "white";
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    let y = 10;
+    for (const plot of plots) {
+      for (const { color, dash, name, signal } of plot.content.curves) {
+        Object.assign(context, { strokeStyle: color, fillStyle: "#1f2933", lineWidth: 2, font: FONT, textBaseline: "middle", textAlign: "left" });
+        context.setLineDash(dash);
+        context.beginPath();
+        context.moveTo(MARGIN.left, y + line / 2);
+        context.lineTo(MARGIN.left + 26, y + line / 2);
+        context.stroke();
+        context.fillText(`${signal} (${name})`, MARGIN.left + 32, y + line / 2);
+        y += line;
+      }
+      paint(context, { x: 0, y, width, height }, plot);
+      y += height;
+    }
+    return canvas.toDataURL("image/png");
+  }
+  const tool = (text, title, act) => {
+    const made = element("button", tools, { title, "aria-label": title });
+    made.textContent = text;
+    made.onclick = () => { act(); made.blur(); };
   };
+  tool("+ plot", "Another plot", () => add(known()[0]));
+  tool("−", "See more of the time (wheel)", () => zoom(1 / 1.6));
+  tool("+", "See less of the time (wheel)", () => zoom(1.6));
+  tool("CSV", "Save the signals shown as a table", () => download(`${file}.csv`, URL.createObjectURL(new Blob([csv()], { type: "text/csv" }))));
+  tool("PNG", "Save the plots as a picture", () => download(`${file}.png`, png()));
+  names.forEach(add);
+
+  // Takes other figures of the same kind, and keeps what is chosen; whoever looks at all goes on to do so.
+  function replace(newSources, newSpan) {
+    const all = view[0] === span[0] && view[1] === span[1];
+    [sources, span] = [newSources, newSpan];
+    if (all) view = [...span];
+    plots.forEach(fill);
+  }
+  return { move, redraw, replace, csv, png };
 }

@@ -11,10 +11,10 @@ from ce_gym.bench.exactness.legs.control import Controllers
 from ce_gym.bench.exactness.legs.signals import Motion
 from ce_gym.bench.exactness.mechanisms import leg_on_stand, without_limits
 from ce_gym.bench.exactness.protocol import BANDWIDTHS, COUNTED, HOLD, PLANT_STEP, POSES, SETTLE, SLOWEST, Array, Leg
-from ce_gym.bench.measure.progress import shown
 from ce_gym.dynamics.model import Model
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim.simulator import Simulator
+from ce_gym.viewer.console import shown
 
 
 @dataclass(frozen=True)

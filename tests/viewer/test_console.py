@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from ce_gym.bench.measure.progress import shown
+from ce_gym.viewer.console import shown
 
 
 def test_nothing_is_said_where_nobody_looks(capsys: pytest.CaptureFixture[str]) -> None:

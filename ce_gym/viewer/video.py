@@ -1,0 +1,105 @@
+"""Rollouts as moving pictures: MP4, WebM or GIF files, drawn by rays, without a display or a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.viewer.console import shown
+from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.page.poses import PosedModel
+from ce_gym.viewer.page.scene import load_model
+from ce_gym.viewer.raytrace.picture import Picture
+from ce_gym.viewer.rollouts.rollout import Rollout
+
+# Of a GIF, ffmpeg chooses the colours that the whole film needs most, and stores what changes between frames.
+_PALETTE = "split[a][b];[a]palettegen=max_colors=128[p];[b][p]paletteuse=dither=bayer:bayer_scale=5:diff_mode=rectangle"
+KINDS: dict[str, tuple[float, dict[str, Any]]] = {
+    ".mp4": (50.0, {"codec": "libx264", "output_params": ["-crf", "23", "-movflags", "+faststart"]}),
+    ".webm": (50.0, {"codec": "libvpx-vp9", "output_params": ["-crf", "36", "-b:v", "0"]}),
+    ".gif": (20.0, {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-vf", _PALETTE]}),
+}
+"""Most pictures in a second, and how ffmpeg encodes them, by the ending of a file."""
+SMALLEST, LARGEST = 16, 4096  # edge of a picture [pixels]
+
+
+def write_video(
+    rollout: Rollout,
+    path: str | Path,
+    *,
+    size: tuple[int, int] = (640, 480),
+    fps: float | None = None,
+    model: PosedModel | None = None,
+) -> Path:
+    """Write a rollout as a video in real time and return its path.
+
+    Args:
+        rollout: What to show: one robot.
+        path: A name that ends in .mp4, .webm or .gif.
+        size: Width and height [pixels], even numbers.
+        fps: Pictures in a second, at most the rollout's frames [1/s]; by default up to 50, of a GIF up to 20.
+        model: The posed robot; built from the rollout if not given.
+
+    Raises:
+        ViewerError: The name or the size is of no video, embreex or imageio-ffmpeg is not installed, or the file cannot
+            be written.
+    """
+    path = Path(path)
+    check_video(path, size)
+    writer = _ffmpeg()
+    usual, encoding = KINDS[path.suffix.lower()]
+    fps = min(fps or usual, 1 / rollout.dt)
+    model = model or load_model(rollout)
+    width, height = size
+    picture = Picture(model, rollout.q[0], width=width, height=height, terrain=rollout.ground)
+    fresh = path.with_name(f".{path.name}")  # a film is whole or not there
+    film = writer(str(fresh), size, fps=fps, macro_block_size=2, ffmpeg_log_level="error", **encoding)
+    try:
+        film.send(None)
+        for pixels in _pictures(rollout, picture, fps):
+            film.send(pixels)
+        film.close()
+        fresh.replace(path)
+    except OSError as error:
+        raise ViewerError(f"{path}: ffmpeg cannot write it ({' '.join(str(error).split())[:200]})") from None
+    finally:
+        film.close()
+        fresh.unlink(missing_ok=True)
+    return path
+
+
+def check_video(path: Path, size: tuple[int, int]) -> None:
+    """See whether a file and a size can be those of a video, before time is spent on it.
+
+    Raises:
+        ViewerError: They cannot.
+    """
+    if path.suffix.lower() not in KINDS:
+        raise ViewerError(f"{path}: expected a name that ends in {', '.join(KINDS)}")
+    if not path.resolve().parent.is_dir():
+        raise ViewerError(f"{path}: no such folder; expected one that is there")
+    for edge in size:
+        if edge % 2 or not SMALLEST <= edge <= LARGEST:
+            raise ViewerError(
+                f"size {size[0]} x {size[1]}: expected even numbers from {SMALLEST} to {LARGEST} [pixels]"
+            )
+
+
+def _pictures(rollout: Rollout, picture: Picture, fps: float) -> Iterator[NDArray[np.uint8]]:
+    """Draw the frame that is nearest to each moment of the film."""
+    moments = rollout.times[0] + np.arange(int(rollout.duration * fps) + 1) / fps
+    nearest = np.abs(rollout.times - moments[:, None]).argmin(1)
+    for frame in shown(nearest.tolist(), "drawing"):
+        yield picture.draw(rollout.q[frame])
+
+
+def _ffmpeg() -> Any:
+    try:
+        from imageio_ffmpeg import write_frames
+    except ImportError:
+        raise ViewerError.missing_ffmpeg() from None
+    return write_frames
