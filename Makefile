@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 EXTRAS := viewer,video,fast,train,export,rsl-rl,gpu,bench,docs,dev
 
-.PHONY: help venv demo test arm lint types docs links wheel clean
+.PHONY: help venv demo test arm lint types docs gallery links wheel clean
 
 help:
 	@echo "make demo    train Mini Cheetah to walk, then write a rollout to look at in a browser (a few minutes)"
@@ -13,6 +13,7 @@ help:
 	@echo "make lint    ruff: style and format"
 	@echo "make types   pyright: types, as on Linux, macOS and Windows"
 	@echo "make docs    this documentation as HTML in docs/_build/html; a warning is an error"
+	@echo "make gallery make the moving pictures of the documentation anew from the policies that come along"
 	@echo "make links   follow the links of README and docs that lead out into the web"
 	@echo "make wheel   build sdist and wheel into dist/"
 	@echo "make venv    create .venv with everything the others need"
@@ -48,6 +49,10 @@ types: .venv/installed
 docs: .venv/installed
 	$(BIN)/python -m sphinx -W --keep-going --nitpicky -q -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
+
+gallery: .venv/installed
+	for robot in jvrc1 mini_cheetah mit_humanoid tello; do $(BIN)/python -m ce_gym play $${robot}_velocity --size 320 240 \
+		--command 1.5 0.5 0 0 --command 1.5 0.5 0 0.8 --video docs/images/$${robot}.gif || exit 1; done
 
 links: .venv/installed
 	$(BIN)/python -m sphinx -q -b linkcheck docs docs/_build/links

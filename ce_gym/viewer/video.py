@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ce_gym.viewer.console import shown
 from ce_gym.viewer.errors import ViewerError
-from ce_gym.viewer.page.poses import PosedModel
 from ce_gym.viewer.page.scene import load_model
 from ce_gym.viewer.raytrace.picture import Picture
 from ce_gym.viewer.rollouts.rollout import Rollout
@@ -33,7 +32,7 @@ def write_video(
     *,
     size: tuple[int, int] = (640, 480),
     fps: float | None = None,
-    model: PosedModel | None = None,
+    model: Any = None,
 ) -> Path:
     """Write a rollout as a video in real time and return its path.
 
@@ -42,7 +41,7 @@ def write_video(
         path: A name that ends in .mp4, .webm or .gif.
         size: Width and height [pixels], even numbers.
         fps: Pictures in a second, at most the rollout's frames [1/s]; by default up to 50, of a GIF up to 20.
-        model: The posed robot; built from the rollout if not given.
+        model: The `Model` of the robot; built from the rollout if not given.
 
     Raises:
         ViewerError: The name or the size is of no video, embreex or imageio-ffmpeg is not installed, or the file cannot

@@ -10,8 +10,8 @@ import fnmatch
 import warnings
 
 import ce_gym
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.viewer.console import shown
 
 COLUMNS = ("id", "checker", "what it says")
 

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import load_robot, robots
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim import Simulator
+from ce_gym.viewer.console import shown
 
 NUM_ENVS = 256
 """Robots in a batch."""

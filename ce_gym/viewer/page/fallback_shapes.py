@@ -1,4 +1,4 @@
-"""Shapes for bodies that have none: stick figures of whole robots, discs of rotors."""
+"""What is drawn of bodies: meshes, shapes; where there is neither, stick figures of whole robots, discs of rotors."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from ce_gym.model.description import Body, Robot, Shape
 from ce_gym.model.frames import Placement, Vec3
+from ce_gym.viewer.meshes.triangles import MOST, Triangles, drawn_meshes
+from ce_gym.viewer.meshes.visuals import visuals_of
 from ce_gym.viewer.page.three import Color
 
 Array = NDArray[np.float64]
@@ -16,11 +18,17 @@ LIGHT, DARK = (0.93, 0.94, 0.95), (0.16, 0.18, 0.21)
 STICK_COLORS = {"link": (0.30, 0.45, 0.62), "rotor": (0.90, 0.55, 0.20)}
 
 
-def shapes_of(robot: Robot) -> dict[str, tuple[Shape, ...]]:
-    """Return what is drawn for each body: its shapes, or a stick figure if no body has any."""
-    if any(body.shapes for body in robot.bodies):
-        return {body.name: body.shapes for body in robot.bodies}
-    return stick_figure(robot)
+def drawn_of(robot: Robot, triangles: int = MOST) -> dict[str, tuple[Shape | Triangles, ...]]:
+    """Return what is drawn for each body: its meshes, its shapes, or a stick figure if no body has any.
+
+    Args:
+        robot: Which robot.
+        triangles: How many all its meshes may have.
+    """
+    meshes = drawn_meshes(robot, triangles)
+    if meshes or any(body.shapes for body in robot.bodies):
+        return {body.name: meshes.get(body.name, body.shapes) for body in robot.bodies}
+    return {**stick_figure(robot)}
 
 
 def stick_figure(robot: Robot) -> dict[str, tuple[Shape, ...]]:
@@ -52,7 +60,7 @@ def rotor_discs(robot: Robot) -> dict[str, Shape]:
 
     Rotors without mass get none, nor do robots that are stick figures anyway.
     """
-    if not any(body.shapes for body in robot.bodies):
+    if not visuals_of(robot) and not any(body.shapes for body in robot.bodies):
         return {}
     return {body.name: _disc(body) for body in robot.rotors() if not body.shapes and body.inertial.mass > 0}
 

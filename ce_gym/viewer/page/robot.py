@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from ce_gym.model.description import Body, Robot, Shape
 from ce_gym.model.frames import Placement
+from ce_gym.viewer.meshes.triangles import MOST, Triangles
 from ce_gym.viewer.page import animation, three
 from ce_gym.viewer.page.belts import Part, belt_parts
-from ce_gym.viewer.page.fallback_shapes import DARK, LIGHT, rotor_discs, shapes_of
+from ce_gym.viewer.page.fallback_shapes import DARK, LIGHT, drawn_of, rotor_discs
 from ce_gym.viewer.page.three import Color, Command
 
 Array = NDArray[np.float64]
@@ -30,16 +31,19 @@ def body_paths(robot: Robot, root: str) -> dict[str, str]:
     return paths
 
 
-def robot_commands(robot: Robot, root: str, *, tint: Color | None = None, opacity: float = 1.0) -> Iterator[Command]:
+def robot_commands(
+    robot: Robot, root: str, *, tint: Color | None = None, opacity: float = 1.0, triangles: int = MOST
+) -> Iterator[Command]:
     """Draw all bodies of a robot.
 
     Args:
-        robot: What to draw. If no body has shapes, each is a small ball joined to its parent by a stick.
+        robot: What to draw. If no body has meshes or shapes, each is a small ball joined to its parent by a stick.
         root: Scene path of the whole robot.
         tint: One colour for everything, in place of the shapes' own.
         opacity: Factor on the opacity of everything, 0..1.
+        triangles: How many all its meshes may have.
     """
-    paths, shapes, inside = body_paths(robot, root), shapes_of(robot), belt_parts(robot)
+    paths, shapes, inside = body_paths(robot, root), drawn_of(robot, triangles), belt_parts(robot)
     for name, disc in rotor_discs(robot).items():
         inside.setdefault(name, []).append(Part(disc, ()))
     for body in robot.bodies:
@@ -47,7 +51,7 @@ def robot_commands(robot: Robot, root: str, *, tint: Color | None = None, opacit
             color = tint or shape.color
             path = f"{paths[body.name]}/{body.kind}_{index}"
             yield _shape_command(path, shape, color, opacity * shape.color[3])
-            if body.kind == "rotor" and shape.type == "cylinder":
+            if body.kind == "rotor" and isinstance(shape, Shape) and shape.type == "cylinder":
                 yield _spoke_command(f"{path}_spoke", shape, color, opacity)
         if body.name in inside:
             path = f"{paths[body.name]}/inside"
@@ -83,8 +87,10 @@ def _joint(body: Body, path: str, sign: int) -> Command:
     return {"path": path, "rest": rest, "axis": list(body.joint.axis), "sign": sign}
 
 
-def _shape_command(path: str, shape: Shape, color: Color, opacity: float) -> Command:
+def _shape_command(path: str, shape: Shape | Triangles, color: Color, opacity: float) -> Command:
     matrix = _matrix(shape.placement)
+    if isinstance(shape, Triangles):
+        return three.mesh(path, three.triangles(shape.vertices, shape.faces), color, matrix, opacity=opacity, flat=True)
     if shape.type == "box":
         return three.mesh(path, three.box(*shape.size), color, matrix, opacity=opacity)
     if shape.type == "sphere":
@@ -114,9 +120,14 @@ def extent(robot: Robot, positions: Array, rotations: Array) -> tuple[Array, Arr
         rotations: Shape (n_bodies, 3, 3).
     """
     low, high = positions.min(0), positions.max(0)
-    shapes = shapes_of(robot)
+    shapes = drawn_of(robot)
     for body, position, rotation in zip(robot.bodies, positions, rotations, strict=True):
         for shape in shapes[body.name]:
+            if isinstance(shape, Triangles):
+                own = shape.vertices @ np.array(shape.placement.rotation).T + shape.placement.position
+                corners = own @ rotation.T + position
+                low, high = np.minimum(low, corners.min(0)), np.maximum(high, corners.max(0))
+                continue
             centre = position + rotation @ np.array(shape.placement.position)
             reach = _half_edges(shape, rotation @ np.array(shape.placement.rotation))
             low, high = np.minimum(low, centre - reach), np.maximum(high, centre + reach)

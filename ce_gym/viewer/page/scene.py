@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.meshes.triangles import MOST
 from ce_gym.viewer.page import animation, arrows, three
 from ce_gym.viewer.page.lights_and_camera import camera_commands, eye, field_command, surroundings
 from ce_gym.viewer.page.poses import PosedModel, PosedRollout, smooth
@@ -71,7 +72,8 @@ def build_scene(runs: Sequence[PosedRollout], *, spacing: float | None = None) -
     for index, run in enumerate(runs):
         ghost = index > 0 and spacing == 0
         tint = GHOST_TINTS[(index - 1) % len(GHOST_TINTS)] if ghost else None
-        commands += robot_commands(run.robot, run.path, tint=tint, opacity=GHOST_OPACITY if ghost else 1.0)
+        opacity = GHOST_OPACITY if ghost else 1.0
+        commands += robot_commands(run.robot, run.path, tint=tint, opacity=opacity, triangles=MOST // len(runs))
         commands.append(three.set_transform(run.path, poses[index]))
         clips += run.clips(end)
         for arrow in () if ghost else arrows.all_arrows(run):

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Command = dict[str, Any]
 Color = Sequence[float]
 
-_FLOAT32_ARRAY = 0x17  # MessagePack extension code that meshcat's page decodes as a Float32Array
+_EXTENSIONS = {"u2": 0x14, "u4": 0x16, "f4": 0x17}  # MessagePack codes that meshcat's page decodes as typed arrays
 FRONT, BACK = 0, 1  # three.js: which faces of a mesh are drawn
 _REPEAT, _LINEAR, _LINEAR_MIPMAP = 1000, 1006, 1008  # three.js texture constants
 
@@ -35,7 +35,8 @@ def pack(command: Command) -> bytes:
 
 
 def _pack_array(umsgpack: Any, array: NDArray[Any]) -> Any:
-    return umsgpack.Ext(_FLOAT32_ARRAY, np.ascontiguousarray(array, dtype="<f4").tobytes())
+    kind = array.dtype.str[1:] if array.dtype.kind == "u" else "f4"
+    return umsgpack.Ext(_EXTENSIONS[kind], np.ascontiguousarray(array, dtype=f"<{kind}").tobytes())
 
 
 def _umsgpack() -> Any:
@@ -88,8 +89,10 @@ def set_object(path: str, kind: str, matrix: Array, **parts: Any) -> Command:
     return {"type": "set_object", "path": path, "object": {**scene, "object": item}}
 
 
-def mesh(path: str, geometry: Command, color: Color, matrix: Array, *, opacity: float = 1.0) -> Command:
-    """Return the command that draws a solid."""
+def mesh(
+    path: str, geometry: Command, color: Color, matrix: Array, *, opacity: float = 1.0, flat: bool = False
+) -> Command:
+    """Return the command that draws a solid; `flat` shades each triangle by itself, so that edges stay sharp."""
     material: Command = {
         "type": "MeshStandardMaterial",
         "color": hex_color(color),
@@ -98,6 +101,7 @@ def mesh(path: str, geometry: Command, color: Color, matrix: Array, *, opacity: 
         "side": FRONT,
         "transparent": opacity < 1,
         "opacity": float(opacity),
+        **({"flatShading": True} if flat else {}),
     }
     return set_object(path, "Mesh", matrix, geometry=geometry, material=material)
 
@@ -174,6 +178,17 @@ def capsule(radius: float, length: float) -> Command:
     heights = radius * np.sin(angles) + np.where(angles > 0, 0.5, -0.5) * length
     points = [{"x": float(x), "y": float(y)} for x, y in zip(radius * np.cos(angles), heights, strict=True)]
     return {"type": "LatheGeometry", "points": points, "segments": 32, "phiStart": 0.0, "phiLength": 2 * np.pi}
+
+
+def triangles(vertices: Array, faces: NDArray[Any]) -> Command:
+    """Return triangles `faces`, shape (m, 3), between `vertices`, shape (n, 3) [m]."""
+    small = len(vertices) < 2**16
+    index = {
+        "type": f"Uint{16 if small else 32}Array",
+        "array": faces.ravel().astype(np.uint16 if small else np.uint32),
+    }
+    position = {"itemSize": 3, "type": "Float32Array", "array": vertices.ravel(), "normalized": False}
+    return {"type": "BufferGeometry", "data": {"attributes": {"position": position}, "index": index}}
 
 
 def plane(x: float, y: float) -> Command:

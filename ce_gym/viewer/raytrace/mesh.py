@@ -69,6 +69,8 @@ def mesh_of(commands: Iterable[Command], paths: dict[str, int]) -> Mesh:
 def _solid(geometry: dict[str, Any]) -> tuple[Array, Array, Indices]:
     """Return vertices (n, 3), their normals (n, 3) and triangles (m, 3) of a geometry of `ce_gym.viewer.page.three`."""
     kind = geometry["type"]
+    if kind == "BufferGeometry":
+        return _faceted(geometry["data"])
     if kind == "BoxGeometry":
         return _box(np.array([geometry["width"], geometry["height"], geometry["depth"]]) / 2)
     if kind == "CylinderGeometry":
@@ -83,6 +85,15 @@ def _solid(geometry: dict[str, Any]) -> tuple[Array, Array, Indices]:
     along = np.gradient(outline, axis=0)
     outward = np.column_stack([along[:, 1], -along[:, 0]])
     return _turned(outline, outward / np.linalg.norm(outward, axis=1, keepdims=True))
+
+
+def _faceted(data: dict[str, Any]) -> tuple[Array, Array, Indices]:
+    """Triangles that share no corners, each with its own normal."""
+    vertices = np.reshape(data["attributes"]["position"]["array"], (-1, 3))
+    corners = vertices[np.reshape(data["index"]["array"], (-1, 3)).astype(np.intp)]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+    return corners.reshape(-1, 3), np.repeat(normals, 3, axis=0), np.arange(3 * len(corners)).reshape(-1, 3)
 
 
 def _box(half: Array) -> tuple[Array, Array, Indices]:
