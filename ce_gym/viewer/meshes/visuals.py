@@ -15,6 +15,7 @@ import numpy as np
 
 from ce_gym.model import RobotError
 from ce_gym.model.description import Robot, Shape
+from ce_gym.model.formats.mjcf.balls import balls_in_loops
 from ce_gym.model.formats.mjcf.bodies import read_bodies
 from ce_gym.model.formats.mjcf.equalities import locked_joints
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement, read_mjcf
@@ -131,7 +132,7 @@ def resolved(name: str, folder: Path) -> Path | None:
 def _of_mjcf(path: Path) -> Iterator[tuple[str, Visual]]:
     source = read_mjcf(path)
     model, kinds = source.model, source.mujoco.mjtGeom
-    frames = read_bodies(source, locked_joints(source)).frames
+    frames = read_bodies(source, locked_joints(source), balls_in_loops(source)).frames
     types = {kinds.mjGEOM_BOX: "box", kinds.mjGEOM_SPHERE: "sphere"}
     types |= {kinds.mjGEOM_CAPSULE: "capsule", kinds.mjGEOM_CYLINDER: "cylinder"}
     for geom in range(model.ngeom):
