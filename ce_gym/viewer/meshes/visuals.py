@@ -115,7 +115,7 @@ def _own_color(visual: Any, colors: dict[str, Color], where: str, file: str) -> 
 def resolved(name: str, folder: Path) -> Path | None:
     """Return the file that a URDF in a folder names; None if it is not there or of another kind.
 
-    Of `package://NAME/rest` the folder NAME is that of the URDF or above it, or lies beside one of these.
+    Of the address of a package, the folder of that name is that of the URDF or above it, or lies beside one of these.
     """
     kind, colons, rest = name.partition("://")
     if not colons:
