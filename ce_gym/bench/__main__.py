@@ -18,7 +18,7 @@ from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
     "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak", "gpu",
-    "digests", "fuzz", "files", "ids", "gradients", "exactness",
+    "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness",
 )  # fmt: skip
 
 

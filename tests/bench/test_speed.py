@@ -135,3 +135,22 @@ def test_tables_in_markdown_and_csv(tmp_path):
     assert table.as_markdown().splitlines()[2:] == ["| robot | us |", "| --- | --- |", "| a | 0.1235 |", "| b |  |"]
     table.write_csv(tmp_path / "t.csv")
     assert (tmp_path / "t.csv").read_text() == "robot,us\na,0.123456\nb,\n"
+
+
+def test_compiled_derivatives_are_those_of_the_model():
+    pytest.importorskip("mujoco")
+    from ce_gym.bench.speed import forward
+    from ce_gym.compile import aligned_zeros, lane_count
+    from ce_gym.dynamics.model import Model
+
+    robot, lanes = load_robot("four_bar"), lane_count("float64")
+    model, kernel = Model(robot, "armature"), forward.kernel(robot, "armature", "float64", derivatives=True)
+    states = forward.random_states(model, lanes)
+    arrays = {name: aligned_zeros((1, buffer.size, lanes), "float64") for name, buffer in kernel.buffers.items()}
+    for name in ("q", "v", "tau"):
+        arrays[name][0] = states[name].T
+    kernel(arrays, lanes)
+    expected = model.forward_dynamics_derivatives(*(states[name] for name in ("q", "v", "tau")))
+    ours = [array for name, array in arrays.items() if name not in states]
+    for found, theirs in zip(ours, expected, strict=True):
+        np.testing.assert_allclose(found[0].T, theirs[:, 0], rtol=1e-9, atol=1e-9)

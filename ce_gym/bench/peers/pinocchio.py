@@ -120,15 +120,25 @@ def load(robot: Robot) -> Peer:
 
 def competitors(peer: Peer, n_states: int = 64) -> dict[str, Competitor]:
     """Return each of its methods called from a Python loop on standing states with random velocities and forces."""
+    states = _states(peer, n_states)
+    return {name: Competitor(_loop(method, states), n_states) for name, method in peer.methods().items()}
+
+
+def derivatives(peer: Peer, n_states: int = 64) -> Competitor:
+    """Return `computeABADerivatives`, of a robot without loops, called from a Python loop on such states."""
+    model, data = peer.model, peer.model.createData()
+    call = _loop(lambda q, v, tau: pin.computeABADerivatives(model, data, q, v, tau), _states(peer, n_states))
+    return Competitor(call, n_states)
+
+
+def _states(peer: Peer, n_states: int) -> list[tuple[Array, Array, Array]]:
     rng = np.random.default_rng(0)
     q = np.array([0.0] * 3 + [1.0] + [0.0] * 3 if peer.robot.floating else [])
     pose = dict(peer.robot.pose.joints)
     q = peer.positions(np.array([*q, *(pose.get(name, 0.0) for name in peer.robot.independent)]))
     moving = 0.0 if len(peer.loops) else 1.0  # random velocities would tear loops apart
-    states = [
-        (q, moving * rng.uniform(-2, 2, peer.model.nv), rng.uniform(-10, 10, peer.model.nv)) for _ in range(n_states)
-    ]
-    return {name: Competitor(_loop(method, states), n_states) for name, method in peer.methods().items()}
+    nv = peer.model.nv
+    return [(q, moving * rng.uniform(-2, 2, nv), rng.uniform(-10, 10, nv)) for _ in range(n_states)]
 
 
 def overhead(n_calls: int = 64) -> Competitor:
@@ -141,7 +151,7 @@ def overhead(n_calls: int = 64) -> Competitor:
     return Competitor(_loop(lambda q, v, tau: pin.aba(model, data, q, v, tau), states), n_calls)
 
 
-def _loop(method: Callable[[Array, Array, Array], Array], states: list[tuple[Array, Array, Array]]) -> Call:
+def _loop(method: Callable[[Array, Array, Array], object], states: list[tuple[Array, Array, Array]]) -> Call:
     def run() -> None:
         for state in states:
             method(*state)

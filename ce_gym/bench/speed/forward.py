@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""Forward dynamics alone as something to time: our kernel on random states, and MuJoCo's `mj_forward`.
+"""Forward dynamics and its derivatives as something to time: our kernels on random states, and MuJoCo's `mj_forward`.
 
 (MuJoCo's compiled modules carry no types, hence the line above.)
 """
@@ -17,18 +17,20 @@ from ce_gym.model.description import Robot
 from ce_gym.sim.kernel_key import model_key
 
 
-def kernel(robot: Robot, level: str, dtype: str) -> Kernel:
-    """Compile forward dynamics of a robot on tiles."""
+def kernel(robot: Robot, level: str, dtype: str, derivatives: bool = False) -> Kernel:
+    """Compile forward dynamics of a robot, or its derivatives with respect to q, v and tau, on tiles."""
     model = Model(robot, transmission=level)
 
     def build() -> Program:
-        inputs = (("q", model.nq), ("v", model.nv), ("tau", model.nv), ("vdot", model.nv))
-        call = Call(model.casadi_function("forward_dynamics"), ("q", "v", "tau"), ("vdot",))
-        return Program(
-            f"{robot.name} {level} forward dynamics", tuple(Buffer(name, n, "tiles") for name, n in inputs), (call,)
-        )
+        function = model.casadi_function("forward_dynamics")
+        if derivatives:
+            function = model.derivatives("forward_dynamics", function.name_in()).casadi_function("jacobian")
+        given, left = tuple(function.name_in()), tuple(function.name_out())
+        sizes = {name: function.numel_in(name) for name in given} | {name: function.numel_out(name) for name in left}
+        buffers = tuple(Buffer(name, n, "tiles") for name, n in sizes.items())
+        return Program(f"{robot.name} {level} {function.name()}", buffers, (Call(function, given, left),))
 
-    return load_kernel(f"{source_fingerprint(__name__)} {model_key(model)}", build, dtype)
+    return load_kernel(f"{source_fingerprint(__name__)} {model_key(model)} {derivatives}", build, dtype)
 
 
 def random_states(model: Model, num_envs: int) -> dict[str, np.ndarray]:
@@ -41,14 +43,18 @@ def random_states(model: Model, num_envs: int) -> dict[str, np.ndarray]:
     return {"q": q, "v": rng.uniform(-2.0, 2.0, shape), "tau": rng.uniform(-10.0, 10.0, shape), "vdot": np.zeros(shape)}
 
 
-def ours(robot: Robot, level: str, dtype: str, num_envs: int, num_threads: int = 1) -> Competitor:
+def ours(
+    robot: Robot, level: str, dtype: str, num_envs: int, num_threads: int = 1, derivatives: bool = False
+) -> Competitor:
     """Return our kernel on random states as something to time; one unit of work is the acceleration of one robot."""
-    compiled, lanes = kernel(robot, level, dtype), lane_count(dtype)
+    compiled, lanes = kernel(robot, level, dtype, derivatives), lane_count(dtype)
     num_envs = -(-num_envs // lanes) * lanes
+    rows = random_states(Model(robot, transmission=level), num_envs)
     arrays = {}
-    for name, rows in random_states(Model(robot, transmission=level), num_envs).items():
-        arrays[name] = aligned_zeros((num_envs // lanes, rows.shape[1], lanes), dtype)
-        arrays[name][:] = rows.reshape(-1, lanes, rows.shape[1]).swapaxes(1, 2)
+    for name, buffer in compiled.buffers.items():
+        arrays[name] = aligned_zeros((num_envs // lanes, buffer.size, lanes), dtype)
+        if name in rows:
+            arrays[name][:] = rows[name].reshape(-1, lanes, buffer.size).swapaxes(1, 2)
     repeats = 8
 
     def run() -> None:

@@ -1,0 +1,260 @@
+# pyright: reportAttributeAccessIssue=false
+"""Time of derivatives beside that of steps, MuJoCo's finite differences and Pinocchio's analytic derivatives; one core.
+
+Robots fly, or stand on their feet; a window of sub-steps is stepped, and gone back through with its iterations made
+again. MuJoCo differentiates with `mjd_transitionFD`, at the fastest settings with which it stands. Everything takes
+turns in one run. (MuJoCo's compiled modules carry no types, hence the line above.)
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+
+import mujoco
+import numpy as np
+
+from ce_gym.bench.measure.progress import shown
+from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
+from ce_gym.bench.measure.timing import Competitor, Timing, interleaved, ratio
+from ce_gym.bench.peers import mujoco_settings, stand
+from ce_gym.bench.speed import forward, stepping
+from ce_gym.bench.speed.benchmark import bare
+from ce_gym.compile import Call, calls_of
+from ce_gym.compile.cache import FOLDER_VARIABLE
+from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.stepping.derivatives import adjoint_function, primal_function
+from ce_gym.export.mujoco_batch import STATE, Batch
+from ce_gym.model import Robot, load_robot
+from ce_gym.model.errors import RobotError
+from ce_gym.sim.derivative_kernels import linearization_program, load_linearization_kernel
+from ce_gym.sim.derivatives import StepDerivatives
+from ce_gym.sim.simulator import Simulator
+
+LEVELS, SCENES = ("exact", "armature"), ("in flight", "standing")
+WINDOW = 32
+"""Sub-steps that are gone back through."""
+HIGH = 1.0
+"""How much higher than they stand robots fly [m]."""
+PARAMETERS = ("kp", "kd", "motor_strength", "rotor_inertia", "ratio", "stiffness", "damping", "friction")
+"""Figures with respect to which steps are differentiated, too."""
+MUJOCO_STATES = 8
+DIFFERENCE = 1e-6
+"""Of MuJoCo's finite differences, forward ones, which are twice as fast as central ones."""
+LINEARIZE = {"in flight": 13.0, "standing": 25.0}
+LARGEST = {"backward": 3.0, "parameters": 1.3, "compile": 15.0}
+LEAST_OVER_MUJOCO = 80.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--robot", default="mini_cheetah", help="name or path of a robot with feet")
+    parser.add_argument("--dt", type=float, default=0.005, help="sub-step [s]")
+    parser.add_argument("--num-envs", type=int, default=256, help="robots in our batch")
+    parser.add_argument("--rounds", type=int, default=9, help="how often each side is timed")
+
+
+def run(arguments: argparse.Namespace) -> Report:
+    """Run the benchmark."""
+    stepping.quiet()
+    report, robot = Report("derivatives"), bare(load_robot(arguments.robot), "foot")
+    sides: dict[str, Competitor] = {}
+    for level in shown(LEVELS, "set up"):
+        sides |= _ours(Model(robot, level), arguments)
+    sides |= _mujoco(robot, LEVELS[1], arguments.dt)
+    _steps(sides, interleaved(sides, arguments.rounds, time.thread_time), report)
+    _dynamics(robot, arguments, report)
+    _kernels(robot, report)
+    report.remarks.append(
+        f"ce_gym: {arguments.num_envs} robots a call, float64, Python calls and records included; `backward` makes "
+        f"iterations again; parameters are {', '.join(PARAMETERS)}. MuJoCo: forward differences, from a Python loop."
+    )
+    return report
+
+
+def _ours(model: Model, arguments: argparse.Namespace) -> dict[str, Competitor]:
+    """Return steps and their linearisation; on exact transmissions the way back through steps, too."""
+    sides: dict[str, Competitor] = {}
+    for scene in SCENES:
+        where = f"{model.transmission}, {scene}"
+        for what, parameters in (("", ()), (" with parameters", PARAMETERS)):
+            if parameters and model.transmission != LEVELS[0]:
+                continue
+            sim, target = _standing(model, arguments, parameters)
+            if scene == SCENES[0]:
+                sim.set_state(sim.q + HIGH * (np.arange(model.nq) == 2), sim.v)
+            derivatives = StepDerivatives(sim)
+            sides[f"step{what}, {where}"] = Competitor(_stepping(derivatives, target), WINDOW * sim.num_envs)
+            if model.transmission == LEVELS[0]:
+                sides[f"backward{what}, {where}"] = Competitor(_back(derivatives, target), WINDOW * sim.num_envs)
+            if not parameters:
+                linearize = partial(derivatives.linearize, target)
+                sides[f"linearize, {where}"] = Competitor(linearize, sim.num_envs)
+    return sides
+
+
+def _standing(model: Model, arguments: argparse.Namespace, parameters: tuple[str, ...]) -> tuple[Simulator, np.ndarray]:
+    """Return robots that have stood for a while with jittering targets, and the last of these."""
+    sim = Simulator(model, arguments.num_envs, arguments.dt, parameters=parameters, outputs=())
+    jitter = stand.targets(model.robot, sim.num_envs, round(stand.SETTLE / stand.HOLD), seed=1)
+    for i in range(jitter.shape[1]):
+        sim.step(jitter[:, i], round(stand.HOLD / arguments.dt))
+    return sim, np.ascontiguousarray(jitter[:, -1])
+
+
+def _stepping(derivatives: StepDerivatives, target: np.ndarray) -> Callable[[], object]:
+    """Return a call that steps robots from where they are now."""
+    start = derivatives.state()
+
+    def step() -> None:
+        derivatives.restore(start)
+        derivatives.simulator.step(target, WINDOW)
+
+    return step
+
+
+def _back(derivatives: StepDerivatives, target: np.ndarray) -> Callable[[], object]:
+    """Return a call that goes back through the same steps."""
+    sim, rng = derivatives.simulator, np.random.default_rng(0)
+    weights = {name: rng.normal(size=(sim.num_envs, sim.model.nv)) for name in ("q", "v")}
+    derivatives.step(target, WINDOW)
+    return partial(derivatives.backward, weights, derivatives.take())
+
+
+def _mujoco(robot: Robot, level: str, dt: float) -> dict[str, Competitor]:
+    """Return steps and finite differences of standing robots and of the same in the air."""
+    settings, batch, _ = mujoco_settings.fastest(robot, level, dt)
+    sides: dict[str, Competitor] = {}
+    for scene in SCENES:
+        states = batch.states[:MUJOCO_STATES].copy()
+        states[:, 3] += HIGH * (scene == SCENES[0])  # time, x, y, z
+        name = f"{level}, {scene}"
+        step, differentiate = _mujoco_calls(batch, states, stand.targets(robot, MUJOCO_STATES, 1, seed=2)[:, 0])
+        sides[f"mj_step, {name} ({settings})"] = Competitor(step, MUJOCO_STATES)
+        sides[f"mjd_transitionFD, {name}"] = Competitor(differentiate, MUJOCO_STATES)
+    return sides
+
+
+def _mujoco_calls(
+    batch: Batch, states: np.ndarray, targets: np.ndarray
+) -> tuple[Callable[[], object], Callable[[], object]]:
+    model, datas = batch.model, [mujoco.MjData(batch.model) for _ in states]
+    A, B = np.zeros((2 * model.nv, 2 * model.nv)), np.zeros((2 * model.nv, model.nu))
+
+    def put() -> None:
+        for data, state, target in zip(datas, states, targets, strict=True):
+            mujoco.mj_setState(model, data, state, STATE)
+            data.ctrl[:] = target
+
+    def step() -> None:
+        put()
+        for data in datas:
+            mujoco.mj_step(model, data)
+
+    def differentiate() -> None:
+        put()
+        for data in datas:
+            mujoco.mjd_transitionFD(model, data, DIFFERENCE, False, A, B, None, None)
+
+    return step, differentiate
+
+
+def _steps(sides: dict[str, Competitor], timings: dict[str, Timing], report: Report) -> None:
+    """Add times of steps and their derivatives, and what is required of them."""
+    rows: list[tuple[Cell, ...]] = []
+    mujoco_steps = {name.split(" (")[0]: name for name in sides if name.startswith("mj_step")}
+    for name, timing in timings.items():
+        what, where = name.split(" (")[0].split(", ", 1)
+        own = mujoco_steps[f"mj_step, {where}"] if what.startswith("mj") else f"step, {where}"
+        compared = ratio(timing, timings[own])
+        settings = name.split(" (")[1][:-1] if " (" in name else ""
+        rows.append((what, *where.split(", "), 1e6 * timing.best, compared.of_best, compared.median, settings))
+    columns = ("what", "level", "scene", "best [us]", "times a step", "by rounds", "settings")
+    report.tables.append(Table("Steps and their derivatives, for one robot and sub-step", columns, tuple(rows)))
+    for scene in SCENES:
+        here = f"exact, {scene}"
+        for claim, slow, fast, most in (
+            ("linearize / step", "linearize", "step", LINEARIZE[scene]),
+            ("backward / step", "backward", "step", LARGEST["backward"]),
+            ("backward with parameters / without", "backward with parameters", "backward", LARGEST["parameters"]),
+        ):
+            found = ratio(timings[f"{slow}, {here}"], timings[f"{fast}, {here}"])
+            claim = f"{claim}, {here}, at most {most:g}"
+            report.requirements.append(Requirement(claim, str(found), max(found.of_best, found.median) <= most))
+        here = f"armature, {scene}"
+        found = ratio(timings[f"mjd_transitionFD, {here}"], timings[f"linearize, {here}"])
+        claim = f"mjd_transitionFD / linearize, {here}, at least {LEAST_OVER_MUJOCO:g}"
+        report.requirements.append(Requirement(claim, str(found), found.cautious >= LEAST_OVER_MUJOCO))
+
+
+def _dynamics(robot: Robot, arguments: argparse.Namespace, report: Report) -> None:
+    """Add times of forward dynamics and of its derivatives by q, v and tau, beside Pinocchio's."""
+    n = 64
+    model = Model(robot, "armature")
+    given = [forward.random_states(model, n)[name] for name in ("q", "v", "tau")]
+    sides = {
+        "forward dynamics, compiled": forward.ours(robot, "armature", "float64", n),
+        "derivatives, compiled": forward.ours(robot, "armature", "float64", n, derivatives=True),
+        "Model.forward_dynamics_derivatives": Competitor(lambda: model.forward_dynamics_derivatives(*given), n),
+    }
+    sides |= _pinocchio(robot, report)
+    timings = interleaved(sides, arguments.rounds, time.thread_time)
+    first = timings["derivatives, compiled"]
+    rows = [(name, 1e6 * timing.best, ratio(timing, first).median) for name, timing in timings.items()]
+    title = f"Forward dynamics and its derivatives, {robot.name} armature, double precision"
+    report.tables.append(Table(title, ("side", "best [us]", "times ours, compiled"), tuple(rows)))
+
+
+def _pinocchio(robot: Robot, report: Report) -> dict[str, Competitor]:
+    try:
+        from ce_gym.bench.peers import pinocchio as peers
+
+        peer = peers.load(robot)
+    except (ImportError, RobotError) as error:
+        report.remarks.append(f"Pinocchio: {error}")
+        return {}
+    return {
+        "Pinocchio aba": peers.competitors(peer)["aba"],
+        "Pinocchio computeABADerivatives": peers.derivatives(peer),
+        "Pinocchio (call of a single joint)": peers.overhead(),
+    }
+
+
+def _kernels(robot: Robot, report: Report) -> None:
+    """Add instructions of kernels, and the time that they take to compile."""
+    rows: list[tuple[Cell, ...]] = []
+    model = Model(robot, LEVELS[0])
+    options = Simulator(model, outputs=()).options
+    once, back = (make(model.mechanism, options) for make in (primal_function, adjoint_function))
+    program = linearization_program(model, options)
+    forwards = sum(call.function.n_instructions() for call in calls_of(program.steps) if isinstance(call, Call))
+    rows.append(("one iteration of a step", once.n_instructions()))
+    rows.append(("its reverse mode", back.n_instructions()))
+    rows.append(("linearize, with all iterations that there can be", forwards))
+    report.tables.append(Table(f"Kernels of {robot.name} exact", ("what", "instructions"), tuple(rows)))
+    with _nothing_cached():
+        start = time.process_time()
+        load_linearization_kernel(model, options, "float64")
+        seconds = time.process_time() - start
+    claim = f"compilation of linearize, at most {LARGEST['compile']:g} s of one core"
+    report.requirements.append(Requirement(claim, f"{seconds:.1f} s", seconds <= LARGEST["compile"]))
+
+
+@contextmanager
+def _nothing_cached() -> Iterator[None]:
+    """Let kernels be kept in a folder of their own for a while."""
+    before = os.environ.get(FOLDER_VARIABLE)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ[FOLDER_VARIABLE] = folder
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[FOLDER_VARIABLE]
+            else:
+                os.environ[FOLDER_VARIABLE] = before
