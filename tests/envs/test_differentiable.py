@@ -156,13 +156,13 @@ def test_a_diverged_robot_has_no_gradient(env):
 
 def test_a_step_in_parts_has_no_gradient_though_a_reset_followed(env):
     """One robot of those whose time is up is too fast for its sub-step, and a new one in its place when it is seen."""
-    differentiable, ones = env.differentiable(), np.ones((N, 48))
+    differentiable, ones = env.differentiable(), np.ones((N, SEEN))
     env.reset(seed=0)
     env.elapsed_steps = np.where(np.arange(N) < 4, env.max_episode_steps - 1, 0)
     v = env.batch.rows("v")
-    v[2, 8] = 500.0  # rad/s, a knee's, more than half a radian in a sub-step
+    v[2, 7] = 500.0  # rad/s, of the forearm, more than half a radian in a sub-step
     env.batch.write("v", v)
-    *_, truncated, infos = differentiable.step(np.zeros((N, 12)))
+    *_, truncated, infos = differentiable.step(np.zeros((N, ACTIONS)))
     assert truncated[:4].all()
     assert not infos["diverged"].any()
     differentiable.backward(ones, np.ones(N), ones)
