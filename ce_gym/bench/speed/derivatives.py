@@ -19,7 +19,6 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from ce_gym.bench.measure.progress import shown
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, Timing, interleaved, ratio
 from ce_gym.bench.peers import mujoco_settings, stand
@@ -35,6 +34,7 @@ from ce_gym.model.errors import RobotError
 from ce_gym.sim.derivative_kernels import linearization_program, load_linearization_kernel
 from ce_gym.sim.derivatives import StepDerivatives
 from ce_gym.sim.simulator import Simulator
+from ce_gym.viewer.console import shown
 
 LEVELS, SCENES = ("exact", "armature"), ("in flight", "standing")
 WINDOW = 32
