@@ -10,7 +10,8 @@ from tripod import TRIPOD
 
 import ce_gym  # noqa: F401 - registers the environments
 from ce_gym.envs.runtime.setup import make_program
-from ce_gym.envs.task.terrain_tiles import BORDER, PLATFORM, checked_terrain, make_field
+from ce_gym.envs.task.terrain_kinds import BORDER, PLATFORM
+from ce_gym.envs.task.terrain_tiles import checked_terrain, make_field
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -32,6 +33,50 @@ def zeros(envs) -> np.ndarray:
 def ground_under(envs) -> np.ndarray:
     q = envs.state()["q"]
     return make_field(envs.batch.program.task.terrain).at(q[:, 0], q[:, 1])[:, 0]
+
+
+@pytest.mark.parametrize("kind", ["boxes", "gaps", "stones"])
+def test_a_course_is_between_platform_and_rim(kind: str):
+    """Heights are those asked for, platform and rim are level, and the share that is land is that of the figures."""
+    figures = {"boxes": {"height": 0.2, "side": 0.4}, "gaps": {"land": 0.6}, "stones": {"stone": 0.5}}[kind]
+    figures |= {} if kind == "boxes" else {"gap": 0.2, "depth": 0.7}
+    field = make_field(checked_terrain({"kind": kind, "levels": 2, "columns": 2, "cell": 0.02, **figures}))
+    along = np.linspace(-3.98, 3.98, 399)
+    x, y = np.meshgrid(along, along, indexing="ij")
+    away, rim = np.maximum(np.abs(x), np.abs(y)), 4 - BORDER
+    course = (away > PLATFORM + 0.04) & (away < rim - 0.04)
+    assert not field.at(4.0 + x, 4.0 + y)[..., 0].any(), "the lowest level is flat"
+    heights = field.at(12.0 + x, 4.0 + y)[..., 0]
+    assert np.abs(heights[(away < PLATFORM - 0.04) | (away > rim + 0.04)]).max() < 1e-12
+    if kind == "boxes":
+        assert 0.15 < heights[course].max() <= 0.2
+        assert -0.2 <= heights[course].min() < -0.15
+        _, counts = np.unique(np.round(heights[course], 9), return_counts=True)
+        assert counts[counts > 100].sum() > 0.6 * course.sum(), "squares are level"
+        return
+    assert heights.min() == pytest.approx(-0.7, abs=1e-9)
+    starts = np.arange(PLATFORM, rim, 0.8)  # gaps are rings about the middle: areas of the stretches of land
+    rings = np.sum(np.minimum(starts + 0.6, rim) ** 2 - starts**2) / (rim**2 - PLATFORM**2)
+    land = {"stones": (0.5 / 0.7) ** 2, "gaps": rings}[kind]
+    assert np.mean(heights[course] > -0.35) == pytest.approx(land, abs=0.04)
+
+
+def test_a_mixture_is_columns_of_kinds_by_their_shares():
+    """Each tile is that of its kind alone, with figures of its own; pyramids and pits by turns within a kind."""
+    kinds = {"stairs": {"share": 0.5, "rise": 0.2}, "slope": 0.25, "flat": 0.25}
+    mixed = checked_terrain({"kinds": kinds, "levels": 3, "columns": 4, "size": 6.0})
+    assert mixed["cell"] == 0.05
+    assert checked_terrain(mixed) == mixed
+    field, own = make_field(mixed), {"levels": 3, "columns": 2, "size": 6.0}
+    stairs = make_field(checked_terrain({"kind": "stairs", "rise": 0.2, **own}))
+    slope = make_field(checked_terrain({"kind": "slope", "cell": 0.05, **own}))
+    x, y = np.meshgrid(np.linspace(0.1, 17.9, 90), np.linspace(0.2, 5.8, 40), indexing="ij")
+    for column, (alone, first) in enumerate([(stairs, 0.0), (stairs, 6.0), (slope, 0.0)]):
+        expected = alone.at(x, y + first)[..., 0]
+        np.testing.assert_allclose(field.at(x, y + 6 * column)[..., 0], expected, atol=1e-9)
+    assert not field.at(x, y + 18.2)[:, :-5, 0].any()
+    with pytest.raises(ValueError, match=r"terrain\['columns'\]=2; expected more, for a share of 0.1"):
+        make_field(checked_terrain({"kinds": {"stairs": 0.1, "rough": 9}, "columns": 2}))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -295,7 +340,12 @@ def test_specs_survive_json():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"terrain": "sea"}, "terrain='sea'; expected 'flat', 'slope', 'rough', 'stairs', or a mapping"),
+        ({"terrain": "sea"}, "terrain='sea'; expected 'flat', 'slope', 'rough', 'stairs', .*, or a mapping"),
+        ({"terrain": {"kinds": {}}}, r"terrain\['kinds'\]=\{\}; expected shares by kind among flat, slope"),
+        ({"terrain": {"kinds": {"sea": 1}}}, r"terrain\['kinds'\]=\{'sea': 1\}; expected shares by kind"),
+        ({"terrain": {"kinds": {"rough": 0}}}, r"\['kinds'\]\['rough'\]\['share'\]=0; expected a number above 0"),
+        ({"terrain": {"kinds": {"rough": {"rise": 1}}}}, r"\['rough'\]\['rise'\]=1; expected one of share, amplitude"),
+        ({"terrain": {"kind": "stones", "stone": 0.0}}, r"terrain\['stone'\]=0.0; expected a length .* at least 0.1"),
         ({"terrain": 3}, "terrain=3; expected"),
         ({"terrain": {"kind": "slope", "rise": 0.1}}, r"terrain\['rise'\]=0.1; expected one of .*angle for 'slope'"),
         ({"terrain": {"kind": "flat", "size": 3.0}}, r"terrain\['size'\]=3.0; expected no argument for 'flat'"),

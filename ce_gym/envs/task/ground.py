@@ -20,7 +20,7 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.recursion.kinematics import constant, outward_velocity_pass
 from ce_gym.envs.task.curriculum import Curriculum
 from ce_gym.envs.task.sampling import Sampler
-from ce_gym.envs.task.terrain_tiles import PLATFORM
+from ce_gym.envs.task.terrain_kinds import PLATFORM
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.substeps import FRAME, HEIGHTS
 
