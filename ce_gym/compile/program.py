@@ -68,13 +68,16 @@ class Lookup:
         table: a `table` buffer. Entry (i, j) belongs to the place `x = x0 + i cell`, `y = y0 + j cell`.
         frame: buffer of size 3 with each lane's `x0`, `y0` and `cell`.
         points: buffer of size 2 n: x and y of point after point.
-        output: buffer of size 3 n, another one: value and its slopes along x and y, point after point.
+        output: buffer of size 3 n, another one: value and its slopes along x and y, point after point; of size n, the
+            values, without slopes.
+        slopes: whether they are asked for; values alone take half the time.
     """
 
     table: str
     frame: str
     points: str
     output: str
+    slopes: bool = True
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -237,8 +240,8 @@ def _check_lookup(place: str, lookup: Lookup, buffers: dict[str, Buffer]) -> Non
         _check_lanes(f"{place}: {side}", name, buffers)
     if lookup.output in lookup.inputs:
         raise ValueError(f"{place}: output {lookup.output!r} is an input too, expected another buffer")
-    n = buffers[lookup.points].size // 2
-    sizes = (("frame", lookup.frame, 3), ("points", lookup.points, 2 * n), ("output", lookup.output, 3 * n))
+    n, each = buffers[lookup.points].size // 2, 3 if lookup.slopes else 1
+    sizes = (("frame", lookup.frame, 3), ("points", lookup.points, 2 * n), ("output", lookup.output, each * n))
     for side, name, size in sizes:
         if buffers[name].size != size:
             raise ValueError(f"{place}: {side} buffer {name!r} has size {buffers[name].size}, expected {size}")

@@ -171,7 +171,7 @@ class DifferentiableEnv:
         p = self.batch.program
         kinds = p.reward_terms, p.termination_terms, p.observation_terms | p.critic_terms
         named = {f"{term.kind} {name}": term for terms in kinds for name, term in terms.items()}
-        found = {name: _roughness(Stages(p, p.schema), term) for name, term in named.items()}
+        found = {name: _roughness(p.stages, term) for name, term in named.items()}
         return {name: kind for name, kind in found.items() if kind}
 
     def _rows(self, given: Any) -> NDArray:

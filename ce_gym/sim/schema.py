@@ -18,7 +18,7 @@ from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
 from ce_gym.dynamics.model import Model
 from ce_gym.sim.substeps import DT, FRAME
 
-Writer = Literal["physics", "task", "term", "host", "scene"]
+Writer = Literal["physics", "task", "term", "drift", "host", "scene"]
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Row:
         name: Of the buffer.
         size: Numbers that one robot has there; 0 for a plain array of one number for each robot.
         writer: Who changes it: "physics" (the sub-steps), "task" (what an environment does around them), "term" (a
-            reward, observation, termination or metric with memory), "host" (Python only; no reset touches it) or
-            "scene" (constant: how it is stepped, and no part of a snapshot).
+            reward, observation, termination or metric with memory), "drift" (a sensor's error, drawn by resets), "host"
+            (Python only; no reset touches it) or "scene" (constant: how it is stepped, and no part of a snapshot).
         reset: With what a robot begins, a number or shape (size,).
         dtype: Of a plain array, shape (num_envs, size), or (num_envs,) for size 0; "" for one in lanes.
     """

@@ -39,11 +39,12 @@ def run_both(program, rows, dtype, n=N, **arguments):
 
 
 @DTYPES
-def test_look_up(dtype, needs_host_compiler):
+@pytest.mark.parametrize("slopes", [True, False])
+def test_look_up(dtype, slopes, needs_host_compiler):
     points = 4
     buffers = (Buffer("t", 0, "table"), Buffer("f", 3, "rows_in"), Buffer("p", 2 * points, "rows_in"))
-    buffers += (Buffer("found", 3 * points, "rows_out"),)
-    program = Program("cuda lookup", buffers, (Lookup("t", "f", "p", "found"),))
+    buffers += (Buffer("found", (3 if slopes else 1) * points, "rows_out"),)
+    program = Program(f"cuda lookup {slopes}", buffers, (Lookup("t", "f", "p", "found", slopes),))
     rng = np.random.default_rng(0)
     places = rng.uniform(-3, 9, (N, 2 * points))
     places[0, :3] = [np.nan, np.inf, -np.inf]

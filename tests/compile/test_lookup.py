@@ -175,3 +175,24 @@ def test_wrong_programs(message):
     with pytest.raises(ValueError, match=f"^program 'p': .*{message}") as error:
         load_kernel(message, lambda: WRONG[message])
     assert "\n" not in str(error.value)
+
+
+def test_values_alone_are_the_same(kernel):
+    """To rounding, inside and outside, more points than fit into one chunk; what is no number reads the table."""
+    n = 21
+    buffers = (Buffer("table", 0, "table"), Buffer("frame", 3, "rows_in"), Buffer("points", 2 * n, "rows_in"))
+    program = Program("values", (*buffers, Buffer("found", n, "rows_out")), (
+        Lookup("table", "frame", "points", "found", slopes=False),
+    ))  # fmt: skip
+    table = np.random.default_rng(5).normal(0, 0.3, (7, 11))
+    points = np.random.default_rng(6).uniform(-8, 15, (3, n, 2)).astype(kernel.dtype)
+    points[0, 0], points[1, 1] = (np.nan, 2.0), (np.inf, -np.inf)
+    found = np.full((3, n), np.nan, kernel.dtype)
+    arrays = {"table": np.ascontiguousarray(table, kernel.dtype), "points": points.reshape(3, -1), "found": found}
+    arrays["frame"] = np.ascontiguousarray(np.broadcast_to((-1.3, 0.4, 0.25), (3, 3)), kernel.dtype)
+    load_kernel("values", lambda: program, kernel.dtype)(arrays, 3)
+    both = np.concatenate([points.reshape(-1, 2), points.reshape(-1, 2)[:2]]).reshape(-1, N, 2)
+    expected = look_up(kernel, table, both, (-1.3, 0.4, 0.25)).reshape(-1, 3)[: 3 * n, 0]
+    known = np.isfinite(expected)
+    assert known.sum() == 3 * n - 2
+    np.testing.assert_allclose(found.ravel()[known], expected[known], rtol=0, atol=TOLERANCE[kernel.dtype] * 1e3)

@@ -78,7 +78,7 @@ struct Along {
     real weight[3], slope[3];
 };
 
-__device__ __forceinline__ Along along(real u, int count)
+__device__ __forceinline__ Along along(real u, int count, real& t, real& beyond)
 {
     const real number = real(count), half = real(0.5);
     // Both comparisons are false for a NaN, which so becomes a number before it becomes an index.
@@ -87,9 +87,18 @@ __device__ __forceinline__ Along along(real u, int count)
     inside = inside < upper ? inside : upper;
     real nearest = floor(inside + half);
     nearest = nearest < last ? nearest : last;
-    const real t = inside - nearest, beyond = u - inside;
+    t = inside - nearest;
+    beyond = u - inside;
     Along a;
     a.first = int(nearest) - 1;
+    return a;
+}
+
+__device__ __forceinline__ Along with_slopes(real u, int count)
+{
+    const real half = real(0.5);
+    real t, beyond;
+    Along a = along(u, count, t, beyond);
     a.slope[0] = t - half;
     a.slope[1] = real(-2.0) * t;
     a.slope[2] = t + half;
@@ -99,9 +108,26 @@ __device__ __forceinline__ Along along(real u, int count)
     return a;
 }
 
+__device__ __forceinline__ Along with_weights(real u, int count)
+{
+    const real half = real(0.5);
+    real t, beyond;
+    Along a = along(u, count, t, beyond);
+    const real low = t - half, high = t + half;
+    a.weight[0] = low * fma(half, low, beyond);
+    a.weight[1] = fma(-t, fma(real(2.0), beyond, t), real(0.75));
+    a.weight[2] = high * fma(half, high, beyond);
+    return a;
+}
+
 __device__ __forceinline__ real weighed(const real* w, const real* x)
 {
     return w[0] * x[0] + w[1] * x[1] + w[2] * x[2];
+}
+
+__device__ __forceinline__ real weighed_fused(const real* w, const real* x)
+{
+    return fma(w[2], x[2], fma(w[1], x[1], w[0] * x[0]));
 }
 
 template <int POINTS> __device__ void look_up(
@@ -110,8 +136,8 @@ template <int POINTS> __device__ void look_up(
     const real per_cell = real(1.0) / frame[2];
 #pragma unroll 1
     for (int p = 0; p < POINTS; ++p) {
-        const Along r = along((points[2 * p] - frame[0]) * per_cell, rows);
-        const Along c = along((points[2 * p + 1] - frame[1]) * per_cell, columns);
+        const Along r = with_slopes((points[2 * p] - frame[0]) * per_cell, rows);
+        const Along c = with_slopes((points[2 * p + 1] - frame[1]) * per_cell, columns);
         real value[3], slope[3];
         for (int i = 0; i < 3; ++i) {
             const real* line = table + (long long)(r.first + i) * columns + c.first;
@@ -122,6 +148,24 @@ template <int POINTS> __device__ void look_up(
         found[3 * p] = weighed(r.weight, value);
         found[3 * p + 1] = weighed(r.slope, value) * per_cell;
         found[3 * p + 2] = weighed(r.weight, slope) * per_cell;
+    }
+}
+
+template <int POINTS> __device__ void look_up_values(
+    const real* table, int rows, int columns, const real* frame, const real* points, real* found)
+{
+    const real per_cell = real(1.0) / frame[2];
+#pragma unroll 1
+    for (int p = 0; p < POINTS; ++p) {
+        const Along r = with_weights((points[2 * p] - frame[0]) * per_cell, rows);
+        const Along c = with_weights((points[2 * p + 1] - frame[1]) * per_cell, columns);
+        const real* start = table + (long long)r.first * columns + c.first;
+        real sum[3];
+        for (int j = 0; j < 3; ++j) {
+            const real entries[3] = {start[j], start[columns + j], start[2 * columns + j]};
+            sum[j] = weighed_fused(r.weight, entries);
+        }
+        found[p] = weighed_fused(c.weight, sum);
     }
 }
 """

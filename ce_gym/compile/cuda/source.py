@@ -199,7 +199,8 @@ class _KernelText:
     def _look_up(self, lookup: Lookup) -> str:
         n, table = self.sizes[lookup.points] // 2, lookup.table
         lanes = f"{lookup.frame}_, {lookup.points}_, {lookup.output}_"
-        return f"look_up<{n}>(all_{table}, rows_{table}, columns_{table}, {lanes});"
+        name = "look_up" if lookup.slopes else "look_up_values"
+        return f"{name}<{n}>(all_{table}, rows_{table}, columns_{table}, {lanes});"
 
     def _function(self, function: casadi.Function) -> str:
         """Name of a traced function's own C function, for one more place."""

@@ -12,6 +12,7 @@ from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.layout import Layout
 from ce_gym.compile.lowering.function import lower_function
 from ce_gym.compile.lowering.lookup import Table, emit_lookup
+from ce_gym.compile.lowering.lookup_values import emit_value_lookup
 from ce_gym.compile.lowering.random import emit_uniform
 from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
 from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While
@@ -198,7 +199,9 @@ class _TileWork:
         rows = self.layout.shapes[lookup.table]
         table = Table(self._array(buffers[lookup.table]), self._address(rows), self._address(rows + 1))
         frame, points, output = self.lanes[lookup.frame], self.lanes[lookup.points], self.lanes[lookup.output]
-        emit_lookup(self.vectors, table, frame, points, output, buffers[lookup.points].size // 2)
+        n_points = buffers[lookup.points].size // 2
+        emit = emit_lookup if lookup.slopes else emit_value_lookup
+        emit(self.vectors, table, frame, points, output, n_points)
 
     def _call(self, call: Call) -> None:
         """Call one lowered function, if it is needed."""

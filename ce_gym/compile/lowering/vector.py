@@ -54,12 +54,12 @@ class VectorBuilder:
         """The same integer in every lane."""
         return ir.Constant(self.int_type, [number] * self.lanes)
 
-    def splat(self, scalar: Value) -> Value:
-        """A number known at run time in every lane; float or integer."""
-        vector = ir.VectorType(scalar.type, self.lanes)
+    def splat(self, scalar: Value, lanes: int = 0) -> Value:
+        """A number known at run time in every lane, or in so many; float or integer."""
+        vector = ir.VectorType(scalar.type, lanes or self.lanes)
         first = self.builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.IntType(32)(0))
-        lanes = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
-        return self.builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), lanes)
+        places = ir.Constant(ir.VectorType(ir.IntType(32), vector.count), [0] * vector.count)
+        return self.builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), places)
 
     def add(self, a: Value, b: Value) -> Value:
         """Sum."""
@@ -87,13 +87,15 @@ class VectorBuilder:
 
     def intrinsic(self, name: str, *operands: Value) -> Value:
         """`llvm.<name>` on float vectors, such as sqrt, fabs, floor, minnum, copysign."""
-        mangled = f"llvm.{name}.v{self.lanes}f{self.bits}"
-        module = self.builder.module
-        function = module.globals.get(mangled)
-        if function is None:
-            signature = ir.FunctionType(self.float_type, [self.float_type] * len(operands))
-            function = ir.Function(module, signature, mangled)
+        kind = operands[0].type
+        function = self._declared(f"llvm.{name}.v{kind.count}f{self.bits}", kind, [kind] * len(operands))
         return self.builder.call(function, operands)
+
+    def _declared(self, name: str, result: ir.Type, arguments: list[ir.Type]) -> Value:
+        """A function of LLVM's, declared once in a module."""
+        module = self.builder.module
+        known = module.globals.get(name)
+        return ir.Function(module, ir.FunctionType(result, arguments), name) if known is None else known
 
     def polynomial(self, x: Value, coefficients: tuple[float, ...]) -> Value:
         """Horner's scheme; coefficients in ascending order."""
@@ -145,6 +147,43 @@ class VectorBuilder:
                     vectors[i], vectors[i + half] = self._shuffled(*pair, low), self._shuffled(*pair, high)
             half //= 2
         return vectors
+
+    def load_three(self, address: Value, *, more: bool = False) -> Value:
+        """Three floats from an address, a 64-bit integer, on; as a vector of four, for `spread`.
+
+        `more` says that a fourth one may be read, which is faster.
+        """
+        four, word = ir.VectorType(self.float_type.element, 4), ir.IntType(32)
+        pointer, flags = self.builder.inttoptr(address, four.as_pointer()), ir.VectorType(ir.IntType(1), 4)
+        if more:
+            return self.builder.load(pointer, align=self.bits // 8)
+        load = self._declared(f"llvm.masked.load.v4f{self.bits}.p0", four, [pointer.type, word, flags, four])
+        nothing = ir.Constant(four, [0.0] * 4)
+        return self.builder.call(load, (pointer, word(self.bits // 8), ir.Constant(flags, [1, 1, 1, 0]), nothing))
+
+    def spread(self, threes: list[Value]) -> list[Value]:
+        """Three vectors: lane l of the i-th is number i of `threes[l]`, which `load_three` has returned."""
+        fours = [self._joined(threes[k::4]) for k in range(4)]  # number e of lane k + 4 g is at 4 g + e
+        first, second = [(lane // 4) * 4 + lane % 4 // 2 for lane in range(self.lanes)], [0, self.lanes]
+
+        def pairs(a: Value, b: Value, half: int) -> Value:
+            """(a0 b0 a1 b1), or with the other half (a2 b2 a3 b3), four by four."""
+            return self._shuffled(a, b, [2 * half + at + second[lane % 2] for lane, at in enumerate(first)])
+
+        spread = []
+        for half, odd in ((0, 0), (0, 2), (1, 0)):
+            places = [(lane // 4) * 4 + odd + lane % 2 + second[lane % 4 // 2] for lane in range(self.lanes)]
+            spread.append(self._shuffled(pairs(fours[0], fours[1], half), pairs(fours[2], fours[3], half), places))
+        return spread
+
+    def _joined(self, vectors: list[Value]) -> Value:
+        """One vector after the other, as one."""
+        while len(vectors) > 1:
+            length = vectors[0].type.count
+            mask = ir.Constant(ir.VectorType(ir.IntType(32), 2 * length), list(range(2 * length)))
+            pairs = zip(vectors[::2], vectors[1::2], strict=True)
+            vectors = [self.builder.shuffle_vector(a, b, mask) for a, b in pairs]
+        return vectors[0]
 
     def _shuffled(self, a: Value, b: Value, places: list[int]) -> Value:
         mask = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), places)

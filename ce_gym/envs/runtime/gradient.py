@@ -17,7 +17,6 @@ from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
 from ce_gym.envs.runtime.program import TaskProgram
-from ce_gym.envs.runtime.stages import Stages
 
 FLAGS = 2
 """Columns of the rows `control`: whether the gradient goes on from the step after it, and its largest norm."""
@@ -56,7 +55,7 @@ class ControlStepGradient:
         sizes = self.parts | {name: program.schema[name].size for name in own}
         self.carried = sizes | {"q": sizes["q"] - 1}
         self.substeps = program.task.n_substeps
-        self.assess, self.n_draws = Stages(program, program.schema).assess()
+        self.assess, self.n_draws = program.stages.assess()
 
     def program(self) -> Program:
         """Return the program."""

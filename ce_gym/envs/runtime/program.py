@@ -14,7 +14,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
-from ce_gym.compile import Buffer, Call, Program, Repeat, Step
+from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, Step
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
@@ -143,6 +143,11 @@ class TaskProgram:
             rows.append(Row("history", (self.task.history - 1) * sum(self.observation_sizes.values()), "task"))
         return self._rows | {row.name: row for row in (*self.probe.memories, *rows)}
 
+    @property
+    def stages(self) -> Stages:
+        """What is done around the sub-steps, to be traced."""
+        return Stages(self, self.schema, self.probe.looked)
+
     @cached_property
     def state_sizes(self) -> dict[str, int]:
         """Sizes of the state buffers in the lanes of the kernels, by name."""
@@ -178,11 +183,11 @@ class TaskProgram:
         One observation of the policy, neither noisy nor clipped, and whether the episode ends: for robots that
         something else simulates.
         """
-        return Stages(self, self.schema).look()
+        return self.stages.look()
 
     def terms_function(self, terms: Mapping[str, Term]) -> ca.Function:
         """Return the state buffers that terms look at, and the action before -> their values, one after the other."""
-        return Stages(self, self.schema).values(terms)
+        return self.stages.values(terms)
 
     def step_program(self, fused: bool = False) -> Program:
         """Return act, physics and assess as one program.
@@ -191,7 +196,7 @@ class TaskProgram:
             fused: Whether a reset of those who are done follows in the same launch, so that what they leave has to be
                 kept: `final_observation`.
         """
-        assess, n_draws = Stages(self, self.schema).assess()
+        assess, n_draws = self.stages.assess()
         act, size = self.actions.act("delay" in self.schema), self.observation_size + self.critic_size
         outputs = tuple(name for name in ("torque", "contact_forces") if name in self.schema)
         _, scratch, physics = substeps(self.model.mechanism, self.options, outputs)
@@ -211,7 +216,7 @@ class TaskProgram:
         else:
             buffers += [Buffer("target", targets, "scratch")]
             steps = (Call(act, ("action_in",), ("clipped", "target")), *physics)
-        look, seeing = self._look_at_ground()
+        look, seeing = self._look_at_ground(begins=False)
         steps = (*steps, *look, assess)
         if fused:
             seen = SX.sym("observation", size)
@@ -221,7 +226,7 @@ class TaskProgram:
 
     def reset_program(self) -> Program:
         """Return the program that starts new episodes where `chosen` is 1."""
-        stages = Stages(self, self.schema)
+        stages = self.stages
         begin, n_draws = stages.begin()
         buffers = [
             Buffer("first_draws", n_draws, "random"),
@@ -230,7 +235,7 @@ class TaskProgram:
         steps: tuple[Step, ...] = (begin,)
         if self.ground:
             place, n_draws = stages.place()
-            look, seeing = self._look_at_ground()
+            look, seeing = self._look_at_ground(begins=True)
             buffers += [Buffer("place_draws", n_draws, "random"), *seeing]
             steps = (place, *look, begin)
         return self._program("reset", buffers, steps, skip_unless="chosen")
@@ -245,16 +250,23 @@ class TaskProgram:
         state = [b for b in state_buffers(self.schema.values()) if b.name in used and b.name not in own]
         return replace(program, buffers=(*state, *buffers))
 
-    def _look_at_ground(self) -> tuple[tuple[Step, ...], list[Buffer]]:
+    def _look_at_ground(self, begins: bool) -> tuple[tuple[Step, ...], list[Buffer]]:
         """What a program has to do, and the buffers that takes, for the task to see the ground; nothing if flat."""
         if not self.ground:
             return (), []
         buffers, look = self.ground.look(self.state_sizes.get("dependent", 0))
-        return look, [Buffer(HEIGHTS, 0, "table"), *buffers]
+        buffers = [Buffer(HEIGHTS, 0, "table"), *buffers]
+        if not (looked := self.probe.looked):
+            return look, buffers
+        places = self.stages.places(begins)
+        for name, at in zip(looked, places.outputs, strict=True):
+            look = (*look, Lookup(HEIGHTS, FRAME, at, name, slopes=False))
+            buffers += [Buffer(at, 2 * looked[name], "scratch"), Buffer(name, looked[name], "scratch")]
+        return (places, *look), buffers
 
     def function(self, name: Literal["act", "assess", "begin"]) -> ca.Function:
         """Trace what is done once in an environment step, before and after its sub-steps, or in a reset."""
         if name == "act":
             return self.actions.act("delay" in self.schema)
-        stages = Stages(self, self.schema)
+        stages = self.stages
         return (stages.assess() if name == "assess" else stages.begin())[0].function

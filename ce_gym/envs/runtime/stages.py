@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -41,12 +42,14 @@ class Probe:
 
     Attributes:
         sizes: Length of each observation block, by name; the policy's first.
-        memories: Rows of what terms remember.
+        memories: Rows of what terms remember, and of errors of sensors that stay for an episode.
+        looked: How many heights of the ground terms look up, by name of what is found.
         added: A text that changes with terms that users have added, for cache keys.
     """
 
     sizes: dict[str, int]
     memories: tuple[Row, ...]
+    looked: Mapping[str, int]
     added: str
 
 
@@ -56,28 +59,55 @@ class Stages:
     Args:
         program: The task on the robot.
         schema: The state.
+        looked: See `Probe`.
     """
 
-    def __init__(self, program: TaskProgram, schema: Mapping[str, Row]) -> None:
+    def __init__(
+        self, program: TaskProgram, schema: Mapping[str, Row], looked: Mapping[str, int] = MappingProxyType({})
+    ) -> None:
         self.program, self.task, self.model = program, program.task, program.model
         self.schema = {row.name: row for row in schema.values() if not row.dtype and row.name != FRAME}
         self.commands = Commands(self.task, program.curriculum)
         self.state = {name: SX.sym(name, row.size) for name, row in self.schema.items()}
-        self.seen_ground = {SEEN: SX.sym(SEEN, program.ground.size)} if program.ground else {}
+        seen = {SEEN: program.ground.size} if program.ground else {}
+        self.seen_ground = {name: SX.sym(name, size) for name, size in (seen | dict(looked)).items()}
 
     def probe(self) -> Probe:
         """Trace every term once."""
-        p, s = self.program, self._context(self.state | {"previous_action": self.state["action"]})
+        p, sampler = self.program, Sampler()
+        s = self._context(self.state | self.seen_ground | {"previous_action": self.state["action"]})
         for term in (*p.reward_terms.values(), *p.termination_terms.values(), *p.metric_terms.values()):
             term.number(s)
-        blocks = {name: term(s) for name, term in (p.observation_terms | p.critic_terms).items()}
+        sensed, exact = self._blocks(s, sampler)
+        blocks = sensed | exact
         kinds = (p.reward_terms, p.termination_terms, p.metric_terms, p.observation_terms, p.critic_terms)
         added = [term for terms in kinds for term in terms.values() if term.added]
-        values = {f"x{i}": term(s) for i, term in enumerate(added)} | {f"k_{n}": x for n, x in s.kept.items()}
-        inputs = self.state | self.seen_ground | s.remembered
+        values = {f"x{i}": term(s) for i, term in enumerate(added) if term.kind != "observation"}
+        found = {"k": s.kept, "s": sensed, "e": exact, "p": s.places}
+        values |= {f"{kind}_{name}": x for kind, group in found.items() for name, x in group.items()}
+        inputs = self.state | self.seen_ground | s.remembered | s.drifts | s.heights | {"draws": sampler.symbols}
         rows = tuple(Row(name, x.numel(), "term", s.resets[name]) for name, x in s.remembered.items())
+        rows += tuple(Row(name, x.numel(), "drift") for name, x in s.drifts.items())
         text = f"{traced('added', inputs, values).serialize()} {rows!r}" if added else ""
-        return Probe({name: block.numel() for name, block in blocks.items()}, rows, text)
+        looked = {name: places.shape[1] for name, places in s.places.items()}
+        return Probe({name: block.numel() for name, block in blocks.items()}, rows, looked, text)
+
+    def places(self, begins: bool) -> Call:
+        """Trace where terms look at the ground, after the sub-steps or where a robot `begins`; return the call.
+
+        Raises:
+            ValueError: If that depends on what is not known before observations are made.
+        """
+        state = self.state | {"clock": SX(0) if begins else self.state["clock"] + 1}
+        s = self._context(state | self.seen_ground | {"previous_action": state["action"]})
+        self._blocks(s, Sampler())
+        places = {f"{name}_places": ca.vec(at) for name, at in s.places.items()}
+        known = {x.name() for x in ca.symvar(ca.vertcat(*[ca.vec(x) for x in self.state.values()]))}
+        for name, at in places.items():
+            if unknown := {x.name() for x in ca.symvar(at)} - known:
+                expected = "expected positions and memory alone"
+                raise ValueError(f"{name}: depends on {', '.join(sorted(unknown))}; {expected}")
+        return _call("seen_by_terms", self.state, places)
 
     def look(self) -> ca.Function:
         """Trace one observation of the policy, neither noisy nor clipped, and `failed`; of what they look at."""
@@ -138,7 +168,7 @@ class Stages:
         On a field the robots have been placed: their state has where they stand, all but the height of the ground.
         """
         p, sampler = self.program, Sampler()
-        ours = {name for name, row in self.schema.items() if row.writer in ("physics", "task", "term")}
+        ours = {name for name, row in self.schema.items() if row.writer in ("physics", "task", "term", "drift")}
         ours -= {"chosen", "retries"}  # the latter counts on, so that who looks after a reset sees it too
         state = {name: x for name, x in self.state.items() if name in ours}
         fresh = {name: SX(np.broadcast_to(self.schema[name].reset, x.shape[0])) for name, x in state.items()}
@@ -150,6 +180,7 @@ class Stages:
         else:
             fresh["q"] = self._starting_pose(sampler)
         fresh["v"] = self._starting_velocity(sampler)
+        fresh |= {name: state[name] for name in self._drifts} if p.ground else self._drifting(sampler)
         if "grown" in fresh:
             fresh["grown"] = p.curriculum.grown(state)
         if "draw" in fresh:
@@ -177,7 +208,7 @@ class Stages:
         state, sampler, curriculum = self.state, Sampler(), self.program.curriculum
         level = curriculum.level(state, sampler, self.program.control_dt)
         place = starting_place(curriculum, level, sampler)
-        fresh = {"q": self._starting_pose(sampler), "level": level}
+        fresh = {"q": self._starting_pose(sampler), "level": level, **self._drifting(sampler)}
         fresh["q"][:2] = place
         fresh |= {"dependent": SX(self.model.guess)} if "dependent" in state else {}
         after = {name: ca.if_else(state["chosen"] > 0.5, value, state[name]) for name, value in fresh.items()}
@@ -185,7 +216,16 @@ class Stages:
 
     def _context(self, values: Mapping[str, SX]) -> TermContext:
         values = dict(values) | ({"scaled_parameters": 2 * values["draw"] - 1} if "draw" in values else {})
-        return TermContext(self.model.mechanism, values, self.program.control_dt, self.task.gait_period)
+        p = self.program
+        return TermContext(self.model.mechanism, values, p.control_dt, self.task.gait_period, p.contacts)
+
+    @property
+    def _drifts(self) -> list[str]:
+        return [name for name, row in self.schema.items() if row.writer == "drift"]
+
+    def _drifting(self, sampler: Sampler) -> dict[str, SX]:
+        """Draw the errors of sensors that stay for an episode."""
+        return {name: sampler.symmetric(self.schema[name].size, 1.0) for name in self._drifts}
 
     def _failed(self, s: TermContext) -> SX:
         return sum([term.number(s) for term in self.program.termination_terms.values()], SX(0)) > 0
@@ -221,18 +261,29 @@ class Stages:
 
     def _observation(self, s: TermContext, before: SX | None, sampler: Sampler) -> tuple[SX, SX]:
         """The policy's observation, noisy and with its history, then the critic's; and the history to keep."""
-        task, p = self.task, self.program
-        blocks = {name: term(s) for name, term in p.observation_terms.items()}
+        task = self.task
+        blocks, exact = self._blocks(s, sampler)
         noisy = [b + sampler.symmetric(b.numel(), task.noise[n]) if task.noise.get(n) else b for n, b in blocks.items()]
         now = _clipped(ca.vertcat(*noisy))
         kept = SX(0, 1)
         if task.history > 1:
             kept = ca.repmat(now, task.history - 1, 1) if before is None else before
         policy = ca.vertcat(now, kept)
-        critic = SX(0, 1)
-        if task.critic:
-            critic = _clipped(ca.vertcat(*blocks.values(), *[term(s) for term in p.critic_terms.values()]))
+        critic = _clipped(ca.vertcat(SX(0, 1), *exact.values()))
         return ca.vertcat(policy, critic), policy[: kept.numel()]
+
+    def _blocks(self, s: TermContext, sampler: Sampler) -> tuple[dict[str, SX], dict[str, SX]]:
+        """Return the policy's blocks, with errors of sensors but without noise, and the critic's, without either."""
+        own, critic = self.program.observation_terms, self.program.critic_terms
+        s.unit = sampler.unit
+        sensed = {name: term(s) for name, term in own.items()}
+        s.unit = None
+        if not self.task.critic:
+            return sensed, {}
+        s.again = True
+        exact = {name: own[name](s) if f"observation_{name}" in s.erring else block for name, block in sensed.items()}
+        s.again = False
+        return sensed, exact | {name: term(s) for name, term in critic.items()}
 
 
 def _call(name: str, given: Mapping[str, SX], after: Mapping[str, SX]) -> Call:

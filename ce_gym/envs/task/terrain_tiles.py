@@ -43,7 +43,7 @@ def checked_terrain(value: Any) -> dict[str, Any]:
         ValueError: One line that names the argument, its value and what was expected.
     """
     given = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
-    kind = given.pop("kind", "mixed" if "kinds" in given else None)
+    kind: Any = given.pop("kind", "mixed" if "kinds" in given else None)
     known = isinstance(kind, str) and kind in OWN
     check("terrain", value, known, f"{', '.join(map(repr, OWN))}, or a mapping with such a `kind`")
     _check_arguments("terrain", kind, given, OWN[kind])

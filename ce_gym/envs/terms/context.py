@@ -6,7 +6,7 @@ A term is a free function of a `TermContext`. What is here is traced when it is 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -40,23 +40,41 @@ class TermContext:
             ground under the base and each contact sphere, shape (3 (1 + n_spheres),), if it is not flat.
         control_dt: Length of a control step [s].
         gait_period: Time of one cycle of the gait's clock [s].
+        contacts: Names of the contact spheres that take part in the physics.
 
     Attributes:
         term: Kind and name of the term that is being traced, for what it remembers.
         remembered: What terms have recalled, by name of the state.
         resets: With what that begins, a number or shape (size,).
         kept: What terms have kept, likewise.
+        places: Where terms look at the ground of a field, x and y [m], shape (2, n), by name of what they find.
+        heights: What they find there [m], shape (n,), likewise.
+        unit: Draws a number in [0, 1) while sensors err; None where terms are exact, as rewards and critics have them.
+        drifts: Errors that stay for an episode, by name of the state.
+        erring: Terms that have asked for errors.
+        again: Whether those are traced a second time, without errors, for a critic.
     """
 
     def __init__(
-        self, mechanism: Mechanism, values: Mapping[str, SX], control_dt: float, gait_period: float = 1.0
+        self,
+        mechanism: Mechanism,
+        values: Mapping[str, SX],
+        control_dt: float,
+        gait_period: float = 1.0,
+        contacts: Sequence[str] = (),
     ) -> None:
         self.mechanism, self.control_dt, self._values = mechanism, control_dt, values
-        self._gait_period = gait_period
+        self._gait_period, self._contacts = gait_period, tuple(contacts)
         self.term = ""
         self.remembered: dict[str, SX] = {}
         self.resets: dict[str, ArrayLike] = {}
         self.kept: dict[str, SX] = {}
+        self.places: dict[str, SX] = {}
+        self.heights: dict[str, SX] = {}
+        self.unit: Callable[[], SX] | None = None
+        self.drifts: dict[str, SX] = {}
+        self.erring: set[str] = set()
+        self.again = False
         robot = mechanism.robot
         self._n_joints = len(robot.independent)
         pose = dict(robot.pose.joints)
@@ -77,7 +95,8 @@ class TermContext:
         return self.remembered[key]
 
     def _key(self, name: str) -> str:
-        return f"{self.term}_{name}".replace("__", "_")  # CasADi's rule for names
+        exact = "_exact" if self.again and self.term in self.erring else ""
+        return f"{self.term}_{name}{exact}".replace("__", "_")  # CasADi's rule for names
 
     def keep(self, name: str, value: SX) -> None:
         """Keep something for the next control step, see `recall`.
@@ -107,11 +126,61 @@ class TermContext:
         "grown", "How often the range of commands has grown, see `ce_gym.envs.task.curriculum`.", SX(0)
     )
 
+    def ground_under(self, name: str, places: SX) -> SX:
+        """Return heights of the ground under places [m], shape (n,): a look-up, on flat ground just zeros.
+
+        Args:
+            name: Of what is found, a word.
+            places: x and y of each [m], shape (2, n); of positions, and of what the term recalls and drifts by.
+        """
+        if not self._ground.numel():
+            return SX(ca.DM.zeros(places.shape[1]))
+        key = self._key(name)
+        self.places[key] = places
+        return self.heights.setdefault(key, self._values.get(key, SX.sym(key, places.shape[1])))
+
+    def drift(self, name: str, size: int = 1) -> SX:
+        """Return errors of a sensor that stay for an episode, in [-1, 1), shape (size,); 0 where terms are exact."""
+        self.erring.add(self.term)
+        if self.unit is None:
+            return SX(ca.DM.zeros(size))
+        key = self._key(name)
+        return self.drifts.setdefault(key, self._values.get(key, SX.sym(key, size)))
+
+    def chance(self, size: int) -> SX:
+        """Return numbers in [0, 1), drawn anew in every control step, shape (size,); 1 where terms are exact."""
+        self.erring.add(self.term)
+        if self.unit is None:
+            return SX(ca.DM.ones(size))
+        return ca.vertcat(*[self.unit() for _ in range(size)])
+
+    @property
+    def exact(self) -> bool:
+        """Whether terms are exact; a term that looks at this is traced once with errors and once without."""
+        self.erring.add(self.term)
+        return self.unit is None
+
+    @property
+    def begins(self) -> SX:
+        """1 in the first observation of an episode, else 0."""
+        return self._values["clock"] == 0
+
     @property
     def air_time(self) -> SX:
         """How long each foot had been in the air up to the previous control step [s], shape (n_feet,)."""
         self._feet  # noqa: B018  (says so if there are none)
         return self._values["air_time"]
+
+    @property
+    def foot_loads(self) -> list[SX]:
+        """Normal force on each foot in the last sub-step [N]; 0 on one whose spheres take no part in the physics."""
+        self._feet  # noqa: B018  (says so if there are none)
+        loads = {contact.body: SX(0) for contact in self.mechanism.robot.contacts if contact.group == "foot"}
+        bodies = {contact.name: contact.body for contact in self.mechanism.robot.contacts if contact.group == "foot"}
+        for i, name in enumerate(self._contacts):
+            if name in bodies:
+                loads[bodies[name]] += self.load[i]
+        return list(loads.values())
 
     @property
     def phase(self) -> SX:
@@ -191,6 +260,20 @@ class TermContext:
                     above = over_ground(above, *ca.vertsplit(self._ground[3 * i + 3 : 3 * i + 6]))
                 points.append((sphere.body, above - sphere.radius, velocity))
         return points
+
+    @property
+    def foot_places(self) -> list[SX]:
+        """Mean x and y of the spheres of each foot and z of its lowest point, in the world [m], shape (3,) each."""
+        self._feet  # noqa: B018  (says so if there are none)
+        spheres: dict[str, list[SX]] = {}
+        for sphere in self.mechanism.robot.contacts:
+            if sphere.group == "foot":
+                centre = self.kinematics.bodies[sphere.body].point_position(constant(np.array(sphere.position)))
+                spheres.setdefault(sphere.body, []).append(centre - np.array([0.0, 0.0, sphere.radius]))
+        return [
+            ca.vertcat(sum(p[:2] for p in points) / len(points), ca.mmin(ca.horzcat(*[p[2] for p in points])))
+            for points in spheres.values()
+        ]
 
     def touching(self, group: str) -> SX:
         """Whether each contact sphere of a group is on the ground, 0 or 1, shape (n,)."""

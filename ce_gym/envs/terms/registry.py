@@ -17,7 +17,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.terms import metrics, observations, rewards, terminations
+from ce_gym.envs.terms import height_scan, metrics, observations, rewards, sensors, terminations
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.sim.arguments import is_number
 
@@ -35,7 +35,7 @@ def _functions_of(module: ModuleType) -> dict[str, Function]:
 
 OWN: dict[str, dict[str, Function]] = {
     "reward": _functions_of(rewards),
-    "observation": _functions_of(observations),
+    "observation": _functions_of(observations) | _functions_of(height_scan) | _functions_of(sensors),
     "termination": _functions_of(terminations),
     "metric": _functions_of(metrics),
 }

@@ -1,0 +1,112 @@
+"""What a robot sees of the ground around it: heights on a grid of points, as an observation term.
+
+Signs and shapes are those of legged_gym and Isaac Lab: base height minus ground, so that a hole is positive; the grid
+turns with the heading of the base and stays level whatever its roll and pitch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.envs.terms.context import TermContext
+
+MOST_POINTS = 2000
+"""In one scan."""
+
+
+def height_scan(
+    s: TermContext,
+    size: Sequence[float] = (1.6, 1.0),
+    spacing: float = 0.1,
+    centre: Sequence[float] = (0.0, 0.0),
+    around: str = "base",
+    clip: float = 1.0,
+    scale: float = 1.0,
+    drift: float = 0.0,
+    shift: float = 0.0,
+    dropout: float = 0.0,
+    delay: int = 0,
+) -> SX:
+    """Heights of the base, less its standing height, above a grid of points on the ground [m], shape (17 x 11,).
+
+    Args:
+        s: The robot.
+        size: Length and width of the grid [m].
+        spacing: Distance of its points [m]. The last axis is width: `reshape(17, 11)` has rows from behind to ahead,
+            columns from right to left.
+        centre: Its middle, ahead of and to the left of what it is around [m].
+        around: "base"; or "feet", for a grid around each, and heights of its lowest point.
+        clip: Largest reading either way [m].
+        scale: What readings are multiplied by.
+        drift: Largest error of all readings in an episode [m].
+        shift: Largest error of where the grid is along x and along y in an episode [m].
+        dropout: Share of readings that are lost, and read 0.
+        delay: How many control steps readings are late.
+
+    Raises:
+        ValueError: One line that names the parameter, its value and what was expected.
+    """
+    grid = _grid(size, spacing, centre)
+    _check("around", around, around in ("base", "feet"), "'base' or 'feet'")
+    for name, value in (("clip", clip), ("drift", drift), ("shift", shift)):
+        _check(name, value, value >= 0, "a length from 0 m on")
+    _check("dropout", dropout, 0 <= dropout < 1, "a share from 0 up to 1")
+    _check("delay", delay, isinstance(delay, int) and 0 <= delay <= 100, "a whole number from 0 to 100")
+    seen = _late(s, _seen_from(s, around), delay)
+    heading, centres = seen[:2], ca.reshape(seen[2:], 3, -1)
+    turned = ca.horzcat(heading, ca.vertcat(-heading[1], heading[0])) @ ca.DM(grid)
+    away = shift * s.drift("shift", 2) if shift else SX(2, 1)
+    at = [turned + ca.repmat(centres[:2, i] + away, 1, grid.shape[1]) for i in range(centres.shape[1])]
+    above = ca.vec(ca.repmat(centres[2, :], grid.shape[1], 1)) - s.ground_under("heights", ca.horzcat(*at))
+    reading = ca.fmax(-clip, ca.fmin(clip, above + (drift * s.drift("offset") if drift else 0)))
+    if dropout:
+        reading = ca.if_else(s.chance(reading.numel()) < dropout, 0, reading)
+    return scale * reading
+
+
+def _grid(size: Sequence[float], spacing: float, centre: Sequence[float]) -> NDArray:
+    """Points of a grid about its middle [m], shape (2, n), the second coordinate changing first."""
+    for name, value, least in (("size", size, 0.0), ("centre", centre, -np.inf)):
+        numbers = isinstance(value, Sequence) and len(value) == 2 and all(_number(x) and x >= least for x in value)
+        _check(name, value, numbers, "two lengths [m]")
+    _check("spacing", spacing, spacing > 0, "a length above 0 m")
+    counts = [int(round(length / spacing, 6)) + 1 for length in size]
+    _check("size", size, counts[0] * counts[1] <= MOST_POINTS, f"at most {MOST_POINTS} points")
+    x, y = (spacing * (np.arange(n) - (n - 1) / 2) + c for n, c in zip(counts, centre, strict=True))
+    return np.stack([along.ravel() for along in np.meshgrid(x, y, indexing="ij")])
+
+
+def _seen_from(s: TermContext, around: str) -> SX:
+    """Cosine and sine of the heading; then x and y of each centre, and how far up what sees it is, one after other."""
+    base = s.kinematics.bodies[s.mechanism.robot.bodies[0].name]
+    ahead = base.R[:2, 0]
+    heading = ahead / ca.fmax(ca.norm_2(ahead), 1e-6)  # a base that looks straight up has none
+    if around == "base":
+        return ca.vertcat(heading, s.q[:2], s.q[2] - s.mechanism.robot.pose.height)
+    return ca.vertcat(heading, *s.foot_places)
+
+
+def _late(s: TermContext, now: SX, delay: int) -> SX:
+    """What there was so many control steps ago, or when the episode began."""
+    if not delay or s.exact:
+        return now
+    before = s.recall("seen", size=delay * now.numel())
+    before = ca.if_else(s.begins, ca.repmat(now, delay, 1), before)
+    s.keep("seen", ca.vertcat(now, before)[: before.numel()])
+    return before[-now.numel() :]
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+
+
+def _check(name: str, value: Any, valid: bool, expected: str) -> None:
+    if not valid:
+        raise ValueError(f"observation term 'height_scan': {name}={value!r}; expected {expected}")
