@@ -248,7 +248,7 @@ class Simulator:
             expected = "one of those declared with Simulator(..., parameters=)"
             raise ValueError(f"parameter {name!r}; expected {expected}: {declared}")
         columns, chosen, new = self._columns[name], self._chosen(mask), to_numpy(value)
-        size = columns.stop - columns.start
+        size = int(columns.stop - columns.start)
         check_shape(name, new, (), (size,), (self.num_envs, size))
         check_parameter(self.model.robot, name, new)
         with self._section:

@@ -144,7 +144,7 @@ def test_dropped_robots_come_to_rest(robot: str, dt: float, stiffness: float, dt
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 0}, "num_envs=0; expected at least 1"),
+        ({"num_envs": 0}, "num_envs=0; expected a whole number, at least 1"),
         ({"dt": -1.0}, "dt=-1.0; expected between 0 and 0.1 s"),
         ({"dtype": "float16"}, "dtype='float16'; expected 'float64' or 'float32'"),
         ({"control": "velocity"}, "control='velocity'; expected 'position' or 'torque'"),
