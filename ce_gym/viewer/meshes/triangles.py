@@ -150,5 +150,6 @@ def _thinned(mesh: Triangles, share: float) -> Triangles:
         return mesh
     import fast_simplification
 
-    vertices, faces = fast_simplification.simplify(mesh.vertices.astype(np.float32), mesh.faces, target_count=most)
-    return Triangles(np.asarray(vertices, float), _proper(faces), mesh.placement, mesh.color)
+    faces = mesh.faces.astype(np.int32)
+    vertices, fewer, *_ = fast_simplification.simplify(mesh.vertices, faces, target_count=most)
+    return Triangles(np.asarray(vertices, float), _proper(fewer), mesh.placement, mesh.color)
