@@ -62,8 +62,14 @@ def row_of(key: Mapping[str, Any], folder: Path, overrides: Sequence[str] = (), 
         raise KeyboardInterrupt
     judged = [judge(policy, key["env"], episodes, kwargs) for policy in (*checkpoints(trained.policy), trained.policy)]
     last = judged[-1]
-    found = {name: last[name] for name in (*FIGURES, "steps")} | {"load": round(os.getloadavg()[0], 1)}
+    found = {name: last[name] for name in (*FIGURES, "steps")} | {"load": load()}
     return {**key, **found, **times(judged)}
+
+
+def load() -> float:
+    """Return how many programs wanted a core, the mean of the last minute; NaN on Windows, which does not count."""
+    average = getattr(os, "getloadavg", None)
+    return round(average()[0], 1) if average else float("nan")
 
 
 def checkpoints(policy: Path) -> list[Path]:
