@@ -32,8 +32,8 @@ MAY_IMPORT = {
 LAYERS = {
     "model": "errors table frames assets constraints coordinates description clusters mechanism checks"
     " generators formats load listing",
-    "model/formats": "text_file reading placement standing rotor_rule rotor_links hinges motors collections urdf"
-    " mjcf yaml",
+    "model/formats": "text_file reading placement standing rotor_rule rotor_links hinges motors collections"
+    " contact_shapes urdf mjcf yaml",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
     "dynamics": "algebra constraints standing recursion forces functions derivatives stepping evaluation model",

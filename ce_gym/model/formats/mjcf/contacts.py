@@ -19,12 +19,11 @@ beyond it that several limbs hang on; "limb" is the rest, which no task simulate
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ce_gym.model.description import ContactMaterial, ContactSphere
+from ce_gym.model.formats.contact_shapes import DIAGONALS, Sphere, points, spheres_of
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.source import MjcfSource, rotation
 from ce_gym.model.formats.placement import transform_point, vec3
@@ -32,8 +31,8 @@ from ce_gym.model.formats.placement import transform_point, vec3
 FOOT_BAND = 0.02
 """Spheres whose undersides are this close [m] to the lowest one are feet."""
 
-DIAGONALS = np.array(list(product((1.0, -1.0), repeat=3)))
-CROSS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+RIM = 4
+"""Points on each rim of a cylinder."""
 
 _DEFAULT_SOLVER = ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0))  # MuJoCo's solref and solimp
 
@@ -85,35 +84,33 @@ def _solid(source: MjcfSource, geom: int) -> bool:
     return bool(source.model.geom_contype[geom] or source.model.geom_conaffinity[geom])
 
 
-def _spheres(source: MjcfSource, geom: int) -> Iterator[tuple[str, NDArray[np.float64], float]]:
+def _spheres(source: MjcfSource, geom: int) -> Iterator[Sphere]:
     """Iterate over name, centre [m] in the geom's frame and radius [m] of the spheres that stand for a geom."""
-    kinds = source.mujoco.mjtGeom
-    name, kind = source.name("geom", geom), source.model.geom_type[geom]
+    name = source.name("geom", geom)
+    return ((f"{name}{suffix}", centre, radius) for suffix, centre, radius in _parts(source, geom, name))
+
+
+def _parts(source: MjcfSource, geom: int, name: str) -> Iterator[Sphere]:
+    kinds, kind = source.mujoco.mjtGeom, source.model.geom_type[geom]
     a, b, c = (float(x) for x in source.model.geom_size[geom])
     if kind == kinds.mjGEOM_SPHERE:
-        yield name, np.zeros(3), a
+        yield from spheres_of("sphere", (a,))
     elif kind == kinds.mjGEOM_CAPSULE:
-        for end, side in (("top", 1.0), ("bottom", -1.0)):
-            yield f"{name}_{end}", np.array([0.0, 0.0, side * b]), a
+        yield from spheres_of("capsule", (a, 2 * b))
     elif kind == kinds.mjGEOM_BOX:
-        yield from _points(f"{name}_corner", DIAGONALS * (a, b, c))
+        yield from spheres_of("box", (2 * a, 2 * b, 2 * c))
     elif kind == kinds.mjGEOM_CYLINDER:
-        yield from _points(f"{name}_rim", np.array([(x * a, y * a, z * b) for z in (1, -1) for x, y in CROSS]))
+        yield from spheres_of("cylinder", (a, 2 * b), rim=RIM)
     elif kind == kinds.mjGEOM_ELLIPSOID:
-        yield from _points(f"{name}_end", np.vstack([np.diag((a, b, c)), -np.diag((a, b, c))]))
+        yield from points("_end", np.vstack([np.diag((a, b, c)), -np.diag((a, b, c))]))
     elif kind == kinds.mjGEOM_MESH:
         mesh = int(source.model.geom_dataid[geom])
         first, count = int(source.model.mesh_vertadr[mesh]), int(source.model.mesh_vertnum[mesh])
         vertices = np.array(source.model.mesh_vert[first : first + count], dtype=float)
         furthest = dict.fromkeys(int(np.argmax(vertices @ diagonal)) for diagonal in DIAGONALS)
-        yield from _points(f"{name}_vertex", vertices[list(furthest)])
+        yield from points("_vertex", vertices[list(furthest)])
     else:
         source.leave_out("contact of geom {}, which is a height field or signed distance field", name)
-
-
-def _points(name: str, points: NDArray[np.float64]) -> Iterator[tuple[str, NDArray[np.float64], float]]:
-    """Iterate over points as spheres of no radius, numbered."""
-    return ((f"{name}{i + 1}", point, 0.0) for i, point in enumerate(points))
 
 
 def _grouped(spheres: list[ContactSphere], heights: list[float], tree: MjcfTree) -> tuple[ContactSphere, ...]:

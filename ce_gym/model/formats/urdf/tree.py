@@ -40,6 +40,7 @@ class UrdfTree:
         constraints: The file's <mimic> joints.
         notes: What was left out.
         fixed: Links that were asked for to be kept apart, by name.
+        collisions: The <collision> elements of every link that has some, in the link's frame; None for a mesh.
     """
 
     name: str
@@ -48,6 +49,7 @@ class UrdfTree:
     constraints: tuple[LinearConstraint, ...]
     notes: tuple[str, ...]
     fixed: Mapping[str, FixedLink]
+    collisions: Mapping[str, tuple[Shape | None, ...]]
 
 
 def read_urdf(path: Path, base: Base | None = None, apart: Collection[str] = ()) -> UrdfTree:
@@ -94,7 +96,9 @@ class _Reader:
         mimics = tuple(self._mimics())
         name = self.graph.robot.get("name") or Path(self.file).stem
         fixed = {link: self._fixed(link) for link in self.apart}
-        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes), fixed)
+        collisions = {link: tuple(self._shapes_of(link, "collision")) for link in self.graph.order}
+        collisions = {link: shapes for link, shapes in collisions.items() if shapes}
+        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes), fixed, collisions)
 
     def _root_is_world(self, base: Base | None) -> bool:
         floating = [joint for joint in self.joints.values() if joint.type == "floating"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ce_gym.model.constraints import LinearConstraint
-from ce_gym.model.description import Body, Robot
+from ce_gym.model.description import Body, Robot, Shape
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.mjcf.robot import read_robot
 from ce_gym.model.formats.reading import Section
@@ -23,11 +23,13 @@ class Links:
         robot: Not checked yet.
         frames: Body and pose of every frame that can be named, links merged into others included.
         fixed: Links that no joint moves but that the YAML file calls rotors, by name; no body has their mass.
+        collisions: What a URDF says of how its links touch, in the frame of each; None for a mesh.
     """
 
     robot: Robot
     frames: dict[str, Frame]
     fixed: Mapping[str, FixedLink]
+    collisions: Mapping[str, tuple[Shape | None, ...]]
 
 
 def read_links(path: Path, file: Section) -> Links:
@@ -51,12 +53,12 @@ def read_links(path: Path, file: Section) -> Links:
         tree = read_urdf(path.parent / file.text("urdf"), base, rotors.data)
         independent = _not_tied(tree.bodies, tree.constraints)
         robot = Robot(tree.name, tree.bodies, tree.constraints, independent, notes=tree.notes)
-        return Links(robot, dict(tree.frames), tree.fixed)
+        return Links(robot, dict(tree.frames), tree.fixed, tree.collisions)
     if "base" in file:
         raise bad(file.file, "base", file.get("base"), "none, because an MJCF file says itself what its base is")
     driven = {joint for _, rotor in rotors.sections() for joint in names_in(rotor, "ratios")}
     robot, frames, fixed = read_robot(path.parent / file.text("mjcf"), file.section("gears"), driven, rotors.data)
-    return Links(robot, frames, fixed)
+    return Links(robot, frames, fixed, {})
 
 
 def names_in(section: Section, key: str) -> tuple[str, ...]:

@@ -7,19 +7,19 @@ body may also name a link that a fixed joint merged into a body.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.constraints import Constraint
-from ce_gym.model.description import Body, ContactMaterial, ContactSphere, Gains, Pose, Robot
+from ce_gym.model.description import Body, ContactMaterial, Gains, Pose, Robot
 from ce_gym.model.errors import bad, unknown
-from ce_gym.model.formats.placement import transform_point, vec3
+from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
 from ce_gym.model.formats.standing import with_limits
-from ce_gym.model.formats.urdf.tree import Frame
-from ce_gym.model.formats.yaml.constraints import frame_named, read_constraints
+from ce_gym.model.formats.yaml.constraints import read_constraints
+from ce_gym.model.formats.yaml.contacts import read_contacts
 from ce_gym.model.formats.yaml.links import read_links
 from ce_gym.model.formats.yaml.rotors import add_rotors, read_motors
 
@@ -61,7 +61,7 @@ def robot_from_yaml(path: Path) -> Robot:
     if "assembly" in file:
         robot = replace(robot, assembly=file.section("assembly").numbers())
     if "contacts" in file:
-        robot = replace(robot, contacts=tuple(_contacts(file.section("contacts"), links.frames)))
+        robot = replace(robot, contacts=tuple(read_contacts(file.section("contacts"), links)))
     if "material" in file:
         robot = replace(robot, material=_material(file.section("material")))
     robot = replace(robot, pose=_pose(file.section("pose"), robot), gains=_gains(file.section("gains"), robot))
@@ -109,16 +109,6 @@ def _pose(section: Section, robot: Robot) -> Pose:
     joints = (*given.items(), *_among(robot.pose.joints, set(robot.independent) - set(given)))
     pose = with_limits(joints, robot.bodies, robot.independent)
     return Pose(section.number("height", robot.pose.height), pose)
-
-
-def _contacts(section: Section, frames: dict[str, Frame]) -> Iterator[ContactSphere]:
-    for name, contact in section.sections():
-        contact.allow("body", "position", "radius", "group")
-        body, pose = frame_named(contact, "body", frames)
-        if body is None:
-            raise bad(contact.file, contact.key("body"), contact.text("body"), "a body that moves")
-        centre = transform_point(pose, vec3(contact.vector("position", 3)))
-        yield ContactSphere(name, body, centre, contact.number("radius"), contact.text("group", "foot"))
 
 
 def _material(section: Section) -> ContactMaterial:

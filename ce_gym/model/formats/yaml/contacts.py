@@ -1,0 +1,74 @@
+"""`contacts:` of a YAML file -> contact spheres: spheres themselves, primitives, and collisions of a URDF."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ce_gym.model.description import ContactSphere, Shape
+from ce_gym.model.errors import bad
+from ce_gym.model.formats.contact_shapes import FACES, on_face, spheres_of
+from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform_point, vec3
+from ce_gym.model.formats.reading import Section
+from ce_gym.model.formats.yaml.constraints import frame_named
+from ce_gym.model.formats.yaml.links import Links
+from ce_gym.model.frames import Placement
+
+SIZES = {"box": 3, "cylinder": 2, "capsule": 2}
+"""How many lengths a primitive has: edges, or radius and length along z [m]."""
+MOST_ON_RIM = 64
+"""Most spheres on one rim of a cylinder."""
+
+
+def read_contacts(section: Section, links: Links) -> Iterator[ContactSphere]:
+    """Iterate over the contact spheres; several that stand for one entry are numbered."""
+    for name, entry in section.sections():
+        body, frame = frame_named(entry, "body", links.frames)
+        if body is None:
+            raise bad(entry.file, entry.key("body"), entry.text("body"), "a body that moves")
+        group, kind = entry.text("group", "foot"), entry.text("shape", "sphere", ("sphere", *SIZES, "collision"))
+        if kind == "sphere":
+            entry.allow("body", "shape", "position", "radius", "group")
+            centre = transform_point(frame, vec3(entry.vector("position", 3)))
+            yield ContactSphere(name, body, centre, entry.number("radius"), group)
+            continue
+        shapes = list(_collisions(entry, links)) if kind == "collision" else [_primitive(entry, kind)]
+        for i, shape in enumerate(shapes):
+            stem = f"{name}_{i + 1}" if len(shapes) > 1 else name
+            pose = compose(frame, shape.placement)
+            for suffix, centre, radius in _spheres(entry, shape):
+                yield ContactSphere(f"{stem}{suffix}", body, transform_point(pose, vec3(centre)), radius, group)
+
+
+def _primitive(entry: Section, kind: str) -> Shape:
+    entry.allow("body", "shape", "size", "position", "rpy", "radius", "face", "rim", "group")
+    size = entry.vector("size", SIZES[kind])
+    if min(size) < 0.0 or (kind != "capsule" and min(size) == 0.0):
+        raise bad(entry.file, entry.key("size"), list(size), "lengths above 0 [m]")
+    turned = rotation_from_rpy(*entry.vector("rpy", 3, (0.0, 0.0, 0.0)))
+    return Shape(kind, size, Placement(vec3(entry.vector("position", 3, (0.0, 0.0, 0.0))), turned))  # type: ignore[arg-type]
+
+
+def _collisions(entry: Section, links: Links) -> Iterator[Shape]:
+    """Iterate over the <collision> elements of a link."""
+    entry.allow("body", "shape", "radius", "face", "rim", "group")
+    link = entry.text("body")
+    shapes = links.collisions.get(link, ())
+    if not shapes or None in shapes:
+        told, expected = ("a mesh", "primitives") if shapes else (None, "some in its URDF file")
+        raise bad(entry.file, f"{entry.path} <collision> of {link!r}", told, f"{expected}: box, cylinder or sphere")
+    return (shape for shape in shapes if shape)
+
+
+def _spheres(entry: Section, shape: Shape) -> list[tuple[str, np.ndarray, float]]:
+    """Return suffixes, centres in the frame of a shape and radii of the spheres that stand for it."""
+    radius, rim = entry.number("radius", 0.0), entry.number("rim", 8.0)
+    most = {"box": min(shape.size) / 2, "cylinder": min(shape.size[0], shape.size[-1] / 2)}.get(shape.type, 0.0)
+    if not 0.0 <= radius <= most and "radius" in entry:
+        expected = f"from 0 to {most:g} [m], by which edges are rounded" if most else "none: its size has it"
+        raise bad(entry.file, entry.key("radius"), radius, expected)
+    if rim not in range(3, MOST_ON_RIM + 1):
+        raise bad(entry.file, entry.key("rim"), rim, f"a whole number from 3 to {MOST_ON_RIM}, of spheres on a rim")
+    face = entry.text("face", "", FACES)
+    return on_face(list(spheres_of(shape.type, shape.size, radius, int(rim))), face)
