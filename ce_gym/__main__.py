@@ -20,6 +20,7 @@ from ce_gym.policies import add_env_arg
 from ce_gym.viewer.cli import add_play_command, add_view_command
 from ce_gym.viewer.console import Parser, examples, print_anything
 from ce_gym.viewer.live.command import add_live_command
+from ce_gym.viewer.watch.command import add_watch_command
 
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
 
@@ -29,6 +30,7 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
   python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
   python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
   python -m ce_gym live POLICY           drive, push and throw it in a browser
+  python -m ce_gym watch RUN             see how training goes: curves, and the present policy
   python -m ce_gym view walk.npz         show recorded rollouts, several side by side or as ghosts
   python -m ce_gym bench                 benchmarks, in a clone of the repository
 
@@ -112,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     add_play_command(commands)
     add_view_command(commands)
     add_live_command(commands)
+    add_watch_command(commands)
     commands.add_parser("bench", help="benchmarks, in a clone of the repository; without a name, the list of them")
     return parser
 

@@ -24,6 +24,7 @@ from run_folder import going_on
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.utils import FloatSchedule
+from training_page import Present
 
 
 class _Quiet(BaseCallback):
@@ -153,6 +154,17 @@ class Checkpoints(_Quiet):
         if self.num_timesteps >= self.next:
             self.save()
             self.next = self.num_timesteps + self.every
+
+
+class KeepPresent(_Quiet):
+    """Writes the policy for a page between updates."""
+
+    def __init__(self, present: Present) -> None:
+        super().__init__()
+        self.present = present
+
+    def _on_rollout_start(self) -> None:
+        self.present.keep()
 
 
 class Lenient(KVWriter):

@@ -6,6 +6,7 @@ A learner is a program that has `train(job) -> Trained`; `main` here does all el
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import platform
 import time
@@ -19,6 +20,7 @@ import gymnasium
 from console import EPISODES, SEED, THREADS, Parser, above_zero, run
 from run_folder import make_folder
 from settings import NETWORK, Settings, SettingsError, config_file, load_env_args, load_settings, make_settings, parsed
+from training_page import TrainingPage
 
 from ce_gym import usable_cores
 from ce_gym.policies import PolicyError, add_env_arg, environment_of, load_policy, locate_policy
@@ -41,6 +43,7 @@ class Job:
         resume: A policy to go on from.
         seconds: Longest time to train [s]; the steps done by then are kept.
         tensorboard: Whether to write TensorBoard logs.
+        page: Whether a page shows the present policy.
     """
 
     env_id: str
@@ -52,6 +55,7 @@ class Job:
     resume: Path | None = None
     seconds: float = float("inf")
     tensorboard: bool = True
+    page: bool = False
 
 
 @dataclass(frozen=True)
@@ -210,6 +214,7 @@ def jobs(args: argparse.Namespace, folder: str = "", settings: type = Settings) 
             resume=resume,
             seconds=60.0 * args.minutes,
             tensorboard=args.tensorboard,
+            page=args.page,
         )
         for seed in seeds
     ]
@@ -257,6 +262,9 @@ def parser() -> argparse.ArgumentParser:
     where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")
     where.add_argument("--no-tensorboard", dest="tensorboard", action="store_false", help="write no TensorBoard logs")
     where.add_argument(
+        "--page", action="store_true", help="show learning curves and the present policy in a browser while it trains"
+    )
+    where.add_argument(
         "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation at the end"
     )
     return result
@@ -286,9 +294,16 @@ def _train_all(
     program: str, train: Callable[[Job], Trained], args: argparse.Namespace, folder: str, settings: type
 ) -> int:
     """Do what a command line asks for; return the exit code."""
+    wanted = jobs(args, folder, settings)
+    with TrainingPage([job.out for job in wanted], wanted[0].env_id) if args.page else contextlib.nullcontext():
+        return _train_each(program, train, wanted, args.episodes)
+
+
+def _train_each(program: str, train: Callable[[Job], Trained], wanted: list[Job], episodes: int) -> int:
+    """Do some training runs, one after the other; return the exit code."""
     from evaluate import evaluate, report  # what judges is not needed before
 
-    for job in jobs(args, folder, settings):
+    for job in wanted:
         make_folder(job.out)
         print(f"training {job.env_id}, seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", flush=True)
         trained = train(job)
@@ -296,6 +311,6 @@ def _train_all(
         if trained.interrupted:
             print(f"interrupted; go on with: python train/{program} --resume {trained.policy}")
             return 130
-        result = evaluate(load_policy(trained.policy), job.env_id, episodes=args.episodes, **job.env_kwargs)
+        result = evaluate(load_policy(trained.policy), job.env_id, episodes=episodes, **job.env_kwargs)
         print(report(result), flush=True)
     return 0

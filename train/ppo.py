@@ -30,6 +30,7 @@ from callbacks import (
     EntropySchedule,
     EpisodeLog,
     FallCost,
+    KeepPresent,
     Lenient,
     NoiseSchedule,
     ShowProgress,
@@ -45,6 +46,7 @@ from run_folder import going_on, make_folder, save_somewhere, write_whole
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.utils import FloatSchedule
+from training_page import Present
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
 from ce_gym.adapters.sb3_asymmetric import AsymmetricPolicy
@@ -89,9 +91,11 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
         with going_on():
             save(model, record(), job.out / "checkpoints" / f"policy_{model.num_timesteps}")
 
+    present = Present(lambda path: save(model, record(), path), job.out, job.page)
+
     with StopInOrder(job.seconds) as stop:
         callbacks = [Stop(stop), Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog(), SpreadEpisodes()]
-        callbacks += [WriteCurve(job.out / "curve.csv", earlier), progress]
+        callbacks += [WriteCurve(job.out / "curve.csv", earlier), progress, KeepPresent(present)]
         callbacks.append(EntropySchedule(settings.entropy, settings.final_entropy, settings.steps))
         if settings.fall_cost:
             callbacks.append(FallCost(settings.fall_cost, settings.steps))

@@ -21,6 +21,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
 from progress import Curve, Log, ProgressBar, StopInOrder, read_curve
 from run_folder import going_on, make_folder, save_somewhere, write_whole
+from training_page import Present
 
 from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
 
@@ -61,6 +62,7 @@ def _learn(learner: Any, job: Job, name: str) -> Trained:
         return written | {"learner": name, "finished": finished, "shares": bar.shares}
 
     every = max(s.steps // CHECKPOINTS, 1)
+    present = Present(lambda path: save_policy(learner, record(), path), job.out, job.page)
     with StopInOrder(job.seconds) as stop:
         while learner.steps < s.steps and not stop.due:
             before = learner.steps // every
@@ -69,6 +71,7 @@ def _learn(learner: Any, job: Job, name: str) -> Trained:
             log.add(learner.steps, time.perf_counter() - start, means, figures)
             bar.advance(learner.steps)
             bar.describe(means, learner.step_seconds, learner.collect_seconds)
+            present.keep()
             if learner.steps // every > before and learner.steps < s.steps:
                 with going_on():
                     save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
@@ -91,6 +94,17 @@ def save(learner: Any, record: dict[str, Any], path: Path) -> Path:
     files = {".learner.npz": state.getvalue(), ".json": text.encode(), ".npz": policy.getvalue()}
     write_whole({path.with_name(path.name + kind): data for kind, data in files.items()})
     return path.with_name(f"{path.name}.npz")
+
+
+def save_policy(learner: Any, record: dict[str, Any], path: Path) -> None:
+    """Write `path`.npz alone: to act, not to go on from.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    policy = io.BytesIO()
+    write_npz(learner.actor(), record, policy)
+    write_whole({path.with_name(f"{path.name}.npz"): policy.getvalue()})
 
 
 def resume(learner: Any, policy: Path) -> None:

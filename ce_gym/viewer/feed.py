@@ -1,4 +1,4 @@
-"""Server-sent events of a live page: the newest poses and the ground around the robots."""
+"""Server-sent events of a live page: the newest poses, and what is kept beside them, such as the ground."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Feed:
     def __init__(self) -> None:
         self._news = threading.Condition(threading.RLock())  # a finalizer may close it amid a call
         self._event, self._count, self._watchers = b"", 0, 0
-        self._ground, self._grounds = b"", 0
+        self._kept: dict[str, tuple[int, bytes]] = {}
         self.closed = False
 
     def publish(self, event: bytes) -> bool:
@@ -26,10 +26,11 @@ class Feed:
             self._news.notify_all()
             return self._watchers > 0
 
-    def put_ground(self, event: bytes) -> None:
-        """Send another piece of ground before the next event."""
+    def keep(self, kind: str, data: bytes) -> None:
+        """Send data of a kind before the next event, in an event of that name; browsers that come later get it, too."""
         with self._news:
-            self._ground, self._grounds = event, self._grounds + 1
+            number = self._kept[kind][0] + 1 if kind in self._kept else 1
+            self._kept[kind] = number, b"event: %s\ndata: %s\n\n" % (kind.encode(), data)
 
     def close(self) -> None:
         """End the stream of every browser."""
@@ -39,7 +40,7 @@ class Feed:
 
     def events(self) -> Iterator[bytes]:
         """Yield the newest poses to one browser until the feed is closed."""
-        seen = grounds = 0
+        seen, had = 0, dict[str, int]()
         with self._news:
             self._watchers += 1
         try:
@@ -51,8 +52,9 @@ class Feed:
                     if self.closed:
                         return
                     event, seen = (self._event, self._count) if self._count > seen else (b":\n\n", seen)
-                    if self._grounds > grounds:
-                        event, grounds = self._ground + event, self._grounds
+                    fresh = {kind: kept for kind, kept in self._kept.items() if kept[0] > had.get(kind, 0)}
+                    had |= {kind: number for kind, (number, _) in fresh.items()}
+                    event = b"".join(kept for _, kept in fresh.values()) + event
                 yield event
         finally:
             with self._news:

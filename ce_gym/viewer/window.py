@@ -62,7 +62,7 @@ class Window:
             print(f"watch at {self.url}", flush=True)
         moves = self._scene.moves([self._model], [q])
         if ground := self._scene.new_ground(moves):
-            self._feed.put_ground(ground)
+            self._feed.keep("ground", ground)
         if self._feed.publish(f"data: {json.dumps(moves)}\n\n".encode()):
             time.sleep(max(0.0, self._due - time.monotonic()))
         self._due = max(self._due, time.monotonic() - self._period) + self._period

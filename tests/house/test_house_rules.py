@@ -42,7 +42,7 @@ LAYERS = {
     "envs": "terms task runtime policy_spec differentiable rendering base single vector registration custom",
     "export": "joint_ties mjcf_text mjcf_equalities mjcf mujoco_model mujoco_coordinates mujoco_batch mujoco_twin"
     " guesses new_robot",
-    "viewer": "errors console meshes rollouts page raytrace video server feed window renderers live cli",
+    "viewer": "errors console meshes rollouts page raytrace video server feed window renderers live watch cli",
     "bench": "measure peers instructions soak digests fuzz speed throughput paper accuracy stability"
     " gpu exactness __main__",
 }

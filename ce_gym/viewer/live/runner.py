@@ -152,7 +152,7 @@ class Runner:
         session = self.session
         moves = self.scene.moves([robot.model for robot in session.robots], session.poses())
         if ground := self.scene.new_ground(moves):
-            self.feed.put_ground(ground)
+            self.feed.keep("ground", ground)
         self.feed.publish(f"data: {json.dumps({'moves': moves, 'state': self.state()})}\n\n".encode())
 
     def state(self) -> dict[str, Any]:

@@ -37,6 +37,13 @@ function label(value, step) {
   return text(value, step);
 }
 
+// A number to read: 0.0123, 4.56, 1234, 1.2e-5; nothing of what is none.
+function figure(value) {
+  const size = Math.abs(value);
+  if (!Number.isFinite(value)) return "";
+  return size >= 1e6 || (size && size < 1e-3) ? value.toExponential(2) : size >= 100 ? value.toFixed(0) : value.toPrecision(3);
+}
+
 // Smallest and largest value of some arrays, with room, zero among them.
 function rangeOf(arrays) {
   let [low, high] = [0, 0];
@@ -75,9 +82,10 @@ function drawGraph(context, { x, y, width, height }, { curves, from, to, range, 
   }
   context.textBaseline = "top";
   context.textAlign = "center";
+  const free = right - context.measureText(unit).width - 16;  // up to here, numbers do not overprint the unit
   for (const time of columns.values) {
     line("#e4e7eb", [], 1, straight(across(time), top, across(time), bottom));
-    if (across(time) < right - 14) context.fillText(label(time, columns.step), across(time), bottom + 6);
+    if (across(time) < free) context.fillText(label(time, columns.step), across(time), bottom + 6);
   }
   context.textAlign = "right";
   context.fillText(unit, right, bottom + 6);

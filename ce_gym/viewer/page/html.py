@@ -115,7 +115,7 @@ def _data(runs: Sequence[PosedRollout], plot: Sequence[str], *, ghosts: bool) ->
     robots = [
         {
             "name": name_of(run),
-            "color": _css(color_of(index)),
+            "color": css(color_of(index)),
             "ghost": ghosts and index > 0,
             "times": packed(run.times),
             **one.as_json(),
@@ -150,10 +150,11 @@ def _legend(runs: Sequence[PosedRollout]) -> str:
     items += [(color, text, [f"{a.path}/{leaf}" for a in who]) for color, text, leaf, who in arrows_of if who]
     return "".join(
         f'<li><label><input type="checkbox" checked data-paths="{html.escape(json.dumps(paths))}">'
-        f'<i style="background:{_css(color)}"></i>{html.escape(text)}</label></li>'
+        f'<i style="background:{css(color)}"></i>{html.escape(text)}</label></li>'
         for color, text, paths in items
     )
 
 
-def _css(color: three.Color) -> str:
+def css(color: three.Color) -> str:
+    """Return a colour as style sheets write it."""
     return f"#{three.hex_color(color):06x}"

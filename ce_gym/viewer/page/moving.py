@@ -93,7 +93,7 @@ class MovingScene:
         return base[:2, 3] if self.robot.floating else self._middle
 
     def new_ground(self, moves: dict[str, list[float]]) -> bytes | None:
-        """Return the event that draws the ground around the first robot, None if it is flat or there already."""
+        """Return the command that draws the ground around the first robot, None if it is flat or there already."""
         place = self._place({path: np.reshape(matrix, (4, 4)).T for path, matrix in moves.items()})
         row, column = np.floor(place / BLOCK).astype(int).tolist()
         if self._terrain is None or self._block == (row, column):
@@ -102,4 +102,4 @@ class MovingScene:
         ground, root = around(self._terrain, block), self.paths[0][self.robot.bodies[0].name]
         command = field_command(f"{WORLD}/ground", ground, [root], reach(ground, block))
         self._block = (row, column)
-        return f"event: ground\ndata: {json.dumps(command)}\n\n".encode()
+        return json.dumps(command).encode()

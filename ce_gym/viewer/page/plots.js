@@ -19,7 +19,7 @@ function download(name, url) {
 }
 
 // Panel of plots.
-//   sources: {name, color, times, signals, commanded, limits}, see charts.py; names: the signal of each plot at first;
+//   sources: {name, color, times, signals, commanded, limits}, see charts.py; names: of each plot at first, the signal or signals;
 //   span: first and last time; seek: is called with a time that was pointed at, or null where time cannot be chosen.
 function makePlots(parent, sources, names, { span, unit, seek, file }) {
   let view = [...span], now = seek ? span[0] : null, drawn = "";
@@ -62,8 +62,10 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
       };
       if (k === plot.signals.length - 1) button("+", "Another signal in this plot", () => { plot.signals.push(signal); fill(plot); });
       button("×", "Remove this signal", () => { plot.signals.splice(k, 1); plot.signals.length ? fill(plot) : remove(plot); });
-      const values = element("div", plot.rows, { class: "values" });
-      for (const curve of plot.content.curves.filter(one => one.signal === signal)) {
+      const curves = plot.content.curves.filter(one => one.signal === signal);
+      const inline = plot.signals.length > 1 && curves.length === 1;  // or many signals would take more room than their plot
+      const values = element("div", inline ? row : plot.rows, { class: "values" });
+      for (const curve of curves) {
         const text = element("span", values, { title: curve.name, style: `color: ${curve.color}` });
         element("i", text, { class: curve.dash.length ? "dashed" : "" });
         curve.text = element("span", text);
@@ -75,9 +77,9 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
     plots.splice(plots.indexOf(plot), 1);
     plot.box.remove();
   }
-  function add(signal) {
+  function add(signals) {
     const box = element("div", list, { class: "plot" });
-    const plot = { box, rows: element("div", box), canvas: element("canvas", box), signals: [signal] };
+    const plot = { box, rows: element("div", box), canvas: element("canvas", box), signals: [signals].flat() };
     plots.push(plot);
     point(plot.canvas);
     fill(plot);
@@ -126,7 +128,7 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
       paint(context, { x: 0, y: 0, width, height: TALL }, plot);
       for (const { text, times, values } of plot.content.curves) {
         const at = now === null ? times.length - 1 : frameAt(times, now);
-        text.textContent = at >= 0 ? values[at].toPrecision(3) : "";
+        if (text) text.textContent = figure(values[at]);
       }
     }
   }
@@ -189,7 +191,17 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
     const all = view[0] === span[0] && view[1] === span[1];
     [sources, span] = [newSources, newSpan];
     if (all) view = [...span];
-    plots.forEach(fill);
+    const choosing = parent.contains(document.activeElement) && document.activeElement.tagName === "SELECT";
+    plots.forEach(plot => update(plot, choosing));
+    redraw();
+  }
+  // Rows stay where they are if they would be the same, so that a list somebody has opened does not close.
+  function update(plot, choosing) {
+    const before = plot.content, options = plot.rows.querySelector("select")?.options.length, after = contentOf(plot);
+    const names = content => content.curves.map(curve => `${curve.name} ${curve.signal}`).join();
+    if (!choosing && (names(before) !== names(after) || options !== known().length)) { fill(plot); return; }
+    after.curves.forEach((curve, i) => { curve.text = before.curves[i]?.text; });
+    plot.content = after;
   }
   return { move, redraw, replace, csv, png };
 }
