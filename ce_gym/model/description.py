@@ -147,6 +147,23 @@ class ContactSphere:
 
 
 @dataclass(frozen=True)
+class Capsule:
+    """What a link is to other links of its robot: all that is within a radius of a segment.
+
+    Attributes:
+        body: Name of the link.
+        start: Of the segment, in the body frame [m].
+        end: The same point for a sphere [m].
+        radius: [m].
+    """
+
+    body: str
+    start: Vec3
+    end: Vec3
+    radius: float
+
+
+@dataclass(frozen=True)
 class ContactMaterial:
     """Compliance and friction of a robot's contacts with the ground, figures of each contact sphere.
 
@@ -227,6 +244,8 @@ class Robot:
         independent: Bodies whose joint coordinates are the independent coordinates `y`, in the order of `y`.
         contacts: Spheres that may touch the ground.
         material: Compliance and friction of the contacts.
+        capsules: What links are to each other, of those whose shapes do not say it or say it wrongly.
+        self_collisions: Pairs of links that push each other apart, in a scene that asks for it.
         motors: One for each driven rotor.
         pose: The standing pose.
         gains: PD gains for position control of the independent joints.
@@ -245,6 +264,8 @@ class Robot:
     independent: tuple[str, ...] = ()
     contacts: tuple[ContactSphere, ...] = ()
     material: ContactMaterial = ContactMaterial()
+    capsules: tuple[Capsule, ...] = ()
+    self_collisions: tuple[tuple[str, str], ...] = ()
     motors: tuple[Motor, ...] = ()
     pose: Pose = Pose()
     gains: Gains = Gains()

@@ -190,7 +190,7 @@ class StepDerivatives:
             tangent space of positions.
         """
         simulator, nv = self.simulator, self.simulator.model.nv
-        if not METHODS[simulator.options.method].is_euler:
+        if not METHODS[simulator.options.method].is_euler or simulator.options.self_collisions:
             return self._linearize_by_rows(target)
         columns = np.empty((simulator.num_envs, 2 * nv + len(simulator.target_names), 2 * nv))
         every = {**simulator._arrays, **simulator._batch.tables, "target": self._target(target)}
@@ -200,7 +200,7 @@ class StepDerivatives:
         return whole[:, :, : 2 * nv], whole[:, :, 2 * nv :]
 
     def _linearize_by_rows(self, target: ArrayLike) -> tuple[NDArray, NDArray]:
-        """Return the same row by row, in reverse mode, for any method."""
+        """Return the same row by row, in reverse mode, for any method, and for links that push each other apart."""
         nv, n = self.simulator.model.nv, self.simulator.num_envs
         A = np.zeros((n, 2 * nv, 2 * nv))
         B = np.zeros((n, 2 * nv, len(self.simulator.target_names)))

@@ -8,10 +8,16 @@ from typing import Any
 from ce_gym.compile import Buffer, Program
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.self_contact import apart_when_standing
 from ce_gym.model import Robot
+from ce_gym.model.checks.collisions import adjacent, capsules_of, colliding
+from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.devices import Cpu, Device
 from ce_gym.sim.kernel_key import laws_key, model_key
 from ce_gym.sim.substeps import substeps
+
+MOST_PAIRS = 32
+"""Most pairs of capsules in a scene: the system of their forces is dense."""
 
 
 def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, ...]:
@@ -30,6 +36,34 @@ def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, .
         expected = f"'all', groups or names among {', '.join(sorted(known - {'all'}))}"
         raise ValueError(f"contacts={name!r}; expected {expected}")
     return tuple(c.name for c in robot.contacts if wanted & {"all", c.group, c.name})
+
+
+def select_pairs(mechanism: Mechanism, pairs: str | Sequence[Sequence[str]]) -> tuple[tuple[str, str], ...]:
+    """Return pairs of links that push each other apart, each of which has a capsule.
+
+    Args:
+        mechanism: The robot.
+        pairs: "listed", "all", or pairs of names.
+
+    Raises:
+        ValueError: If a name is no link's, a link has no capsule, or it stands for no such choice.
+    """
+    robot = mechanism.robot
+    if isinstance(pairs, str) and pairs not in ("listed", "all"):
+        raise ValueError(f"self_collisions={pairs!r}; expected 'listed', 'all', or pairs of names of links")
+    everything = apart_when_standing(mechanism) if pairs == "all" else robot.self_collisions
+    chosen = everything if isinstance(pairs, str) else tuple(tuple(pair) for pair in pairs)
+    known = [body.name for body in robot.bodies if body.kind == "link" and capsules_of(robot, body.name)]
+    for pair in chosen:
+        if len(pair) != 2 or not set(pair) <= set(known):
+            raise ValueError(f"self_collisions: {pair!r}; expected two links with capsules among {', '.join(known)}")
+        if adjacent(*map(robot.body, pair)):
+            raise ValueError(f"self_collisions: {pair!r}; expected two links of which none carries the other")
+    if (count := len(colliding(robot, chosen))) > MOST_PAIRS:  # type: ignore[arg-type]
+        raise ValueError(
+            f"self_collisions: {count} pairs of capsules; expected at most {MOST_PAIRS}, name those that matter"
+        )
+    return chosen  # type: ignore[return-value]
 
 
 def load_step_kernel(

@@ -22,10 +22,11 @@ from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import OUTPUTS
 from ce_gym.model import ContactMaterial
+from ce_gym.model.checks.collisions import colliding
 from ce_gym.sim.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
-from ce_gym.sim.kernels import load_step_kernel, select_contacts
+from ce_gym.sim.kernels import load_step_kernel, select_contacts, select_pairs
 from ce_gym.sim.pieces import piece_length, run_substeps
 from ce_gym.sim.placement import Placement
 from ce_gym.sim.schema import Row, physics_rows
@@ -69,6 +70,10 @@ class Simulator:
             motors themselves.
         parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
         terrain: The ground; the plane z = 0 if None, which is faster.
+        self_collisions: Which links push each other apart: "listed" for the pairs of the robot's file, "all" for pairs
+            of links that are neither adjacent nor in each other in the standing pose, or pairs of names.
+        seldom: Contacts, as in `contacts`, that are computed only where they are near the ground, such as "knee"; while
+            they are not near, that saves their time.
         retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move by more than
             `ce_gym.dynamics.stepping.parts.LARGEST_MOVE`; it alone then makes the sub-step in parts.
         device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
@@ -108,6 +113,8 @@ class Simulator:
         motors: str = "ideal",
         parameters: Sequence[str] = (),
         terrain: Terrain | None = None,
+        self_collisions: str | Sequence[Sequence[str]] = (),
+        seldom: str | Sequence[str] = (),
         retry: int = 6,
         device: str | Device = "cpu",
     ) -> None:
@@ -139,6 +146,8 @@ class Simulator:
             motors=motors,
             ground="field" if terrain is not None and self.contact_names else "flat",
             parameters=tuple(parameters),
+            self_collisions=select_pairs(model.mechanism, self_collisions),
+            seldom=tuple(name for name in select_contacts(model.robot, seldom) if name in self.contact_names),
             retry=retry,
         )
         self.target_names = target_names(model.mechanism, self.options.control)
@@ -182,7 +191,11 @@ class Simulator:
             check_shape(name, value, (size,), (self.num_envs, size))
             if not (np.abs(value) <= np.finfo(self.dtype).max).all():
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
-        rows |= {name: np.zeros(self._arrays[name].shape[1]) for name in ("anchor", "diverged") if name in self._arrays}
+        rows |= {
+            name: np.zeros(self._arrays[name].shape[1])
+            for name in ("anchor", "pressed", "diverged")
+            if name in self._arrays
+        }
         if self.contact_names:
             rows["load"] = self._resting_load(rows["q"])
         if "dependent" in self._arrays:
@@ -309,6 +322,16 @@ class Simulator:
     def n_retried(self) -> int:
         """How many sub-steps robots have made in parts, see `retry`."""
         return int(self._read("retries").sum())
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """The links of each pair of capsules that may touch."""
+        return tuple((a.body, b.body) for a, b in colliding(self.model.robot, self.options.self_collisions))
+
+    @property
+    def pair_forces(self) -> Array:
+        """Forces that push the capsules of each of `pairs` apart after a step [N], shape (num_envs, n_pairs)."""
+        return self._read("pressed")
 
     @property
     def contact_forces(self) -> Array:

@@ -64,6 +64,37 @@ def test_collisions_of_a_link_that_is_merged_into_another(contacts):
     assert len(contacts("rod: {body: leg, shape: collision}")) == 16
 
 
+def robot_with(tmp_path, text: str):
+    (tmp_path / "m.urdf").write_text(URDF)
+    (tmp_path / "m.yaml").write_text(f"urdf: m.urdf\n{text}\n")
+    return load_robot(tmp_path / "m.yaml")
+
+
+def test_capsules_and_pairs_of_links_by_any_name_of_theirs(tmp_path):
+    ball = "capsules: {sole: {from: [0, 0, 0], radius: 0.03}, trunk: [{from: [0, 0, 0], to: [1, 0, 0], radius: 0.1}]}"
+    with pytest.raises(RobotError, match="none carries the other"):
+        robot_with(tmp_path, f"{ball}\nself_collisions: [[trunk, sole]]")
+    sole, trunk = robot_with(tmp_path, ball).capsules
+    assert (sole.body, sole.start, sole.end, sole.radius) == ("leg", (0.0, 0.0, -0.3), (0.0, 0.0, -0.3), 0.03)
+    assert (trunk.body, trunk.end) == ("trunk", (1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("self_collisions: [[trunk]]", r"self_collisions\[0\]"),
+        ("self_collisions: [[trunk, hoof]]", "hoof"),
+        ("capsules: {hoof: {from: [0, 0, 0], radius: 0.1}}", "hoof"),
+        ("capsules: {leg: {from: [0, 0, 0], radius: 0}}", "radius"),
+        ("capsules: {leg: {from: [0, 0], radius: 1}}", r"capsules.leg\[0\].from"),
+    ],
+)
+def test_capsules_that_cannot_be_are_one_line(tmp_path, text, said):
+    with pytest.raises(RobotError, match=said) as error:
+        robot_with(tmp_path, text)
+    assert "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize(
     ("entry", "said"),
     [

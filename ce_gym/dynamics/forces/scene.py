@@ -8,6 +8,7 @@ from typing import Literal
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import reference_guess
 from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
+from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactMaterial
 from ce_gym.model.mechanism import Mechanism
 
@@ -31,6 +32,8 @@ class StepOptions:
         motors: Name among `MOTORS` of the model of the motors.
         ground: "flat" for the plane z = 0, "field" for a height and slope under each contact that the caller supplies.
         parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
+        self_collisions: Pairs of links that push each other apart.
+        seldom: Contacts that are looked at only where they are near, see `stepping/choice.py`.
         retry: How often a kernel may halve a step for a robot that fails in it, see `stepping/parts.py`.
     """
 
@@ -44,6 +47,8 @@ class StepOptions:
     motors: str = "ideal"
     ground: Ground = "flat"
     parameters: tuple[str, ...] = ()
+    self_collisions: tuple[tuple[str, str], ...] = ()
+    seldom: tuple[str, ...] = ()
     retry: int = 6
 
 
@@ -84,6 +89,7 @@ class State:
         load: Normal force of each contact over the last step [N], shape (n_contacts,).
         anchor: Horizontal deflections of the contacts' bristles, world axes [m], shape (2 n_contacts,); empty without.
         dependent: Where the dependent coordinates that no formula gives will be, roughly, shape (n_guess,).
+        pressed: Force between each pair of capsules over the last step [N], shape (n_pairs,).
     """
 
     q: SX
@@ -91,6 +97,7 @@ class State:
     load: SX
     anchor: SX
     dependent: SX
+    pressed: SX
 
     def items(self) -> list[tuple[str, SX]]:
         """Return the parts that are there, by name."""
@@ -118,6 +125,7 @@ def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
     layout, n = mechanism.robot.layout, len(options.contacts)
     sizes = {"q": layout.nq, "v": layout.nv, "load": n}
     sizes |= {"anchor": 2 * n if options.material.bristle > 0 else 0, "dependent": len(reference_guess(mechanism))}
+    sizes["pressed"] = len(colliding(mechanism.robot, options.self_collisions))
     return {name: size for name, size in sizes.items() if size}
 
 

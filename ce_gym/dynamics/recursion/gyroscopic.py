@@ -87,18 +87,19 @@ def turning_momentum(mechanism: Mechanism, v: SX, dt: float) -> SX | None:
 
 
 def solve_turning(inertia: SX, turning: SX, force: SX) -> SX:
-    """Solve `(inertia - [skew(turning), 0; 0, 0]) a = force` for the acceleration of a base, shape (6,).
+    """Solve `(inertia - [skew(turning), 0; 0, 0]) a = force` for the acceleration of a base, shape (6, n).
 
     Args:
         inertia: Symmetric positive definite, angular part first, shape (6, 6).
         turning: Shape (3,).
-        force: Shape (6,).
+        force: Shape (6, n).
     """
     across = inertia[:3, 3:]
-    linear = solve_positive_definite(inertia[3:, 3:], ca.horzcat(across.T, force[3:]))
+    linear = solve_positive_definite(inertia[3:, 3:], ca.horzcat(across.T, force[3:, :]))
     left = inertia[:3, :3] - across @ linear[:, :3] - skew(turning)
-    angular = _solve_three(left, force[:3] - across @ linear[:, 3])
-    return ca.vertcat(angular, linear[:, 3] - linear[:, :3] @ angular)
+    moment = force[:3, :] - across @ linear[:, 3:]
+    angular = ca.horzcat(*[_solve_three(left, moment[:, i]) for i in range(moment.shape[1])])
+    return ca.vertcat(angular, linear[:, 3:] - linear[:, :3] @ angular)
 
 
 def _solve_three(A: SX, b: SX) -> SX:

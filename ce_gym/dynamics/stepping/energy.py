@@ -16,7 +16,7 @@ from ce_gym.dynamics.forces.passive import limit_stiffness, yielding_joints
 from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.recursion.derived import kinetic_and_potential
 from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
-from ce_gym.dynamics.stepping.step import touching
+from ce_gym.dynamics.stepping.step import meeting_pairs, touching
 
 
 def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
@@ -36,10 +36,11 @@ def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
 
 
 def contact_energy(scene: Scene, state: State) -> SX:
-    """Return the energy of contact springs and bristles [J]."""
+    """Return the energy of contact springs and bristles, those between links too [J]."""
     kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
     k, k_t = scene.figures.compliance.stiffness, scene.figures.compliance.bristle
     touches = [contact.touch for contact in touching(scene, kinematics, state, 0.0)]
+    touches += [pair.touch for pair in meeting_pairs(scene, kinematics, state, 0.0)]
     return sum((k * ca.fmax(t.depth, 0) ** 2 + k_t * ca.sumsqr(t.anchor) for t in touches), SX(0)) / 2
 
 

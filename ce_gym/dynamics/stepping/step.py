@@ -29,6 +29,7 @@ from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.passive import ball_forces, passive_forces, yielding_forces
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
+from ce_gym.dynamics.forces.self_collision import Frictionless, LinearPair, Pair, meeting, pressed_on, settled
 from ce_gym.dynamics.recursion.ce_aba import (
     BodyTerms,
     JointTerms,
@@ -39,6 +40,7 @@ from ce_gym.dynamics.recursion.ce_aba import (
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, steadying_couples, turning_momentum
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
+from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactSphere
 from ce_gym.model.mechanism import Mechanism
 
@@ -52,6 +54,7 @@ class Solved:
         vdot: Acceleration, shape (nv,).
         motion: The same of joints and bodies.
         contacts: Forces of the contacts of the scene.
+        pairs: Forces between links.
         motors: What the motors deliver to the joints.
         friction: Dry friction of the joints, one or none.
     """
@@ -60,6 +63,7 @@ class Solved:
     vdot: SX
     motion: Motion
     contacts: list[LinearContact]
+    pairs: list[LinearPair]
     motors: SaturatedForce
     friction: list[SaturatedForce]
 
@@ -72,15 +76,20 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
         state: At the start of the step.
         target: Targets or torques of what `target_names` says, shape (n_targets,).
         dt: Length of the step [s].
-        iterate: From the iteration before: of each contact, the motors, joints' dry friction, shape (iterate_size,).
+        iterate: From the iteration before: of contacts, pairs, motors, joints' dry friction, shape (iterate_size,).
     """
     mechanism, acting = scene.mechanism, acting_forces(scene, state, target, dt, iterate)
     kinematics, contacts, gravity = acting.kinematics, acting.contacts, acting.gravity
     external, at_once = on_bodies(contacts, gravity, acting.couples), is_moment(dt)
     turning = None if at_once else TurningDamping(state.v, dt)
     momentum = None if at_once else turning_momentum(mechanism, state.v, dt)
+    forces = SX.sym("forces", len(acting.pairs))
+    external = pressed_on(external, acting.pairs, forces)
     articulation = inward_inertia_pass(mechanism, kinematics, acting.joints, external, turning)
-    vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
+    if acting.pairs:
+        vdot, a = settled(mechanism, kinematics, articulation, momentum, acting.pairs, forces)
+    else:
+        vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
     return acting.solved(vdot, a)
 
 
@@ -91,6 +100,7 @@ class Acting:
     Attributes:
         kinematics: At the start of the step.
         contacts: Forces of the contacts of the scene.
+        pairs: Forces between links.
         motors: What the motors deliver to the joints.
         friction: Dry friction of the joints, one or none.
         joints: Those and what the joints do by themselves.
@@ -100,6 +110,7 @@ class Acting:
 
     kinematics: Kinematics
     contacts: list[LinearContact]
+    pairs: list[LinearPair]
     motors: SaturatedForce
     friction: list[SaturatedForce]
     joints: JointTerms
@@ -109,7 +120,7 @@ class Acting:
     def solved(self, vdot: SX, a: dict[str, SX]) -> Solved:
         """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each."""
         motion = Motion(vdot[vdot.numel() - self.motors.tau.numel() :], a, self.gravity)
-        return Solved(self.kinematics, vdot, motion, self.contacts, self.motors, self.friction)
+        return Solved(self.kinematics, vdot, motion, self.contacts, self.pairs, self.motors, self.friction)
 
 
 def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Acting:
@@ -119,8 +130,10 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
 
     laws, driven = touching(scene, kinematics, state, dt), Motors(scene, kinematics, y, yd, target, dt)
-    *of_contacts, of_motors, of_friction = split(iterate, [law.size for law in (*laws, driven)])
-    contacts = [law.linearise(part) for law, part in zip(laws, of_contacts, strict=True)]
+    meeting = meeting_pairs(scene, kinematics, state, dt)
+    *of_contacts, of_motors, of_friction = split(iterate, [law.size for law in (*laws, *meeting, driven)])
+    contacts = [law.linearise(part) for law, part in zip(laws, of_contacts, strict=False)]
+    pairs = [law.linearise(part) for law, part in zip(meeting, of_contacts[len(laws) :], strict=True)]
     motors = driven.linearise(of_motors)
     rubbing = JointFriction(mechanism, kinematics, yd, dt)
     friction = [rubbing.linearise(of_friction)] if rubbing.size else []
@@ -131,7 +144,7 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     joints = on_coordinates(mechanism, of_balls, of_joints)
     couples = {} if is_moment(dt) else steadying_couples(mechanism, kinematics, dt)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    return Acting(kinematics, contacts, motors, friction, joints, couples, gravity)
+    return Acting(kinematics, contacts, pairs, motors, friction, joints, couples, gravity)
 
 
 def is_moment(dt: SX | float) -> bool:
@@ -185,11 +198,13 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         load=stacked([ca.fmax(c.normal_after(gain), 0) for _, c, gain in contacts]),
         anchor=stacked(anchors) if state.anchor.numel() else state.anchor,
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
+        pressed=stacked([ca.fmax(pair.normal_after(pair.gain(motion)), 0) for pair in solved.pairs]),
     )
-    unconverged = ca.sum1(stacked([c.check(motion) for c in solved.contacts])) > 0
+    touches = [*solved.contacts, *solved.pairs]
+    unconverged = ca.sum1(stacked([c.check(motion) for c in touches])) > 0
     for force in saturated:
         unconverged = ca.logic_or(force.check(motion), unconverged)
-    of_contacts = stacked([c.next_iterate(motion) for c in solved.contacts])
+    of_contacts = stacked([c.next_iterate(motion) for c in touches])
     # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of motors are fixed
     # points by themselves.
     of_contacts = ca.if_else(unconverged, of_contacts, iterate[: of_contacts.numel()])
@@ -210,8 +225,9 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
 def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many iterations of a step may follow the first."""
     contacts = FRICTION[options.friction].iterations if options.contacts else 0
+    pairs = Frictionless.iterations if options.self_collisions else 0
     limited = ITERATIONS if limit_count(mechanism, options) else 0
-    return max(contacts, limited, STICK_ITERATIONS if friction_count(mechanism) else 0)
+    return max(contacts, pairs, limited, STICK_ITERATIONS if friction_count(mechanism) else 0)
 
 
 def first_iterate(scene: Scene) -> SX:
@@ -221,7 +237,8 @@ def first_iterate(scene: Scene) -> SX:
 
 def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many numbers an iteration leaves for the next."""
-    return Contact.size * len(options.contacts) + limit_count(mechanism, options) + friction_count(mechanism)
+    touches = len(options.contacts) + len(colliding(mechanism.robot, options.self_collisions))
+    return Contact.size * touches + limit_count(mechanism, options) + friction_count(mechanism)
 
 
 def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:
@@ -240,6 +257,16 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> l
         touch = touch_ground(body, position, sphere.radius, height, up, state.load[i], anchor)
         contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt))
     return contacts
+
+
+def meeting_pairs(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Pair]:
+    """Place the capsules of every pair of links that may touch against each other."""
+    robot, options, compliance = scene.mechanism.robot, scene.options, scene.figures.compliance
+    law, pairs = normal_law(options.normal_law, options.material), []
+    for i, pair in enumerate(colliding(robot, options.self_collisions)):
+        bodies = kinematics.bodies[pair[0].body], kinematics.bodies[pair[1].body]
+        pairs.append(meeting(pair, bodies, state.pressed[i], compliance, law, dt))
+    return pairs
 
 
 def contact_spheres(mechanism: Mechanism, options: StepOptions) -> list[ContactSphere]:

@@ -54,7 +54,11 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
         parts[stage.name] = iterated(scene, start, target, length, stage.iterations)
     first = parts[plan.stages[0].name]
     if isinstance(plan.end, Rates):
-        after = replace(_moved(plan.end, before, list(parts.values()), dt, layout), load=first.state.load)
+        after = replace(
+            _moved(plan.end, before, list(parts.values()), dt, layout),
+            load=first.state.load,
+            pressed=first.state.pressed,
+        )
     else:
         after = combined(plan, {name: part.state for name, part in parts.items()}, layout)
     error = error_estimate(plan, {name: part.state for name, part in parts.items()})
@@ -100,7 +104,7 @@ def _from_flat(flat: SX, like: State, layout: Layout) -> State:
         q[i : i + 4] = q[i : i + 4] / ca.norm_2(q[i : i + 4])
     if layout.floating:
         v = ca.vertcat(v[:3], quaternion_to_rotation(q[3:7]).T @ v[3:6], v[6:])
-    return State(q=q, v=v, load=like.load, anchor=anchor, dependent=like.dependent)
+    return State(q=q, v=v, load=like.load, anchor=anchor, dependent=like.dependent, pressed=like.pressed)
 
 
 def _rate(state: State, solved: Solved, layout: Layout) -> SX:

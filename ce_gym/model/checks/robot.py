@@ -21,6 +21,7 @@ from ce_gym.model.checks.body import (
     moves_inertia,
     violates_triangle_inequality,
 )
+from ce_gym.model.checks.collisions import adjacent, capsules_of
 from ce_gym.model.checks.constraint import check_constraint
 from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
@@ -166,12 +167,33 @@ def _check_contacts(robot: Robot, file: str) -> None:
             raise bad(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
         check_finite(file, f"{key}.position", contact.position)
         check_not_negative(file, f"{key}.radius", contact.radius, " [m]")
+    _check_capsules(robot, file)
     for name in ("stiffness", "damping", "friction", "bristle", "dissipation"):
         value = getattr(robot.material, name)
         if value is not None:
             check_not_negative(file, f"material.{name}", value)
     if not 0.0 < robot.material.slip_speed < math.inf:
         raise bad(file, "material.slip_speed", robot.material.slip_speed, "more than 0 [m/s]")
+
+
+def _check_capsules(robot: Robot, file: str) -> None:
+    links = [body.name for body in robot.bodies if body.kind == "link"]
+    for capsule in robot.capsules:
+        key = f"capsules.{capsule.body}"
+        if capsule.body not in links:
+            raise unknown(file, key, capsule.body, links, "the name of a link")
+        check_finite(file, key, (*capsule.start, *capsule.end))
+        if not 0.0 < capsule.radius < math.inf:
+            raise bad(file, f"{key} radius", capsule.radius, "more than 0 [m]")
+    for pair in robot.self_collisions:
+        for name in pair:
+            if name not in links:
+                raise unknown(file, "self_collisions", name, links, "the name of a link")
+            if not capsules_of(robot, name):
+                raise bad(file, "self_collisions", name, "a link with a box, cylinder, sphere, or one of `capsules`")
+        one, other = robot.body(pair[0]), robot.body(pair[1])
+        if adjacent(one, other):
+            raise bad(file, "self_collisions", pair, "two links of which none carries the other")
 
 
 def _check_motors(robot: Robot, file: str) -> None:

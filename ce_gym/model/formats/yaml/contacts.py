@@ -1,4 +1,7 @@
-"""`contacts:` of a YAML file -> contact spheres: spheres themselves, primitives, and collisions of a URDF."""
+"""What touches, in a YAML file: `contacts:` with the ground -> spheres; `capsules:` and `self_collisions:` of links.
+
+Contacts are spheres themselves, primitives, and collisions of a URDF.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ce_gym.model.description import ContactSphere, Shape
-from ce_gym.model.errors import bad
+from ce_gym.model.description import Capsule, ContactSphere, Shape
+from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.contact_shapes import FACES, on_face, spheres_of
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform_point, vec3
 from ce_gym.model.formats.reading import Section
@@ -39,6 +42,34 @@ def read_contacts(section: Section, links: Links) -> Iterator[ContactSphere]:
             pose = compose(frame, shape.placement)
             for suffix, centre, radius in _spheres(entry, shape):
                 yield ContactSphere(f"{stem}{suffix}", body, transform_point(pose, vec3(centre)), radius, group)
+
+
+def read_capsules(section: Section, links: Links) -> Iterator[Capsule]:
+    """Iterate over what links are to each other: a capsule, or several, under the name of each."""
+    for link in section:
+        if links.frames.get(link, (None, None))[0] is None:
+            raise unknown(section.file, section.path, link, links.frames, "the name of a body that moves")
+        body, frame = links.frames[link]
+        entries = section.list(link) if isinstance(section.get(link), list) else [section.get(link)]
+        for i, entry in enumerate(entries):
+            one = Section(section.file, f"{section.key(link)}[{i}]", entry).allow("from", "to", "radius")
+            start = one.vector("from", 3)
+            ends = [transform_point(frame, vec3(end)) for end in (start, one.vector("to", 3, start))]
+            yield Capsule(str(body), ends[0], ends[1], one.number("radius"))
+
+
+def read_pairs(file: Section, links: Links) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of links that push each other apart, by the names of the bodies that they are part of."""
+    pairs: list[tuple[str, str]] = []
+    for i, pair in enumerate(file.list("self_collisions")):
+        key = f"{file.key('self_collisions')}[{i}]"
+        if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(name, str) for name in pair)):
+            raise bad(file.file, key, pair, "a list of two links")
+        for name in pair:
+            if links.frames.get(name, (None, None))[0] is None:
+                raise unknown(file.file, key, name, links.frames, "the name of a body that moves")
+        pairs.append((str(links.frames[pair[0]][0]), str(links.frames[pair[1]][0])))
+    return tuple(pairs)
 
 
 def _primitive(entry: Section, kind: str) -> Shape:

@@ -19,7 +19,7 @@ from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
 from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.yaml.constraints import read_constraints
-from ce_gym.model.formats.yaml.contacts import read_contacts
+from ce_gym.model.formats.yaml.contacts import read_capsules, read_contacts, read_pairs
 from ce_gym.model.formats.yaml.links import read_links
 from ce_gym.model.formats.yaml.rotors import add_rotors, read_motors
 
@@ -27,6 +27,7 @@ _JOINT_FIGURES = {"joint_friction": "friction", "joint_stiffness": "stiffness", 
 _KEYS = (
     *("name", "urdf", "mjcf", "base", "sources", "notes", "kept_inertia", "gravity", "gears"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
+    *("capsules", "self_collisions"),
     *_JOINT_FIGURES,
 )
 
@@ -62,6 +63,8 @@ def robot_from_yaml(path: Path) -> Robot:
         robot = replace(robot, assembly=file.section("assembly").numbers())
     if "contacts" in file:
         robot = replace(robot, contacts=tuple(read_contacts(file.section("contacts"), links)))
+    pairs = read_pairs(file, links)
+    robot = replace(robot, capsules=tuple(read_capsules(file.section("capsules"), links)), self_collisions=pairs)
     if "material" in file:
         robot = replace(robot, material=_material(file.section("material")))
     robot = replace(robot, pose=_pose(file.section("pose"), robot), gains=_gains(file.section("gains"), robot))

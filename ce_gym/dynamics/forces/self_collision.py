@@ -1,0 +1,248 @@
+"""Contact between links of a robot, as capsules: a spring and a damper along the line between their axes.
+
+The implicit force of a pair depends on the accelerations of two branches, which the recursion cannot take into one
+body's inertia. But accelerations are linear in the forces `lam` of pairs. So the recursion runs with these as unknowns,
+and what the pairs' normal velocities gain, `g = g0 + W lam`, is put into the law `lam = f - D (v_n + g)` of each:
+
+    (1 + D W) lam = f - D (v_n + g0),
+
+one small system, solved exactly. Force and reaction are the same number at the same line, so that both momenta are
+kept, and a contact that lasts adds no energy, as on the ground: `W` is positive semidefinite, `D` is not negative.
+There is no friction. Which pairs act is found by the iterations of the step, as for contacts with the ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.algebra.spatial import SX, cross, mirrored, solve_positive_definite
+from ce_gym.dynamics.forces.contact import (
+    Compliance,
+    Contact,
+    Iterate,
+    LinearContact,
+    NormalLaw,
+    TangentialForce,
+    Touch,
+)
+from ce_gym.dynamics.forces.law import Motion
+from ce_gym.dynamics.recursion.ce_aba import (
+    Articulation,
+    BodyTerms,
+    outward_acceleration_pass,
+    outward_response_pass,
+)
+from ce_gym.dynamics.recursion.gyroscopic import solve_turning
+from ce_gym.dynamics.recursion.kinematics import BodyState, Kinematics, constant
+from ce_gym.model.description import Capsule
+from ce_gym.model.mechanism import Mechanism
+
+PARALLEL = 1e-6
+"""Square of the sine below which axes count as parallel; the middle of them then is where they touch."""
+APART = 1e-9
+"""Keeps the distance between axes from zero [m]."""
+
+
+class Frictionless:
+    """No force but along the normal."""
+
+    iterations = 2
+
+    def linearise(self, contact: LinearContact) -> TangentialForce:
+        """Return no force."""
+        return TangentialForce(SX(3, 1), SX(1, 1), SX(3, 1), SX(3, 1))
+
+    def check(self, contact: LinearContact, slip: SX, gain: SX) -> SX:
+        """Return that nothing has changed."""
+        return SX(0)
+
+
+@dataclass
+class Ends:
+    """A capsule on a body, and where the other one is nearest to it.
+
+    Attributes:
+        name: Of the body.
+        body: Its kinematics.
+        point: Of the axis that is nearest to the other's, in the body frame [m], shape (3,).
+        push: Direction away from the other, in the body frame, shape (3,).
+    """
+
+    name: str
+    body: BodyState
+    point: SX
+    push: SX
+
+    def along(self, motion: SX) -> SX:
+        """Return what of a spatial motion of the body (6,) moves the point away from the other's."""
+        return ca.dot(self.push, motion[3:] + cross(motion[:3], self.point))
+
+    @property
+    def wrench(self) -> SX:
+        """Wrench of a unit force on the body, body coordinates, shape (6,)."""
+        return ca.vertcat(cross(self.point, self.push), self.push)
+
+
+@dataclass
+class Pair(Contact):
+    """Two capsules of a robot that may touch, for the length of one step: a `ForceLaw`.
+
+    Its touch is in axes of its own, whose first is the normal.
+
+    Attributes:
+        ends: Both.
+    """
+
+    ends: tuple[Ends, Ends]
+
+    def linearise(self, iterate: SX) -> LinearPair:
+        """Linearise about an iterate, shape (size,)."""
+        return LinearPair(self, Iterate.of(iterate))
+
+
+class LinearPair(LinearContact):
+    """A pair about an iterate."""
+
+    law: Pair
+
+    def gain(self, motion: Motion) -> SX:
+        """Return what the normal velocity gains in the step [m/s], as the first of (3,)."""
+        first, second = (end.along(motion.a[end.name] - end.body.drift) for end in self.law.ends)
+        return _normal(self.law.dt * (first + second))
+
+
+def meeting(
+    capsules: tuple[Capsule, Capsule],
+    bodies: tuple[BodyState, BodyState],
+    load: SX,
+    compliance: Compliance,
+    normal: NormalLaw,
+    dt: float,
+) -> Pair:
+    """Place two capsules against each other.
+
+    Args:
+        capsules: Both.
+        bodies: Kinematics of the bodies that carry them.
+        load: Force between them over the last step [N].
+        compliance: What they are made of; friction is left out.
+        normal: Law of the force.
+        dt: Step length [s].
+    """
+    axes = [[constant(np.array(end)) for end in (one.start, one.end)] for one in capsules]
+    placed = [[body.point_position(end) for end in axis] for axis, body in zip(axes, bodies, strict=True)]
+    shares = nearest(*placed[0], *placed[1], long=tuple(one.start != one.end for one in capsules))
+    points = [a + share * (b - a) for (a, b), share in zip(axes, shares, strict=True)]
+    apart = bodies[0].point_position(points[0]) - bodies[1].point_position(points[1])
+    distance = ca.sqrt(ca.sumsqr(apart) + APART**2)
+    n = apart / distance
+    first, second = (
+        Ends(one.body, body, point, body.R.T @ (way * n))
+        for one, body, point, way in zip(capsules, bodies, points, (1, -1), strict=True)
+    )
+    closing = first.along(first.body.v) + second.along(second.body.v)
+    depth = capsules[0].radius + capsules[1].radius - distance
+    still = SX(3, 1)
+    touch = Touch(_normal(SX(1)), still, depth, _normal(closing), still, load, still)
+    return Pair(f"{first.name} {second.name}", touch, compliance, normal, Frictionless(), dt, (first, second))
+
+
+def nearest(a: SX, b: SX, c: SX, d: SX, long: tuple[bool, ...] = (True, True)) -> tuple[SX, SX]:
+    """Return where two segments are nearest to each other, as shares of their lengths.
+
+    Source: Ericson, "Real-Time Collision Detection", 2005, section 5.1.9; without branches.
+
+    Args:
+        a: Start of the first, shape (3,).
+        b: Its end.
+        c: Start of the second.
+        d: Its end.
+        long: Whether each has a length.
+    """
+    u, w, r = b - a, d - c, a - c
+    uu, ww, uw, ur, wr = ca.sumsqr(u), ca.sumsqr(w), ca.dot(u, w), ca.dot(u, r), ca.dot(w, r)
+    if not long[1]:
+        return (_clipped(-ur / uu) if long[0] else SX(0)), SX(0)
+    if not long[0]:
+        return SX(0), _clipped(wr / ww)
+    small = PARALLEL * uu * ww
+    share = _clipped((uw * wr - ur * ww + small / 2) / (uu * ww - uw**2 + small))
+    other = _clipped((uw * share + wr) / ww)
+    return _clipped((uw * other - ur) / uu), other
+
+
+def pressed_on(external: dict[str, BodyTerms], pairs: Sequence[LinearPair], forces: SX) -> dict[str, BodyTerms]:
+    """Return what acts on bodies with the forces of pairs [N], shape (n_pairs,)."""
+    result = dict(external)
+    for i, pair in enumerate(pairs):
+        for end in pair.law.ends:
+            old = result.get(end.name, BodyTerms(SX(6, 6), SX(6, 1)))
+            result[end.name] = BodyTerms(old.inertia, old.force + end.wrench * forces[i])
+    return result
+
+
+def settled(
+    mechanism: Mechanism,
+    kinematics: Kinematics,
+    articulation: Articulation,
+    momentum: SX | None,
+    pairs: Sequence[LinearPair],
+    forces: SX,
+) -> tuple[SX, dict[str, SX]]:
+    """Find the forces of pairs, and the accelerations that come of them, as `outward_acceleration_pass` returns them.
+
+    With `Y` what a unit force of each pair leaves at a cluster or the base on its way inwards, and `J` the Jacobian of
+    the pairs' distances, `J A^-1 J^T = sum Y^T D^-1 Y`: the factorisation that the recursion is.
+
+    Args:
+        mechanism: The mechanism.
+        kinematics: From the outward velocity pass.
+        articulation: From the inward pass, in terms of the forces.
+        momentum: Of a floating base, see `turning_momentum`, if there is a step.
+        pairs: About an iterate.
+        forces: Symbols of their forces, shape (n_pairs,).
+    """
+    n, none = len(pairs), SX(ca.DM.zeros(len(pairs)))
+    left = {k: ca.sparsify(ca.jacobian(u, forces)) for k, u in articulation.u.items()}
+    W = sum((Y.T @ solve_positive_definite(articulation.D[k], Y) for k, Y in left.items() if Y.nnz()), SX(n, n))
+    W = mirrored(W)
+    free = replace(articulation, u={k: ca.substitute(u, forces, none) for k, u in articulation.u.items()})
+    of_base = SX(6, n)
+    if articulation.base is not None:
+        inertia, wrench = articulation.base
+        Y = ca.jacobian(wrench, forces)
+        of_base = solve_positive_definite(inertia, Y) if momentum is None else solve_turning(inertia, momentum, Y)
+        W += Y.T @ of_base
+        free.base = inertia, ca.substitute(wrench, forces, none)
+    vdot, a = outward_acceleration_pass(mechanism, kinematics, free, momentum)
+    motion = Motion(vdot, a, {})
+    start = [pair.normal_after(pair.gain(motion)) for pair in pairs]
+    slopes = ca.vertcat(*[pair.law.dt * pair.normal_slope for pair in pairs])
+    found = eliminated(SX.eye(n) + ca.diag(slopes) @ W, ca.vertcat(*start))
+    change = {k: Y @ found for k, Y in left.items()}
+    more, bodies = outward_response_pass(mechanism, kinematics, articulation, change, of_base @ found)
+    return vdot + more, {name: value + bodies[name] for name, value in a.items()}
+
+
+def eliminated(A: SX, b: SX) -> SX:
+    """Solve `A x = b` without pivoting, where `A` is positive definite but for a scaling of rows and columns."""
+    n, rows, x = b.numel(), [A[i, :] for i in range(b.numel())], [b[i] for i in range(b.numel())]
+    for i in range(n):
+        for j in range(i + 1, n):
+            factor = rows[j][i] / rows[i][i]
+            rows[j], x[j] = rows[j] - factor * rows[i], x[j] - factor * x[i]
+    for i in reversed(range(n)):
+        x[i] = (x[i] - sum((rows[i][j] * x[j] for j in range(i + 1, n)), SX(0))) / rows[i][i]
+    return ca.vertcat(*x)
+
+
+def _normal(x: SX) -> SX:
+    return ca.sparsify(ca.vertcat(x, SX(2, 1)))
+
+
+def _clipped(x: SX) -> SX:
+    return ca.fmax(0, ca.fmin(1, x))

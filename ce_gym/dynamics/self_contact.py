@@ -1,0 +1,34 @@
+"""Which links of a robot may touch each other: those that are apart where it stands, in numbers."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.self_collision import nearest
+from ce_gym.dynamics.standing import Standing, standing_pose
+from ce_gym.model.checks.collisions import capsules_of, separate_links
+from ce_gym.model.description import Capsule
+from ce_gym.model.mechanism import Mechanism
+
+
+def apart_when_standing(mechanism: Mechanism) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of links that are not adjacent and no capsules of which meet in the standing pose."""
+    standing, robot = standing_pose(mechanism), mechanism.robot
+    return tuple(
+        (one, other)
+        for one, other in separate_links(robot)
+        if all(distance(standing, a, b) > 0 for a in capsules_of(robot, one) for b in capsules_of(robot, other))
+    )
+
+
+def distance(standing: Standing, a: Capsule, b: Capsule) -> float:
+    """Return how far two capsules are apart [m], negative if they meet."""
+    ends = [
+        standing.p[one.body] + standing.R[one.body] @ np.array(end) for one in (a, b) for end in (one.start, one.end)
+    ]
+    shares = nearest(*[SX(ca.DM(end)) for end in ends], long=(a.start != a.end, b.start != b.end))
+    s, t = (float(ca.evalf(SX(share))) for share in shares)
+    apart = ends[0] + s * (ends[1] - ends[0]) - ends[2] - t * (ends[3] - ends[2])
+    return float(np.linalg.norm(apart)) - a.radius - b.radius

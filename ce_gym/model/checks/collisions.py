@@ -1,0 +1,60 @@
+"""Which capsules stand for the links of a robot, and which pairs of them may touch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from ce_gym.model.description import Body, Capsule, Robot, Shape
+from ce_gym.model.frames import Vec3
+
+
+def colliding(robot: Robot, pairs: Sequence[tuple[str, str]]) -> tuple[tuple[Capsule, Capsule], ...]:
+    """Return the pairs of capsules of pairs of links, in their order."""
+    return tuple((a, b) for one, other in pairs for a in capsules_of(robot, one) for b in capsules_of(robot, other))
+
+
+def capsules_of(robot: Robot, link: str) -> tuple[Capsule, ...]:
+    """Return the capsules of a link: those that the robot names, or the longest that is inside one of its shapes."""
+    own = tuple(capsule for capsule in robot.capsules if capsule.body == link)
+    inside = [_inside(link, shape) for shape in robot.body(link).shapes]
+    return own or tuple(sorted(inside, key=_length)[-1:])
+
+
+def separate_links(robot: Robot) -> Iterator[tuple[str, str]]:
+    """Iterate over pairs of links that have capsules and of which none carries the other."""
+    links = [body for body in robot.bodies if body.kind == "link" and capsules_of(robot, body.name)]
+    for one, other in combinations(links, 2):
+        if not adjacent(one, other):
+            yield one.name, other.name
+
+
+def adjacent(one: Body, other: Body) -> bool:
+    """Whether two links are the same or one carries the other."""
+    return one.name in (other.name, other.parent) or other.name == one.parent
+
+
+def _inside(link: str, shape: Shape) -> Capsule:
+    """Return the largest capsule inside a shape, along the longest edge of a box."""
+    axis, half, radius = 2, 0.0, shape.size[0]
+    if shape.type == "capsule":
+        half = shape.size[1] / 2
+    elif shape.type == "cylinder":
+        radius = min(radius, shape.size[1] / 2)
+        half = shape.size[1] / 2 - radius
+    elif shape.type == "box":
+        axis, radius = int(np.argmax(shape.size)), min(shape.size) / 2
+        half = max(shape.size) / 2 - radius
+    way = half * np.array(shape.placement.rotation)[:, axis]
+    start, end = (_tuple(np.array(shape.placement.position) + side * way) for side in (-1.0, 1.0))
+    return Capsule(link, start, end, radius)
+
+
+def _length(capsule: Capsule) -> float:
+    return float(np.linalg.norm(np.subtract(capsule.end, capsule.start))) + 2 * capsule.radius
+
+
+def _tuple(x: np.ndarray) -> Vec3:
+    return (float(x[0]), float(x[1]), float(x[2]))

@@ -1,0 +1,236 @@
+"""Links that push each other apart, against dense solves, closed forms and balances; and what is near alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from tripod import TRIPOD
+
+import ce_gym
+from ce_gym.dynamics import Model
+from ce_gym.dynamics.algebra.spatial import SX, quaternion_to_rotation
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.forces.self_collision import nearest
+from ce_gym.dynamics.stepping.trace import iteration_function, step_function
+from ce_gym.model import Body, ContactMaterial, Inertial, Joint, Placement, Robot
+from ce_gym.model.checks.collisions import colliding, separate_links
+from ce_gym.model.description import Capsule, Shape
+from ce_gym.sim import Simulator
+
+STILL = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
+PAIR = (("plate", "forearm"),)
+
+
+def slider(name: str, mass: float) -> Body:
+    """A ball that slides along x."""
+    joint = Joint("prismatic", axis=(1.0, 0.0, 0.0))
+    return Body(name, "link", None, Placement(), joint, Inertial(mass, (0.0,) * 3, STILL), (Shape("sphere", (0.1,)),))
+
+
+def tripod(*plate: Capsule, gravity=(0.0, 0.0, 0.0)) -> Robot:
+    """A floating robot whose forearm is a rod, with what its plate is."""
+    rod = Capsule("forearm", (0.0, 0.0, 0.0), (0.0, 0.0, 0.12), 0.02)
+    return replace(ce_gym.load_robot(TRIPOD), capsules=(rod, *plate), gravity=gravity)
+
+
+def beside_the_hand(robot: Robot, gap: float, way, length=0.0) -> Capsule:
+    """A capsule of the plate that is this far from the forearm's end in the standing pose."""
+    model = Model(robot)
+    positions, rotations = model.body_poses(model.standing_q)
+    plate, forearm = (model.body_names.index(name) for name in ("plate", "forearm"))
+    hand = positions[forearm] + rotations[forearm] @ [0.0, 0.0, 0.12]
+    way = np.array(way) / np.linalg.norm(way)
+    start = rotations[plate].T @ (hand + (0.05 + gap) * way - positions[plate])
+    along = length * np.cross(way, [0.0, 0.0, 1.0])
+    return Capsule("plate", tuple(start - along), tuple(start + along), 0.03)
+
+
+def gaps(model: Model, q, pairs) -> np.ndarray:
+    """Distances between capsules [m], by brute force over their axes, refined."""
+    positions, rotations = model.body_poses(q)
+    found = []
+    for pair in pairs:
+        ends = []
+        for one in pair:
+            i = model.body_names.index(one.body)
+            ends += [positions[i] + rotations[i] @ np.array(end) for end in (one.start, one.end)]
+        found.append(closest(*ends) - pair[0].radius - pair[1].radius)
+    return np.array(found)
+
+
+def closest(a, b, c, d) -> float:
+    """Distance between two segments: coordinate descent on a convex function."""
+    s = t = 0.5
+    for _ in range(400):
+        s = np.clip(np.dot(c + t * (d - c) - a, b - a) / max(np.dot(b - a, b - a), 1e-12), 0, 1)
+        t = np.clip(np.dot(a + s * (b - a) - c, d - c) / max(np.dot(d - c, d - c), 1e-12), 0, 1)
+    return float(np.linalg.norm(a + s * (b - a) - c - t * (d - c)))
+
+
+def test_nearest_points_of_segments():
+    rng = np.random.default_rng(0)
+    ends = [SX.sym(name, 3) for name in "abcd"]
+    shares = ca.Function("nearest", ends, list(nearest(*ends)))
+    for _ in range(100):
+        a, b, c, d = rng.normal(size=(4, 3))
+        s, t = (float(x) for x in shares(a, b, c, d))
+        assert np.linalg.norm(a + s * (b - a) - c - t * (d - c)) == pytest.approx(closest(a, b, c, d), abs=1e-5)
+    s, t = (float(x) for x in shares([0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]))  # parallel: in the middle
+    assert (s, t) == pytest.approx((0.5, 0.5), abs=1e-6)
+
+
+def test_two_balls_rebound_as_a_reduced_mass_on_a_spring():
+    """Momentum to rounding; velocities, depth and duration as half a period of the spring, order one in the step."""
+    stiffness, dt = 5e4, 2e-5
+    bodies = (slider("a", 1.0), slider("b", 3.0))
+    material = ContactMaterial(stiffness, 0.0, 0.8)
+    model = Model(Robot("balls", bodies, independent=("a", "b"), material=material))
+    options = StepOptions(dt, control="torque", material=material, self_collisions=(("a", "b"),))
+    step = step_function(model.mechanism, options, ("energy",))
+    q, v, load, deepest, lasted = np.array([-0.1001, 0.1]), np.array([1.0, 0.0]), 0.0, 0.0, 0
+    for _ in range(1200):
+        found = step(q=q, v=v, pressed=load, diverged=0, target=np.zeros(2))
+        q, v, load = (found[f"{name}_next"].full().ravel() for name in ("q", "v", "pressed"))
+        deepest, lasted = max(deepest, 0.2 - (q[1] - q[0])), lasted + (load[0] > 0)
+        assert v @ [1.0, 3.0] == pytest.approx(1.0, abs=1e-13)
+        assert float(found["energy"]) <= 0.5 + 1e-12
+    frequency = np.sqrt(stiffness / 0.75)
+    assert v == pytest.approx([-0.5, 0.5], abs=0.01)
+    assert deepest == pytest.approx(1 / frequency, rel=0.01)
+    assert lasted * dt == pytest.approx(np.pi / frequency, rel=0.01)
+
+
+def test_forces_of_several_pairs_against_a_dense_solve():
+    """From rest: M v+ = dt J^T lam with lam = k d - (c + dt k) J v+, J by differences; no momentum comes of it."""
+    dt = 0.004
+    first = tripod()
+    robot = tripod(beside_the_hand(first, -0.004, (1, 0.3, 0.2), 0.02), beside_the_hand(first, -0.002, (0.2, -1, 0.1)))
+    model, pairs = Model(robot), colliding(robot, PAIR)
+    assert len(pairs) == 2
+    options = StepOptions(dt, control="torque", material=robot.material, self_collisions=PAIR)
+    q, k, c = model.standing_q, robot.material.stiffness, robot.material.damping
+    step = step_function(model.mechanism, options)
+    found = step(q=q, v=np.zeros(model.nv), pressed=np.zeros(2), diverged=0, target=np.zeros(2))
+    after, lam, turned = (found[name].full().ravel() for name in ("v_next", "pressed_next", "q_next"))
+    after[3:6] = ca.evalf(quaternion_to_rotation(SX(turned[3:7]))).full() @ after[3:6]  # in the axes of the start
+    J = np.zeros((2, model.nv))
+    for i in range(2):
+        e = np.zeros(model.nq)
+        e[7 + i] = 1e-6
+        J[:, 6 + i] = (gaps(model, q + e, pairs) - gaps(model, q - e, pairs)) / 2e-6
+    depth = -gaps(model, q, pairs)
+    np.testing.assert_allclose(lam, k * depth - (c + dt * k) * (J @ after), rtol=1e-4)
+    damping = np.diag([0.0] * 6 + [robot.body(name).joint.damping for name in robot.independent])
+    M = model.mass_matrix(q)
+    np.testing.assert_allclose((M + dt * damping) @ after, dt * J.T @ lam, atol=1e-5 * np.abs(dt * lam).max())
+    assert (lam > 5).all()
+    np.testing.assert_allclose((M @ after)[:6], 0, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def folded() -> Simulator:
+    """Tripods on their feet with a rod that may hit the plate: the arm moves freely."""
+    first = tripod()
+    robot = tripod(beside_the_hand(first, 0.02, (1, 0.3, 0.2), 0.02), gravity=(0.0, 0.0, -9.81))
+    return Simulator(Model(robot), 24, control="torque", contacts="foot", self_collisions=PAIR, outputs=("energy",))
+
+
+def moving(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """States of tripods, of which every third throws its arm at the plate."""
+    rng, model = np.random.default_rng(5), Model(TRIPOD)
+    q, v = np.tile(model.standing_q, (n, 1)), np.zeros((n, model.nv))
+    q[:, 2] -= 1e-4
+    v[::3, 6:] = rng.uniform(-6, 6, (len(v[::3]), 2))
+    return q, v
+
+
+def test_a_robot_does_what_it_would_do_alone(folded: Simulator):
+    """Bit for bit, whether its neighbours in a tile have links near each other or not; and energy does not grow."""
+    q, v = moving(24)
+    folded.set_state(q, v)
+    energy, touched = None, np.zeros(24, bool)
+    for _ in range(60):
+        folded.step(np.zeros(2), 1)
+        touched |= folded.pair_forces[:, 0] > 0
+        assert energy is None or (folded.energy <= energy + 1e-3 * np.abs(energy)).all()
+        energy = folded.energy
+    assert 2 <= touched.sum() <= 8
+    together = folded.q
+    for i in (*np.flatnonzero(touched)[:2], 1):
+        folded.set_state(np.tile(q[i], (24, 1)), np.tile(v[i], (24, 1)))
+        folded.step(np.zeros(2), 60)
+        np.testing.assert_array_equal(folded.q[7], together[i])
+    assert folded.pairs == PAIR
+
+
+def test_gradients_go_through_pairs(folded: Simulator):
+    """Against central differences, where links press on each other."""
+    derivatives, n = ce_gym.StepDerivatives(folded), 24
+    q, v = moving(n)
+    folded.set_state(q, v)
+    for _ in range(60):
+        before = folded.snapshot()
+        folded.step(np.zeros(2), 1)
+        if (folded.pair_forces > 5).any():
+            break
+    robot = int(folded.pair_forces.argmax())
+    folded.restore(before)
+    weights = np.zeros((n, 8))
+    weights[:, 6:] = [1.0, -0.5]
+    found = derivatives.gradient(np.zeros(2), {"v": weights})["v"][robot]
+    base, states = folded.v, []
+    for i in (6, 7):
+        ends = []
+        for way in (1e-6, -1e-6):
+            folded.restore(before)
+            rows = derivatives.state()
+            rows["v"] = base.copy()
+            rows["v"][:, i] += way
+            derivatives.restore(rows)
+            folded.step(np.zeros(2), 1)
+            ends.append(float(folded.v[robot] @ weights[robot]))
+        states.append((ends[0] - ends[1]) / 2e-6)
+    np.testing.assert_allclose(found[6:], states, rtol=1e-5, atol=1e-7)
+
+
+def test_what_is_not_asked_for_costs_nothing_and_adjacent_links_are_left_out():
+    model = Model(tripod(gravity=(0.0, 0.0, -9.81)))
+    feet = tuple(name for name in model.contact_names if name in ("front", "left", "right"))
+    plain = iteration_function(model.mechanism, StepOptions(contacts=feet))
+    same = iteration_function(Model(TRIPOD).mechanism, StepOptions(contacts=feet))
+    assert plain.serialize() == same.serialize()
+    assert ("plate", "upper_arm") not in list(separate_links(model.robot))
+    for pairs, said in (
+        ([("plate", "upper_arm")], "upper_arm"),  # has no capsule
+        ([("plate", "tail")], "tail"),
+        ([("plate",)], "plate"),
+        ("some", "some"),
+    ):
+        with pytest.raises(ValueError, match=f"self_collisions.*{said}"):
+            Simulator(model, self_collisions=pairs)
+    whole = tripod(Capsule("plate", (0.0,) * 3, (0.0,) * 3, 0.1), Capsule("upper_arm", (0.0,) * 3, (0.0,) * 3, 0.1))
+    with pytest.raises(ValueError, match="carries the other"):
+        Simulator(Model(whole), self_collisions=[("plate", "upper_arm")])
+
+
+def test_contacts_that_are_seldom_near_act_where_they_are():
+    """A tripod that stands and one that is dropped on its lid: as with all contacts computed always."""
+    model = Model(TRIPOD)
+    always = Simulator(model, 16, outputs=("contact_forces",))
+    seldom = Simulator(model, 16, seldom=("knee", "torso"), outputs=("contact_forces",))
+    q = np.tile(model.standing_q, (16, 1))
+    q[::5, 2], q[::5, 3], q[::5, 4] = 0.3, 0.0, 1.0  # upside down
+    for sim in (always, seldom):
+        sim.set_state(q, np.zeros(model.nv))
+        sim.step(model.standing_q[7:], 120)
+    np.testing.assert_allclose(seldom.q, always.q, atol=1e-6)
+    np.testing.assert_allclose(seldom.contact_forces, always.contact_forces, atol=1e-3)
+    assert (always.contact_forces[0, 3:, 2] > 1).any()
+    together = seldom.q
+    for i in (0, 1):
+        seldom.set_state(q[i], np.zeros(model.nv))
+        seldom.step(model.standing_q[7:], 120)
+        np.testing.assert_array_equal(seldom.q[3], together[i])
