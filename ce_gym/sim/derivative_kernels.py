@@ -72,24 +72,32 @@ def gradient_program(model: Model, options: StepOptions) -> Program:
     return Program(f"{model.robot.name} {model.transmission} step gradient", tuple(buffers), tuple(steps))
 
 
-def load_linearization_kernel(model: Model, options: StepOptions, dtype: str) -> Any:
+def load_linearization_kernel(model: Model, options: StepOptions, dtype: str, whole_state: bool = False) -> Any:
     """Compile, or load from the cache, the kernel of the Jacobian of one sub-step."""
 
     def build() -> Program:
-        return linearization_program(model, options)
+        return linearization_program(model, options, whole_state)
 
-    return load_kernel(f"step linearization {_key(model, options)}", build, dtype)
+    kind = "step linearization of the whole state" if whole_state else "step linearization"
+    return load_kernel(f"{kind} {_key(model, options)}", build, dtype)
 
 
-def linearization_program(model: Model, options: StepOptions) -> Program:
-    """Return the program: `ends` becomes the derivatives of [q; v], for each direction of q, v and the target."""
-    linear, n = Linearization(model.mechanism, options), iterations_of(model.mechanism, options)
+def linearization_program(model: Model, options: StepOptions, whole_state: bool = False) -> Program:
+    """Return the program: `ends` becomes the derivatives of a state, for each direction of that state and the target.
+
+    Args:
+        model: The robot at a transmission level.
+        options: The scene.
+        whole_state: Whether the state is [q; v; load; anchor], what of these there is, in place of [q; v].
+    """
+    linear = Linearization(model.mechanism, options, whole_state)
+    n = iterations_of(model.mechanism, options)
     steps, sizes = _Columns(linear, n).steps, {}
     ground, looks = _ground(model, options)
     given = {name: x.numel() for name, x in linear.given.inputs().items() if name not in ("ground", "places")}
     buffers = [Buffer(name, size, "rows_in" if name == "target" else "tiles") for name, size in given.items()]
     buffers += ground
-    buffers.append(Buffer("ends", 2 * linear.nv * len(linear.directions), "rows_out", "float64"))
+    buffers.append(Buffer("ends", linear.size * len(linear.directions), "rows_out", "float64"))
     for call in steps:  # every other buffer is as large as what is first written to it
         for i, name in enumerate(call.outputs):
             sizes.setdefault(name, call.function.numel_out(i))
@@ -111,7 +119,7 @@ class _Columns:
     """The calls of that program: iteration by iteration, and in each direction by direction."""
 
     def __init__(self, linear: Linearization, n: int) -> None:
-        self.linear, self.chained = linear, n > 1 and bool(linear.local)
+        self.linear, self.chained = linear, linear.chained
         self.columns = [f"column{i}" for i in range(len(linear.directions))]
         self.changes = [linear.change_function(group) for group in linear.groups]
         self.iterate, self.solve = linear.iteration_function(), linear.solve_function()
@@ -120,7 +128,9 @@ class _Columns:
         self.pressed_drift = [linear.pressed_drift_function()] if linear.local and self.drift else []
         if self.chained:
             self.gains, self.pass_on = linear.gains_function(), linear.pass_on_function()
+        self.kept = [f"kept{i}" for i in range(len(self.columns))] if linear.keeps_gains else []
         sizes = {"iterate": linear.iterate.numel()} | dict.fromkeys(self.columns, linear.nv)
+        sizes |= {name: linear.wrt["gains"].numel() for name in self.kept}
         sizes |= {f"active{k}": 1 for k in range(1, n)}
         zeros = {name: SX(ca.DM.zeros(size)) for name, size in sizes.items() if size} | {"active0": SX(1)}
         self.steps = [Call(ca.Function("begin", [], list(zeros.values())), (), tuple(zeros))]
@@ -142,12 +152,13 @@ class _Columns:
         steps += [call(self.iterate), *map(call, self.drift)]
         steps += [_call(function, names, "contact_acts") for function in self.pressed_drift]
         steps += [call(self.gains, vdot="vdot_before")] if passes else []
-        column = iter(self.columns)
+        column, kept = iter(self.columns), iter(self.kept)
         for g, change in enumerate(self.changes):
             steps.append(call(change))
             steps += [_call(self.presses[g], names, "contact_acts")] if g in self.presses else []
             for i in range(change.n_out()):
                 here = {"column": next(column), "change": f"change{i}"}
+                here |= {"gains": next(kept)} if self.kept else {}
                 here |= {f"{name}_next": buffer for name, buffer in here.items()}
                 steps += [call(self.pass_on, direct=f"direct{g}_{i}", **here)] if passes else []
                 steps.append(call(self.solve, **here))
@@ -158,7 +169,11 @@ class _Columns:
         """The columns of the step's derivative from those of its acceleration."""
         linear, names = self.linear, {"diverged": "tried_diverged"}
         end, gather = linear.end_function(), linear.gather_function()
-        each = [_call(end, {"column": name, "end": f"end_{name}"}) for name in self.columns]
+        kept = self.kept or self.columns
+        each = [
+            _call(end, {"column": name, "gains": gains, "end": f"end_{name}"})
+            for name, gains in zip(self.columns, kept, strict=True)
+        ]
         return [
             _call(linear.slope_function(), names),
             *each,

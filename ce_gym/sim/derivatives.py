@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ce_gym.compile import aligned_zeros
 from ce_gym.dynamics.algebra.batched import evaluate
 from ce_gym.dynamics.stepping.derivatives import primal_function, state_parts
+from ce_gym.dynamics.stepping.linearization import REMEMBERED
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import mending_function
 from ce_gym.dynamics.stepping.plan import MOVED
@@ -85,7 +86,7 @@ class StepDerivatives:
         if isinstance(keep_every, bool) or not isinstance(keep_every, int | np.integer) or keep_every < 1:
             raise ValueError(f"keep_every={keep_every!r}; expected a whole number, at least 1")
         self.simulator, self._records = simulator, list[Record]()
-        self._keep_every = keep_every
+        self._keep_every, self._linear = keep_every, dict[bool, Any]()
         primal = primal_function(simulator.model.mechanism, simulator.options)
         self._parts = state_parts(primal)
         self.state_sizes = {n: simulator.model.nv if n == "q" else size for n, size in self._parts.items()}
@@ -179,38 +180,43 @@ class StepDerivatives:
         """
         return self._gradient(self.simulator._arrays, self._target(target), self._weights(weights))
 
-    def linearize(self, target: ArrayLike) -> tuple[NDArray, NDArray]:
+    def linearize(self, target: ArrayLike, whole_state: bool = False) -> tuple[NDArray, NDArray]:
         """Return how one sub-step from the present state depends on that state and on the target.
 
         Args:
             target: As for `Simulator.step`.
+            whole_state: Whether the state is [q; v; load; anchor], what of these there is, instead of [q; v]: contacts
+                remember the latter two from step to step, and only the whole can be chained over steps in contact.
 
         Returns:
-            `A`, shape (num_envs, 2 nv, 2 nv), and `B`, shape (num_envs, 2 nv, n_targets), of the state [q; v] in the
-            tangent space of positions.
+            `A`, shape (num_envs, n, n), and `B`, shape (num_envs, n, n_targets), of that state, in the tangent space of
+            positions; n is 2 nv and what contacts remember.
         """
-        simulator, nv = self.simulator, self.simulator.model.nv
+        simulator, sizes = self.simulator, self._linear_sizes(whole_state)
         if not METHODS[simulator.options.method].is_euler or simulator.options.self_collisions:
-            return self._linearize_by_rows(target)
-        columns = np.empty((simulator.num_envs, 2 * nv + len(simulator.target_names), 2 * nv))
+            return self._linearize_by_rows(target, whole_state)
+        n = sum(sizes.values())
+        columns = np.empty((simulator.num_envs, n + len(simulator.target_names), n))
         every = {**simulator._arrays, **simulator._batch.tables, "target": self._target(target)}
         every |= {"ends": columns.reshape(simulator.num_envs, -1)}
-        self._forward_kernel(every, simulator.num_envs, num_threads=simulator.num_threads)
+        self._forward_kernels(whole_state)(every, simulator.num_envs, num_threads=simulator.num_threads)
         whole = columns.transpose(0, 2, 1)
-        return whole[:, :, : 2 * nv], whole[:, :, 2 * nv :]
+        return whole[:, :, :n], whole[:, :, n:]
 
-    def _linearize_by_rows(self, target: ArrayLike) -> tuple[NDArray, NDArray]:
+    def _linear_sizes(self, whole_state: bool) -> dict[str, int]:
+        remembered = REMEMBERED if whole_state else ()
+        return {name: n for name, n in self.state_sizes.items() if name in ("q", "v", *remembered)}
+
+    def _linearize_by_rows(self, target: ArrayLike, whole_state: bool = False) -> tuple[NDArray, NDArray]:
         """Return the same row by row, in reverse mode, for any method, and for links that push each other apart."""
-        nv, n = self.simulator.model.nv, self.simulator.num_envs
-        A = np.zeros((n, 2 * nv, 2 * nv))
-        B = np.zeros((n, 2 * nv, len(self.simulator.target_names)))
-        for row in range(2 * nv):
-            one = np.broadcast_to(np.eye(nv)[row % nv], (n, nv))
-            found = self.gradient(target, {"q" if row < nv else "v": one})
-            A[:, row] = np.hstack([found["q"], found["v"]])
-            if "target" in found:
-                B[:, row] = found["target"]
-        return A, B
+        n, sizes = self.simulator.num_envs, self._linear_sizes(whole_state)
+        A, B = list[NDArray](), list[NDArray]()
+        for name, size in sizes.items():
+            for row in np.eye(size):
+                found = self.gradient(target, {name: np.broadcast_to(row, (n, size))})
+                A.append(np.hstack([found[part] for part in sizes]))
+                B.append(found.get("target", np.zeros((n, 0))))
+        return np.stack(A, axis=1), np.stack(B, axis=1)
 
     def _through_parts(
         self, arrays: Mapping[str, NDArray], target: NDArray, weights: Mapping[str, NDArray], chosen: NDArray
@@ -232,9 +238,12 @@ class StepDerivatives:
     def _kernel(self) -> Any:
         return load_gradient_kernel(self.simulator.model, self.simulator.options, self.simulator.dtype)
 
-    @cached_property
-    def _forward_kernel(self) -> Any:
-        return load_linearization_kernel(self.simulator.model, self.simulator.options, self.simulator.dtype)
+    def _forward_kernels(self, whole_state: bool) -> Any:
+        if whole_state not in self._linear:
+            simulator = self.simulator
+            given = simulator.model, simulator.options, simulator.dtype
+            self._linear[whole_state] = load_linearization_kernel(*given, whole_state)
+        return self._linear[whole_state]
 
     @property
     def _kept(self) -> list[str]:

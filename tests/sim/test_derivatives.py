@@ -183,6 +183,49 @@ def weighted_differences(
     return found, differences.center
 
 
+def test_linearizations_of_the_whole_state_chain_through_contact():
+    """Robots land, slide and come to rest; what contacts remember passes from step to step."""
+    sim, target = dropped()
+    derivatives, nv = StepDerivatives(sim), sim.model.nv
+    differences = Differences(sim, target, 20)
+    theirs = np.stack([differences.column(part, i) for part in ("q", "v") for i in range(nv)], axis=2)
+    differences.restore()
+    chain, without = chained(derivatives, target, 20)
+    assert errors(chain[:, : 2 * nv, : 2 * nv], theirs).max() < 1e-5
+    assert errors(without, theirs).max() > 0.1  # loads held as they are
+
+
+def chained(derivatives: StepDerivatives, target: np.ndarray, n_substeps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Products of `A` of the whole state and of its part [q; v] over some sub-steps, each compared with reverse mode."""
+    sim, nv = derivatives.simulator, derivatives.simulator.model.nv
+    whole, part = np.eye(sum(derivatives.state_sizes.values())), np.eye(2 * nv)
+    for _ in range(n_substeps):
+        A, B = derivatives.linearize(target, whole_state=True)
+        assert errors(np.dstack([A, B]), np.dstack(derivatives._linearize_by_rows(target, True))).max() < 1e-12
+        whole, part = A @ whole, A[:, : 2 * nv, : 2 * nv] @ part
+        sim.step(target)
+    return whole, part
+
+
+def test_linearizations_with_bristles_chain():
+    """A block that slides on one of its corners."""
+    sim, nothing = sliding_block(contacts=("c0",)), np.zeros(0)
+    derivatives = StepDerivatives(sim)
+    assert derivatives.state_sizes == {"q": 6, "v": 6, "load": 1, "anchor": 2}
+    touching = read_rows(sim._arrays["load"], 9)[:, 0] > 1.0
+    assert touching.sum() >= 3
+    weights, rng = {}, np.random.default_rng(3)
+    for name, size in derivatives.state_sizes.items():
+        weights[name] = rng.normal(size=(9, size))
+    start = derivatives.state()
+    chain, _ = chained(derivatives, nothing, 10)
+    derivatives.restore(start)
+    derivatives.step(nothing, 10)
+    found, _, _ = derivatives.backward(weights)
+    theirs = np.einsum("nij,ni->nj", chain, np.hstack(list(weights.values())))
+    assert errors(np.hstack(list(found.values())), theirs).max() < 1e-9
+
+
 def test_dry_friction_of_joints_that_stick_and_slip():
     """Forwards and backwards, in a leg whose links are loops: friction of dependent joints varies with the pose."""
     robot = load_robot("planar_leg_linkage")

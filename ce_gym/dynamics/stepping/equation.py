@@ -50,6 +50,7 @@ class Equation:
         inertia: Symbols of the inertias of clusters whose joints are damped, shape (d, d) each.
         order: Rows of `v`, those of a body before those of what it carries.
         wrt: What directions are changes of, by name; "gains" are those of velocities in the iteration before.
+        remembered: Sizes of what the state after the step has besides positions and velocities, by name.
     """
 
     def __init__(self, mechanism: Mechanism, options: StepOptions) -> None:
@@ -70,6 +71,7 @@ class Equation:
         gains = stacked([contact.iterate.gain for contact in self.acting.contacts])
         every = {**dict(given.state.items()), "target": given.target, "gains": gains}
         self.wrt = {name: value for name, value in every.items() if value.numel()}
+        self.remembered: dict[str, int] = {}
 
     @property
     def nv(self) -> int:
@@ -219,14 +221,14 @@ class Equation:
 
     @cached_property
     def end_values(self) -> SX:
-        """Positions and velocities after the step at the given acceleration."""
+        """The state after the step at the given acceleration."""
         given = self.given
         after = stepped(given.scene, given.state, self.solved, given.dt, self.iterate).state
-        return ca.vertcat(after.q, after.v)
+        return ca.vertcat(after.q, after.v, *[getattr(after, name) for name in self.remembered])
 
     def tangent_after(self, columns: SX) -> SX:
-        """Take changes of positions after the step to their tangent space."""
-        nq = columns.size1() - self.nv
+        """Take changes of positions in the state after the step to their tangent space."""
+        nq = self.given.state.q.numel()
         tangent = tangent_basis(self.end_values[:nq], self.layout).T
         for _, row in self.layout.turns:  # rows of rotations have length 1/2
             tangent[row : row + 3, :] *= 4

@@ -25,13 +25,41 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.derivatives import iterations_of
 from ce_gym.dynamics.stepping.equation import Direction, Equation, acts, packed, there
 from ce_gym.dynamics.stepping.factors import factorised, solved_with
 from ce_gym.dynamics.stepping.step import solve, stepped
+from ce_gym.model.mechanism import Mechanism
+
+REMEMBERED = ("load", "anchor")
+"""Parts of a state besides positions and velocities whose derivatives are not zero: what contacts remember."""
 
 
 class Linearization(Equation):
-    """The traced functions; their inputs and outputs are buffers by name."""
+    """The traced functions; their inputs and outputs are buffers by name.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+        whole_state: Whether the state is all that a step hands on to the next, what contacts remember included, and
+            not only positions and velocities.
+
+    Attributes:
+        remembered: Sizes of what the state has besides positions and velocities, by name.
+        chained: Whether iterations pass something smooth on.
+    """
+
+    def __init__(self, mechanism: Mechanism, options: StepOptions, whole_state: bool = False) -> None:
+        super().__init__(mechanism, options)
+        known = dict(self.given.state.items())
+        self.remembered = {name: known[name].numel() for name in REMEMBERED if whole_state and name in known}
+        self.chained = bool(self.local) and iterations_of(mechanism, options) > 1
+
+    @property
+    def size(self) -> int:
+        """Of the state, positions counted in their tangent space."""
+        return 2 * self.nv + sum(self.remembered.values())
 
     @cached_property
     def groups(self) -> list[list[Direction]]:
@@ -40,8 +68,8 @@ class Linearization(Equation):
         groups = [[(name, i) for i in range(base)] for name in ("q", "v") if base]
         for start in range(base, self.nv, 3):
             groups.append([(name, i) for name in ("q", "v") for i in range(start, min(start + 3, self.nv))])
-        targets = [("target", i) for i in range(self.given.target.numel())]
-        return groups + ([targets] if targets else [])
+        others = self.remembered | {"target": self.given.target.numel()}
+        return groups + [[(name, i) for i in range(n)] for name, n in others.items() if n]
 
     @property
     def directions(self) -> list[Direction]:
@@ -135,33 +163,38 @@ class Linearization(Equation):
         """Trace how the state after the step changes with the acceleration.
 
         Returns:
-            Function (*inputs) -> slope.
+            Function (*inputs) -> slope; and how it changes with gains of the iteration before, if those are kept.
         """
-        return traced("slope", self.inputs, {"slope": packed(self._slope)})
+        left = {"slope": packed(self._slope)} | ({"end_gained": packed(self._end_gained)} if self.keeps_gains else {})
+        return traced("slope", self.inputs, left)
 
     def end_function(self) -> ca.Function:
         """Trace what the change of the acceleration does to the state after the step, along one direction.
 
         Returns:
-            Function (slope, column) -> that of positions, in their tangent space, and velocities, (2 nv,).
+            Function (slope, column, gains) -> that of the state, positions in their tangent space, (size,). Only loads
+            depend on gains, those of the iteration before the last.
         """
         slope, column = SX.sym("slope", self._slope.nnz()), SX.sym("column", self.nv)
-        end = SX(self._slope.sparsity(), slope) @ column
-        return traced("end", {"slope": slope, "column": column}, {"end": end})
+        given, end = {"slope": slope, "column": column}, SX(self._slope.sparsity(), slope) @ column
+        if self.keeps_gains:
+            given |= {"end_gained": SX.sym("gained", self._end_gained.nnz()), "gains": SX.sym("gains", self.wrt["gains"].numel())}
+            end += SX(self._end_gained.sparsity(), given["end_gained"]) @ given["gains"]
+        return traced("end", given, {"end": end})
 
     def gather_function(self) -> ca.Function:
         """Trace the derivative of the step.
 
         Returns:
-            Function (*inputs, what `end_function` returns for each direction) -> ends, shape (2 nv, directions), in the
-            order of q, v and the target; zeros for a robot that has diverged.
+            Function (*inputs, what `end_function` returns for each direction) -> ends, shape (size, directions), in the
+            order of q, v, what is remembered and the target; zeros for a robot that has diverged.
         """
-        ends = [SX.sym("end", 2 * self.nv) for _ in self.directions]
+        ends = [SX.sym("end", self.size) for _ in self.directions]
         still = [
             self.to_own_axes(group, ca.jtimes(self.end_values, self.x, self.seeds(group))) for group in self.groups
         ]
         whole = self.tangent_after(ca.horzcat(*still)) + ca.horzcat(*ends)
-        places = {name: i for i, name in enumerate(("q", "v", "target"))}
+        places = {name: i for i, name in enumerate(("q", "v", *self.remembered, "target"))}
         order = sorted(range(len(ends)), key=lambda i: (places[self.directions[i][0]], self.directions[i][1]))
         whole = ca.if_else(self.given.diverged, 0, ca.densify(whole)[:, order])
         return traced("gather", self.inputs | {f"end{i}": end for i, end in enumerate(ends)}, {"ends": whole})
@@ -183,14 +216,29 @@ class Linearization(Equation):
         """Trace what the iteration before does to the equation of motion along one direction.
 
         Returns:
-            Function (gained, into, direct, column, change) -> change (nv,), given the column of the one before.
+            Function (gained, into, direct, column, change) -> change (nv,), given the column of the one before; if
+            gains are kept, (..., active, gains) -> (change, gains), those as they were where `active` is 0.
         """
         gained, into = SX.sym("gained", self._gained.nnz()), SX.sym("into", self._into.nnz())
         direct = SX.sym("direct", self._gains.numel())
         column, change = SX.sym("column", self.nv), SX.sym("change", self.nv)
         gains = direct + SX(self._gained.sparsity(), gained) @ column
         given = {"gained": gained, "into": into, "direct": direct, "column": column, "change": change}
-        return traced("pass_on", given, {"change_next": change + SX(self._into.sparsity(), into) @ gains})
+        left = {"change_next": change + SX(self._into.sparsity(), into) @ gains}
+        if self.keeps_gains:
+            given |= {"active": SX.sym("active"), "gains": SX.sym("gains", gains.numel())}
+            left["gains_next"] = ca.if_else(given["active"], gains, given["gains"])
+        return traced("pass_on", given, left)
+
+    @property
+    def keeps_gains(self) -> bool:
+        """Whether the state after the step depends on gains of the iteration before by more than the acceleration."""
+        return self.chained and bool(self._end_gained.nnz())
+
+    @cached_property
+    def _end_gained(self) -> SX:
+        after = self.tangent_after(ca.jacobian(self.end_values, self.wrt.get("gains", SX(0, 1))))
+        return ca.sparsify(after)
 
     @cached_property
     def _gains(self) -> SX:
