@@ -180,20 +180,23 @@ class StepDerivatives:
         """
         return self._gradient(self.simulator._arrays, self._target(target), self._weights(weights))
 
-    def linearize(self, target: ArrayLike, whole_state: bool = False) -> tuple[NDArray, NDArray]:
+    def linearize(self, target: ArrayLike, whole_state: bool = False, by_rows: bool = False) -> tuple[NDArray, NDArray]:
         """Return how one sub-step from the present state depends on that state and on the target.
 
         Args:
             target: As for `Simulator.step`.
             whole_state: Whether the state is [q; v; load; anchor], what of these there is, instead of [q; v]: contacts
                 remember the latter two from step to step, and only the whole can be chained over steps in contact.
+            by_rows: Whether to use the kernel of the reverse mode, row by row, which takes longer than the one made for
+                this and compiles sooner. Methods other than `euler` do so anyway.
 
         Returns:
             `A`, shape (num_envs, n, n), and `B`, shape (num_envs, n, n_targets), of that state, in the tangent space of
             positions; n is 2 nv and what contacts remember.
         """
         simulator, sizes = self.simulator, self._linear_sizes(whole_state)
-        if not METHODS[simulator.options.method].is_euler or simulator.options.self_collisions:
+        options = simulator.options
+        if by_rows or options.self_collisions or not METHODS[options.method].is_euler:
             return self._linearize_by_rows(target, whole_state)
         n = sum(sizes.values())
         columns = np.empty((simulator.num_envs, n + len(simulator.target_names), n))

@@ -196,7 +196,7 @@ def test_linearizations_of_the_whole_state_chain_through_contact():
 
 
 def chained(derivatives: StepDerivatives, target: np.ndarray, n_substeps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Products of `A` of the whole state and of its part [q; v] over some sub-steps, each compared with reverse mode."""
+    """Products of `A` of the whole state, compared with reverse mode, and of its part [q; v] over some sub-steps."""
     sim, nv = derivatives.simulator, derivatives.simulator.model.nv
     whole, part = np.eye(sum(derivatives.state_sizes.values())), np.eye(2 * nv)
     for _ in range(n_substeps):

@@ -178,7 +178,10 @@ class Linearization(Equation):
         slope, column = SX.sym("slope", self._slope.nnz()), SX.sym("column", self.nv)
         given, end = {"slope": slope, "column": column}, SX(self._slope.sparsity(), slope) @ column
         if self.keeps_gains:
-            given |= {"end_gained": SX.sym("gained", self._end_gained.nnz()), "gains": SX.sym("gains", self.wrt["gains"].numel())}
+            given |= {
+                "end_gained": SX.sym("gained", self._end_gained.nnz()),
+                "gains": SX.sym("gains", self.wrt["gains"].numel()),
+            }
             end += SX(self._end_gained.sparsity(), given["end_gained"]) @ given["gains"]
         return traced("end", given, {"end": end})
 
