@@ -177,7 +177,7 @@ def test_mimic_becomes_a_constraint(load_urdf):
     assert robot.independent == ("b",)
 
 
-def test_shapes_keep_their_colours_and_meshes_are_noted(load_urdf):
+def test_shapes_keep_their_colours_and_meshes_are_the_viewers(load_urdf):
     visuals = [
         '<visual><geometry><box size="1 2 3"/></geometry><material name="red"/></visual>',
         '<visual><origin xyz="0 0 1"/><geometry><cylinder radius="1" length="2"/></geometry></visual>',
@@ -190,7 +190,7 @@ def test_shapes_keep_their_colours_and_meshes_are_noted(load_urdf):
     assert box == Shape("box", (1.0, 2.0, 3.0), color=(1.0, 0.0, 0.0, 1.0))
     assert (cylinder.size, cylinder.placement.position) == ((1.0, 2.0), (0.0, 0.0, 1.0))
     assert (sphere.type, sphere.color) == ("sphere", (0.0, 1.0, 0.0, 0.5))
-    assert robot.notes == ("link a: a mesh is not drawn",)
+    assert robot.notes == ()
 
 
 def test_links_may_be_listed_in_any_order(write_robot, tmp_path):

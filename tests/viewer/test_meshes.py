@@ -9,6 +9,7 @@ import pytest
 
 from ce_gym.dynamics import Model
 from ce_gym.model import LossyImportWarning, load_robot
+from ce_gym.model.description import Shape
 from ce_gym.viewer import Rollout
 from ce_gym.viewer.meshes.triangles import MOST, Triangles, drawn_meshes
 from ce_gym.viewer.page.html import page
@@ -44,14 +45,19 @@ def dae(corners: np.ndarray, meter: float) -> str:
     numbers = " ".join(map(str, (corners / meter).ravel()))
     return f"""<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
 <asset><unit name="part" meter="{meter}"/><up_axis>Z_UP</up_axis></asset>
+<library_effects><effect id="e"><profile_COMMON><technique sid="c"><lambert><diffuse><color>0 0.2 1 1</color></diffuse>
+</lambert></technique></profile_COMMON></effect></library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
 <library_geometries><geometry id="g"><mesh>
 <source id="p"><float_array id="a" count="12">{numbers}</float_array><technique_common>
 <accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
 <param name="Z" type="float"/></accessor></technique_common></source>
 <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/>
+<triangles count="4" material="s"><input semantic="VERTEX" source="#v" offset="0"/>
 <p>{" ".join(str(i) for face in FACES for i in face)}</p></triangles></mesh></geometry></library_geometries>
-<library_visual_scenes><visual_scene id="s"><node id="n"><instance_geometry url="#g"/></node></visual_scene>
+<library_visual_scenes><visual_scene id="s"><node id="n"><instance_geometry url="#g">
+<bind_material><technique_common><instance_material symbol="s" target="#m"/></technique_common>
+</bind_material></instance_geometry></node></visual_scene>
 </library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
 
 
@@ -93,6 +99,9 @@ def test_meshes_of_a_urdf_are_where_it_says(name: str, where: str, text: str, tm
     assert isinstance(shape, Triangles)
     assert len(shape.faces) == 4
     np.testing.assert_allclose(points_of(shape), MOVED, atol=1e-6)
+    np.testing.assert_allclose(
+        shape.color, (0.0, 0.2, 1.0, 1.0) if name.endswith(".dae") else Shape.color, atol=1 / 255
+    )
 
 
 def test_meshes_of_an_mjcf_are_where_it_says(tmp_path: Path) -> None:
@@ -114,6 +123,17 @@ def test_meshes_of_an_mjcf_are_where_it_says(tmp_path: Path) -> None:
     assert shape.color == (1.0, 0.0, 0.0, 1.0)
     expected = sorted_points((CORNERS - [0.1, 0, 0]) * [2, 1, 3] + [1, 2, 3])
     np.testing.assert_allclose(points_of(shape), expected, atol=1e-6)
+
+
+def test_places_in_a_picture_that_is_not_there_are_no_colour(tmp_path: Path) -> None:
+    """As some tools write every OBJ file."""
+    file = urdf(tmp_path, '<mesh filename="one.obj"/>')
+    lines = obj(CORNERS, np.array(FACES)).replace("f ", "vt 0 0\nf ", 1).splitlines()
+    faces = [" ".join(["f", *(f"{i}/1" for i in line.split()[1:])]) if line[0] == "f" else line for line in lines]
+    (file.parent / "one.obj").write_text("\n".join(faces) + "\n")
+    (shape,) = drawn_meshes(load_robot(file, floating=True))["base"]
+    assert isinstance(shape, Triangles)
+    assert shape.color == Shape.color
 
 
 def ball(rows: int = 60) -> tuple[np.ndarray, np.ndarray]:
@@ -175,6 +195,7 @@ def test_what_cannot_be_read_is_drawn_by_shapes(text: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("name", ["missing.stl", "package://other/one.stl", "http://host/one.stl", "one.urdf"])
 def test_what_is_not_there_is_drawn_by_shapes(name: str, tmp_path: Path) -> None:
     robot = load_robot(urdf(tmp_path, f'<mesh filename="{name}"/>'), floating=True)
-    assert drawn_meshes(robot) == {}
+    with pytest.warns(UserWarning, match=r"one.urdf: 1 meshes are not there, such as .*; expected .stl, .obj, .dae"):
+        assert drawn_meshes(robot) == {}
     (shape,) = [one for one in robot_commands(robot, "/robot") if one["type"] == "set_object"]
     assert shape["object"]["geometries"][0]["type"] == "BoxGeometry"

@@ -10,6 +10,10 @@ const THREE = MeshCat.THREE;
 viewer.scene.fog = new THREE.Fog(HORIZON, 8, 40);
 viewer.gui.domElement.hidden = true;  // meshcat's own panel
 const node = path => viewer.scene_tree.find(path.split("/").filter(Boolean));
+// A ghost in the same place as the robot is behind it, or their surfaces would flicker.
+node("/world/1").object.traverse(({ material }) => {
+  if (material) Object.assign(material, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4 });
+});
 const show = (path, on) => { node(path).object.visible = on; };
 
 // Messages go one after the other; of those that follow each other quickly only the newest of a kind is sent.

@@ -120,9 +120,16 @@ def _unit(file: Path) -> float:
 def _color(scene: Any) -> Color | None:
     """Return the colour of most of a file's triangles, if it has any."""
     largest = max(scene.geometry.values(), key=lambda one: len(one.faces))
-    if not getattr(largest.visual, "defined", False):
+    visual: Any = largest.visual
+    if not getattr(visual, "defined", False):
         return None
-    red, green, blue, alpha = (float(x) / 255 for x in np.ravel(largest.visual.to_color().main_color)[:4])
+    if visual.kind == "texture":  # the colours of pictures are not read, those of a COLLADA file's materials are
+        if getattr(visual.material, "baseColorFactor", None) is None:
+            return None
+        found = visual.material.main_color
+    else:
+        found = visual.to_color().main_color
+    red, green, blue, alpha = (float(x) / 255 for x in np.ravel(found)[:4])
     return (red, green, blue, alpha)
 
 

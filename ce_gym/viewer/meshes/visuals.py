@@ -5,6 +5,7 @@ Physics knows nothing of meshes, so that they are no part of a `Robot`; its file
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -67,7 +68,11 @@ def visuals_of(robot: Robot) -> dict[str, tuple[Visual, ...]]:
 
 @lru_cache(maxsize=32)
 def _read(source: Path, changed: int, floating: bool) -> dict[str, tuple[Visual, ...]]:
-    """Read a file as it was at the time `changed`."""
+    """Read a file as it was at the time `changed`.
+
+    Warns:
+        UserWarning: Meshes that it names are not there.
+    """
     try:
         if source.suffix.lower() in (".yaml", ".yml"):
             data = read_yaml(source).data
@@ -80,7 +85,7 @@ def _read(source: Path, changed: int, floating: bool) -> dict[str, tuple[Visual,
 
 
 def _of_urdf(path: Path, floating: bool) -> Iterator[tuple[str, Visual]]:
-    graph = UrdfGraph(path)
+    graph, missing = UrdfGraph(path), list[str]()
     frames, colors = (
         read_tree(graph, "floating" if floating else "fixed").frames,
         read.colors_of(graph.file, graph.robot),
@@ -90,9 +95,13 @@ def _of_urdf(path: Path, floating: bool) -> Iterator[tuple[str, Visual]]:
         for visual in element.findall("visual") if body else ():
             mesh, where = visual.find("geometry/mesh"), f"link {link!r}"
             seen = read.shape(graph.file, where, visual, colors) if mesh is None else _mesh(graph.file, where, visual)
+            missing += [mesh.get("filename", "")] if mesh is not None and seen is None else []
             if seen is not None and body is not None:
                 color = _own_color(visual, colors, where, graph.file) if mesh is not None else seen.color
                 yield body, replace(seen, placement=compose(frame, seen.placement), color=color)
+    if missing:
+        told = f"{len(missing)} meshes are not there, such as {missing[0]!r}; expected {', '.join(KINDS)} files"
+        warnings.warn(f"{path}: {told}: shapes are drawn", stacklevel=2)
 
 
 def _mesh(file: str, where: str, visual: Any) -> MeshFile | None:

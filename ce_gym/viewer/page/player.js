@@ -53,6 +53,9 @@ function follow(on) {
 // Ghosts stay as they are, in their own colour: of two robots that both were transparent nobody could tell which is which.
 const ghostly = new Set();
 robots.forEach((robot, i) => { if (robot.ghost) node(`/world/${i}`).object.traverse(object => ghostly.add(object)); });
+for (const { material } of ghostly) {  // in the same place as the robot they are behind it, or their surfaces would flicker
+  if (material) Object.assign(material, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4 });
+}
 function xray(on) {
   viewer.scene.traverse(object => {
     if (ghostly.has(object)) return;

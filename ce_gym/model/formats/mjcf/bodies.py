@@ -237,8 +237,8 @@ def shapes(source: MjcfSource, tree: MjcfTree) -> Iterator[tuple[str, Shape]]:
         kind = types.get(kinds(int(model.geom_type[geom])))
         if carrier is None:
             continue
-        if kind is None:
-            undrawn += 1
+        if kind is None:  # meshes are drawn by the viewer, which reads the file again
+            undrawn += kinds(int(model.geom_type[geom])) != kinds.mjGEOM_MESH
             continue
         a, b, c = (float(x) for x in model.geom_size[geom])
         size = {"box": (2 * a, 2 * b, 2 * c), "sphere": (a,)}.get(kind, (a, 2 * b))
@@ -246,4 +246,4 @@ def shapes(source: MjcfSource, tree: MjcfTree) -> Iterator[tuple[str, Shape]]:
         red, green, blue, alpha = (float(x) for x in model.geom_rgba[geom])
         yield carrier, Shape(kind, size, pose, (red, green, blue, alpha))  # type: ignore[arg-type]
     if undrawn:
-        source.leave_out("the drawing of {} geoms (meshes and ellipsoids)", str(undrawn))
+        source.leave_out("the drawing of {} geoms (ellipsoids and the like)", str(undrawn))

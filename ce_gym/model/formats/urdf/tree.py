@@ -160,8 +160,6 @@ class _Reader:
     def _shapes(self, link: str, frame: Placement) -> Iterator[Shape]:
         """Iterate over what is drawn of a link: primitives; where all that can be seen is meshes, those that touch."""
         shapes = {tag: self._shapes_of(link, tag) for tag in ("visual", "collision")}
-        if None in shapes["visual"]:
-            self.notes.append(f"link {link}: a mesh is not drawn")
         drawn = [shape for shape in shapes["visual"] if shape] or [shape for shape in shapes["collision"] if shape]
         return (replace(shape, placement=compose(frame, shape.placement)) for shape in drawn)
 
