@@ -53,6 +53,23 @@ def test_page_needs_nothing_from_outside(tmp_path: Path, model: StandIn) -> None
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_large_page_says_what_takes_how_much(
+    tmp_path: Path, model: StandIn, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    options = {"models": [model], "max_fps": 1000.0}
+    small = write_html(make_rollout(frames=20), tmp_path / "small.html", **options).stat().st_size
+    assert not recwarn.list
+    monkeypatch.setattr("ce_gym.viewer.page.html.LARGE", small)
+    large = write_html(make_rollout(frames=2000, step=0.002), tmp_path / "large.html", **options).stat().st_size
+    told = str(recwarn.pop(UserWarning).message)
+    assert told.startswith(f"{tmp_path / 'large.html'}: {large / 1e6:.1f} MB, of which ")
+    assert "\n" not in told
+    figures = {words: float(figure) for words, figure in re.findall(r"(movements|plots|ground|viewer) (\d+\.\d)", told)}
+    assert len(figures) == 4
+    assert sum(figures.values()) == pytest.approx(large / 1e6, abs=0.25)
+    assert figures["movements"] + figures["plots"] == pytest.approx((large - small) / 1e6, abs=0.15)
+
+
 def test_page_holds_the_scene(model: StandIn) -> None:
     commands = commands_in(page(make_rollout(), models=[model]))
     assert {c["type"] for c in commands} == {"set_object", "set_property", "set_transform", "set_animation"}

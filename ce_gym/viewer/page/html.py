@@ -7,6 +7,7 @@ import html
 import importlib.util
 import json
 import string
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from ce_gym.viewer.rollouts.rollout import Rollout
 HERE = Path(__file__).parent
 FIRST_COLOR = (0.15, 0.20, 0.27)
 OTHERS_COLOR = (0.62, 0.66, 0.70)
+LARGE = 5_000_000
+"""Bytes beyond which a page says why."""
 
 
 def page(
@@ -47,13 +50,31 @@ def page(
     Raises:
         ViewerError: meshcat is not installed, a rollout does not fit its robot, or there is no such signal.
     """
+    return _made(rollouts, title, models, spacing, plot, max_fps)[0]
+
+
+def _made(
+    rollouts: Rollout | Sequence[Rollout],
+    title: str | None = None,
+    models: Sequence[PosedModel] | None = None,
+    spacing: float | None = None,
+    plot: Sequence[str] = (),
+    max_fps: float | None = None,
+) -> tuple[str, dict[str, int]]:
+    """Return the page, and how many of its characters are what; see `page`."""
     rollouts = [rollouts] if isinstance(rollouts, Rollout) else list(rollouts)
     meshcat_code()  # fails before anything is computed if meshcat is missing
     max_fps = max_fps or (50.0 if len(rollouts) <= ROW else 25.0)
     runs = pose_rollouts(rollouts, models, max_fps)
-    commands = [base64.b64encode(three.pack(command)).decode() for command in build_scene(runs, spacing=spacing)]
+    scene = [
+        (command, base64.b64encode(three.pack(command)).decode()) for command in build_scene(runs, spacing=spacing)
+    ]
+    commands = [packed for _, packed in scene]
     title = title or " / ".join(dict.fromkeys(Path(rollout.robot).stem for rollout in rollouts))
-    return filled(
+    data = _data(runs, plot, ghosts=spacing == 0)
+    moving = sum(len(packed) for command, packed in scene if command["type"] == "set_animation")
+    sizes = {"movements": moving, "plots": len(data), "meshes, shapes and ground": sum(map(len, commands)) - moving}
+    text = filled(
         HERE / "player.html",
         title,
         legend=_legend(runs),
@@ -62,15 +83,25 @@ def page(
         plots=plots_code(),
         player=source("player.js"),
         commands=json.dumps(commands),
-        data=_data(runs, plot, ghosts=spacing == 0),
+        data=data,
         frame=repr(max(rollouts[0].dt, 1.0 / max_fps)),
     )
+    return text, {**sizes, "the viewer": len(text) - sum(sizes.values())}
 
 
 def write_html(rollouts: Rollout | Sequence[Rollout], path: str | Path, **options: Any) -> Path:
-    """Write the page of rollouts to a file and return its path; see `page` for the options."""
+    """Write the page of rollouts to a file and return its path; see `page` for the options.
+
+    Warns:
+        UserWarning: It is larger than 5 MB; says what takes how much.
+    """
     path = Path(path)
-    path.write_text(page(rollouts, **options), encoding="utf-8")
+    text, sizes = _made(rollouts, **options)
+    path.write_text(text, encoding="utf-8")
+    if len(text) > LARGE:
+        told = ", ".join(f"{name} {size / 1e6:.1f}" for name, size in sorted(sizes.items(), key=lambda one: -one[1]))
+        advice = "fewer seconds, robots or frames (max_fps) take less"
+        warnings.warn(f"{path}: {len(text) / 1e6:.1f} MB, of which {told}; {advice}", stacklevel=2)
     return path
 
 
