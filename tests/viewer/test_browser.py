@@ -237,7 +237,9 @@ def test_a_plot_takes_several_signals_and_leaves_files(at_rest: Chromium, twins:
     assert len(colors) == 5  # two robots and the command, two robots
     assert len(set(colors)) == 3
     table = list(csv.DictReader(at_rest.run("plots.csv()").splitlines()))
-    assert [row["source"] for row in table] == [name for name in ("exact", "armature") for _ in range(round(SECONDS / STEP) + 1)]
+    assert [row["source"] for row in table] == [
+        name for name in ("exact", "armature") for _ in range(round(SECONDS / STEP) + 1)
+    ]
     rewards = [float(row["reward"]) for row in table]
     np.testing.assert_allclose(rewards, np.concatenate([twin.signals[:, 0] for twin in twins]), atol=1e-6)
     np.testing.assert_allclose([float(row["forward speed [m/s], commanded"]) for row in table], 0.3, atol=1e-6)
