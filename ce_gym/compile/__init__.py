@@ -3,7 +3,7 @@
 Importing this package imports none of the heavy ones: `load_kernel` does, when it is called.
 """
 
-from ce_gym.compile.arrays import aligned_zeros, lane_count
+from ce_gym.compile.arrays import aligned_copy, aligned_zeros, lane_count
 from ce_gym.compile.critical import CriticalSection
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.loading import load_kernel
@@ -20,6 +20,7 @@ __all__ = [
     "Repeat",
     "Step",
     "While",
+    "aligned_copy",
     "aligned_zeros",
     "calls_of",
     "lane_count",

@@ -37,3 +37,10 @@ def aligned_zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
     raw = np.zeros(n_bytes + ALIGNMENT, np.uint8)
     start = -raw.ctypes.data % ALIGNMENT
     return raw[start : start + n_bytes].view(dtype).reshape(shape)
+
+
+def aligned_copy(array: np.ndarray) -> np.ndarray:
+    """Return a copy of an array that starts on a multiple of 64 bytes."""
+    copy = aligned_zeros(array.shape, array.dtype)
+    copy[...] = array
+    return copy

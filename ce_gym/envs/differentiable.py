@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.compile import aligned_zeros, load_kernel
+from ce_gym.compile import aligned_copy, load_kernel
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.runtime.batch import kernel_key
 from ce_gym.envs.runtime.gradient import ControlStepGradient
@@ -98,7 +98,7 @@ class DifferentiableEnv:
     def step(self, actions: Any) -> tuple[Any, ...]:
         """Step the environment and record; arguments and results are those of its own `step`."""
         batch, same_step = self.batch, getattr(self.env, "autoreset_mode", None) == AutoresetMode.SAME_STEP
-        arrays = self._spare.pop() if self._spare else {name: _like(batch.arrays[name]) for name in self._kept}
+        arrays = self._spare.pop() if self._spare else {name: aligned_copy(batch.arrays[name]) for name in self._kept}
         for name, array in arrays.items():
             array[...] = batch.arrays[name]
         counters, ignored = batch.arrays["counters"].copy(), batch.arrays["finished"].copy()
@@ -187,10 +187,6 @@ class DifferentiableEnv:
                 raise ValueError(f"gradient of observation {name!r} has shape {np.shape(part)}; expected that of it")
             rows[:, columns[name]] += np.reshape(part, (n, -1))
         return rows
-
-
-def _like(array: NDArray) -> NDArray:
-    return aligned_zeros(array.shape, array.dtype.name)
 
 
 def _roughness(stages: Stages, term: Term) -> str:

@@ -33,16 +33,65 @@ def load_gradient_kernel(model: Model, options: StepOptions, dtype: str) -> Any:
     return load_kernel(f"step gradient {_key(model, options)}", build, dtype)
 
 
+class Chain:
+    """The iterations of one sub-step, what each begins with kept, and the way back through those that were needed.
+
+    Args:
+        primal: An iteration of the step, see `primal_function`.
+        adjoint: Its reverse mode, see `adjoint_function`.
+        n: How many iterations there may be.
+        at: Ends the names of the buffers of what is kept: iterates and which iterations were needed.
+    """
+
+    def __init__(self, primal: ca.Function, adjoint: ca.Function, n: int, at: str = "") -> None:
+        self.primal, self.adjoint, self.n, self.at = primal, adjoint, n, at
+
+    def kept(self, name: str, k: int) -> str:
+        """Name of the buffer of "iterate" or "active" of iteration k."""
+        return f"{name}{self.at}{k}"
+
+    def begun(self) -> Call:
+        """Return a call that begins with no iterate, and with no iteration but the first.
+
+        Iterations that are skipped leave alone whether the next one is needed: what another tile left must not say so.
+        """
+        values = {self.kept("active", k): SX(ca.DM.zeros(1)) for k in range(1, self.n + 1)}
+        values[self.kept("active", 0)] = SX.ones(1)
+        if "iterate" in self.primal.name_in():
+            values[self.kept("iterate", 0)] = SX(ca.DM.zeros(self.primal.numel_in("iterate")))
+        return Call(ca.Function("begin", [], list(values.values())), (), tuple(values))
+
+    def forwards(self, n: int, before: dict[str, str], after: dict[str, str]) -> list[Call]:
+        """Return calls of the first n iterations; buffers of what they are given and leave are called so by name."""
+        calls = []
+        for k in range(n):
+            here = {"iterate": self.kept("iterate", k)} | before
+            there = {"iterate": self.kept("iterate", k + 1), "unconverged": self.kept("active", k + 1)} | after
+            given = tuple(here.get(x, x) for x in self.primal.name_in())
+            left = tuple(there[x.removesuffix("_next")] for x in self.primal.name_out())
+            calls.append(Call(self.primal, given, left, only_if=self.kept("active", k) if k else ""))
+        return calls
+
+    def backwards(self, names: dict[str, str]) -> list[Call]:
+        """Return calls of the way back, from no gradient; buffers are called as the functions do, or by name."""
+        sizes = {"sums": self.adjoint.numel_in("sums"), "pending": 1}
+        sizes |= {"owed": self.adjoint.numel_in("owed")} if "owed" in self.adjoint.name_in() else {}
+        values = [SX.ones(1) if name == "pending" else SX(ca.DM.zeros(size)) for name, size in sizes.items()]
+        calls = [Call(ca.Function("begin", [], values), (), tuple(names.get(name, name) for name in sizes))]
+        for k in reversed(range(self.n)):
+            here = {name: self.kept(name, k) for name in ("iterate", "active")} | names
+            given = tuple(here.get(x, x) for x in self.adjoint.name_in())
+            left = tuple(names.get(x, x) for x in (x.removesuffix("_next") for x in self.adjoint.name_out()))
+            calls.append(Call(self.adjoint, given, left, only_if=self.kept("active", k)))
+        return calls
+
+
 def gradient_program(model: Model, options: StepOptions) -> Program:
     """Return the program: the iterations of the step, then back through those that were needed."""
     primal, adjoint = (make(model.mechanism, options) for make in (primal_function, adjoint_function))
-    n = iterations_of(model.mechanism, options)
-    parts = state_parts(primal)
-    scratch = {f"iterate{k}": primal.numel_in("iterate") for k in range(n)} if n > 1 else {}
-    scratch |= {f"active{k}": 1 for k in range(n)} | {"pending": 1}
-    if n > 1:
-        scratch |= {"owed": adjoint.numel_in("owed"), "tried_diverged": 1}
-        scratch |= {f"tried_{name}": size for name, size in parts.items()}
+    n, parts = iterations_of(model.mechanism, options), state_parts(primal)
+    chain = Chain(primal, adjoint, n)
+    tried = {name: f"tried_{name}" for name in (*parts, "diverged")}
     ground, looks = _ground(model, options)
     buffers = [Buffer(name, primal.numel_in(name), "tiles") for name in (*parts, "diverged", DT)] + ground
     if "parameters" in primal.name_in():
@@ -51,24 +100,12 @@ def gradient_program(model: Model, options: StepOptions) -> Program:
         buffers.append(Buffer("target", primal.numel_in("target"), "rows_in"))
     buffers += [Buffer(f"w_{name}", adjoint.numel_in(f"w_{name}"), "rows_in", "float64") for name in parts]
     buffers.append(Buffer("sums", adjoint.numel_in("sums"), "rows_out", "float64"))
+    steps = [*looks, chain.begun(), *chain.forwards(n - 1, {}, tried), *chain.backwards({})]
+    known, scratch = {buffer.name for buffer in buffers}, dict[str, int]()
+    for call in steps:
+        if isinstance(call, Call):
+            scratch |= {name: call.function.numel_out(i) for i, name in enumerate(call.outputs) if name not in known}
     buffers += [Buffer(name, size, "scratch") for name, size in scratch.items()]
-    begin = {name: size for name, size in scratch.items() if not name.startswith("tried_")}
-    values = [
-        SX.ones(size) if name in ("active0", "pending") else SX(ca.DM.zeros(size)) for name, size in begin.items()
-    ]
-    zeros = ca.Function("begin", [], [*values, SX(ca.DM.zeros(adjoint.numel_in("sums")))])
-    steps = [*looks, Call(zeros, (), (*begin, "sums"))]
-    for k in range(n - 1):
-        given = tuple(f"iterate{k}" if name == "iterate" else name for name in primal.name_in())
-        here = {"iterate_next": f"iterate{k + 1}", "unconverged": f"active{k + 1}"}
-        left = tuple(here.get(name, f"tried_{name.removesuffix('_next')}") for name in primal.name_out())
-        steps.append(Call(primal, given, left, only_if=f"active{k}"))
-    for k in reversed(range(n)):
-        here = {"iterate": f"iterate{k}", "active": f"active{k}"}
-        left = tuple(name.removesuffix("_next") for name in adjoint.name_out())
-        steps.append(
-            Call(adjoint, tuple(here.get(name, name) for name in adjoint.name_in()), left, only_if=f"active{k}")
-        )
     return Program(f"{model.robot.name} {model.transmission} step gradient", tuple(buffers), tuple(steps))
 
 

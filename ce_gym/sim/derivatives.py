@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.compile import aligned_zeros
+from ce_gym.compile import aligned_copy
 from ce_gym.dynamics.algebra.batched import evaluate
 from ce_gym.dynamics.stepping.derivatives import primal_function, state_parts
 from ce_gym.dynamics.stepping.linearization import REMEMBERED
@@ -112,7 +112,7 @@ class StepDerivatives:
         for _ in range(n_substeps):
             last = self._records[-1] if self._records else None
             if last is None or len(last.targets) >= self._keep_every or not self._is_as_left(last):
-                arrays = {name: _aligned_copy(simulator._arrays[name]) for name in self._kept}
+                arrays = {name: aligned_copy(simulator._arrays[name]) for name in self._kept}
                 self._records.append(Record(arrays, None if last is None else self._where_left(last)))
             retries = simulator._batch.rows("retries")
             simulator.step(rows, 1)
@@ -303,16 +303,10 @@ class StepDerivatives:
         """Return the state after one sub-step of all robots."""
         simulator = self.simulator
         every = {**simulator._arrays, **arrays}
-        lanes = {name: _aligned_copy(every[name]) for name in simulator._kernel.buffers if name in every}
+        lanes = {name: aligned_copy(every[name]) for name in simulator._kernel.buffers if name in every}
         given = {**lanes, **simulator._batch.tables, "target": target}
         simulator._kernel(given, simulator.num_envs, {TIMES: 1}, num_threads=simulator.num_threads)
         return {name: lanes[name] for name in self._kept}
-
-
-def _aligned_copy(array: NDArray) -> NDArray:
-    copy = aligned_zeros(array.shape, array.dtype.name)
-    copy[...] = array
-    return copy
 
 
 @dataclass(frozen=True)

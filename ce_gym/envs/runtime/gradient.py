@@ -17,6 +17,7 @@ from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
 from ce_gym.envs.runtime.program import TaskProgram
+from ce_gym.sim.derivative_kernels import Chain
 
 FLAGS = 2
 """Columns of the rows `control`: whether the gradient goes on from the step after it, and its largest norm."""
@@ -93,46 +94,28 @@ class ControlStepGradient:
     def _forwards(self) -> list[Step]:
         act = self.task.function("act")
         steps: list[Step] = [Call(act, ("action_in",), ("clipped", "target"))]
-        # iterations that are skipped leave alone whether the next one is needed: what another tile left must not say so
-        flags = ca.Function("flags", [], [SX.ones(1)] + [SX(ca.DM.zeros(1))] * self.iterations)
-        steps += [
-            Call(flags, (), tuple(f"active@{k}.{i}" for i in range(self.iterations + 1))) for k in range(self.substeps)
-        ]
         for k in range(self.substeps):
-            if "iterate" in self.primal.name_in():
-                zeros = ca.Function("zeros", [], [SX(ca.DM.zeros(self.primal.numel_in("iterate")))])
-                steps.append(Call(zeros, (), (f"iterate@{k}.0",)))
-            steps += [self._iteration(k, i) for i in range(self.iterations)]
+            chain = self._chain(k)
+            after = self._parts_at(k + 1) | {"torque": "torque@"}
+            steps += [chain.begun(), *chain.forwards(self.iterations, self._parts_at(k), after)]
         return steps
 
-    def _iteration(self, k: int, i: int) -> Call:
-        """Return iteration i of sub-step k."""
-        here = {"iterate": f"iterate@{k}.{i}"}
-        moving = (*self.parts, "diverged")
-        given = tuple(here.get(x) or (self._at(x, k) if x in moving else x) for x in self.primal.name_in())
-        there = {"iterate_next": f"iterate@{k}.{i + 1}", "unconverged": f"active@{k}.{i + 1}", "torque": "torque@"}
-        left = tuple(there.get(x) or self._at(x.removesuffix("_next"), k + 1) for x in self.primal.name_out())
-        return Call(self.primal, given, left, only_if=f"active@{k}.{i}" if i else "")
+    def _chain(self, k: int) -> Chain:
+        """Return the iterations of sub-step k."""
+        return Chain(self.primal, self.adjoint, self.iterations, f"@{k}.")
+
+    def _parts_at(self, k: int) -> dict[str, str]:
+        """Names of the buffers of the state before sub-step k."""
+        return {name: self._at(name, k) for name in (*self.parts, "diverged")}
 
     def _backwards(self) -> list[Step]:
         flags = ("control", *(f"w_{name}" for name in self.carried))
         steps: list[Step] = [Call(self._begun(), flags, (*flags[1:], "by_target")), self._assessed()]
         for k in reversed(range(self.substeps)):
-            sizes = {"sums": self.adjoint.numel_in("sums"), "pending": 1}
-            sizes |= {"owed": self.adjoint.numel_in("owed")} if "owed" in self.adjoint.name_in() else {}
-            values = [SX.ones(1) if name == "pending" else SX(ca.DM.zeros(size)) for name, size in sizes.items()]
-            steps.append(Call(ca.Function("begin", [], values), (), tuple(BACK.get(x, x) for x in sizes)))
-            steps += [self._iteration_adjoint(k, i) for i in reversed(range(self.iterations))]
+            steps += self._chain(k).backwards(self._parts_at(k) | BACK)
             state = tuple(f"w_{name}" for name in self.parts)
             steps.append(Call(self._split(), (BACK["sums"], "by_target"), (*state, "w_torque", "by_target")))
         return [*steps, Call(self._act_adjoint(), ("action_in", "by_clipped", "by_target"), ("by_action",))]
-
-    def _iteration_adjoint(self, k: int, i: int) -> Call:
-        here = {"iterate": f"iterate@{k}.{i}", "active": f"active@{k}.{i}", **BACK}
-        moving = (*self.parts, "diverged")
-        given = tuple(here.get(x) or (self._at(x, k) if x in moving else x) for x in self.adjoint.name_in())
-        left = tuple(BACK.get(x, x) for x in (x.removesuffix("_next") for x in self.adjoint.name_out()))
-        return Call(self.adjoint, given, left, only_if=f"active@{k}.{i}")
 
     def _begun(self) -> ca.Function:
         """Trace (control, *carried gradients) -> the same, cut or shortened, and a gradient of 0 to the target."""
