@@ -120,6 +120,18 @@ for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
   }
 }
 
+// Where the window is narrow, the robot stands in the part of it that plots and bar leave, whole.
+function fit() {
+  const width = find("pane").offsetWidth, height = window.innerHeight, narrow = width <= 820;
+  viewer.camera.zoom = narrow ? Math.min(1, 1.2 * width / height) : 1;
+  const hidden = narrow ? find("low").offsetHeight - find("about").offsetHeight : 0;
+  viewer.camera.setViewOffset(width, height, 0, hidden / 2, width, height);
+  viewer.set_dirty();
+}
+window.addEventListener("resize", fit);
+find("charts").addEventListener("change", fit);
+fit();
+
 function refresh() {
   moveFields();
   if (find("xray").checked) moveBelts();
