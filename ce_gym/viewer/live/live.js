@@ -10,6 +10,14 @@ const THREE = MeshCat.THREE;
 viewer.scene.fog = new THREE.Fog(HORIZON, 8, 40);
 viewer.gui.domElement.hidden = true;  // meshcat's own panel
 const node = path => viewer.scene_tree.find(path.split("/").filter(Boolean));
+// In a narrow window the robot stands in it whole.
+function fit() {
+  viewer.camera.zoom = Math.min(1, 1.2 * window.innerWidth / window.innerHeight);
+  viewer.camera.updateProjectionMatrix();
+}
+window.addEventListener("resize", fit);
+fit();
+
 // A ghost in the same place as the robot is behind it, or their surfaces would flicker.
 node("/world/1").object.traverse(({ material }) => {
   if (material) Object.assign(material, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4 });
