@@ -96,7 +96,7 @@ def test_the_linear_limit_is_the_simulation_s():
     motion = signals.Motion(*(np.tile(x, (400, 8, 1)) for x in (model.standing_q, *np.zeros((2, 3)))))
     pushed = motion.x[0] + 1e-4, np.zeros((8, 3))
     band = np.where(np.arange(400) < 50, 0, np.where(np.arange(400) < 350, -1, 1))
-    task = loops.Task("joints", "chirp", motion, pushed, pushed[0], band, (1.0, 2.0))
+    task = loops.Task("joints", "chirp", motion, pushed, signals.held(pushed[0], 400), band, (1.0, 2.0))
     first, last = loops.follow(CHEETAH_LEG, task, ("armature",), (0.97 * hz, 1.03 * hz)).error[:, 0, :, 0]
     assert last[0] < 0.5 * first[0]
     assert last[1] > 2.0 * first[1]
@@ -109,6 +109,32 @@ def test_an_exact_controller_tracks_and_makes_no_error_of_torque():
     )
     assert (exact[0] == 0).all()
     assert (armature[0] > 1e-3).all()
+
+
+def test_a_posture_that_goes_along_asks_for_nothing_on_the_path():
+    """A posture that stays behind is fought over by controllers of unlike models, the harder the stiffer it is held."""
+    leg = LEGS["mit_humanoid_leg"]
+    behind, along = loops.tasks(leg, 0)[4:]
+    foot = signals.foot_at(Model(leg_on_stand(leg)), along.posture.x)
+    np.testing.assert_allclose(foot, along.motion.x, atol=2e-3)  # of a stride's harmonics, the first twelve
+    shares = [
+        result.torque_error[0, 0].mean(-1) / result.torque[0, 0].mean(-1)
+        for result in (
+            loops.follow(leg, replace(one, band=0 * one.band), ("armature",), (3.0, 20.0), samples=300)
+            for one in (behind, along)
+        )
+    ]
+    assert shares[0][1] > 1.5 * shares[0][0]
+    assert shares[1][1] == pytest.approx(shares[1][0], rel=0.1)
+
+
+def test_joints_that_take_a_foot_along():
+    model = Model(leg_on_stand(LEGS["mit_humanoid_leg"]))
+    chirp, rest = signals.foot_chirp(model, 0)
+    part = signals.Motion(*(x[:200] for x in (chirp.x, chirp.xd, chirp.xdd)))
+    again = signals.of_foot(model, signals.of_joints(model, part, rest))
+    np.testing.assert_allclose(again.x, part.x, atol=1e-9)
+    np.testing.assert_allclose(again.xd[2:-2], part.xd[2:-2], atol=1e-3 * np.abs(part.xd).max())
 
 
 def test_the_paper_s_points_are_on_the_map():

@@ -10,8 +10,11 @@ import numpy as np
 from ce_gym.bench.exactness.protocol import Array
 from ce_gym.dynamics.model import Model
 
-INPUTS = ("q", "v", "x", "xd", "xdd", "rest", "w")
-"""State; place, velocity and acceleration asked for; posture; natural frequency of the loop [rad/s]."""
+INPUTS = ("q", "v", "x", "xd", "xdd", "rest", "restd", "restdd", "w")
+"""State; place, velocity and acceleration asked for; those of the posture; natural frequency of the loop [rad/s]."""
+
+ALONG = "foot, posture along"
+"""Operational space whose posture moves with the foot, so that it asks for nothing while the foot is on its path."""
 
 
 def law(model: Model, controller: str) -> ca.Function:
@@ -19,12 +22,14 @@ def law(model: Model, controller: str) -> ca.Function:
 
     Args:
         model: Of a leg with a fixed base and one contact, its foot.
-        controller: "joints" for computed torque; "foot" for operational space (Khatib 1987), whose inverse Jacobian is
-            weighted by the mass matrix, and which takes the joints to a posture in its null space.
+        controller: "joints" for computed torque; otherwise operational space (Khatib 1987), whose inverse Jacobian is
+            weighted by the mass matrix, and which takes the joints to a posture, at rest or moving, in its null space.
     """
     n = model.nv
-    sizes = (n, n, *((n,) * 3 if controller == "joints" else (3,) * 3), n, 1)
-    q, v, x, xd, xdd, rest, w = given = [ca.SX.sym(name, size) for name, size in zip(INPUTS, sizes, strict=True)]
+    sizes = (n, n, *((n,) * 3 if controller == "joints" else (3,) * 3), n, n, n, 1)
+    q, v, x, xd, xdd, rest, restd, restdd, w = given = [
+        ca.SX.sym(name, size) for name, size in zip(INPUTS, sizes, strict=True)
+    ]
     kp, kd = w**2, 2 * w
     if controller == "joints":
         vdot = xdd + kd * (xd - v) + kp * (x - q)
@@ -33,11 +38,11 @@ def law(model: Model, controller: str) -> ca.Function:
         drift = model.casadi_function("contact_accelerations")(q, v, ca.SX(n, 1))
         J = ca.jacobian(foot, q)
         MJ = ca.solve(model.casadi_function("mass_matrix")(q), J.T)
-        posture = kp * (rest - q) - kd * v
+        posture = restdd + kd * (restd - v) + kp * (rest - q)
         wanted = xdd + kd * (xd - velocity) + kp * (x - foot) - drift
         vdot = posture + MJ @ ca.solve(J @ MJ, wanted - J @ posture)
     tau = model.casadi_function("inverse_dynamics")(q, v, vdot)
-    return ca.Function(f"{controller}_{model.transmission}", given, [tau], INPUTS, ["tau"])
+    return ca.Function(f"{controller.split(',')[0]}_{model.transmission}", given, [tau], INPUTS, ["tau"])
 
 
 class Controllers:

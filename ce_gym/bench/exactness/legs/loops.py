@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ce_gym.bench.exactness.legs import signals
-from ce_gym.bench.exactness.legs.control import Controllers
+from ce_gym.bench.exactness.legs.control import ALONG, Controllers
 from ce_gym.bench.exactness.legs.signals import Motion
 from ce_gym.bench.exactness.mechanisms import leg_on_stand, without_limits
 from ce_gym.bench.exactness.protocol import BANDWIDTHS, COUNTED, HOLD, PLANT_STEP, POSES, SETTLE, SLOWEST, Array, Leg
@@ -22,11 +22,11 @@ class Task:
     """A motion to follow with a kind of controller.
 
     Attributes:
-        controller: "joints" or "foot".
+        controller: "joints", "foot" or "foot, posture along".
         signal: "chirp" or "swing".
         motion: Of the joints or of the foot.
         start: State at the beginning, q and v, each of shape (n_poses, nq).
-        rest: The posture in the null space of the foot, shape (n_poses, nq).
+        posture: Of the joints in the null space of the foot.
         band: Which band every sample is counted in, -1 for none, shape (n_times,).
         frequencies: Of the bands [Hz].
     """
@@ -35,7 +35,7 @@ class Task:
     signal: str
     motion: Motion
     start: tuple[Array, Array]
-    rest: Array
+    posture: Motion
     band: Array
     frequencies: tuple[float, ...]
 
@@ -56,7 +56,7 @@ class Tracked:
 
 
 def tasks(leg: Leg, seed: int) -> list[Task]:
-    """Return the four tasks of a leg."""
+    """Return the six tasks of a leg."""
     model = Model(leg_on_stand(leg))
     joints, (foot, rest), running = (
         signals.joint_chirp(model, seed),
@@ -69,14 +69,21 @@ def tasks(leg: Leg, seed: int) -> list[Task]:
     push = np.linalg.pinv(signals.foot_jacobian(model, rest)) @ foot.xd[0][..., None]
     pose, _ = signals.centres(model, seed, amplitude=0.0)
     settling = np.arange(len(running.x)) < len(running.x) * SETTLE / (SETTLE + COUNTED)
-    counted, begin = np.where(settling, -1, 0), (running.x[0], running.xd[0])
-    stride = (leg.frequency,)
+    counted, stride = np.where(settling, -1, 0), (leg.frequency,)
+    stepping, along = signals.of_foot(model, running), signals.of_joints(model, foot, rest)
+    still, standing = signals.held(rest, len(band)), signals.held(pose, len(counted))
     return [
-        Task("joints", "chirp", joints, (joints.x[0], joints.xd[0]), rest, band, bands),
-        Task("foot", "chirp", foot, (rest, push[..., 0]), rest, band, bands),
-        Task("joints", "swing", running, begin, pose, counted, stride),
-        Task("foot", "swing", signals.of_foot(model, running), begin, pose, counted, stride),
+        Task("joints", "chirp", joints, _start(joints), still, band, bands),
+        Task("foot", "chirp", foot, (rest, push[..., 0]), still, band, bands),
+        Task(ALONG, "chirp", foot, _start(along), along, band, bands),
+        Task("joints", "swing", running, _start(running), standing, counted, stride),
+        Task("foot", "swing", stepping, _start(running), standing, counted, stride),
+        Task(ALONG, "swing", stepping, _start(running), running, counted, stride),
     ]
+
+
+def _start(joints: Motion) -> tuple[Array, Array]:
+    return joints.x[0], joints.xd[0]
 
 
 def follow(
@@ -94,16 +101,14 @@ def follow(
     plant.set_state(*(np.broadcast_to(x, (*shape, exact.nv)).reshape(count, -1) for x in task.start))
     controllers = Controllers(exact, [Model(robot, level) for level in levels], task.controller, per_level)
     w = np.repeat(2 * np.pi * np.array(bandwidths), POSES)[:, None]
-    rest = np.tile(task.rest, (len(bandwidths), 1))
     times = range(len(task.band) if samples is None else samples)
     sums, counts = np.zeros((3, len(task.frequencies), *shape)), np.zeros(len(task.frequencies))
     for i in shown(times, f"{leg.robot} {task.controller} {task.signal}"):
         q, v = (x.reshape(len(levels), per_level, -1) for x in (plant.q, plant.v))
-        motion = task.motion
-        aim = [np.tile(x[i], (len(bandwidths), 1)) for x in (motion.x, motion.xd, motion.xdd)]
-        torque, ideal = controllers(q, v, *aim, rest, w)
+        aim, posture = (_tiled(motion, i, len(bandwidths)) for motion in (task.motion, task.posture))
+        torque, ideal = controllers(q, v, *aim, *posture, w)
         if task.band[i] >= 0:
-            foot = task.controller == "foot"
+            foot = task.controller != "joints"
             place = signals.foot_at(exact, q) if foot else q
             error = ((place - aim[0]) ** 2).sum(-1) / (1 if foot else exact.nv)
             squares = error, ((torque - ideal) ** 2).mean(-1), (ideal**2).mean(-1)
@@ -111,3 +116,7 @@ def follow(
             counts[task.band[i]] += 1
         plant.step(torque.reshape(count, -1), round(HOLD / PLANT_STEP))
     return Tracked(*np.sqrt(sums / np.maximum(counts, 1)[:, None, None, None]))
+
+
+def _tiled(motion: Motion, i: int, times: int) -> list[Array]:
+    return [np.tile(x[i], (times, 1)) for x in (motion.x, motion.xd, motion.xdd)]

@@ -35,8 +35,8 @@ def feedback(model: Model, controller: str) -> ca.Function:
     given = one.sx_in()
     slope = ca.Function("slope", given, [ca.jacobian(one(*given), ca.vertcat(*given[:2]))])
     q, x, w = ca.SX.sym("q", model.nv), ca.SX.sym("x", given[2].shape[0]), ca.SX.sym("w")
-    still = ca.SX(x.shape[0], 1)
-    return ca.Function("feedback", [q, x, w], [slope(q, ca.SX(model.nv, 1), x, still, still, q, w)])
+    still, at_rest = ca.SX(x.shape[0], 1), ca.SX(model.nv, 1)
+    return ca.Function("feedback", [q, x, w], [slope(q, at_rest, x, still, still, q, at_rest, at_rest, w)])
 
 
 def largest_bandwidth(leg: Leg, level: str, controller: str, poses: Array) -> Array:
