@@ -153,6 +153,18 @@ def test_a_landing_gives_the_rigid_impulse_and_balances_momentum():
     assert np.ptp(whole[stopped]) > 0.1 * whole.max()  # designs differ, so agreement is no accident
 
 
+def test_free_motors_do_not_press_on():
+    """Light feet come to a stop, and the impulse nears its rigid limit as the stiffness grows."""
+    faller = contacts.Faller("tello", "none", control="torque")
+    whole = faller.rigid_impulse().sum(-1)
+    errors = []
+    for stiffness in STIFFNESSES[-2:]:
+        landing = faller.land(stiffness, contacts.LOSS_TIME * stiffness)
+        assert landing.compressed.all()
+        errors.append(np.abs(landing.impulse / whole - 1).max())
+    assert errors[1] < 0.5 * errors[0] < 0.5 * contacts.BAR
+
+
 def test_a_rigid_impulse_stops_the_feet():
     model = Model(on_soles("tello"), "armature")
     q, J = model.standing_q, contacts.feet_jacobian(model, model.standing_q)

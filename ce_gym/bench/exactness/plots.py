@@ -94,6 +94,8 @@ def contacts(table: Table, out: Path) -> Path:
                     color=color,
                     label=level,
                 )
+                free = [r["over rigid, motors free"] for r in own]
+                column[0].plot([r["stiffness [N/m]"] for r in own], free, ":", color=color)
                 if level == "exact":
                     continue
                 rows = chosen(table, robot=robot, level=level, inertia=1.0, stiffness=STIFFNESSES[-2])
@@ -106,7 +108,7 @@ def contacts(table: Table, out: Path) -> Path:
             column[1].xaxis.set_minor_formatter(NullFormatter())
             column[0].axhline(1.0, color=GREY, linewidth=0.8)
             column[1].axhline(1.0, color=GREY, linewidth=0.8)
-        panels[0][0].set_ylabel("impulse / rigid limit of the level")
+        panels[0][0].set_ylabel("impulse / rigid limit of the level\n(dotted: motors let go)")
         panels[1][0].set_ylabel("peak force / exact, at 5e6 N/m\n(lines: roots of rigid effective masses)")
         panels[0][0].legend()
         figure.suptitle("Landings at 1 m/s", fontweight="bold")
