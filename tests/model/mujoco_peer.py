@@ -102,7 +102,9 @@ def compare(path, robot, level="coupled", spread=0.3, seed=0, armature=None):
     rng = np.random.default_rng(seed)
     pose = dict(robot.pose.joints)
     for _ in range(4):
-        y = np.array([pose[name] for name in robot.independent]) + rng.uniform(-spread, spread, len(robot.independent))
+        y = np.array([pose.get(name, 0.0) for name in robot.independent]) + rng.uniform(
+            -spread, spread, len(robot.independent)
+        )
         quat = rng.normal(size=4)
         base = np.concatenate([rng.normal(size=3), quat / np.linalg.norm(quat)]) if robot.floating else np.zeros(0)
         q, v, tau = np.concatenate([base, y]), rng.uniform(-1, 1, model.nv), rng.uniform(-5, 5, model.nv)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +24,31 @@ ROBOTS = {
 """Mass [kg], reflected inertia of a leg's joints [kg m^2], legs."""
 
 
+def free(robot, folder: Path) -> Path:
+    """Write the robot's URDF, less what has no mass, on a floating joint, for MuJoCo."""
+    text = Path(robot.source).with_suffix(".urdf").read_text()
+    text = re.sub(
+        r'  <link name="\w+_crank_\d">.*?</link>\n|  <joint name="\w+_crank_\d_joint".*?</joint>\n',
+        "",
+        text,
+        flags=re.S,
+    )
+    ends = f'<parent link="w"/><child link="{robot.bodies[0].name}"/>'
+    base = f'<link name="w"/><joint name="b" type="floating">{ends}</joint>'
+    path = folder / "free.urdf"
+    path.write_text(text.replace("</robot>", f"{base}</robot>"))
+    return path
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_mujoco_finds_the_same_mass_matrix_and_accelerations(name, tmp_path):
     pytest.importorskip("mujoco")
     from mujoco_peer import compare
 
     robot = load_robot(name)
-    text = Path(robot.source).with_suffix(".urdf").read_text()
-    ends = f'<parent link="w"/><child link="{robot.bodies[0].name}"/>'
-    base = f'<link name="w"/><joint name="b" type="floating">{ends}</joint>'
-    (tmp_path / "free.urdf").write_text(text.replace("</robot>", f"{base}</robot>"))
     armature = {f"{leg}_{joint}": value for leg in ROBOTS[name][2] for joint, value in ROBOTS[name][1].items()}
     assert set(armature) == set(robot.independent)
-    compare(tmp_path / "free.urdf", robot, "armature", armature=armature)
+    compare(free(robot, tmp_path), robot, "armature", armature=armature)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -66,3 +79,55 @@ def test_levels_differ_in_what_rotors_do(name):
     added = np.diag(M["armature"] - M["none"])[6:]
     np.testing.assert_allclose(added, [reflected[joint] for joint in robot.independent], rtol=1e-6)
     assert np.abs(M["exact"] - M["armature"])[:6, 6:].max() > 1e-4, "rotors couple to the base"
+
+
+G1_MOTORS = {"5020": 1.410049e-5 * 16**2, "7520_14": 4.964394e-5 * 14.318182**2, "7520_22": 4.958405e-5 * 22.5**2}
+"""Reflected inertias [kg m^2], which mjlab gives as 0.00361, 0.01018 and 0.02510."""
+G1_LEG = {"hip_pitch": "7520_14", "hip_roll": "7520_22", "hip_yaw": "7520_14", "knee": "7520_22"}
+
+
+def test_g1_s_motors_turn_ankles_through_rods_and_all_others_directly():
+    robot = load_robot("g1")
+    models = {level: Model(robot, level) for level in LEVELS}
+    exact = models["exact"]
+    q, at = exact.standing_q, exact.joint_links
+    added = (models["armature"].mass_matrix(q) - models["none"].mass_matrix(q))[6:, 6:]
+    for side in ("left", "right"):
+        for joint, motor in G1_LEG.items():
+            row = at.index(f"{side}_{joint}")
+            assert added[row, row] == pytest.approx(G1_MOTORS[motor], rel=1e-6)
+        rows = [at.index(f"{side}_ankle_{axis}") for axis in ("pitch", "roll")]
+        step, cranks = 1e-6, []
+        for row in rows:  # by differences of the closed loop
+            ends = [
+                exact.spanning(q + sign * step * np.eye(len(q))[7 + row], np.zeros(exact.nv))[0] for sign in (1, -1)
+            ]
+            columns = [1 + 6 + exact.spanning_names.index(f"{side}_ankle_crank_{i}") for i in (1, 2)]
+            cranks.append((ends[0] - ends[1])[columns] / (2 * step))
+        reflected = np.array(cranks) @ np.array(cranks).T * G1_MOTORS["5020"]
+        np.testing.assert_allclose(np.diag(added)[rows], np.diag(reflected), rtol=1e-6)
+    assert [added[at.index(name), at.index(name)] for name in ("torso", "waist_roll")] == pytest.approx(
+        [2 * G1_MOTORS["5020"]] * 2
+    )
+
+
+def test_mujoco_finds_g1_without_its_rotors(tmp_path):
+    pytest.importorskip("mujoco")
+    from mujoco_peer import compare
+
+    robot = load_robot("g1")
+    assert robot.total_mass == pytest.approx(33.341142, abs=1e-6)
+    assert not missing(robot)
+    compare(free(robot, tmp_path), robot, "none", spread=0.1)
+
+
+def test_g1_s_ankles_close_over_their_whole_range():
+    model = Model("g1")
+    limits = {name: model.robot.body(name).joint.position for name in model.joint_links}
+    for pitch in np.linspace(*limits["left_ankle_pitch"], 9):
+        for roll in np.linspace(*limits["left_ankle_roll"], 9):
+            q = model.standing_q
+            q[[7 + model.joint_links.index(f"left_ankle_{axis}") for axis in ("pitch", "roll")]] = pitch, roll
+            angles = dict(zip(model.spanning_names, model.spanning(q, np.zeros(model.nv))[0][7:], strict=True))
+            cranks = [angles[f"left_ankle_crank_{i}"] for i in (1, 2)]
+            assert np.abs(cranks).max() < 1.4  # a crank in line with its rod moves nothing
