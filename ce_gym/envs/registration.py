@@ -10,7 +10,7 @@ from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.errors import bad
 from ce_gym.model.mechanism import LEVELS
 
-ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1", "go1", "go2", "berkeley_humanoid")
+ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1", "go1", "go2", "g1", "berkeley_humanoid")
 """Robots that ship with the package and have what the tasks ask for."""
 
 
