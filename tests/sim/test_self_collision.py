@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
+import gymnasium
 import numpy as np
 import pytest
 from tripod import TRIPOD
@@ -234,3 +237,22 @@ def test_contacts_that_are_seldom_near_act_where_they_are():
         seldom.set_state(q[i], np.zeros(model.nv))
         seldom.step(model.standing_q[7:], 120)
         np.testing.assert_array_equal(seldom.q[3], together[i])
+
+
+def test_environments_take_both(tmp_path):
+    """An episode with contacts that are seldom near and links that could touch, but do not, is one without."""
+    for file in Path(TRIPOD).parent.glob("tripod.*"):
+        shutil.copy(file, tmp_path)
+    robot, runs = tmp_path / "tripod.yaml", []
+    ball, rod = "{from: [0, 0, -0.05], radius: 0.01}", "{from: [0, 0, 0], to: [0, 0, 0.12], radius: 0.02}"
+    capsules = f"capsules: {{plate: {ball}, forearm: {rod}}}\nself_collisions: [[plate, forearm]]\n"
+    robot.write_text(robot.read_text() + capsules)
+    for more in ({}, {"seldom": ["knee"], "self_collisions": "listed"}):
+        scene = {"robot": str(robot), "contacts": ["foot", "knee"], **more}
+        envs = gymnasium.make_vec("ce_gym/MiniCheetahStand-v0", num_envs=9, **scene)
+        envs.reset(seed=3)
+        for _ in range(10):
+            observation = envs.step(np.zeros(envs.action_space.shape, np.float32))[0]
+        runs.append(observation)
+        envs.close()
+    np.testing.assert_allclose(runs[0], runs[1], atol=1e-6)

@@ -2,8 +2,8 @@
 
 Contacts that are declared to be seldom, and pairs of links, are left out of the light scene. Which of the two a robot
 makes follows from its own state alone, so that no result depends on its neighbours in a tile; a tile makes both if its
-robots differ. Near is what its speed takes to the other within twice the step, or within a margin; what gets a speed
-from elsewhere in the step that takes it further than that begins to act in the step after it.
+robots differ. Near is what is within a margin of the other, or would be within two steps at the speed at which it
+approaches; what gets a speed from elsewhere in the step that takes it further begins to act in the step after it.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def near_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
     contacts = touching(scene, kinematics, state, dt)
     touches = [contacts[i].touch for i in left_out]
     touches += [pair.touch for pair in meeting_pairs(scene, kinematics, state, dt)]
-    reach = [touch.depth + MARGIN + STEPS * dt * ca.norm_2(touch.velocity) for touch in touches]
+    reach = [touch.depth - STEPS * dt * ca.fmin(ca.dot(touch.normal, touch.velocity), 0) for touch in touches]
     loads = ca.vertcat(SX(0, 1), *[touch.load for touch in touches])
-    near = ca.logic_or(ca.mmax(ca.vertcat(*reach)) > 0, ca.sum1(loads) > 0)
+    near = ca.logic_or(ca.mmax(ca.vertcat(*reach)) > -MARGIN, ca.sum1(loads) > 0)
     found = {"near": near, "apart": ca.logic_not(near)}
     everything = ca.vertcat(*found.values())
     inputs = {name: x for name, x in given.inputs().items() if ca.depends_on(everything, x)}

@@ -25,7 +25,7 @@ from ce_gym.envs.task.ground import Ground
 from ce_gym.envs.task.randomisation import Randomised
 from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.registry import Term, terms_of
-from ce_gym.sim.kernels import select_contacts
+from ce_gym.sim.kernels import select_contacts, select_pairs
 from ce_gym.sim.schema import Row, physics_rows, state_buffers
 from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
@@ -91,6 +91,8 @@ class TaskProgram:
             motors=task.motors,
             ground="field" if self.ground and self.contacts else "flat",
             parameters=self.randomised.parameters,
+            self_collisions=select_pairs(self.model.mechanism, task.self_collisions),
+            seldom=tuple(name for name in select_contacts(robot, task.seldom) if name in self.contacts),
         )
 
     @property

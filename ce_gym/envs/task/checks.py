@@ -37,8 +37,10 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
         return value
     if name == "terrain":
         return checked_terrain(value)
-    if name == "contacts":
+    if name in ("contacts", "seldom"):
         return value if isinstance(value, str) else _names(name, value)
+    if name == "self_collisions":
+        return value if isinstance(value, str) else tuple(_names(name, pair) for pair in _sequence(name, value))
     if name == "command_range":
         pairs = tuple(_pair(name, pair) for pair in _sequence(name, value))
         check(name, value, len(pairs) == 3, "three pairs (low, high) with low <= high")

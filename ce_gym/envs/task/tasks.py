@@ -55,6 +55,8 @@ class Task:
         terrain: The ground, by its `kind` and the arguments of that, see `ce_gym.envs.task.terrain_tiles`.
         contacts: Which contact spheres take part: "all", or names of groups or spheres. Spheres that end the episode
             when they touch the ground need not.
+        seldom: Those of them that are computed only where they are near, see `ce_gym.Simulator`.
+        self_collisions: Which links push each other apart: "listed", "all" or pairs, see `ce_gym.Simulator`.
         friction: "tangent" or "secant", see `ce_gym.Simulator`.
         motors: "ideal" or "limited", see `ce_gym.Simulator`.
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
@@ -87,6 +89,8 @@ class Task:
     episode_length: int = 1000
     terrain: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({"kind": "flat"}))
     contacts: str | tuple[str, ...] = ("foot", "knee")
+    seldom: str | tuple[str, ...] = ()
+    self_collisions: str | tuple[tuple[str, ...], ...] = ()
     friction: Literal["tangent", "secant"] = "tangent"
     motors: Literal["ideal", "limited"] = "ideal"
     only_positive: bool = True
