@@ -91,7 +91,7 @@ def test_a_long_log_is_thinned_to_means(run: Path):
     assert np.isnan(few.signals["learning: std"]).all()
 
 
-@pytest.mark.parametrize("rest", ["", "400,8,2", "400,8,2,14,-4,-0.4", "\n\n", "1,2\n"])
+@pytest.mark.parametrize("rest", ["", "400,8,2", "400,8,2,14,-4,-0.4", "400,8,2,14,-4,-0.4,0.", "\n\n", "1,2\n"])
 def test_lines_that_are_being_written_wait(rest: str, run: Path):
     (run / "progress.csv").write_text(log(3) + rest)
     assert read_log(run).steps.tolist() == [100, 200, 300]
