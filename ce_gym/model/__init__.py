@@ -15,6 +15,7 @@ from ce_gym.model.constraints import (
 from ce_gym.model.coordinates import Layout
 from ce_gym.model.description import (
     Body,
+    Capsule,
     ContactMaterial,
     ContactSphere,
     Gains,
@@ -34,6 +35,7 @@ __all__ = [
     "IDENTITY",
     "ZERO",
     "Body",
+    "Capsule",
     "Cluster",
     "ClusterTree",
     "Constraint",
