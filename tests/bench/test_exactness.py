@@ -103,7 +103,7 @@ def test_the_linear_limit_is_the_simulation_s():
 
 
 def test_an_exact_controller_tracks_and_makes_no_error_of_torque():
-    chirp = loops.tasks(CHEETAH_LEG, 0)[0]
+    chirp = next(loops.chirps(CHEETAH_LEG, 0))
     exact, armature = np.moveaxis(
         loops.follow(CHEETAH_LEG, chirp, ("exact", "armature"), samples=200).torque_error, 1, 0
     )
@@ -114,13 +114,13 @@ def test_an_exact_controller_tracks_and_makes_no_error_of_torque():
 def test_a_posture_that_goes_along_asks_for_nothing_on_the_path():
     """A posture that stays behind is fought over by controllers of unlike models, the harder the stiffer it is held."""
     leg = LEGS["mit_humanoid_leg"]
-    behind, along = loops.tasks(leg, 0)[4:]
+    _, behind, along = loops.swings(leg, 0)
     foot = signals.foot_at(Model(leg_on_stand(leg)), along.posture.x)
     np.testing.assert_allclose(foot, along.motion.x, atol=2e-3)  # of a stride's harmonics, the first twelve
     shares = [
         result.torque_error[0, 0].mean(-1) / result.torque[0, 0].mean(-1)
         for result in (
-            loops.follow(leg, replace(one, band=0 * one.band), ("armature",), (3.0, 20.0), samples=300)
+            loops.follow(leg, replace(one, band=0 * one.band), ("armature",), (3.0, 20.0), samples=150)
             for one in (behind, along)
         )
     ]

@@ -30,7 +30,7 @@ def test_rows_that_are_there_are_not_made_again(tmp_path, capsys):
     assert [(row["learner"], row["seed"]) for row in rows] == [("fast_ppo", "3"), ("ppo", "3")]
     for row in rows:
         assert sum(float(row[name]) for name in ("physics", "policy", "learning")) == pytest.approx(1, abs=0.01)
-        assert float(row["processor"]) > 0
+        assert float(row["processor"]) >= 0  # in tenths of a second, which a run so short may not take
         assert int(row["steps"]) >= 6000
     assert f"| {ID} | fast_ppo | 1       | 1     |" in capsys.readouterr().out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,31 +56,37 @@ class Tracked:
     torque: Array
 
 
-def tasks(leg: Leg, seed: int) -> list[Task]:
-    """Return the six tasks of a leg."""
+def tasks(leg: Leg, seed: int) -> Iterator[Task]:
+    """Yield the six tasks of a leg."""
+    yield from chirps(leg, seed)
+    yield from swings(leg, seed)
+
+
+def chirps(leg: Leg, seed: int) -> Iterator[Task]:
+    """Yield the chirps of the joints, and of the foot with a posture at rest and with one that goes along."""
     model = Model(leg_on_stand(leg))
-    joints, (foot, rest), running = (
-        signals.joint_chirp(model, seed),
-        signals.foot_chirp(model, seed),
-        signals.swing(model, leg, seed),
-    )
+    joints, (foot, rest) = signals.joint_chirp(model, seed), signals.foot_chirp(model, seed)
     _, frequency = signals.chirp_times()
     band = np.floor(frequency - SLOWEST).astype(int)
     bands = tuple(SLOWEST + 0.5 + i for i in range(band.max() + 1))
+    still = signals.held(rest, len(band))
+    yield Task("joints", "chirp", joints, _start(joints), still, band, bands)
     push = np.linalg.pinv(signals.foot_jacobian(model, rest)) @ foot.xd[0][..., None]
-    pose, _ = signals.centres(model, seed, amplitude=0.0)
+    yield Task("foot", "chirp", foot, (rest, push[..., 0]), still, band, bands)
+    along = signals.of_joints(model, foot, rest)
+    yield Task(ALONG, "chirp", foot, _start(along), along, band, bands)
+
+
+def swings(leg: Leg, seed: int) -> Iterator[Task]:
+    """Yield the swing leg as a motion of the joints, and of the foot with either posture."""
+    model = Model(leg_on_stand(leg))
+    running, (pose, _) = signals.swing(model, leg, seed), signals.centres(model, seed, amplitude=0.0)
     settling = np.arange(len(running.x)) < len(running.x) * SETTLE / (SETTLE + COUNTED)
     counted, stride = np.where(settling, -1, 0), (leg.frequency,)
-    stepping, along = signals.of_foot(model, running), signals.of_joints(model, foot, rest)
-    still, standing = signals.held(rest, len(band)), signals.held(pose, len(counted))
-    return [
-        Task("joints", "chirp", joints, _start(joints), still, band, bands),
-        Task("foot", "chirp", foot, (rest, push[..., 0]), still, band, bands),
-        Task(ALONG, "chirp", foot, _start(along), along, band, bands),
-        Task("joints", "swing", running, _start(running), standing, counted, stride),
-        Task("foot", "swing", stepping, _start(running), standing, counted, stride),
-        Task(ALONG, "swing", stepping, _start(running), running, counted, stride),
-    ]
+    standing, stepping = signals.held(pose, len(counted)), signals.of_foot(model, running)
+    yield Task("joints", "swing", running, _start(running), standing, counted, stride)
+    yield Task("foot", "swing", stepping, _start(running), standing, counted, stride)
+    yield Task(ALONG, "swing", stepping, _start(running), running, counted, stride)
 
 
 def _start(joints: Motion) -> tuple[Array, Array]:
