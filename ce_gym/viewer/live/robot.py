@@ -6,16 +6,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import casadi as ca
-import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.model import Model
-from ce_gym.envs.base import BaseEnv
 from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.sim.batch import Snapshot
-from ce_gym.viewer.errors import ViewerError
+from ce_gym.viewer.rollouts.driving import made
 
 Array = NDArray[np.float64]
 Act = Callable[[Any], NDArray[np.float32]]
@@ -55,13 +53,7 @@ class LiveRobot:
 
     def __init__(self, env_id: str, act: Act | None = None, **kwargs: Any) -> None:
         options = {**kwargs, **UNDISTURBED, "randomise": RANGES}
-        try:
-            self._env = gymnasium.make_vec(env_id, 1, vectorization_mode="vector_entry_point", **options)
-        except (TypeError, ValueError, ImportError, gymnasium.error.Error) as error:
-            raise ViewerError(f"environment {env_id!r}: {' '.join(str(error).split())}") from error
-        native = self._env.unwrapped
-        if not isinstance(native, BaseEnv):
-            raise ViewerError(f"environment {env_id!r}: expected one of ce_gym, of its own robots or registered ones")
+        self._env, native = made(env_id, 1, options)
         self._native, self._batch, program = native, native.batch, native.batch.program
         self._act = act or (lambda _: np.zeros((1, program.n_actions), np.float32))
         self.model: Model = program.model

@@ -51,27 +51,38 @@ def drive_many(
     act: Act, env_id: str, script: Script = SHOW, *, robots: int, seed: int = 0, label: str = "", **kwargs: Any
 ) -> list[Rollout]:
     """Drive several robots through the same commands; robot `i` has seed `seed + i`. See `drive`."""
-    import gymnasium
-
     seconds = sum(time for time, _ in script)
     # Commands come from the script: the environment draws no new ones before the end of time.
     options = {**kwargs, "contact_forces": True, "command_period": 1e6}
+    envs, native = made(env_id, robots, options)
     try:
-        envs = gymnasium.make_vec(env_id, robots, vectorization_mode="vector_entry_point", **options)
-    except (TypeError, ValueError, ImportError, gymnasium.error.Error) as error:
-        raise ViewerError(f"environment {env_id!r}: {' '.join(str(error).split())}") from error
-    try:
-        if not isinstance(envs.unwrapped, BaseEnv):
-            raise ViewerError(f"environment {env_id!r}: expected one of ce_gym, of its own robots or registered ones")
-        period = envs.unwrapped.dt  # type: ignore[attr-defined]
-        commands = np.repeat([c for _, c in script], [round(t / period) for t, _ in script], axis=0)
+        commands = np.repeat([c for _, c in script], [round(t / native.dt) for t, _ in script], axis=0)
         if script is SHOW:
-            low, high = np.transpose(envs.unwrapped.batch.program.task.command_range)  # type: ignore[attr-defined]
+            low, high = np.transpose(native.batch.program.task.command_range)
             commands = np.clip(commands, low, high)
         more: dict[str, Any] = {"seed": seed, "commands": commands, "label": label, "info": {"env": env_id}}
         return record_lanes(envs, act, seconds, lanes=range(robots), **more)
     finally:
         envs.close()
+
+
+def made(env_id: str, robots: int, options: Mapping[str, Any]) -> tuple[Any, BaseEnv]:
+    """Make an environment of several robots; return it and what is inside its wrappers.
+
+    Raises:
+        ViewerError: If it cannot be made, or is none of ce_gym.
+    """
+    import gymnasium
+
+    try:
+        envs = gymnasium.make_vec(env_id, robots, vectorization_mode="vector_entry_point", **options)
+    except (TypeError, ValueError, ImportError, gymnasium.error.Error) as error:
+        raise ViewerError(f"environment {env_id!r}: {' '.join(str(error).split())}") from error
+    native = envs.unwrapped
+    if not isinstance(native, BaseEnv):
+        envs.close()
+        raise ViewerError(f"environment {env_id!r}: expected one of ce_gym, of its own robots or registered ones")
+    return envs, native
 
 
 def walk(file: Path, script: Script = SHOW, *, env: str | None = None, **options: Any) -> list[Rollout]:

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 
-from ce_gym.envs.base import BaseEnv
 from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.policies import Policy, environment_of
-from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.page.moving import MovingScene
+from ce_gym.viewer.rollouts.driving import made
 
 POLICIES = ("policy.*", "present/policy.*", "checkpoints/policy_*")
 """Where a run keeps policies."""
@@ -57,13 +55,7 @@ class Walker:
     def __init__(self, policy: Policy, env_id: str, kwargs: Mapping[str, Any]) -> None:
         env_id = environment_of(policy.record, env_id or None)
         options = {"command_curriculum": 1.0, **policy.record["env_kwargs"], **kwargs}
-        try:
-            self._env = gymnasium.make_vec(env_id, 1, vectorization_mode="vector_entry_point", **options)
-        except (TypeError, ValueError, ImportError, gymnasium.error.Error) as error:
-            raise ViewerError(f"environment {env_id!r}: {' '.join(str(error).split())}") from error
-        native = self._env.unwrapped
-        if not isinstance(native, BaseEnv):
-            raise ViewerError(f"environment {env_id!r}: expected one of ce_gym, of its own robots or registered ones")
+        self._env, native = made(env_id, 1, options)
         self.policy, self._native, self.dt = policy, native, native.dt
         self._observation, _ = self._env.reset(seed=0)
         program = native.batch.program
