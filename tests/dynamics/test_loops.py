@@ -18,6 +18,7 @@ from ce_gym.model import (
     FunctionConstraint,
     LinearConstraint,
     LoopConstraint,
+    Placement,
     Pose,
     Robot,
     RobotError,
@@ -179,6 +180,20 @@ def test_any_independent_joint_will_do():
         q, v = model.from_spanning(q_span, v_span)
         vdot = model.forward_dynamics(q, v, model.actuator_matrix(q, ["crank"]).T @ [tau])
         np.testing.assert_allclose(model.spanning_acceleration(q, v, vdot), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("angle", np.linspace(0.1, 3.0, 30))
+def test_dead_centre_is_refused(angle):
+    """Crank and rocker about one axis, with a coupler that just reaches: rounding decides whether the loop closes."""
+    bodies = (
+        link("crank", None, (0.0, 0.0, 0.0)),
+        link("coupler", "crank", (0.5, 0.0, 0.0)),
+        link("rocker", None, (0.0, 0.0, 0.0)),
+    )
+    pin = LoopConstraint("pin", "revolute", "coupler", "rocker", Placement((1.0, 0.0, 0.0)), Placement((0.5, 0.0, 0.0)))
+    pose, rest = Pose(joints=(("crank", angle),)), (("coupler", 3.0), ("rocker", angle + np.pi))
+    with pytest.raises(RobotError, match="the cluster tied by pin (is singular|has 1 independent joints)"):
+        Model(Robot("dead", bodies, (pin,), ("crank",), pose=pose, assembly=rest))
 
 
 def test_singular_choice_is_refused():

@@ -166,11 +166,14 @@ class Assembler:
         K = K / np.abs(K).max(axis=1, keepdims=True).clip(1e-300)
         values = np.linalg.svd(K[:, self.dependent], compute_uv=False)
         if values[-1] <= SINGULAR * values[0]:
-            names = ", ".join(self.cluster.bodies[i] for i in self.dependent)
-            chosen = ", ".join(self.cluster.independent)
-            expected = f"expected independent joints that determine {names} at the standing pose, unlike {chosen}"
-            raise self._error(f"is singular: {expected}")
+            raise self.singular()
         return float(values[0] / values[-1])
+
+    def singular(self) -> RobotError:
+        """Return the error of a cluster whose independent joints do not determine the others."""
+        names, chosen = ", ".join(self.cluster.bodies[i] for i in self.dependent), ", ".join(self.cluster.independent)
+        expected = f"expected independent joints that determine {names} at the standing pose, unlike {chosen}"
+        return self._error(f"is singular: {expected}")
 
 
 def _smallest(K: Array) -> float:

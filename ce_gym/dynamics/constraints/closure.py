@@ -71,7 +71,8 @@ class Closure:
     """
 
     def __init__(self, robot: Robot, cluster: Cluster) -> None:
-        self.assembly = Assembler(robot, cluster).assemble()
+        assembler = Assembler(robot, cluster)
+        self.assembly = assembler.assemble()
         d, m = len(cluster.independent), len(self.assembly.unknown)
         self.y, self.z = SX.sym("y", d), SX.sym("z", m)
         self.phi = self._rows(robot, cluster)
@@ -83,6 +84,9 @@ class Closure:
         self.rows = ca.Function("rows", [self.y, self.z], [self.phi])
         self.locate = self._locate()
         self.rates = self._rates()
+        found, _ = self.locate(self.reference[:d], self.guess)
+        if not np.isfinite(found.full()).all():  # at a dead centre rounding decides whether there is a solution
+            raise assembler.singular()
 
     @property
     def guess(self) -> np.ndarray:
