@@ -17,8 +17,8 @@ from types import ModuleType
 from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
-    "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "soak", "gpu",
-    "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness",
+    "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "adaptive",
+    "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness",
 )  # fmt: skip
 
 

@@ -16,9 +16,20 @@ from ce_gym.compile import Buffer
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
 from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.stepping.control import control_sizes
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.sim.arguments import check, is_number
+from ce_gym.sim.devices import Array
 from ce_gym.sim.substeps import DT, FRAME
 
 Writer = Literal["physics", "task", "term", "drift", "host", "scene"]
+
+TOLERANCE = 1e-3
+"""What is asked for where nothing is said [rad or m]."""
+TOLERATED = "tolerance"
+"""Name of the buffer with that of each robot."""
+FIRST = 10
+"""The first step that a robot tries is so many times shorter than a sub-step."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +53,9 @@ class Row:
     dtype: str = ""
 
 
-def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str], dt: float) -> list[Row]:
+def physics_rows(
+    model: Model, options: StepOptions, outputs: Sequence[str], dt: float, tolerance: float = TOLERANCE
+) -> list[Row]:
     """Return the rows of what the sub-steps of a scene read and write.
 
     Args:
@@ -50,6 +63,7 @@ def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str], dt:
         options: The scene.
         outputs: What is computed besides the state.
         dt: Length of a sub-step [s].
+        tolerance: Of a method with steps of its own [rad or m].
     """
     joints, contacts, motors = len(model.joint_links), len(options.contacts), len(model.robot.motors)
     start = {"q": model.standing_q, "dependent": model.guess}
@@ -62,6 +76,11 @@ def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str], dt:
         defaults = parameter_defaults(model.robot, options.material, options.parameters)
         values = np.concatenate(list(defaults.values()))
         rows.append(Row("parameters", len(values), "host", values))
+    if METHODS[options.method].controlled:
+        first = {"step_length": dt / FIRST}
+        sizes = control_sizes(model.robot.layout)
+        rows += [Row(name, size, "physics", first.get(name, 0.0)) for name, size in sizes.items() if name != TOLERATED]
+        rows.append(Row(TOLERATED, 1, "scene", tolerance))
     rows.append(Row(DT, 1, "scene", dt))
     return rows + ([Row(FRAME, 3, "host")] if options.ground == "field" else [])
 
@@ -69,3 +88,31 @@ def physics_rows(model: Model, options: StepOptions, outputs: Sequence[str], dt:
 def state_buffers(rows: Iterable[Row]) -> list[Buffer]:
     """Return the buffers of a kernel that rows in its lanes are."""
     return [Buffer(row.name, row.size, "tiles") for row in rows if not row.dtype]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps that robots have made at lengths of their own, shape (num_envs,) each.
+
+    Attributes:
+        taken: How many.
+        refused: How many were tried again, shorter.
+        missed: How many of those taken missed the tolerance: they were as short as can be.
+        length: What is tried next, unless the end of an interval is nearer [s].
+        error: Estimated error of the last one that was taken [rad or m].
+    """
+
+    taken: Array
+    refused: Array
+    missed: Array
+    length: Array
+    error: Array
+
+
+def checked_tolerance(method: str, tolerance: float | None) -> float:
+    """Return the tolerance of a method [rad or m], `TOLERANCE` if None; ValueError if it has none or it is none."""
+    controlled = METHODS[method].controlled
+    check("tolerance", tolerance, controlled or tolerance is None, f"None, because method is {method!r}")
+    found = TOLERANCE if tolerance is None else tolerance
+    check("tolerance", tolerance, is_number(found) and 1e-9 <= found <= 1, "between 1e-9 and 1 rad or m")
+    return found

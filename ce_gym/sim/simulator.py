@@ -29,7 +29,7 @@ from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.kernels import load_step_kernel, select_contacts, select_pairs
 from ce_gym.sim.pieces import piece_length, run_substeps
 from ce_gym.sim.placement import Placement
-from ce_gym.sim.schema import Row, physics_rows
+from ce_gym.sim.schema import Row, Steps, checked_tolerance, physics_rows
 from ce_gym.sim.terrain import Terrain
 
 FAILURES = Row("failures", 0, "host", dtype="int64")
@@ -62,7 +62,9 @@ class Simulator:
         outputs: Which of "torque", "motor_speed", "power", "contact_forces", "energy", "error", "loop_gap" and
             "nearness" to compute; those left out cost nothing and read as errors.
         method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
-            scenes).
+            scenes); or "adaptive": every robot advances by `dt` in extrapolated steps of its own, which are as long as
+            `tolerance` allows.
+        tolerance: Of "adaptive", the error of positions that is asked for [rad or m]; 1e-3 if None.
         normal_law: "kelvin_voigt" or "hunt_crossley", of the contacts' normal force; that of the material if None.
         friction: "tangent" iterates where a contact changes between stick and slip; "secant" is faster and slow to
             break away.
@@ -108,6 +110,7 @@ class Simulator:
         material: ContactMaterial | None = None,
         outputs: Sequence[str] = ("torque", "contact_forces"),
         method: str = "euler",
+        tolerance: float | None = None,
         normal_law: str | None = None,
         friction: str = "tangent",
         motors: str = "ideal",
@@ -130,6 +133,7 @@ class Simulator:
             check_choice(argument, self._made_with[argument], known)
         for name in outputs:
             check_choice("outputs", name, OUTPUTS)
+        self.tolerance = checked_tolerance(method, tolerance)
         self._device = device_named(device)
         self.device = self._device.name
         self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
@@ -155,7 +159,7 @@ class Simulator:
         self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
         self._section = CriticalSection(f"Simulator of {num_envs} {model.robot.name}")
         ground = terrain if self.options.ground == "field" else None
-        rows = [*physics_rows(model, self.options, asked, dt), FAILURES]
+        rows = [*physics_rows(model, self.options, asked, dt, self.tolerance), FAILURES]
         self._batch = Batch(rows, num_envs, dtype, self._device, ground)
         self._arrays = self._batch.arrays
         defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
@@ -193,9 +197,11 @@ class Simulator:
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
         rows |= {
             name: np.zeros(self._arrays[name].shape[1])
-            for name in ("anchor", "pressed", "diverged")
+            for name in ("anchor", "pressed", "diverged", "step_error", "step_change")
             if name in self._arrays
         }
+        if "step_length" in self._arrays:
+            rows["step_length"] = np.atleast_1d(self._batch.schema["step_length"].reset)
         if self.contact_names:
             rows["load"] = self._resting_load(rows["q"])
         if "dependent" in self._arrays:
@@ -320,8 +326,17 @@ class Simulator:
 
     @property
     def n_retried(self) -> int:
-        """How many sub-steps robots have made in parts, see `retry`."""
+        """How many sub-steps robots have made in parts, see `retry`; how many steps "adaptive" has refused."""
         return int(self._read("retries").sum())
+
+    @property
+    def steps(self) -> Steps:
+        """What steps each robot has made so far, of method "adaptive"; ValueError for others."""
+        if "step_length" not in self._arrays:
+            raise ValueError(f"method={self.options.method!r} makes no steps of its own; expected 'adaptive'")
+        names = {"taken": "steps_taken", "refused": "retries", "missed": "steps_missed", "length": "step_length"}
+        rows = {name: self._read(buffer)[:, 0] for name, buffer in (names | {"error": "step_error"}).items()}
+        return Steps(**rows)
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:

@@ -12,10 +12,12 @@ from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step, While
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.choice import full_function, light, light_function, near_function
+from ce_gym.dynamics.stepping.control import beginning_function as beginning_of_interval
+from ce_gym.dynamics.stepping.control import control_function, control_sizes
 from ce_gym.dynamics.stepping.ground_lookup import places_function, planes_function, touching_function
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import beginning_function, judging_function, mending_function
-from ce_gym.dynamics.stepping.plan import MOVED, Plan, Rates, Stage
+from ce_gym.dynamics.stepping.plan import MOVED, OFF, Plan, Rates, Stage
 from ce_gym.dynamics.stepping.step import iterate_size, iterations_needed
 from ce_gym.dynamics.stepping.trace import combination_function, iteration_function, step_function
 from ce_gym.model.mechanism import Mechanism
@@ -43,20 +45,24 @@ def substeps(
     options = replace(options, dt=None)
     plan, most = METHODS[options.method], iterations_needed(mechanism, options)
     staged = any(min(stage.iterations, most) for stage in plan.stages)
-    asked = (*outputs, MOVED) if plan.single or not staged else tuple(name for name in outputs if name != "error")
+    measured = {MOVED: 1} | ({OFF: mechanism.robot.layout.nv} if plan.controlled else {})
+    asked = (*outputs, *measured) if plan.single or not staged else tuple(name for name in outputs if name != "error")
     function = (iteration_function if staged else step_function)(mechanism, options, asked)
     kept = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
     if len(kept) < len(outputs):
         return substeps(mechanism, options, tuple(kept))
     sizes = {name: function.numel_in(name) for name in function.name_in() if name not in ("iterate", "ground")}
     sizes |= {"retries": 1, **kept} | ({FRAME: 3} if "ground" in function.name_in() else {})
+    sizes |= control_sizes(mechanism.robot.layout) if plan.controlled else {}
     fractions = {TRIED: 1.0} | ({_own(plan, stage): stage.length for stage in plan.stages} if staged else {})
-    each = _staged(mechanism, options, function, kept | {MOVED: 1}) if staged else _whole(mechanism, options, function)
-    buffers, try_part = each
-    begin, take = beginning_function(fractions), _take_part(mechanism, options, kept, fractions)
+    told = kept | measured
+    buffers, try_part = _staged(mechanism, options, function, told) if staged else _whole(mechanism, options, function)
+    begin = (beginning_of_interval if plan.controlled else beginning_function)(fractions)
+    take = (_take_step if plan.controlled else _take_part)(mechanism, options, kept, fractions)
     started = tuple(begin.name_out())
     buffers += [Buffer(name, 1, "scratch") for name in started]
-    return sizes, buffers, (Repeat(TIMES, (Call(begin, (DT,), started), While("unfinished", (*try_part, *take)))),)
+    begins = Call(begin, tuple(begin.name_in()), started)
+    return sizes, buffers, (Repeat(TIMES, (begins, While("unfinished", (*try_part, *take)))),)
 
 
 TRIED = "tried"
@@ -85,6 +91,14 @@ def _take_part(
         Call(mend, tuple(mend.name_in()), left, only_if="unfinished"),
         Call(copy, tuple(tried), tuple(name.removeprefix(f"{TRIED}_") for name in tried)),
     )
+
+
+def _take_step(
+    mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int], fractions: Mapping[str, float]
+) -> tuple[Call, ...]:
+    """Take what was tried where its error is allowed, and say how long the next step is."""
+    control = control_function(mechanism, options, outputs, fractions)
+    return (Call(control, tuple(control.name_in()), tuple(name.removesuffix("_next") for name in control.name_out())),)
 
 
 def _whole(mechanism: Mechanism, options: StepOptions, step: ca.Function) -> Parts:

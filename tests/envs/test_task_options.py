@@ -199,3 +199,32 @@ def test_bad_arguments(arguments: dict, message: str):
         make(**arguments)
     assert "\n" not in str(caught.value)
     assert caught.value.__cause__ is None
+
+
+def test_steps_of_their_own():
+    """Every environment to its tolerance: alone as among others, and to what finer steps of one length give."""
+    actions = np.random.default_rng(0).uniform(-1, 1, (5, 3, make(3).single_action_space.shape[0])).astype(np.float32)
+
+    def ends(n: int, **arguments) -> tuple[np.ndarray, np.ndarray]:
+        envs = make(n, contacts=("foot",), terminations=(), **arguments)
+        for action in actions:
+            rewards = envs.step(action[:n])[1]
+        return envs.state()["q"], rewards
+
+    adaptive = {"method": "adaptive", "tolerance": 1e-4, "dt": 0.02, "n_substeps": 1}
+    (q, rewards), (fine, _) = ends(3, **adaptive), ends(3, method="extrapolated", dt=2e-5, n_substeps=1000)
+    (alone, reward) = ends(1, **adaptive)
+    np.testing.assert_array_equal(alone[0], q[0])
+    np.testing.assert_array_equal(reward, rewards[:1])
+    assert 0 < np.abs(q - fine).max() < 30e-4
+    coarse, _ = ends(3, method="extrapolated", dt=0.02, n_substeps=1)
+    assert np.abs(coarse - fine).max() > 10 * np.abs(q - fine).max()
+
+
+def test_methods_that_do_not_fit():
+    with pytest.raises(ValueError, match=r"tolerance=0.001; expected None, because method is 'euler'"):
+        make(tolerance=1e-3)
+    with pytest.raises(ValueError, match=r"method='leapfrog'; expected 'euler' or"):
+        make(method="leapfrog")
+    with pytest.raises(ValueError, match=r"control step with method='adaptive'; expected 'euler'"):
+        make(method="adaptive").unwrapped.differentiable()

@@ -7,7 +7,9 @@ import numpy as np
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.stepping.control import control_sizes
 from ce_gym.sim.kernels import load_step_kernel
+from ce_gym.sim.schema import FIRST
 from ce_gym.sim.tiles import tiles, write_rows
 
 
@@ -43,11 +45,20 @@ class Ours:
         joints = len(self.model.joint_links)
         self.targets = [np.ascontiguousarray(np.broadcast_to(row, (num_envs, joints))) for row in scene.drive]
 
-    def run(self, n: int) -> Array:
-        """Run through the scene with `n` sub-steps to a hold; returns positions of the first, (n_holds, nq)."""
+    def run(self, n: int, tolerance: float | None = None) -> Array:
+        """Run through the scene; returns positions of the first robot at the end of every hold, (n_holds, nq).
+
+        Args:
+            n: Sub-steps to a hold.
+            tolerance: Of a method with steps of its own [rad or m].
+        """
         for name, rows in self.starts.items():
             write_rows(self.arrays[name], rows)
         self.arrays["dt"][:] = HOLD / n
+        if tolerance is not None:
+            for name in control_sizes(self.model.robot.layout):
+                self.arrays[name][:] = {"step_length": HOLD / n / FIRST, "tolerance": tolerance}.get(name, 0.0)
+            self.arrays["retries"][:] = 0.0
         path = np.empty((self.scene.holds, self.model.nq))
         for i, target in enumerate(self.targets):
             if self.scene.push is not None:

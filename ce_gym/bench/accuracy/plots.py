@@ -6,11 +6,15 @@ Lines are ours in blue and green, MuJoCo's in orange, red and grey; the palette 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ce_gym.bench.accuracy.curves import MARGIN, Curve, Measured
 from ce_gym.bench.paper.plots import BLUE, GREEN, GREY, ORANGE, RED, SKY, STYLE, plt
+
+if TYPE_CHECKING:
+    from ce_gym.bench.accuracy.adaptive import Delivered
 
 COLUMNS = 4
 OURS = {
@@ -71,3 +75,26 @@ def _look(curve: Curve) -> tuple[str, dict[str, Any]]:
     marker = MARKERS[curve.method]
     label = f"MuJoCo {curve.method}, {VARIANTS[kind]}"
     return label, {"color": COLORS[kind], "marker": marker, "linestyle": "--", "markerfacecolor": "none"}
+
+
+def draw_adaptive(found: Sequence[Delivered], out: Path) -> Path:
+    """Draw error delivered against error asked, and time against that of the best fixed step; returns the file."""
+    with plt.rc_context({**STYLE, "lines.linewidth": 1.0, "lines.markersize": 3.5}):
+        figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 4.2), layout="constrained")
+        colors = plt.get_cmap("tab20").colors  # type: ignore[attr-defined]
+        for i, name in enumerate(dict.fromkeys(d.scene for d in found)):
+            rows = [d for d in found if d.scene == name and d.counts]
+            look = {"marker": "os^D"[i % 4], "color": colors[i % 20], "label": name}
+            left.plot([d.asked for d in rows], [d.error for d in rows], **look)
+            timed = [(d.error, d.slower) for d in rows if d.slower is not None]
+            right.plot([error for error, _ in timed], [slower for _, slower in timed], **look)
+        ends = sorted({d.asked for d in found})
+        left.plot(ends, ends, color=GREY, linestyle="--", label="as asked")
+        left.set(xscale="log", yscale="log", xlabel="asked [m, rad]", ylabel="delivered [m, rad]", title="Error")
+        right.axhline(1.0, color=GREY, linestyle="--")
+        right.set(xscale="log", yscale="log", xlabel="error delivered [m, rad]", title="Time / best fixed step")
+        figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize="small")
+        path = out / "adaptive.png"
+        figure.savefig(path, dpi=90)
+        plt.close(figure)
+    return path

@@ -29,7 +29,14 @@ def iterations_of(mechanism: Mechanism, options: StepOptions) -> int:
 
 
 def primal_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
-    """Trace what is differentiated: an iteration of the step, or the step itself if that is one expression."""
+    """Trace what is differentiated: an iteration of the step, or the step itself if that is one expression.
+
+    Raises:
+        ValueError: If steps choose their lengths: these would have to be differentiated too.
+    """
+    if METHODS[options.method].controlled:
+        others = " or ".join(repr(name) for name, plan in METHODS.items() if not plan.controlled)
+        raise ValueError(f"derivatives of steps with method={options.method!r}; expected {others}")
     whole = iterations_of(mechanism, options) == 1
     return (step_function if whole else iteration_function)(mechanism, options, outputs, follows=True)
 

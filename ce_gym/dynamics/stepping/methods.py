@@ -2,12 +2,13 @@
 
 `EULER`, the default, is one linearly implicit step: order 1, stable for stiff contact, friction and gains.
 `EXTRAPOLATED` makes one such step and two of half the length and extrapolates (Richardson): order 2 in smooth motion,
-as stable, with an estimate of its error. Runge-Kutta methods are explicit and meant for smooth scenes and for
-references; stiff contact limits their steps.
+as stable, with an estimate of its error. `ADAPTIVE` makes such steps as long as the estimate allows. Runge-Kutta
+methods are explicit and meant for smooth scenes and for references; stiff contact limits their steps.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import sqrt
 
 from ce_gym.dynamics.stepping.plan import Ends, Plan, Rates, Stage
@@ -19,6 +20,8 @@ EXTRAPOLATED = Plan(
     (Stage("coarse"), Stage("half", length=1 / 2), Stage("fine", start="half", length=1 / 2)),
     Ends({"fine": 2.0, "coarse": -1.0}, means={"half": 1 / 2, "fine": 1 / 2}, error=("fine", "coarse")),
 )
+
+ADAPTIVE = replace(EXTRAPOLATED, controlled=True)
 
 
 def runge_kutta(order: int, a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Plan:
@@ -69,5 +72,11 @@ RK8 = runge_kutta(
 )
 """Cooper and Verner (1972), eleven stages: the reference for smooth motion."""
 
-METHODS: dict[str, Plan] = {"euler": EULER, "extrapolated": EXTRAPOLATED, "rk4": RK4, "rk8": RK8}
+METHODS: dict[str, Plan] = {
+    "euler": EULER,
+    "extrapolated": EXTRAPOLATED,
+    "adaptive": ADAPTIVE,
+    "rk4": RK4,
+    "rk8": RK8,
+}
 """All methods, by the name that `Simulator(method=...)` takes."""

@@ -5,7 +5,7 @@ A light link under more torque than a step can follow turns by radians in one, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import casadi as ca
 
@@ -73,12 +73,7 @@ def mending_function(
     divisible = ca.logic_and(part > 1.5 * 0.5**options.retry, old["diverged"] < 0.5)
     refused = ca.logic_and(unfit, divisible)
     taken = ca.logic_and(part > 0, ca.logic_not(refused))
-    results, first = dict(tried), left >= 1
-    for name in outputs:
-        if name in MEANS:
-            results[name] = ca.if_else(first, 0, old[name]) + part * tried[name]
-        elif name in AT_START:
-            results[name] = ca.if_else(first, tried[name], old[name])
+    results = reported(old, tried, outputs, left >= 1, part)
     after = {f"tried_{name}": ca.if_else(taken, value, old[name]) for name, value in results.items()}
     ahead = ca.if_else(taken, left - part, left)
     unfinished = ca.logic_or(refused, ca.logic_and(taken, ca.logic_and(ahead > 0, tried["diverged"] < 0.5)))
@@ -88,3 +83,24 @@ def mending_function(
     given |= old | {f"tried_{name}": value for name, value in tried.items()}
     results = {name + "_next" * (name in given): value for name, value in after.items()}
     return traced("mend", given, results | lengths(after["part"], dt, fractions))
+
+
+def reported(
+    old: Mapping[str, SX], tried: Mapping[str, SX], outputs: Iterable[str], first: SX, part: SX
+) -> dict[str, SX]:
+    """Return what a part of a step leaves if it is taken: means are added up, what belongs to the start is the first's.
+
+    Args:
+        old: State and outputs after the part before.
+        tried: The same after this one.
+        outputs: Which are outputs.
+        first: Whether it is the first.
+        part: Of the whole.
+    """
+    results = dict(tried)
+    for name in outputs:
+        if name in MEANS:
+            results[name] = ca.if_else(first, 0, old[name]) + part * tried[name]
+        elif name in AT_START:
+            results[name] = ca.if_else(first, tried[name], old[name])
+    return results

@@ -20,6 +20,8 @@ AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "contact_forces")
 """Outputs that belong to the start of a step, or are means over it; the others belong to its end."""
 MOVED = "moved"
 """Name of the output that says how far a step moves its fastest joint, at the speed of its end [rad or m]."""
+OFF = "off"
+"""Name of the output that estimates the errors of a step in its positions [rad or m], shape (nv,)."""
 AFTER = "after"
 """Name of the step as a whole, where outputs are evaluated at its end and not combined from stages."""
 
@@ -81,11 +83,13 @@ class Plan:
         order: Its global error is of this order in the step length, where the motion is smooth.
         stages: In the order in which they are evaluated; the first starts from the state before the step.
         end: How the state after the step follows from them.
+        controlled: Whether kernels make steps as long as the estimate of their error allows, see `control.py`.
     """
 
     order: int
     stages: tuple[Stage, ...]
     end: Ends | Rates = field(default_factory=Rates)
+    controlled: bool = False
 
     @property
     def single(self) -> bool:
@@ -135,3 +139,16 @@ def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:
         return SX(0)
     one, other = plan.end.error
     return ca.norm_2(ends[one].v - ends[other].v)
+
+
+def position_errors(plan: Plan, ends: Mapping[str, State], layout: Layout) -> SX:
+    """Return estimated errors of positions after a step [rad or m], shape (nv,), of a plan that has an estimate.
+
+    Those of orientations are rotation vectors, which come first.
+    """
+    assert isinstance(plan.end, Ends)
+    one, other = (ends[name].q for name in plan.end.error)
+    turns = {i for i, _ in layout.turns}
+    turned = [between(one[i : i + 4], other[i : i + 4]) for i in sorted(turns)]
+    others = [i for i in range(one.numel()) if not any(start <= i < start + 4 for start in turns)]
+    return ca.vertcat(*turned, (one - other)[others])

@@ -17,7 +17,7 @@ from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.plan import AFTER, MOVED, combined, error_estimate
+from ce_gym.dynamics.stepping.plan import AFTER, MOVED, OFF, combined, error_estimate, position_errors
 from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
 from ce_gym.model.mechanism import Mechanism
@@ -40,7 +40,7 @@ def step_function(
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
-        outputs: Names among `OUTPUTS`, or `MOVED`; what is not asked for costs nothing.
+        outputs: Names among `OUTPUTS`, or `MOVED` or `OFF`; what is not asked for costs nothing.
         follows: Whether contacts that move find the plane of the ground higher or lower there; for derivatives on a
             field. `places`, where the centres of contacts are, is one more of what is given then.
 
@@ -89,15 +89,18 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
     flags = {"diverged": SX.sym("diverged")} | {f"{name}_diverged": SX.sym(name) for name in ends}
     given = dict(before.items()) | flags
     given |= {f"{stage}_{name}": value for stage, end in ends.items() for name, value in end.items()}
-    after = combined(plan, ends, mechanism.robot.layout)
+    layout = mechanism.robot.layout
+    after = combined(plan, ends, layout)
     sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
     results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in before.items()}
     results["diverged_next"] = ca.if_else(sane, 0, 1)
     for name, size in outputs.items():
-        if name in ("error", MOVED):
-            dt, base = SX.sym("dt"), mechanism.robot.layout.base_nv
-            results[name] = furthest(after.v, base, dt) if name == MOVED else error_estimate(plan, ends)
-            given["dt"] = dt
+        if name == MOVED:
+            given["dt"] = SX.sym("dt")
+            results[name] = furthest(after.v, layout.base_nv, given["dt"])
+            continue
+        if name in ("error", OFF):
+            results[name] = error_estimate(plan, ends) if name == "error" else position_errors(plan, ends, layout)
             continue
         told = {stage: SX.sym(name, size) for stage in plan.shares(name)}
         given |= {f"{stage}_{name}": value for stage, value in told.items()}
@@ -164,6 +167,11 @@ class Given:
         """Return an output, combined from parts of a step."""
         if name == "error":
             return parts[AFTER].error
+        if name == OFF:
+            plan = METHODS[self.scene.options.method]
+            return position_errors(
+                plan, {s.name: parts[s.name].state for s in plan.stages}, self.mechanism.robot.layout
+            )
         return ca.vec(weighted(shares, {part: self._of(parts[part], name) for part in shares}))
 
     def _of(self, stepped: Stepped, name: str) -> SX:

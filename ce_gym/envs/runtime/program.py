@@ -26,7 +26,7 @@ from ce_gym.envs.task.randomisation import Randomised
 from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.registry import Term, terms_of
 from ce_gym.sim.kernels import select_contacts, select_pairs
-from ce_gym.sim.schema import Row, physics_rows, state_buffers
+from ce_gym.sim.schema import Row, checked_tolerance, physics_rows, state_buffers
 from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
 HOST_ROWS = (
@@ -88,6 +88,7 @@ class TaskProgram:
             contacts=self.contacts,
             material=robot.material,
             friction=task.friction,
+            method=task.method,
             motors=task.motors,
             ground="field" if self.ground and self.contacts else "flat",
             parameters=self.randomised.parameters,
@@ -126,7 +127,8 @@ class TaskProgram:
             "target": len(self.actions.targets) if late else 0,
             **self.curriculum.sizes,
         }
-        physics = physics_rows(self.model, self.options, outputs, self.task.dt)
+        tolerance = checked_tolerance(self.task.method, self.task.tolerance)
+        physics = physics_rows(self.model, self.options, outputs, self.task.dt, tolerance)
         rows = [replace(row, writer="task") if row.name == "parameters" else row for row in (*physics, *HOST_ROWS)]
         rows += [Row(name, size, "task") for name, size in sizes.items() if size]
         rows += [Row(FRAME, 3, "host")] if self.ground and not self.contacts else []

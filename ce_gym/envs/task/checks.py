@@ -8,17 +8,18 @@ from typing import Any, get_args
 
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
+from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.envs.task.tasks import Actions
 from ce_gym.envs.task.terrain_tiles import checked_terrain
 from ce_gym.sim.arguments import check, check_choice, check_whole, is_number
 
-CHOICES = {"actions": get_args(Actions), "friction": FRICTION, "motors": MOTORS}
-POSITIVE = ("action_scale", "command_period", "gait_period", "dt")
+CHOICES = {"actions": get_args(Actions), "friction": FRICTION, "motors": MOTORS, "method": METHODS}
+POSITIVE = ("action_scale", "command_period", "gait_period", "dt", "tolerance")
 COUNTS = ("history", "n_substeps", "episode_length", "max_episode_steps")
 TERMS = ("observations", "terminations", "metrics", "critic")
 HEAVIEST = 1e9
 """Largest weight of a reward, either way."""
-LARGEST = {"dt": 0.1, "standing_fraction": 1.0}
+LARGEST = {"dt": 0.1, "standing_fraction": 1.0, "tolerance": 1.0}
 
 
 def checked_value(name: str, value: Any, old: Any) -> Any:

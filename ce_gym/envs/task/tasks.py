@@ -59,6 +59,8 @@ class Task:
         self_collisions: Which links push each other apart: "listed", "all" or pairs, see `ce_gym.Simulator`.
         friction: "tangent" or "secant", see `ce_gym.Simulator`.
         motors: "ideal" or "limited", see `ce_gym.Simulator`.
+        method: How sub-steps are made, "euler" or another, see `ce_gym.Simulator`.
+        tolerance: Of method "adaptive" [rad or m]; every robot then makes steps of its own within each sub-step.
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
         reset_noise: Largest deviation from the standing pose at the start: of joints [rad], joint velocities [rad/s]
             and base velocities [rad/s and m/s].
@@ -93,6 +95,8 @@ class Task:
     self_collisions: str | tuple[tuple[str, ...], ...] = ()
     friction: Literal["tangent", "secant"] = "tangent"
     motors: Literal["ideal", "limited"] = "ideal"
+    method: str = "euler"
+    tolerance: float | None = None
     only_positive: bool = True
     reset_noise: Mapping[str, float] = field(
         default_factory=lambda: MappingProxyType({"joint_position": 0.1, "joint_velocity": 0.2, "base_velocity": 0.2})
