@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("mujoco")
 
 from ce_gym import Model, Simulator
+from ce_gym.bench.accuracy import adaptive
 from ce_gym.bench.accuracy import benchmark as accuracy
 from ce_gym.bench.accuracy import contact as accuracy_contact
 from ce_gym.bench.accuracy import coulomb as accuracy_coulomb
@@ -138,3 +139,40 @@ def test_writes_picture_and_tables(tmp_path, monkeypatch):
     assert exact[1] < exact[0] / 100
     assert all(float(row["time per simulated second [s]"]) > 0 for row in rows)
     assert [r.met for r in report.requirements] == [True]
+
+
+def test_what_adaptive_steps_deliver():
+    """Against curves that are known: the best fixed step between two points of a curve, and which rows count."""
+    scene = short("tumble", 10)
+    fixed = tuple(Point(dt, seconds, error, error) for dt, seconds, error in ((0.02, 1.0, 1e-2), (0.002, 10.0, 1e-4)))
+    faster = tuple(replace(point, seconds=point.seconds / 4) for point in fixed)
+    curves = [Curve("ce_gym", "exact", "extrapolated", fixed), Curve("ce_gym", "exact", "rk4", faster)]
+    known = Measured(scene, 1e-7, curves)
+    good = adaptive.delivered(known, 1e-3, 1e-3, 3.0, (40.0, 2.0, 0.0))
+    assert (good.ratio, good.counts) == (1.0, True)
+    assert good.fixed == pytest.approx(10**0.5)
+    assert good.best == pytest.approx(10**0.5 / 4)
+    assert all(requirement.met for requirement in adaptive.requirements([good]))
+    too_slow, too_far = replace(good, seconds=5.0), replace(good, error=0.1)
+    assert [r.met for r in adaptive.requirements([good, good, too_slow])] == [True, True, False]
+    assert [r.met for r in adaptive.requirements([good, good, too_far])] == [True, False, True]
+    longest = adaptive.delivered(known, 1.0, 1e-2, 3.0, (10.0, 0.0, 0.0))  # one step to a hold: nothing was decided
+    unknown = adaptive.delivered(known, 1e-7, 1e-7, 30.0, (99.0, 0.0, 0.0))  # less than can be told
+    assert not longest.counts
+    assert not unknown.counts
+    assert unknown.fixed is None
+    assert adaptive.row(unknown)[-3:] == (None, None, "no")
+
+
+def test_adaptive_steps_are_the_simulators():
+    scene = short("belt_leg", 3)
+    batch = Ours(scene, "adaptive", "exact", "tangent", 9)
+    paths = [batch.run(1, tolerance) for tolerance in (1e-2, 1e-4, 1e-2)]
+    np.testing.assert_array_equal(paths[0], paths[2])
+    simulator = Simulator(
+        Model(scene.robot), 1, HOLD, control="torque", contacts=(), outputs=(), method="adaptive", tolerance=1e-4
+    )
+    simulator.set_state(scene.q, scene.v)
+    for target, q in zip(scene.drive, paths[1], strict=True):
+        simulator.step(target)
+        np.testing.assert_array_equal(simulator.q[0], q)
