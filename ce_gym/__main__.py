@@ -92,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     inspect.add_argument("name", metavar="NAME", help="name of a robot, path of its file, or id of an environment")
     inspect.add_argument(
-        "--transmission", default="exact", metavar="LEVEL", help="exact (default), coupled, armature or none"
+        "--transmission", default="exact", metavar="LEVEL", help="exact (default), coupled, armature, none or elastic"
     )
     add_env_arg(inspect)
     inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")

@@ -154,7 +154,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("policy", help=WHERE)
     parser.add_argument(
-        "--transmission", metavar="LEVEL", help="exact, coupled, armature or none (default: as trained)"
+        "--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic (default: as trained)"
     )
     parser.add_argument("--pushes", action="store_true", help="also push it, from all sides, harder and harder")
     text = "also judge it on commands that jump, standing, turning in place, going backwards, and pushed"

@@ -235,7 +235,7 @@ def parser() -> argparse.ArgumentParser:
     )
     what = result.add_argument_group("what to train")
     what.add_argument("--env", metavar="ID", help="environment id, such as ce_gym/MiniCheetahVelocity-v0")
-    what.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
+    what.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic")
     what.add_argument(
         "--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees, such as base_height"
     )

@@ -143,7 +143,7 @@ def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(description="Train a policy with RLlib's PPO.")
     parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
-    parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
+    parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic")
     add_env_arg(parser)
     parser.add_argument(
         "--env-runners", type=whole(0, 10_000), default=2, metavar="N", help="processes that step (default 2)"

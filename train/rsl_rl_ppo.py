@@ -102,7 +102,7 @@ def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(description="Train a policy with rsl_rl's PPO.")
     parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
-    parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature or none")
+    parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic")
     parser.add_argument("--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees")
     add_env_arg(parser)
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")

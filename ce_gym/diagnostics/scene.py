@@ -260,7 +260,7 @@ def _parts_of_dynamics(step: SubStep) -> tuple[ca.Function, ca.Function]:
     """Trace what the kinematics leave for the recursions, and the accelerations."""
     mechanism, options = step.model.mechanism, step.options
     state, dt = symbolic_state(mechanism, options), cast(Any, SX.sym("dt"))
-    target = SX.sym("target", len(mechanism.robot.independent))
+    target = SX.sym("target", len(mechanism.robot.commanded))
     solved = solve(make_scene(mechanism, options, SX(0, 1), SX(3, 0)), state, target, dt, SX(6, 0))
     found = [x for body in solved.kinematics.bodies.values() for x in (body.X.E, body.X.p, body.c, body.v[:3])]
     found += [x for c in solved.kinematics.coordinates if c is not None for x in (c.G, c.g)]

@@ -99,7 +99,8 @@ def _work(model: Model, compiled: SubStep | ca.Function) -> Work:
     for name, array in start.items():
         write_rows(array, np.broadcast_to(values.get(name, 0.0), (BATCH, array.shape[1])))
     arrays = {name: tiles(BATCH, array.shape[1], DTYPE) for name, array in start.items()}
-    standing = model.standing_q[model.nq - len(model.joint_links) :]
+    first = model.robot.layout.joints_q
+    standing = model.standing_q[first : first + len(model.joint_links)]
     given = {"target": np.tile(standing, (BATCH, 1))} if "target" not in start else {}
     given[HEIGHTS] = np.zeros((17, 17), DTYPE)
 

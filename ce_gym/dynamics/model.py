@@ -33,7 +33,8 @@ class Model(Evaluator):
 
     Args:
         robot: A description, the name of a robot that ships with the package, or a path to a robot file.
-        transmission: "exact", "coupled", "armature" or "none".
+        transmission: "exact", "coupled", "armature" or "none"; or "elastic", where stretches of elastic transmissions
+            (`Elasticity`, radians of the rotor) follow the joints in `q` and `v`.
         locked_rotors: Whether approximated rotors leave their mass and inertia at rest with their carrier, so that
             total mass is the same at every level. False deletes them, as the paper does in its figures.
         eliminate_rotors: Whether rotors that need no body are eliminated at the exact level. False runs the general
@@ -74,7 +75,7 @@ class Model(Evaluator):
     @property
     def joint_links(self) -> tuple[str, ...]:
         """The link that each independent joint moves, in the order of the joint coordinates."""
-        return self.robot.independent
+        return self.robot.commanded
 
     @property
     def cluster_tree(self) -> ClusterTree:
@@ -84,7 +85,7 @@ class Model(Evaluator):
     @property
     def total_mass(self) -> float:
         """Mass of all bodies, the same at every level unless locked rotors are deleted [kg]."""
-        deleted = not self.locked_rotors and self.transmission != "exact"
+        deleted = not self.locked_rotors and not self.mechanism.exact
         return self.robot.total_mass - (added(r.inertial.mass for r in self.robot.rotors()) if deleted else 0.0)
 
     @property
@@ -287,10 +288,11 @@ class Model(Evaluator):
     def describe(self) -> str:
         """Return a readable account of the robot: figures, and its cluster tree as text."""
         base, rotors = "floating" if self.robot.floating else "fixed", sum(1 for _ in self.robot.rotors())
+        bodies = sum(body.kind != "stretch" for body in self.robot.bodies)
         eliminated = sum(len(spins) for spins in self.mechanism.spins)
         lines = [
             f"{self.robot.name}: {base} base, {len(self.joint_links)} joints, "
-            f"{len(self.body_names)} bodies of which {rotors} rotors, {len(self.cluster_tree.clusters)} clusters, "
+            f"{bodies} bodies of which {rotors} rotors, {len(self.cluster_tree.clusters)} clusters, "
             f"{self.total_mass:.3f} kg",
             f"transmission {self.transmission}: {eliminated} rotors need no body of their own",
             "",

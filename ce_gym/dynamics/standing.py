@@ -169,7 +169,7 @@ def _reflected(mechanism: Mechanism, spins: tuple[Spin, ...], standing: Standing
         return np.zeros((nv, nv))
     G = np.array([standing.G[spin.rotor] for spin in spins])
     reflected = G.T @ (np.array([[spin.inertia] for spin in spins]) * G)
-    if mechanism.level != "exact":
+    if not mechanism.exact:
         return np.diag(np.diag(reflected)) if mechanism.level == "armature" else reflected
     for spin, row in zip(spins, G, strict=True):
         w = standing.J[spin.carrier][:3]

@@ -46,7 +46,7 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
     robot = load_robot(file)
     if problems := missing(robot):
         raise problems[0]
-    ids = ids_of(id_stem(robot, name), str(file))
+    ids = ids_of(id_stem(robot, name), str(file), bool(robot.elastic))
     register(ids)
     return tuple(ids)
 

@@ -53,7 +53,7 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
         `offset[i] + scale[i] * of[rows[i]]`, with `of` one of `coordinates`; else `meaning` says what it is.
     """
     robot, chosen = program.model.robot, program.task
-    joints = robot.independent
+    joints = robot.commanded
     kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
     torques = [robot.body(name).joint.torque for name in joints]
     pose = dict(robot.pose.joints)

@@ -8,10 +8,12 @@ import gymnasium
 
 from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.errors import bad
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1", "go1", "go2", "g1", "berkeley_humanoid")
 """Robots that ship with the package and have what the tasks ask for."""
+STRETCHING = ("mini_cheetah",)
+"""Those of them whose files say how transmissions give way, and which so have the elastic level."""
 
 
 def camel_case(name: str) -> str:
@@ -26,11 +28,21 @@ def environment_ids() -> dict[str, dict[str, str]]:
         >>> ce_gym.environment_ids()["ce_gym/TelloVelocity-None-v0"]
         {'robot': 'tello', 'task': 'velocity', 'transmission': 'none'}
     """
-    return {name: made for robot in ROBOTS for name, made in ids_of(f"ce_gym/{camel_case(robot)}", robot).items()}
+    ids = {}
+    for robot in ROBOTS:
+        ids |= ids_of(f"ce_gym/{camel_case(robot)}", robot, robot in STRETCHING)
+    return ids
 
 
-def ids_of(stem: str, robot: str) -> dict[str, dict[str, str]]:
-    """Return the arguments of every id of a robot: `<stem><Task>[-<Level>]-v0`; `robot` is a name or a path."""
+def ids_of(stem: str, robot: str, stretches: bool) -> dict[str, dict[str, str]]:
+    """Return the arguments of every id of a robot: `<stem><Task>[-<Level>]-v0`.
+
+    Args:
+        stem: What they begin with.
+        robot: A name or a path.
+        stretches: Whether it has elastic transmissions.
+    """
+    levels = (None, *LEVELS, ELASTIC) if stretches else (None, *LEVELS)
     return {
         f"{stem}{camel_case(task)}{f'-{camel_case(level)}' if level else ''}-v0": {
             "robot": robot,
@@ -38,7 +50,7 @@ def ids_of(stem: str, robot: str) -> dict[str, dict[str, str]]:
             "transmission": level or "exact",
         }
         for task in TASKS
-        for level in (None, *LEVELS)
+        for level in levels
     }
 
 

@@ -17,7 +17,8 @@ from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf_equalities import MJCF_JOINTS, add_ties, check_expressible, held_rotors, joint_armature
 from ce_gym.export.mjcf_text import quaternion, text
 from ce_gym.model.description import Robot, Shape
-from ce_gym.model.mechanism import MovingBody, build_mechanism
+from ce_gym.model.errors import bad
+from ce_gym.model.mechanism import ELASTIC, MovingBody, build_mechanism
 
 Array = NDArray[np.float64]
 
@@ -87,6 +88,8 @@ def to_mjcf(
             at the standing pose, or MJCF has no way to say something: a constraint that is a function, a rotor that is
             left out but independent or part of a loop, or the varying diagonal of `armature`.
     """
+    if transmission == ELASTIC:
+        raise bad(robot.source or robot.name, "transmission", transmission, "another level: MJCF has no such drives")
     mechanism = build_mechanism(robot, transmission, eliminate=False)
     ties = joint_ties(mechanism)
     check_expressible(mechanism, ties)

@@ -113,13 +113,14 @@ class Body:
     Attributes:
         name: Unique among all bodies.
         kind: "link", or "rotor" for a body that spins inside a transmission. The transmission levels differ only in
-            what they keep of rotors.
+            what they keep of rotors. "stretch" is no body but the coordinate of an elastic transmission, see
+            `Elasticity`; only the elastic level has some.
         parent: Name of the parent body; None is the world.
         placement: Pose of the body frame in the parent frame when the joint coordinate is zero.
     """
 
     name: str
-    kind: Literal["link", "rotor"]
+    kind: Literal["link", "rotor", "stretch"]
     parent: str | None
     placement: Placement
     joint: Joint
@@ -205,6 +206,44 @@ class Motor:
     friction: float = 0.0
 
 
+def stretch_of(rotor: str) -> str:
+    """Return the name of the coordinate by which the transmission of a rotor stretches, if it is elastic."""
+    return f"{rotor}_stretch"
+
+
+@dataclass(frozen=True)
+class Elasticity:
+    """How the transmission of a rotor gives way: gear mesh, belt or series spring. All figures are the rotor's.
+
+    The stretch is how far the rotor is ahead of where the joints that it drives would have it. What a data sheet says
+    of the output is divided by the square of the gear ratio if it is a stiffness, multiplied by the ratio if an angle.
+
+    Attributes:
+        rotor: Name of the rotor body.
+        stiffness: [N m/rad].
+        damping: [N m s/rad].
+        backlash: Play: how far the rotor turns from one flank to the other, the joints held [rad].
+        preload: Of a belt: the torque at which one of its strands goes slack, beyond which it is half as stiff [N m];
+            infinite for what pulls and pushes alike.
+    """
+
+    rotor: str
+    stiffness: float
+    damping: float = 0.0
+    backlash: float = 0.0
+    preload: float = float("inf")
+
+    @property
+    def stretch(self) -> str:
+        """Name of its coordinate."""
+        return stretch_of(self.rotor)
+
+    @property
+    def linear(self) -> bool:
+        """Whether its torque is proportional to the stretch."""
+        return not self.backlash and self.preload == float("inf")
+
+
 @dataclass(frozen=True)
 class Pose:
     """A named configuration.
@@ -247,6 +286,7 @@ class Robot:
         capsules: What links are to each other, of those whose shapes do not say it or say it wrongly.
         self_collisions: Pairs of links that push each other apart, in a scene that asks for it.
         motors: One for each driven rotor.
+        elastic: How transmissions give way at the elastic level; those that are not named are rigid there, too.
         pose: The standing pose.
         gains: PD gains for position control of the independent joints.
         assembly: Pairs (body, angle) for dependent joints: where they are, roughly, in the standing pose. Chooses among
@@ -267,6 +307,7 @@ class Robot:
     capsules: tuple[Capsule, ...] = ()
     self_collisions: tuple[tuple[str, str], ...] = ()
     motors: tuple[Motor, ...] = ()
+    elastic: tuple[Elasticity, ...] = ()
     pose: Pose = Pose()
     gains: Gains = Gains()
     assembly: tuple[tuple[str, float], ...] = ()
@@ -286,6 +327,12 @@ class Robot:
     def rotors(self) -> Iterator[Body]:
         """Iterate over the bodies that spin inside transmissions."""
         return (body for body in self.bodies if body.kind == "rotor")
+
+    @property
+    def commanded(self) -> tuple[str, ...]:
+        """The independent joints, which come first in `independent`, without stretches of transmissions."""
+        stretches = {body.name for body in self.bodies if body.kind == "stretch"}
+        return tuple(name for name in self.independent if name not in stretches)
 
     @property
     def floating(self) -> bool:

@@ -1,10 +1,11 @@
 """From a robot description to the figures the dynamics needs, at one transmission level.
 
-The four levels differ only in what they keep of a *spinning* rotor; its mass and its inertia at rest always stay with
-the body that carries it, so total mass, coordinates and limits are the same at every level:
+The levels differ only in what they keep of a *spinning* rotor; its mass and its inertia at rest always stay with the
+body that carries it, so total mass and limits are the same at every level, and coordinates at all but the first:
 
 | level      | what is kept of the spin                                                                     |
 |------------|----------------------------------------------------------------------------------------------|
+| `elastic`  | everything, and how far its transmission stretches: a coordinate more for each               |
 | `exact`    | everything: kinetic energy, coupling to the carrier, gyroscopic torque                       |
 | `coupled`  | the reflected inertia `G_r^T J G_r` of each cluster, with its off-diagonal terms             |
 | `armature` | the diagonal of that matrix                                                                  |
@@ -14,6 +15,9 @@ At `exact`, a rotor that spins about a principal axis through its centre of mass
 recursion: its mass, its axial and its mean transverse inertia are constant in its carrier's frame. Its spin, and the
 difference of its transverse moments if it is not symmetric, enter as a `Spin`. Any other rotor stays a body of its
 cluster. That is decided here, rotor by rotor.
+
+A transmission that stretches is a rigid one with a term more, `rotor = sum(ratio * joint) + stretch`, of a joint that
+moves nothing: recursions and constraints need not know of it.
 """
 
 from __future__ import annotations
@@ -26,12 +30,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
-from ce_gym.model.description import Body, Joint, Robot
-from ce_gym.model.errors import RobotError
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import Body, Inertial, Joint, Robot
+from ce_gym.model.errors import RobotError, bad
 
 Level = Literal["exact", "coupled", "armature", "none"]
 LEVELS: tuple[Level, ...] = get_args(Level)
-"""Transmission levels, the exact one first."""
+"""Transmission levels that share all coordinates, the exact one first."""
+ELASTIC = "elastic"
+"""The level above, with a coordinate more for each elastic transmission."""
 Array = NDArray[np.float64]
 
 AXISYMMETRY_TOLERANCE = 1e-9
@@ -99,12 +106,17 @@ class Mechanism:
     """
 
     robot: Robot
-    level: Level
+    level: str
     tree: ClusterTree
     bodies: dict[str, MovingBody]
     spins: tuple[tuple[Spin, ...], ...]
     gravity: Array
     ratio: float | None = None
+
+    @property
+    def exact(self) -> bool:
+        """Whether all of the spin is kept."""
+        return self.level in (ELASTIC, "exact")
 
     def moving(self, cluster: Cluster) -> list[MovingBody]:
         """Return the bodies of a cluster that take part in the recursion, parents first."""
@@ -118,38 +130,82 @@ def build_mechanism(
 
     Args:
         robot: The description.
-        level: "exact", "coupled", "armature" or "none".
+        level: "elastic", "exact", "coupled", "armature" or "none".
         locked_rotors: Whether the mass and inertia at rest of an approximated rotor stay with its carrier. False
             deletes them, as in the "unconstrained" and "approximate" systems of the paper's figures.
         eliminate: Whether rotors that spin about a principal axis are eliminated at the exact level; False keeps every
             rotor as a body, the general algorithm that the elimination is tested against.
 
     Raises:
-        RobotError: If the level does not exist.
+        RobotError: If the level does not exist, or nothing of the robot is elastic at the elastic level.
     """
-    if level not in LEVELS:
-        raise RobotError(f"{robot.name}: transmission {level!r} does not exist; expected one of {', '.join(LEVELS)}")
+    if level not in (ELASTIC, *LEVELS):
+        known = ", ".join((ELASTIC, *LEVELS))
+        raise RobotError(f"{robot.name}: transmission {level!r} does not exist; expected one of {known}")
+    exact, robot = level in (ELASTIC, "exact"), without_stretches(robot)
+    if level == ELASTIC:
+        robot = with_stretches(robot)
     tree = cluster_tree(robot)
     kept = {
         body.name
         for body in robot.bodies
-        if body.kind == "link" or (level == "exact" and not (eliminate and has_principal_axis(body)))
+        if body.kind == "link" or (body.kind == "rotor" and exact and not (eliminate and has_principal_axis(body)))
     }
     carriers = {body.parent for body in robot.bodies}
     for body in robot.bodies:
-        if body.name not in kept and body.name in carriers:
+        if body.kind == "rotor" and body.name not in kept and body.name in carriers:
             raise RobotError(f"{robot.name}: rotor {body.name!r} carries another body; only links can")
-    merged = {b.name: _averaged(b) if level == "exact" else b for b in robot.bodies if b.name not in kept}
+    merged = {b.name: _averaged(b) if exact else b for b in robot.rotors() if b.name not in kept}
     inertias = {name: spatial_inertia(robot.body(name)) for name in kept}
     for rotor in merged.values():
-        if rotor.parent is not None and (locked_rotors or level == "exact"):
+        if rotor.parent is not None and (locked_rotors or exact):
             inertias[rotor.parent] = inertias[rotor.parent] + _seen_from_parent(rotor)
     bodies = {b.name: _moving_body(b, inertias[b.name]) for b in robot.bodies if b.name in kept}
     spins = tuple(
         tuple(_spin(robot.body(name), merged[name]) for name in cluster.bodies if name in merged)
         for cluster in tree.clusters
     )
-    return Mechanism(robot, level, tree, bodies, spins, np.array(robot.gravity))  # type: ignore[arg-type]
+    return Mechanism(robot, level, tree, bodies, spins, np.array(robot.gravity))
+
+
+def with_stretches(robot: Robot) -> Robot:
+    """Return a robot whose elastic transmissions stretch: joints that move nothing, behind the independent ones.
+
+    Raises:
+        RobotError: None is elastic.
+    """
+    if not robot.elastic:
+        expected = f"the stiffness of at least one transmission, for transmission {ELASTIC!r}"
+        raise bad(robot.source or robot.name, "elastic", None, expected)
+    of = {elastic.rotor: elastic.stretch for elastic in robot.elastic}
+    bodies, massless = [], Inertial(0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
+    for body in robot.bodies:
+        bodies.append(body)
+        if body.name in of:
+            joint = Joint("revolute", body.joint.axis)
+            bodies.append(Body(of[body.name], "stretch", body.parent, body.placement, joint, massless))
+    ties = []
+    for tie in robot.constraints:
+        if isinstance(tie, LinearConstraint):
+            more = tuple((of[name], -coefficient) for name, coefficient in tie.coefficients if name in of)
+            tie = replace(tie, coefficients=(*tie.coefficients, *more))
+        ties.append(tie)
+    independent = (*robot.independent, *of.values())
+    return replace(robot, bodies=tuple(bodies), constraints=tuple(ties), independent=independent)
+
+
+def without_stretches(robot: Robot) -> Robot:
+    """Return a robot as it was before `with_stretches`."""
+    stretches = {body.name for body in robot.bodies if body.kind == "stretch"}
+    if not stretches:
+        return robot
+    ties = []
+    for tie in robot.constraints:
+        if isinstance(tie, LinearConstraint):
+            tie = replace(tie, coefficients=tuple(pair for pair in tie.coefficients if pair[0] not in stretches))
+        ties.append(tie)
+    bodies = tuple(body for body in robot.bodies if body.name not in stretches)
+    return replace(robot, bodies=bodies, constraints=tuple(ties), independent=robot.commanded)
 
 
 def has_principal_axis(rotor: Body) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy
 from ce_gym.viewer.console import examples, has_display
 
@@ -55,10 +55,10 @@ def add_play_command(subparsers: Any) -> None:
     parser.add_argument(
         "--transmission",
         nargs="+",
-        choices=LEVELS,
+        choices=(*LEVELS, ELASTIC),
         metavar="LEVEL",
         default=[],
-        help=f"{', '.join(LEVELS[:-1])} or {LEVELS[-1]} (default: as trained); all but the first become ghosts",
+        help=f"{', '.join(LEVELS)} or {ELASTIC} (default: as trained); all but the first become ghosts",
     )
     parser.add_argument(
         "--robots", type=_at_least_one, default=1, metavar="N", help="robots, each with a seed of its own"

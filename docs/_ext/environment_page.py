@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields
 from typing import Any
 
-from ce_gym.envs.registration import camel_case
+from ce_gym.envs.registration import STRETCHING, camel_case
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
 from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.registry import OWN
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 GOALS = {
     "velocity": "Follow a commanded forward, sideways and turning velocity, which changes every few seconds.",
@@ -24,7 +24,10 @@ GOALS = {
     "jump": "Be as high as possible in the second half of every second.",
 }
 FIRST = {
-    "transmission": ('"exact"', '`"exact"`, `"coupled"`, `"armature"` or `"none"`: what is kept of spinning rotors.'),
+    "transmission": (
+        '"exact"',
+        '`"exact"`, `"coupled"`, `"armature"`, `"none"` or `"elastic"`: what is kept of drives.',
+    ),
     "rewards": ("{}", "Weights, or weights and parameters, that replace or add to those below; 0 removes a term."),
     "obs_mode": ('"vector"', '`"vector"`, or `"dict"` for `{"policy": ..., "critic": ...}`.'),
     "dtype": ('"float64"', '`"float64"` or `"float32"` for physics.'),
@@ -73,7 +76,8 @@ def title(robot: str) -> str:
 def _facts(program: TaskProgram, robot: str, name: str) -> list[tuple[str, str]]:
     n, m, bound = program.n_actions, program.observation_size, OBSERVATION_BOUND
     task, step = program.task, program.control_dt
-    levels = [f"`ce_gym/{name}{f'-{camel_case(level)}' if level else ''}-v0`" for level in (None, *LEVELS)]
+    known = (None, *LEVELS, *([ELASTIC] if robot in STRETCHING else []))
+    levels = [f"`ce_gym/{name}{f'-{camel_case(level)}' if level else ''}-v0`" for level in known]
     robot_link = f"[{title(robot)}](../robots/{robot}.md)"
     return [
         ("**Robot**", robot_link),

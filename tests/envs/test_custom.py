@@ -13,7 +13,7 @@ from ce_gym.envs.custom import register_robot
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model import RobotError, assets_folder
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -46,7 +46,7 @@ def registry():
 
 def test_every_task_at_every_level_has_an_id(dog):
     ids = register_robot(dog())
-    assert len(set(ids)) == len(TASKS) * (1 + len(LEVELS))
+    assert len(set(ids)) == len(TASKS) * len((None, *LEVELS, ELASTIC))
     assert set(ids) >= {"ce_gym/MyDogVelocity-v0", "ce_gym/MyDogVelocity-Armature-v0"}
     assert all(env_id in gymnasium.registry for env_id in ids)
     assert Path(gymnasium.spec(ids[0]).kwargs["robot"]).is_absolute(), "it works from any folder"

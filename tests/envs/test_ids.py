@@ -13,6 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import ce_gym
+from ce_gym.envs.registration import STRETCHING
 
 IDS = sorted(ce_gym.environment_ids())
 VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
@@ -21,7 +22,7 @@ ROBOTS = {
 }
 CHECKED = sorted(  # each has to be compiled; `python -m ce_gym.bench ids` checks them all
     {*ROBOTS.values(), *(f"ce_gym/MiniCheetah{task}-v0" for task in ("Stand", "Run", "Jump"))}
-    | {f"ce_gym/MiniCheetahVelocity-{level}-v0" for level in ("Coupled", "Armature", "None")}
+    | {f"ce_gym/MiniCheetahVelocity-{level}-v0" for level in ("Coupled", "Armature", "None", "Elastic")}
 )
 
 
@@ -49,7 +50,11 @@ def test_an_environment_from_its_spec():
 
 def test_every_level_has_an_id():
     levels = {gymnasium.spec(env_id).kwargs["transmission"] for env_id in IDS}
-    assert levels == {"exact", "coupled", "armature", "none"}
+    assert levels == {"exact", "coupled", "armature", "none", "elastic"}
+
+
+def test_robots_with_elastic_transmissions_have_that_level():
+    assert [robot for robot in ROBOTS if ce_gym.load_robot(robot).elastic] == list(STRETCHING)
 
 
 def test_ids_work_in_a_process_that_has_not_imported_the_package():

@@ -36,7 +36,7 @@ LAYERS = {
     " contact_shapes urdf mjcf yaml",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
-    "dynamics": "algebra constraints standing recursion forces self_contact functions derivatives stepping"
+    "dynamics": "algebra constraints standing recursion forces drives self_contact functions derivatives stepping"
     " evaluation model",
     "sim": "arguments tiles devices terrain placement substeps kernel_key kernels derivative_kernels schema batch"
     " pieces simulator derivatives",

@@ -95,12 +95,16 @@ def loop_coordinates(cluster: Cluster, closure: Closure, y: SX, yd: SX, guess: S
     return ClusterCoordinates({name: i for i, name in enumerate(cluster.bodies)}, q, qd, G, g, loop)
 
 
-def geared(coordinates: ClusterCoordinates, rotors: list[str], ratio: SX | float) -> ClusterCoordinates:
-    """Return coordinates whose rotors turn `ratio` times as far; nothing else follows from them."""
-    scale = SX.ones(coordinates.q.numel())
-    scale[[coordinates.index[name] for name in rotors]] = ratio
-    q, qd, g = scale * coordinates.q, scale * coordinates.qd, scale * coordinates.g
-    return replace(coordinates, q=q, qd=qd, G=ca.sparsify(ca.diag(scale) @ coordinates.G), g=g)
+def geared(coordinates: ClusterCoordinates, rotors: dict[str, str], ratio: SX | float) -> ClusterCoordinates:
+    """Return coordinates whose rotors turn `ratio` times as far but for stretches; nothing else follows from them."""
+    scale = SX.eye(coordinates.q.numel())
+    for rotor, stretch in rotors.items():
+        row = coordinates.index[rotor]
+        scale[row, row] = ratio
+        if stretch in coordinates.index:
+            scale[row, coordinates.index[stretch]] = 1 - ratio
+    q, qd, g = scale @ coordinates.q, scale @ coordinates.qd, scale @ coordinates.g
+    return replace(coordinates, q=q, qd=qd, G=ca.sparsify(scale @ coordinates.G), g=g)
 
 
 def explicit_constraint(cluster: Cluster, y: SX) -> SX:

@@ -6,12 +6,16 @@ cluster. A saturated motor gives a constant torque and has no slope, see saturat
 Controllers ask for torques at the joints, or at the motors, see motor_control.py. Torques `tau_m` and speeds `W yd` of
 motors belong to rotors, with `W` the rows of the constraint Jacobian, and what they do to the joints is `W^T tau_m`.
 Limits and friction there do not depend on the transmission level.
+
+At the elastic level motors turn rotors, and see of the joints what encoders at the rotors tell: where joints would be
+if nothing stretched. That is `E [y; x]`, linear in the stretches x, and torques go back by `E^T`, so that implicit
+control is symmetric and takes no energy from nowhere.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
@@ -52,29 +56,54 @@ def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce
     return JointForce(scene.figures.kp * (target - y) - damping * yd, ca.diag(dt * damping))
 
 
+def seen_joints(mechanism: Mechanism, kinematics: Kinematics) -> SX:
+    """Return the matrix that takes coordinates of joints and stretches to what motors see of the joints.
+
+    Shape (nj, n), the identity if nothing stretches. A motor that sees a stretch would have its joints move to have it
+    go away, least squares if there are not as many motors as joints.
+    """
+    robot = mechanism.robot
+    nj, n = len(robot.commanded), len(robot.independent)
+    seen = SX.eye(n)[:nj, :]
+    for cluster in actuated_clusters(mechanism, kinematics) if n > nj else ():
+        d = len(cluster.joints)
+        if cluster.rows[d:]:
+            seen[cluster.joints, cluster.rows[d:]] = _effort_matrix(cluster.W[:, :d]).T @ cluster.W[:, d:]
+    return ca.sparsify(seen)
+
+
 def motor_forces(
-    scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float, iterate: SX
+    scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float, iterate: SX, seen: SX
 ) -> SaturatedForce:
-    """Return what the motors deliver of the torques they are asked for."""
+    """Return what the motors deliver of what they are asked for at the joints, which they see as `seen` has it."""
     strength = scene.figures.strength
-    force = SaturatedForce(strength * asked.tau, strength * asked.slope, iterate.numel())
+    at_joints = SaturatedForce(strength * asked.tau, strength * asked.slope, iterate.numel())
+    joints = list(range(seen.shape[0]))
     model = MOTORS[scene.options.motors]
-    actuated = actuated_clusters(scene.mechanism, kinematics) if model.at_motors else []
+    if not model.at_motors:
+        return _lifted(within_joint_limits(scene, at_joints, joints, iterate, seen), seen)
+    actuated, force = actuated_clusters(scene.mechanism, kinematics), _lifted(at_joints, seen)
     for cluster in actuated:
-        rows, to_motors = cluster.rows, _effort_matrix(cluster.W)
-        shares = JointForce(to_motors @ force.tau[rows], to_motors @ force.slope[rows, rows] @ to_motors.T)
+        rows, to_motors = cluster.joints, _effort_matrix(cluster.W[:, : len(cluster.joints)])
+        shares = JointForce(to_motors @ at_joints.tau[rows], to_motors @ at_joints.slope[rows, rows] @ to_motors.T)
         deliver(model, force, shares, cluster, yd, strength, dt, iterate)
-    driven = {row for cluster in actuated for row in cluster.rows}
-    return within_joint_limits(scene, force, [row for row in range(yd.numel()) if row not in driven], iterate)
+    driven = {row for cluster in actuated for row in cluster.joints}
+    left = [row for row in joints if row not in driven]
+    return within_joint_limits(scene, force, left, iterate, SX.eye(yd.numel()))
 
 
-def within_joint_limits(scene: Scene, force: SaturatedForce, rows: list[int], iterate: SX) -> SaturatedForce:
-    """Return a force of the motors that the joints `rows` limit; it is changed in place."""
+def _lifted(force: SaturatedForce, seen: SX) -> SaturatedForce:
+    """Return a force on what motors see of the joints as one on joints and stretches."""
+    return replace(force, tau=seen.T @ force.tau, slope=ca.sparsify(seen.T @ force.slope @ seen))
+
+
+def within_joint_limits(scene: Scene, force: SaturatedForce, rows: list[int], iterate: SX, seen: SX) -> SaturatedForce:
+    """Return a force of the motors that the joints `rows` limit, which it acts on by `seen`; it is changed in place."""
     robot, strength = scene.mechanism.robot, scene.figures.strength
     for row in rows:
         limit = robot.body(robot.independent[row]).joint.torque
         if not math.isinf(limit):
-            asked, still = JointForce(force.tau[row], force.slope[row, :]), SX(1, force.tau.numel())
+            asked, still = JointForce(force.tau[row], force.slope[row, :] @ seen), SX(1, seen.shape[1])
             ends = JointForce(strength * limit, still), JointForce(-strength * limit, still)
             one = force.limited[row] = Saturation.about(iterate, row, asked, *ends)
             force.slope[row, row] = ca.if_else(one.free, force.slope[row, row], 0)
@@ -89,6 +118,7 @@ class Actuated:
 
     Attributes:
         rows: Its rows of `y`, d of them.
+        joints: Those of them that are no stretches, which come first.
         motors: Its motors.
         places: Where they are among all motors of the robot.
         angles: Of the motors' rotors [rad], shape (n_motors,).
@@ -97,6 +127,7 @@ class Actuated:
     """
 
     rows: list[int]
+    joints: list[int]
     motors: list[Motor]
     places: list[int]
     angles: SX
@@ -105,7 +136,7 @@ class Actuated:
 
 def actuated_clusters(mechanism: Mechanism, kinematics: Kinematics) -> list[Actuated]:
     """Return the clusters with motors."""
-    first = mechanism.robot.layout.joints_v
+    first, count = mechanism.robot.layout.joints_v, len(mechanism.robot.commanded)
     found = []
     for cluster, rows, coordinates in zip(
         mechanism.tree.clusters, kinematics.rows, kinematics.coordinates, strict=True
@@ -115,7 +146,9 @@ def actuated_clusters(mechanism: Mechanism, kinematics: Kinematics) -> list[Actu
         if motors and coordinates is not None:
             turning = [coordinates.index[motor.rotor] for motor in motors]
             W = ca.sparsify(coordinates.G[turning, :])
-            found.append(Actuated([row - first for row in rows], motors, places, coordinates.q[turning], W))
+            mine = [row - first for row in rows]
+            joints = [row for row in mine if row < count]
+            found.append(Actuated(mine, joints, motors, places, coordinates.q[turning], W))
     return found
 
 

@@ -13,6 +13,11 @@ from typing import Protocol
 from ce_gym.dynamics.algebra.spatial import SX
 
 
+def is_moment(dt: SX | float) -> bool:
+    """Whether a step has no length: what is asked for is the acceleration of the moment."""
+    return isinstance(dt, float) and dt == 0
+
+
 @dataclass
 class JointForce:
     """A force on coordinates, `tau - slope @ ydd` over the step.

@@ -31,6 +31,7 @@ from ce_gym.dynamics.forces.actuation import (
     deliver,
     limit_count,
     motor_forces,
+    seen_joints,
     within_joint_limits,
 )
 from ce_gym.dynamics.forces.law import JointForce
@@ -70,15 +71,17 @@ class Motors:
         """Linearise about an iterate, shape (size,)."""
         scene, y, yd, dt = self.scene, self.y, self.yd, self.dt
         if scene.options.control in ("position", "torque"):
-            return motor_forces(scene, self.kinematics, controller(scene, y, yd, self.target, dt), yd, dt, iterate)
-        names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.independent
+            seen = seen_joints(scene.mechanism, self.kinematics)
+            asked = controller(scene, seen @ y, seen @ yd, self.target, dt)
+            return motor_forces(scene, self.kinematics, asked, yd, dt, iterate, seen)
+        names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.commanded
         undriven = [row for row, name in enumerate(joints) if name in names]
         force = self._at_joints(names, undriven, iterate.numel())
         for cluster in actuated_clusters(scene.mechanism, self.kinematics):
             own = self.target[[names.index(motor.rotor) for motor in cluster.motors]]
             asked, model = self._at_motors(cluster, own), MOTORS[scene.options.motors]
             deliver(model, force, asked, cluster, yd, scene.figures.strength, dt, iterate)
-        return within_joint_limits(scene, force, undriven, iterate)
+        return within_joint_limits(scene, force, undriven, iterate, SX.eye(y.numel()))
 
     def _at_motors(self, cluster: Actuated, own: SX) -> JointForce:
         """Return what the motors of a cluster are asked for, given their targets, shape (n_motors,) both."""
@@ -96,13 +99,13 @@ class Motors:
         """Return what is asked of the joints that no motor drives, and nothing of the others."""
         scene, n, strength = self.scene, self.y.numel(), self.scene.figures.strength
         force = SaturatedForce(SX(n, 1), SX(n, n), size)
-        joints = scene.mechanism.robot.independent
+        joints = scene.mechanism.robot.commanded
         control = "position" if scene.options.control == "motor_position" else "torque"
-        full = SX.zeros(n)
+        full = SX.zeros(len(joints))
         for row in rows:
             full[row] = self.target[names.index(joints[row])]
         scene = replace(scene, options=replace(scene.options, control=control))
-        asked = controller(scene, self.y, self.yd, full, self.dt)
+        asked = controller(scene, self.y[: len(joints)], self.yd[: len(joints)], full, self.dt)
         for row in rows:
             force.tau[row], force.slope[row, row] = strength * asked.tau[row], strength * asked.slope[row, row]
         return force
@@ -110,7 +113,7 @@ class Motors:
 
 def motor_springs(scene: Scene, kinematics: Kinematics, y: SX, target: SX) -> tuple[SX, SX]:
     """Return stiffness [N m/rad] and stretch [rad] of each spring of position control at the motors, (n_targets,)."""
-    names, joints = target_names(scene.mechanism, "motor_position"), scene.mechanism.robot.independent
+    names, joints = target_names(scene.mechanism, "motor_position"), scene.mechanism.robot.commanded
     stiffness, at = SX.zeros(len(names)), SX.zeros(len(names))
     for row, name in enumerate(joints):
         if name in names:
@@ -127,14 +130,14 @@ def standing_motors(mechanism: Mechanism) -> dict[str, tuple[float, NDArray[np.f
 
     Returns:
         For each rotor with a motor its angle [rad], its speed for unit velocities of the joints of its cluster, shape
-        (d,), and the speeds of those joints for unit speed of it alone, shape (d,).
+        (d,), and the speeds of those joints for unit speed of it alone, shape (d,); nothing stretches.
     """
     q, still = SX(ca.DM(mechanism.robot.standing_q)), SX(mechanism.robot.layout.nv, 1)
     mechanism = replace(mechanism, ratio=None)
     kinematics = outward_velocity_pass(mechanism, q, still)
     found = {}
     for cluster in actuated_clusters(mechanism, kinematics):
-        W, angles = np.array(ca.evalf(cluster.W)), np.array(ca.evalf(cluster.angles))[:, 0]
+        W, angles = np.array(ca.evalf(cluster.W[:, : len(cluster.joints)])), np.array(ca.evalf(cluster.angles))[:, 0]
         for i, (motor, back) in enumerate(zip(cluster.motors, np.linalg.pinv(W).T, strict=True)):
             found[motor.rotor] = float(angles[i]), W[i], back
     return found
@@ -144,4 +147,4 @@ def _gains(scene: Scene, cluster: Actuated) -> tuple[SX, SX]:
     """Return position [N m/rad] and velocity gains [N m s/rad] of a cluster's motors, shape (n_motors,) each."""
     known = standing_motors(scene.mechanism)
     squares = SX(ca.sparsify(ca.DM(np.array([known[motor.rotor][2] for motor in cluster.motors]) ** 2)))
-    return squares @ scene.figures.kp[cluster.rows], squares @ scene.figures.kd[cluster.rows]
+    return squares @ scene.figures.kp[cluster.joints], squares @ scene.figures.kd[cluster.joints]

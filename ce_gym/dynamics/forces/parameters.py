@@ -25,6 +25,9 @@ PARAMETERS = {
     "motor_strength": "factor on motor torques and their limits [-], 1",
     "rotor_inertia": "factor on the spin inertia of symmetric rotors [-], 1",
     "ratio": "factor on the gear ratios: how far rotors turn for a motion of the joints [-], 1",
+    "drive_stiffness": "factor on the stiffness of elastic transmissions [-], 1",
+    "drive_damping": "factor on their damping [-], 1",
+    "backlash": "factor on their backlash [-], 1",
     "added_mass:BODY": "mass added at the centre of mass of a body [kg], 1",
     "com_shift:BODY": "shift of the centre of mass of a body, in its frame [m], 3",
 }
@@ -40,12 +43,18 @@ class Figures:
         kp: Position gain of each independent joint, shape (nj,); empty if the robot has none.
         kd: Velocity gain of each independent joint, shape (nj,); likewise.
         strength: Factor on motor torques.
+        drive_stiffness: Factor on the stiffness of elastic transmissions.
+        drive_damping: Factor on their damping.
+        backlash: Factor on their backlash.
     """
 
     compliance: Compliance
     kp: SX
     kd: SX
     strength: SX
+    drive_stiffness: SX
+    drive_damping: SX
+    backlash: SX
 
 
 def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str, ...]) -> dict[str, NDArray]:
@@ -61,11 +70,14 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
         "slip_speed": np.array([material.slip_speed]),
         "stiffness": np.array([material.stiffness]),
         "damping": np.array([material.damping]),
-        "kp": np.array([gains["kp"].get(name, 0.0) for name in robot.independent]),
-        "kd": np.array([gains["kd"].get(name, 0.0) for name in robot.independent]),
+        "kp": np.array([gains["kp"].get(name, 0.0) for name in robot.commanded]),
+        "kd": np.array([gains["kd"].get(name, 0.0) for name in robot.commanded]),
         "motor_strength": np.ones(1),
         "rotor_inertia": np.ones(1),
         "ratio": np.ones(1),
+        "drive_stiffness": np.ones(1),
+        "drive_damping": np.ones(1),
+        "backlash": np.ones(1),
     }
     links = [body.name for body in robot.bodies if body.kind == "link"]
     plain |= {f"added_mass:{link}": np.zeros(1) for link in links}
@@ -93,7 +105,7 @@ def check_parameter(robot: Robot, name: str, values: ArrayLike) -> None:
     good, expected = numbers >= 0, "0 or more"
     if kind in ("gravity", "com_shift"):
         good, expected = np.isfinite(numbers), "finite numbers"
-    elif kind in ("ratio", "slip_speed"):
+    elif kind in ("ratio", "slip_speed", "drive_stiffness"):
         good, expected = numbers > 0, "more than 0"
     elif kind == "added_mass":
         mass = robot.body(name.split(":")[1]).inertial.mass
@@ -119,7 +131,8 @@ def figures(robot: Robot, material: ContactMaterial, names: tuple[str, ...], val
         bristle=SX(material.bristle),
     )
     kp, kd = chosen("kp", defaults["kp"]), chosen("kd", defaults["kd"])
-    return Figures(compliance, kp, kd, chosen("motor_strength", 1.0))
+    factors = [chosen(name, 1.0) for name in ("motor_strength", "drive_stiffness", "drive_damping", "backlash")]
+    return Figures(compliance, kp, kd, *factors)
 
 
 def with_parameters(mechanism: Mechanism, names: tuple[str, ...], values: SX) -> Mechanism:

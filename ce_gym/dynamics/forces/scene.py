@@ -107,17 +107,17 @@ class State:
 def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:
     """Return what each entry of a step's target is for, by the name of the body that it moves.
 
-    The independent joints; or, for control at the motors, the motors' rotors and then the joints that no motor drives,
-    which are controlled as joints.
+    The independent joints, without stretches of transmissions; or, for control at the motors, the motors' rotors and
+    then the joints that no motor drives, which are controlled as joints.
     """
     robot = mechanism.robot
     if control in ("position", "torque"):
-        return robot.independent
+        return robot.commanded
     rotors = tuple(motor.rotor for motor in robot.motors)
     driven = {
         name for cluster in mechanism.tree.clusters if set(rotors) & set(cluster.bodies) for name in cluster.bodies
     }
-    return rotors + tuple(name for name in robot.independent if name not in driven)
+    return rotors + tuple(name for name in robot.commanded if name not in driven)
 
 
 def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:

@@ -77,7 +77,7 @@ def inward_force_pass(
             continue
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         spanning = SX(coordinates.qd.numel(), 1)
-        if mechanism.level == "exact":
+        if mechanism.exact:
             for spin in mechanism.spins[k]:
                 row, J = coordinates.index[spin.rotor], spin.inertia
                 spanning[row] = J * qdd[k][row]

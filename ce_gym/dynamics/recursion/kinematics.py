@@ -31,6 +31,7 @@ from ce_gym.dynamics.constraints.cluster_constraints import (
     loop_coordinates,
 )
 from ce_gym.model.clusters import Cluster
+from ce_gym.model.description import stretch_of
 from ce_gym.model.mechanism import Mechanism, MovingBody
 
 
@@ -127,7 +128,7 @@ def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None =
             first, used = used, used + len(closure.guessed)
             coordinates = loop_coordinates(cluster, closure, y, yd, guess[first:used])
         if mechanism.ratio is not None and cluster.independent:
-            rotors = [name for name in cluster.bodies if mechanism.robot.body(name).kind == "rotor"]
+            rotors = {name: stretch_of(name) for name in cluster.bodies if mechanism.robot.body(name).kind == "rotor"}
             coordinates = geared(coordinates, rotors, mechanism.ratio)
         kinematics.coordinates.append(coordinates)
         for body in mechanism.moving(cluster):

@@ -11,6 +11,8 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.drives.mesh import mesh_energy
+from ce_gym.dynamics.forces.actuation import seen_joints
 from ce_gym.dynamics.forces.motor_control import motor_springs
 from ce_gym.dynamics.forces.passive import limit_stiffness, yielding_joints
 from ce_gym.dynamics.forces.scene import Scene, State
@@ -22,8 +24,8 @@ from ce_gym.dynamics.stepping.step import meeting_pairs, touching
 def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
     """Return kinetic, potential and elastic energy [J].
 
-    Elastic are the springs and bristles of contacts, stops and springs of joints, and position control, the last as if
-    motors had no limits.
+    Elastic are the springs and bristles of contacts, stops and springs of joints, transmissions, and position control,
+    the last as if motors had no limits.
 
     Args:
         scene: The robot and what surrounds it.
@@ -32,7 +34,7 @@ def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
     """
     kinetic, potential = kinetic_and_potential(scene.mechanism, state.q, state.v, state.dependent)
     total = kinetic + potential + contact_energy(scene, state) + joint_energy(scene, state, target)
-    return total + spring_energy(scene, state)
+    return total + spring_energy(scene, state) + mesh_energy(scene, state.q[scene.mechanism.robot.layout.joints_q :])
 
 
 def contact_energy(scene: Scene, state: State) -> SX:
@@ -73,7 +75,9 @@ def joint_energy(scene: Scene, state: State, target: SX) -> SX:
         )
         total += limit_stiffness(robot, name)[0] * beyond**2 / 2
     if scene.options.control == "position":
-        total += ca.sum1(scene.figures.strength * scene.figures.kp * (target - y) ** 2) / 2
+        kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
+        at = seen_joints(scene.mechanism, kinematics) @ y
+        total += ca.sum1(scene.figures.strength * scene.figures.kp * (target - at) ** 2) / 2
     if scene.options.control == "motor_position":
         kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
         stiffness, stretch = motor_springs(scene, kinematics, y, target)

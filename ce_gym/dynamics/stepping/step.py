@@ -19,11 +19,12 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretching
 from ce_gym.dynamics.forces.actuation import limit_count
 from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground
 from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
 from ce_gym.dynamics.forces.friction import FRICTION
-from ce_gym.dynamics.forces.law import JointForce, Motion
+from ce_gym.dynamics.forces.law import JointForce, Motion, is_moment
 from ce_gym.dynamics.forces.motor_control import Motors
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.passive import ball_forces, passive_forces, yielding_forces
@@ -57,6 +58,7 @@ class Solved:
         pairs: Forces between links.
         motors: What the motors deliver to the joints.
         friction: Dry friction of the joints, one or none.
+        meshes: Of the transmissions that stretch, one or none.
     """
 
     kinematics: Kinematics
@@ -66,6 +68,7 @@ class Solved:
     pairs: list[LinearPair]
     motors: SaturatedForce
     friction: list[SaturatedForce]
+    meshes: list[MeshForce]
 
 
 def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Solved:
@@ -76,7 +79,8 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
         state: At the start of the step.
         target: Targets or torques of what `target_names` says, shape (n_targets,).
         dt: Length of the step [s].
-        iterate: From the iteration before: of contacts, pairs, motors, joints' dry friction, shape (iterate_size,).
+        iterate: From the iteration before: of contacts, pairs, motors, joints' dry friction, meshes of transmissions,
+            shape (iterate_size,).
     """
     mechanism, acting = scene.mechanism, acting_forces(scene, state, target, dt, iterate)
     kinematics, contacts, gravity = acting.kinematics, acting.contacts, acting.gravity
@@ -103,6 +107,7 @@ class Acting:
         pairs: Forces between links.
         motors: What the motors deliver to the joints.
         friction: Dry friction of the joints, one or none.
+        meshes: Of the transmissions that stretch, one or none.
         joints: Those and what the joints do by themselves.
         couples: What steadies the bodies of ball joints, body axes [N m], shape (3,) each, by name.
         gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
@@ -113,6 +118,7 @@ class Acting:
     pairs: list[LinearPair]
     motors: SaturatedForce
     friction: list[SaturatedForce]
+    meshes: list[MeshForce]
     joints: JointTerms
     couples: dict[str, SX]
     gravity: dict[str, SX]
@@ -120,7 +126,8 @@ class Acting:
     def solved(self, vdot: SX, a: dict[str, SX]) -> Solved:
         """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each."""
         motion = Motion(vdot[vdot.numel() - self.motors.tau.numel() :], a, self.gravity)
-        return Solved(self.kinematics, vdot, motion, self.contacts, self.pairs, self.motors, self.friction)
+        laws = self.contacts, self.pairs, self.motors, self.friction, self.meshes
+        return Solved(self.kinematics, vdot, motion, *laws)
 
 
 def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Acting:
@@ -131,25 +138,22 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
 
     laws, driven = touching(scene, kinematics, state, dt), Motors(scene, kinematics, y, yd, target, dt)
     meeting = meeting_pairs(scene, kinematics, state, dt)
-    *of_contacts, of_motors, of_friction = split(iterate, [law.size for law in (*laws, *meeting, driven)])
+    rubbing = JointFriction(mechanism, kinematics, yd, dt)
+    sizes = [law.size for law in (*laws, *meeting, driven, rubbing)]
+    *of_contacts, of_motors, of_friction, of_meshes = split(iterate, sizes)
     contacts = [law.linearise(part) for law, part in zip(laws, of_contacts, strict=False)]
     pairs = [law.linearise(part) for law, part in zip(meeting, of_contacts[len(laws) :], strict=True)]
     motors = driven.linearise(of_motors)
-    rubbing = JointFriction(mechanism, kinematics, yd, dt)
     friction = [rubbing.linearise(of_friction)] if rubbing.size else []
+    meshes = [Meshes(scene, y, yd, dt).linearise(of_meshes)] if stretching(mechanism) else []
 
     of_balls = ball_forces(mechanism.robot, state.q, state.v, dt)
-    more = [*friction, *yielding_forces(mechanism, kinematics, dt)]
+    more = [*friction, *meshes, *yielding_forces(mechanism, kinematics, dt)]
     of_joints = sum(more, motors + passive_forces(mechanism.robot, y, yd, dt))
     joints = on_coordinates(mechanism, of_balls, of_joints)
     couples = {} if is_moment(dt) else steadying_couples(mechanism, kinematics, dt)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    return Acting(kinematics, contacts, pairs, motors, friction, joints, couples, gravity)
-
-
-def is_moment(dt: SX | float) -> bool:
-    """Whether a step has no length: what is asked for is the acceleration of the moment."""
-    return isinstance(dt, float) and dt == 0
+    return Acting(kinematics, contacts, pairs, motors, friction, meshes, joints, couples, gravity)
 
 
 @dataclass
@@ -162,7 +166,7 @@ class Stepped:
         solved: How it came about.
         torque: Motor torque at each joint, mean over the step [N m or N], shape (nj,).
         contact_forces: Mean force on each contact over the step, world axes [N], shape (3, n_contacts).
-        unconverged: 1 if the active set of a contact, a motor or a joint's friction is not as was assumed, else 0.
+        unconverged: 1 if the active set of a contact, motor, joint's friction or mesh is not as was assumed, else 0.
         iterate: For the next iteration; once converged, a fixed point.
         error: Estimate of the error of the step in `v` [rad/s or m/s]; 0 for a method that has none.
     """
@@ -202,22 +206,24 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
     )
     touches = [*solved.contacts, *solved.pairs]
     unconverged = ca.sum1(stacked([c.check(motion) for c in touches])) > 0
-    for force in saturated:
+    for force in (*saturated, *solved.meshes):
         unconverged = ca.logic_or(force.check(motion), unconverged)
     of_contacts = stacked([c.next_iterate(motion) for c in touches])
     # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of motors are fixed
     # points by themselves.
     of_contacts = ca.if_else(unconverged, of_contacts, iterate[: of_contacts.numel()])
     of_friction = stacked([force.next_iterate(motion) for force in solved.friction])
-    of_friction = ca.if_else(unconverged, of_friction, iterate[iterate.numel() - of_friction.numel() :])
+    of_meshes = stacked([force.next_iterate(motion) for force in solved.meshes])
+    end = iterate.numel() - of_meshes.numel()
+    of_friction = ca.if_else(unconverged, of_friction, iterate[end - of_friction.numel() : end])
     return Stepped(
         state=after,
         before=state,
         solved=solved,
-        torque=motors.tau - motors.slope @ motion.ydd,
+        torque=(motors.tau - motors.slope @ motion.ydd)[: len(scene.mechanism.robot.commanded)],
         contact_forces=ca.horzcat(SX(3, 0), *[R @ c.force_after(gain) for R, c, gain in contacts]),
         unconverged=unconverged,
-        iterate=ca.vertcat(of_contacts, motors.next_iterate(motion), of_friction),
+        iterate=ca.vertcat(of_contacts, motors.next_iterate(motion), of_friction, of_meshes),
         error=SX(0),
     )
 
@@ -227,7 +233,8 @@ def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
     contacts = FRICTION[options.friction].iterations if options.contacts else 0
     pairs = Frictionless.iterations if options.self_collisions else 0
     limited = ITERATIONS if limit_count(mechanism, options) else 0
-    return max(contacts, pairs, limited, STICK_ITERATIONS if friction_count(mechanism) else 0)
+    meshes = MESH_ITERATIONS if mesh_count(mechanism) else 0
+    return max(contacts, pairs, limited, meshes, STICK_ITERATIONS if friction_count(mechanism) else 0)
 
 
 def first_iterate(scene: Scene) -> SX:
@@ -238,7 +245,8 @@ def first_iterate(scene: Scene) -> SX:
 def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many numbers an iteration leaves for the next."""
     touches = len(options.contacts) + len(colliding(mechanism.robot, options.self_collisions))
-    return Contact.size * touches + limit_count(mechanism, options) + friction_count(mechanism)
+    of_joints = limit_count(mechanism, options) + friction_count(mechanism) + mesh_count(mechanism)
+    return Contact.size * touches + of_joints
 
 
 def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:

@@ -10,7 +10,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
-from ce_gym.dynamics.forces.actuation import actuated_clusters
+from ce_gym.dynamics.forces.actuation import actuated_clusters, seen_joints
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import State, StepOptions, make_scene, symbolic_state, target_names
 from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
@@ -183,7 +183,7 @@ class Given:
         if name == "motor_speed":
             return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
         if name == "power":
-            return stepped.torque * yd
+            return stepped.torque * (seen_joints(self.mechanism, kinematics) @ yd)
         if name == "energy":
             return mechanical_energy(self.scene, stepped.state, self.target)
         if name == "loop_gap":

@@ -19,7 +19,7 @@ from ce_gym.envs.task.checks import checked_value, merged_rewards
 from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.sim.arguments import check, check_choice, check_whole
 from ce_gym.sim.devices import Device, device_named
 
@@ -78,7 +78,7 @@ def make_program(
     Args:
         robot: Name of a robot that ships with the package, or a path to a robot file.
         task: Name of a task.
-        transmission: "exact", "coupled", "armature" or "none".
+        transmission: "exact", "coupled", "armature", "none" or "elastic".
         contact_forces: Whether contact forces are computed, for recording.
         rewards: What replaces or adds to the rewards of the task, by the name of the term: a weight, 0 to remove it, or
             a mapping of `weight` and parameters, such as `{"weight": 1.5, "width": 0.25}`.
@@ -95,7 +95,8 @@ def make_program(
         raise ValueError(f"robot={given}; expected the name of a robot or a path to a file")
     check("contact_forces", contact_forces, isinstance(contact_forces, bool), "true or false")
     check("task", task, task in tuple(TASKS), f"one of {', '.join(TASKS)}")
-    check("transmission", transmission, transmission in LEVELS, f"one of {', '.join(LEVELS)}")
+    levels = (*LEVELS, ELASTIC)
+    check("transmission", transmission, transmission in levels, f"one of {', '.join(levels)}")
     model = Model(robot, transmission)
     figures = own_task(model.robot, task)
     for name, given in (("reward_weights", reward_weights), ("rewards", rewards)):

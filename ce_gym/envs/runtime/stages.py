@@ -235,7 +235,9 @@ class Stages:
         standing = self.model.standing_q
         half_yaw = sampler.uniform(-np.pi / 2, np.pi / 2)
         layout = self.model.robot.layout
-        noise = sampler.symmetric(layout.nv - layout.base_nv, self.task.reset_noise["joint_position"])
+        still = SX(layout.joints - len(self.model.joint_links), 1)  # transmissions begin as they are at rest
+        n = layout.nv - layout.base_nv - still.numel()
+        noise = ca.vertcat(sampler.symmetric(n, self.task.reset_noise["joint_position"]), still)
         heading = ca.vertcat(ca.cos(half_yaw), 0, 0, ca.sin(half_yaw))
         balls = [
             turned_by(SX(ca.DM(standing[row : row + 4])), noise[3 * i : 3 * i + 3])
@@ -248,7 +250,9 @@ class Stages:
         """Velocities near rest."""
         noise = self.task.reset_noise
         base = sampler.symmetric(6, noise["base_velocity"])
-        return ca.vertcat(base, sampler.symmetric(self.model.nv - 6, noise["joint_velocity"]))
+        stretches = self.model.robot.layout.joints - len(self.model.joint_links)
+        joints = sampler.symmetric(self.model.nv - 6 - stretches, noise["joint_velocity"])
+        return ca.densify(ca.vertcat(base, joints, SX(stretches, 1)))
 
     def _every(self, period: float, clock: SX) -> SX:
         """1 once in a period [s], else 0."""

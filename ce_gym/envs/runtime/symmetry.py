@@ -129,7 +129,7 @@ def paired_joints(model: Model) -> SignedPermutation | None:
         return None
     positions, rotations = model.body_poses(model.standing_q)
     row = {name: i for i, name in enumerate(model.body_names)}
-    names = robot.independent
+    names = robot.commanded
     axes = np.array([rotations[row[name]] @ bodies[name].axis for name in names])
     origins = np.array([positions[row[name]] for name in names])
     types = np.array([bodies[name].joint.type for name in names])
@@ -142,7 +142,8 @@ def paired_joints(model: Model) -> SignedPermutation | None:
         return None
     partner = np.array(partners)
     sign = np.sign(along[np.arange(len(names)), partner])
-    standing = model.standing_q[len(model.standing_q) - len(names) :]
+    first = robot.layout.joints_q
+    standing = model.standing_q[first : first + len(names)]
     if (partner[partner] != np.arange(len(names))).any() or np.abs(standing[partner] * sign - standing).max() > 1e-6:
         return None
     return SignedPermutation(partner, sign.astype(np.float32))
@@ -151,7 +152,7 @@ def paired_joints(model: Model) -> SignedPermutation | None:
 def _partners(model: Model, fits: NDArray[np.bool_]) -> list[int] | None:
     """Choose a partner for each joint among those that fit: one that is carried by the partner of what carries it."""
     robot, partner = model.robot, {-1: -1}  # -1 is the base
-    number = {name: i for i, name in enumerate(robot.independent)}
+    number = {name: i for i, name in enumerate(robot.commanded)}
 
     def carrier(name: str) -> int:
         parent = robot.body(name).parent
@@ -160,7 +161,7 @@ def _partners(model: Model, fits: NDArray[np.bool_]) -> list[int] | None:
     for body in robot.bodies:  # parents before children
         if (i := number.get(body.name)) is not None:
             wanted = partner[carrier(body.name)]
-            found = [j for j, other in enumerate(robot.independent) if fits[i, j] and carrier(other) == wanted]
+            found = [j for j, other in enumerate(robot.commanded) if fits[i, j] and carrier(other) == wanted]
             if not found:
                 return None
             partner[i] = found[0]
@@ -170,30 +171,35 @@ def _partners(model: Model, fits: NDArray[np.bool_]) -> list[int] | None:
 def dynamics_error(model: Model, joints: SignedPermutation, rng: np.random.Generator) -> float:
     """Return how much reflected accelerations differ from those of reflected states: RMS, the base's or the joints'."""
     q, v = _moved_states(model, rng, 8)
-    tau = np.concatenate([np.zeros((8, 6)), 10 * rng.standard_normal((8, len(joints.index)))], axis=1)
+    n, tau = len(joints.index), np.zeros((8, model.nv))
+    tau[:, 6 : 6 + n] = 10 * rng.standard_normal((8, n))
     expected = _mirror_v(model.forward_dynamics(q, v, tau), joints)
     found = model.forward_dynamics(_mirror_q(q, joints), _mirror_v(v, joints), _mirror_v(tau, joints))
-    parts = (slice(0, 3), slice(3, 6), slice(6, None))
+    parts = (slice(0, 3), slice(3, 6), slice(6, 6 + n))
     return float(max(np.linalg.norm((found - expected)[:, p]) / np.linalg.norm(expected[:, p]) for p in parts))
 
 
 def _moved_states(model: Model, rng: np.random.Generator, n: int) -> tuple[NDArray, NDArray]:
-    """Random states near the standing pose, so that feet are on the ground and off it."""
-    q = np.tile(model.standing_q, (n, 1))
+    """Random states near the standing pose, so that feet are on the ground and off it; nothing stretches."""
+    q, joints = np.tile(model.standing_q, (n, 1)), len(model.joint_links)
     q[:, :3] += rng.uniform(-0.05, 0.05, (n, 3))
     q[:, 3:7] += rng.uniform(-0.1, 0.1, (n, 4))
     q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
-    q[:, 7:] += rng.uniform(-0.2, 0.2, q[:, 7:].shape)
-    return q, rng.uniform(-1, 1, (n, model.nv))
+    q[:, 7 : 7 + joints] += rng.uniform(-0.2, 0.2, (n, joints))
+    v = np.zeros((n, model.nv))
+    v[:, : 6 + joints] = rng.uniform(-1, 1, (n, 6 + joints))
+    return q, v
 
 
 def _mirror_q(q: NDArray, joints: SignedPermutation) -> NDArray:
     quaternion = np.concatenate([[1.0], -REFLECTION])  # its vector is an axis of rotation
-    return np.concatenate([q[:, :3] * REFLECTION, q[:, 3:7] * quaternion, joints(q[:, 7:])], axis=1)
+    end = 7 + len(joints.index)
+    return np.concatenate([q[:, :3] * REFLECTION, q[:, 3:7] * quaternion, joints(q[:, 7:end]), q[:, end:]], axis=1)
 
 
 def _mirror_v(v: NDArray, joints: SignedPermutation) -> NDArray:
-    return np.concatenate([v[:, :6] * TWIST, joints(v[:, 6:])], axis=1)
+    end = 6 + len(joints.index)
+    return np.concatenate([v[:, :6] * TWIST, joints(v[:, 6:end]), v[:, end:]], axis=1)
 
 
 def _states(program: TaskProgram, rng: np.random.Generator) -> dict[str, NDArray]:

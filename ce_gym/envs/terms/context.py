@@ -76,9 +76,9 @@ class TermContext:
         self.erring: set[str] = set()
         self.again = False
         robot = mechanism.robot
-        self._n_joints = len(robot.independent)
+        self._n_joints = len(robot.commanded)
         pose = dict(robot.pose.joints)
-        self.standing_joints = np.array([pose.get(name, 0.0) for name in robot.independent])
+        self.standing_joints = np.array([pose.get(name, 0.0) for name in robot.commanded])
 
     def recall(self, name: str, size: int = 1, reset: ArrayLike = 0.0) -> SX:
         """Return what this term kept in the control step before, shape (size,): memory of its own, one of each robot.
@@ -190,12 +190,14 @@ class TermContext:
     @property
     def joint_positions(self) -> SX:
         """Independent joint positions [rad], shape (n_joints,)."""
-        return self.q[self.q.shape[0] - self._n_joints :]
+        first = self.mechanism.robot.layout.joints_q
+        return self.q[first : first + self._n_joints]
 
     @property
     def joint_velocities(self) -> SX:
         """Independent joint velocities [rad/s], shape (n_joints,)."""
-        return self.v[self.v.shape[0] - self._n_joints :]
+        first = self.mechanism.robot.layout.joints_v
+        return self.v[first : first + self._n_joints]
 
     @property
     def ball_rotations(self) -> SX:

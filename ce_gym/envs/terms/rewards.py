@@ -94,7 +94,7 @@ def knee_contact(s: TermContext) -> SX:
 def joint_limits(s: TermContext, margin: float = 0.05) -> SX:
     """How far joints are nearer to an end of their range than `margin` of its length [rad]."""
     total = SX(0)
-    for i, name in enumerate(s.mechanism.robot.independent):
+    for i, name in enumerate(s.mechanism.robot.commanded):
         low, high = s.mechanism.robot.body(name).joint.position
         if np.isfinite(high - low):
             near = margin * (high - low)

@@ -57,6 +57,7 @@ def check_robot(robot: Robot) -> None:
     _check_something_moves(robot, file)
     _check_contacts(robot, file)
     _check_motors(robot, file)
+    _check_elastic(robot, file)
     _check_pose_and_gains(robot, file)
     _check_inertia(robot, file)
 
@@ -210,6 +211,31 @@ def _check_motors(robot: Robot, file: str) -> None:
                 raise bad(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
         if motor.velocity == 0.0:
             raise bad(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
+
+
+def _check_elastic(robot: Robot, file: str) -> None:
+    """An elastic transmission is one linear tie, in which the rotor follows from joints and nothing from the rotor."""
+    rotors = [body.name for body in robot.rotors()]
+    _check_unique(file, "elastic", [elastic.rotor for elastic in robot.elastic])
+    for elastic in robot.elastic:
+        key = f"elastic.{elastic.rotor}"
+        if elastic.rotor not in rotors:
+            raise unknown(file, "elastic", elastic.rotor, rotors, "the name of a rotor")
+        ties = [tie for tie in robot.constraints if elastic.rotor in tie.bodies]
+        if len(ties) != 1 or not ties[0].linear or elastic.rotor in robot.independent:
+            raise bad(
+                file, key, elastic.rotor, "a rotor that follows from joints by one linear tie, and nothing from it"
+            )
+        if elastic.stretch in (body.name for body in robot.bodies):
+            raise bad(file, "body name", elastic.stretch, f"another one: {elastic.rotor!r} is elastic")
+        if not 0.0 < elastic.stiffness < math.inf:
+            raise bad(file, f"{key}.stiffness", elastic.stiffness, "more than 0 [N m/rad]")
+        check_not_negative(file, f"{key}.damping", elastic.damping, " [N m s/rad]")
+        check_not_negative(file, f"{key}.backlash", elastic.backlash, " [rad]")
+        if not elastic.preload > 0.0:
+            raise bad(file, f"{key}.preload", elastic.preload, "more than 0 [N m]")
+        if elastic.backlash and math.isfinite(elastic.preload):
+            raise bad(file, f"{key}.preload", elastic.preload, "none where there is backlash")
 
 
 def _check_pose_and_gains(robot: Robot, file: str) -> None:

@@ -188,15 +188,19 @@ class Section:
         A name that is written out goes before a pattern, and a pattern before those above it. Keys that are neither a
         pattern nor one of `names` are kept, for the checks to see.
         """
-        found: dict[str, float] = {}
-        for key, value in self.numbers():
+        return {name: self.number(key) for name, key in self.keys_of(names).items()}
+
+    def keys_of(self, names: Collection[str]) -> dict[str, str]:
+        """Return under which key a mapping has something for each name, see `figures`."""
+        found: dict[str, str] = {}
+        for key in self:
             if not set(key) & set("*?["):
                 continue
             fitting = [name for name in names if fnmatchcase(name, key)]
             if not fitting:
                 raise unknown(self.file, self.path, key, names, "a pattern that fits a name")
-            found |= dict.fromkeys(fitting, value)
-        return found | {key: value for key, value in self.numbers() if not set(key) & set("*?[")}
+            found |= dict.fromkeys(fitting, key)
+        return found | {key: key for key in self if not set(key) & set("*?[")}
 
     def list(self, key: str) -> list[Any]:
         """Return a list, empty if the key is missing."""

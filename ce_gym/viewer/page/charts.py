@@ -62,7 +62,7 @@ def charts(run: PosedRollout) -> Charts:
         ViewerError: Torques do not fit the robot's joints.
     """
     rollout, rows, robot = run.rollout, run.frames, run.robot
-    joints, torques, v = robot.independent, rollout.torques[rows], rollout.v[rows]
+    joints, torques, v = robot.commanded, rollout.torques[rows], rollout.v[rows]
     if torques.shape[1] not in (0, len(joints)):
         raise ViewerError(
             f"rollout of {rollout.robot!r} has torques of {torques.shape[1]} joints; the robot has {len(joints)}"

@@ -21,13 +21,13 @@ from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.yaml.constraints import read_constraints
 from ce_gym.model.formats.yaml.contacts import read_capsules, read_contacts, read_pairs
 from ce_gym.model.formats.yaml.links import read_links
-from ce_gym.model.formats.yaml.rotors import add_rotors, read_motors
+from ce_gym.model.formats.yaml.rotors import add_rotors, read_elastic, read_motors
 
 _JOINT_FIGURES = {"joint_friction": "friction", "joint_stiffness": "stiffness", "joint_springref": "springref"}
 _KEYS = (
     *("name", "urdf", "mjcf", "base", "sources", "notes", "kept_inertia", "gravity", "gears"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
-    *("capsules", "self_collisions"),
+    *("capsules", "self_collisions", "elastic"),
     *_JOINT_FIGURES,
 )
 
@@ -50,6 +50,7 @@ def robot_from_yaml(path: Path) -> Robot:
         constraints=(*below.constraints, *ties),
         independent=independent,
         motors=motors,
+        elastic=read_elastic(file.section("elastic"), bodies) if "elastic" in file else below.elastic,
         assembly=file.section("assembly").numbers()
         if "assembly" in file
         else _among(below.assembly, independent, False),

@@ -1,4 +1,4 @@
-"""The `rotors` and `motors` of the project's robot files.
+"""The `rotors`, `motors` and `elastic` transmissions of the project's robot files.
 
 A rotor is given in full (parent, xyz, axis, mass, inertia), or is a link on a fixed joint of the URDF or MJCF file, of
 which only the axis is missing, or has one figure, the moment of inertia about its axis, perhaps from the motor library;
@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from ce_gym.model.constraints import LinearConstraint
-from ce_gym.model.description import Body, Inertial, Joint, Motor
+from ce_gym.model.description import Body, Elasticity, Inertial, Joint, Motor
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.motors import MotorType, motor_type
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, symmetric, vec3
@@ -23,6 +23,7 @@ from ce_gym.model.formats.yaml.links import Links, names_in
 from ce_gym.model.frames import Placement, Vec3
 
 _KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
+_ELASTIC_KEYS = ("stiffness", "damping", "backlash", "preload")
 _MOTOR_KEYS = ("torque", "velocity", "stall", "damping", "friction")
 
 
@@ -39,6 +40,19 @@ def read_motors(section: Section) -> tuple[dict[str, MotorType], tuple[Motor, ..
         given = {key: motor.number(key) for key in motor if key != "use"}
         motors.append(Motor(rotor, **{**figures, **given}))
     return used, tuple(motors)
+
+
+def read_elastic(section: Section, bodies: Iterable[Body]) -> tuple[Elasticity, ...]:
+    """Return how transmissions give way, by rotor, in the order of bodies."""
+    rotors = [body.name for body in bodies if body.kind == "rotor"]
+    keys = section.keys_of(rotors)
+    found = []
+    for rotor in (*(name for name in rotors if name in keys), *(name for name in keys if name not in rotors)):
+        part = section.section(keys[rotor]).allow(*_ELASTIC_KEYS)
+        found.append(
+            Elasticity(rotor, part.number("stiffness"), **{k: part.number(k) for k in part if k != "stiffness"})
+        )
+    return tuple(found)
 
 
 def add_rotors(

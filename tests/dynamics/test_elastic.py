@@ -1,0 +1,249 @@
+"""Transmissions that stretch: against free rotors, closed forms, the rigid limit, and the laws of energy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from elastic_robots import KINDS, LINK, RATIO, ROTOR, differential, elastic, turntable, untied
+
+from ce_gym.dynamics import Model
+from ce_gym.dynamics.drives.mesh import mesh_energy
+from ce_gym.dynamics.forces.scene import StepOptions, make_scene
+from ce_gym.dynamics.stepping.trace import step_function
+from ce_gym.model import Robot
+from ce_gym.model.mechanism import LEVELS
+
+State = tuple[np.ndarray, np.ndarray]
+SX = ca.SX
+
+
+def stepper(model: Model, dt: float, outputs: tuple[str, ...] = (), **options) -> Callable[..., dict[str, np.ndarray]]:
+    """Return a step from positions, velocities and targets to the named results."""
+    function = step_function(model.mechanism, StepOptions(dt, **{"control": "torque", **options}), outputs)
+
+    def step(q, v, target, **parameters) -> dict[str, np.ndarray]:
+        results = function(q=q, v=v, diverged=0.0, target=target, **parameters)
+        assert not float(results["diverged_next"])
+        return {name: value.full().ravel() for name, value in results.items()}
+
+    return step
+
+
+def after(model: Model, dt: float, time: float, target, start: State | None = None, **options) -> State:
+    """Return positions and velocities of a robot that starts at rest."""
+    step, (q, v) = stepper(model, dt, **options), start or (model.standing_q, np.zeros(model.nv))
+    for _ in range(round(time / dt)):
+        result = step(q, v, target)
+        q, v = result["q_next"], result["v_next"]
+    return q, v
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rotors_move_as_free_bodies_that_a_spring_drives(kind: str):
+    """The elastic level has the bodies of a robot whose rotors are tied to nothing, in other coordinates."""
+    robot, rng = KINDS[kind](), np.random.default_rng(0)
+    model, free, rotors = Model(elastic(robot, 1.0), "elastic"), Model(untied(robot)), [r.name for r in robot.rotors()]
+    n = len(robot.independent)
+    q = np.concatenate([Model(robot).standing_q, np.zeros(len(rotors))]) + 0.1 * rng.normal(size=model.nq)
+    v, tau = rng.normal(size=(2, model.nv))
+    W = model.actuator_matrix(q, rotors)
+    np.testing.assert_array_equal(W[:, n:], np.eye(len(rotors)))
+    rows = [model.spanning_names.index(name) for name in rotors]
+    theta, thetad = (x[rows] for x in model.spanning(q, v))
+    on_free = np.concatenate([tau[:n] - W[:, :n].T @ tau[n:], tau[n:]])
+    expected = free.forward_dynamics(np.concatenate([q[:n], theta]), np.concatenate([v[:n], thetad]), on_free)
+    found = model.forward_dynamics(q, v, tau)
+    rotor = model.evaluate(model.casadi_function("spanning_acceleration"), q, v, found)[0][rows, 0]
+    np.testing.assert_allclose(np.concatenate([found[:n], rotor]), expected, rtol=1e-11, atol=1e-11)
+    assert model.total_mass == pytest.approx(robot.total_mass)
+
+
+def two_masses(k: float, d: float, torque: float, time: float) -> np.ndarray:
+    """Angles of table and stretch of the turntable at a time, from its linear equations, in closed form."""
+    M = np.array([[LINK + RATIO**2 * ROTOR, RATIO * ROTOR], [RATIO * ROTOR, ROTOR]])
+    A, b = np.zeros((5, 5)), np.linalg.solve(M, [torque, torque / RATIO])
+    A[:2, 2:4] = np.eye(2)
+    A[2:4, :2], A[2:4, 2:4] = (np.linalg.solve(M, np.diag([0.0, -x])) for x in (k, d))
+    A[2:4, 4] = b
+    small, term, total = A * time / 1024, np.eye(5), np.eye(5)
+    for i in range(1, 12):
+        term = term @ small / i
+        total = total + term
+    return (np.linalg.matrix_power(total, 1024) @ [0.1, 0.02, 0.0, 0.0, 1.0])[:2]
+
+
+@pytest.mark.parametrize(("method", "order", "dt"), [("euler", 1, 1e-5), ("extrapolated", 2, 1e-4), ("rk4", 4, 1e-4)])
+def test_order_of_the_step_at_a_fixed_stiffness(method: str, order: int, dt: float):
+    k, d, time = 2.0, 1e-3, 0.01
+    model, exact = Model(turntable(k, damping=d), "elastic"), two_masses(k, d, 0.3, time)
+    errors = []
+    for step in (dt, dt / 2):
+        q, _ = after(model, step, time, [0.3], (np.array([0.1, 0.02]), np.zeros(2)), method=method)
+        errors.append(np.abs(q - exact).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.15)
+
+
+@pytest.mark.parametrize("control", ["torque", "position"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_as_stiffness_grows_robots_move_as_exact_ones(kind: str, control: str):
+    """The error falls as 1 / k, nine decades of it, at a step that none of the springs could be resolved in."""
+    robot, dt, time = KINDS[kind](), 0.002, 0.03
+    if control == "position" and not robot.gains.kp:
+        pytest.skip("no gains")
+    exact, n = Model(robot), len(robot.independent)
+    target = exact.standing_q + 0.05 if control == "position" else np.full(n, 2.0)
+    expected, _ = after(exact, dt, time, target, control=control)
+    errors = [
+        np.abs(after(Model(elastic(robot, k), "elastic"), dt, time, target, control=control)[0][:n] - expected).max()
+        for k in (1e3, 1e5, 1e7, 1e10)
+    ]
+    np.testing.assert_allclose(np.diff(np.log10(errors)) / [2, 2, 3], -1, atol=0.1)
+
+
+MESHES = {
+    "spring": {},
+    "backlash": {"backlash": 0.02},
+    "damped": {"backlash": 0.02, "damping": 0.01},
+    "belt": {"preload": 5.0, "damping": 0.01},
+}
+
+
+@pytest.mark.parametrize("dt", [1e-4, 0.005, 0.02])
+@pytest.mark.parametrize("mesh", MESHES)
+def test_a_stiff_light_drive_is_stable_and_takes_energy_from_nowhere(mesh: str, dt: float):
+    """10^5 N m/rad and a rotor of 10^-5 kg m^2, thrown from one flank to the other; and a differential of them."""
+    both = Model(elastic(differential(), 1e5, **MESHES[mesh]), "elastic")
+    one = Model(turntable(1e5, **MESHES[mesh]), "elastic")
+    starts = [(one, [0.3, 0.004], [-3.0, 200.0]), (both, [0.3, -0.2, 0.004, 0.02], [-3.0, 2.0, 200.0, -90.0])]
+    for model, q, v in starts:
+        step, energies = stepper(model, dt, ("energy",)), []
+        for _ in range(200):
+            result = step(q, v, np.zeros(len(model.joint_links)))
+            q, v = result["q_next"], result["v_next"]
+            energies.append(float(result["energy"][0]))
+        assert np.diff(energies).max() < 1e-13 * energies[0]
+        gap = MESHES[mesh].get("backlash", 0.0) / 2
+        assert np.abs(q[len(model.joint_links) :]).max() < gap + 1e-3
+
+
+@lru_cache
+def hunting(dt: float) -> tuple[float, float]:
+    """Amplitude [rad] and period [s] of a joint that hunts across its backlash under integral control of the link."""
+    model = Model(turntable(1e5, damping=1.0, backlash=0.02), "elastic")
+    step = step_function(model.mechanism, StepOptions(dt, control="torque"))
+    q, v, integral = SX.sym("q", 2), SX.sym("v", 2), SX.sym("integral")
+    result = step(q=q, v=v, diverged=0.0, target=-20.0 * q[0] - 0.3 * v[0] - 150.0 * integral)
+    state = ca.vertcat(q, v, integral)
+    later = ca.vertcat(result["q_next"], result["v_next"], integral + dt * result["q_next"][0])
+    angles = ca.Function("one", [state], [later]).mapaccum(round(3.5 / dt))([0.01, 0.01, 0.0, 0.0, 0.0])[0, :].full()[0]
+    y = angles[round(2.0 / dt) :]
+    up = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
+    crossings = dt * (up - y[up] / (y[up + 1] - y[up]))
+    return np.ptp(y) / 2, float(np.diff(crossings).mean())
+
+
+@pytest.mark.parametrize(("dt", "within"), [(1e-4, 0.02), (1e-3, 0.1)])
+def test_a_limit_cycle_of_backlash(dt: float, within: float):
+    """As in steps of 10 us, in which the flanks' own oscillation is resolved."""
+    np.testing.assert_allclose(hunting(dt), hunting(1e-5), rtol=within)
+    assert hunting(1e-5)[0] > 0.01 / RATIO / 10, "it does hunt"
+
+
+def test_backlash_is_between_flanks_and_a_belt_half_as_stiff_when_slack():
+    """Torques of meshes, from what turns a rotor of the turntable in a step that is short."""
+    dt, x = 1e-9, np.array([-0.3, -0.05, -0.02, 0.0, 0.03, 0.06, 0.3])
+
+    def torque(**figures: float) -> np.ndarray:
+        step = stepper(Model(turntable(40.0, **figures), "elastic"), dt)
+        rotor = np.array([(step([0.0, s], np.zeros(2), [0.0])["v_next"] / dt) @ [RATIO, 1.0] for s in x])
+        return -ROTOR * rotor
+
+    np.testing.assert_allclose(torque(), 40.0 * x, rtol=1e-6)
+    np.testing.assert_allclose(torque(backlash=0.1), 40.0 * (x - x.clip(-0.05, 0.05)), rtol=1e-6, atol=1e-9)
+    tight = 40.0 * x.clip(-0.1, 0.1) + 20.0 * (x - x.clip(-0.1, 0.1))
+    np.testing.assert_allclose(torque(preload=4.0), tight, rtol=1e-6)
+
+
+@pytest.mark.parametrize("figures", MESHES.values(), ids=MESHES)
+def test_torque_is_the_slope_of_energy(figures: dict[str, float]):
+    model = Model(turntable(40.0, **(figures | {"damping": 0.0})), "elastic")
+    y = SX.sym("y", 2)
+    energy = mesh_energy(make_scene(model.mechanism, StepOptions(), SX(0, 1), SX(3, 0)), y)
+    slope = ca.Function("slope", [y], [ca.gradient(energy, y)])
+    step = stepper(model, 1e-9)
+    for x in (-0.3, -0.004, 0.006, 0.07):
+        rotor = (step([0.0, x], np.zeros(2), [0.0])["v_next"] / 1e-9) @ [RATIO, 1.0]
+        assert -ROTOR * rotor == pytest.approx(float(slope([0.0, x])[1]), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("control", ["position", "motor_position"])
+def test_position_control_holds_the_rotor_where_its_encoder_has_it_wanted(control: str):
+    """A load stretches the transmission: the joint gives way by load / (N^2 k) more than what the gain lets it."""
+    robot = elastic(differential(), 7.0, damping=0.5)
+    pushed = replace(robot, gains=replace(robot.gains, kd=(("left", 3.0), ("right", 3.0))))
+    model, load = Model(pushed, "elastic"), np.array([0.4, -0.3])
+    names = {"target": np.zeros(2)}
+    springs = replace(
+        pushed, bodies=tuple(_loaded(body, dict(zip(("left", "right"), load, strict=True))) for body in pushed.bodies)
+    )
+    model = Model(springs, "elastic")
+    q, v = after(model, 0.02, 20.0, names["target"], control=control)
+    assert np.abs(v).max() < 1e-8
+    N = np.array([[3.0, 4.0], [3.0, -4.0]])
+    of_joints = load - 1e-3 * q[:2]  # a soft spring pulls
+    kp = np.diag([5.0, 8.0])
+    if control == "motor_position":
+        back = np.linalg.inv(N)
+        kp = N.T @ np.diag((back.T**2) @ np.diag(kp)) @ N
+    expected = np.linalg.solve(kp, of_joints) + np.linalg.inv(N.T @ N) @ of_joints / 7.0
+    np.testing.assert_allclose(q[:2], expected, rtol=1e-6)
+
+
+def _loaded(body, load: dict[str, float]):
+    """A body that a soft, long spring pulls with a torque [N m]."""
+    soft = 1e-3
+    if body.name not in load:
+        return body
+    return replace(body, joint=replace(body.joint, stiffness=soft, springref=load[body.name] / soft))
+
+
+def test_parameters_are_those_of_another_robot():
+    """Factors on stiffness, damping, backlash and ratios, against robots with such figures."""
+    figures = {"damping": 0.02, "backlash": 0.04}
+    names = ("drive_stiffness", "drive_damping", "backlash", "ratio")
+    step = stepper(Model(turntable(40.0, **figures), "elastic"), 0.003, parameters=names)
+    other = turntable(40.0 * 1.5, damping=0.04, backlash=0.03)
+    gear = replace(other.constraints[0], coefficients=(("rotor", 1.0), ("table", -RATIO * 1.1)))  # type: ignore[call-arg]
+    expected = stepper(Model(replace(other, constraints=(gear,)), "elastic"), 0.003)
+    q, v = [0.1, 0.05], [2.0, 1.0]
+    found = step(q, v, [0.0], parameters=[1.5, 2.0, 0.75, 1.1])
+    for name, value in expected(q, v, [0.0]).items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-12)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_other_levels_do_not_know_of_it(level: str):
+    """Their models are the same to the instruction."""
+    robot = KINDS["gears and a belt"]()
+    there, without = Model(elastic(robot, 10.0, backlash=0.1), level), Model(robot, level)
+    names = [step_function(model.mechanism, StepOptions(0.005)).serialize() for model in (there, without)]
+    assert names[0] == names[1]
+
+
+def test_a_model_of_the_same_robot_at_another_level():
+    """What an elastic model knows of its robot makes models of other levels, too."""
+    robot = elastic(KINDS["gears and a belt"](), 10.0)
+    again = Model(Model(robot, "elastic").robot, "exact")
+    assert again.robot == robot
+    assert Model(again.robot, "elastic").robot == Model(robot, "elastic").robot
+
+
+def test_a_rigid_robot_has_no_elastic_level():
+    rigid: Robot = differential()
+    with pytest.raises(ValueError, match="elastic is missing: expected the stiffness of at least one transmission"):
+        Model(rigid, "elastic")
