@@ -169,6 +169,13 @@ def test_backlash_is_between_flanks_and_a_belt_half_as_stiff_when_slack():
     np.testing.assert_allclose(torque(preload=4.0), tight, rtol=1e-6)
 
 
+def test_between_flanks_a_rotor_is_free_however_damped_they_are():
+    """It flies towards a flank that it will not reach in this step, and is stopped by one that it will."""
+    step = stepper(Model(turntable(40.0, backlash=0.02, damping=1.0), "elastic"), 1e-4)
+    assert step([0.0, -0.005], [0.0, 50.0], [0.0])["v_next"] @ [0.0, 1.0] == pytest.approx(50.0, rel=1e-12)
+    assert step([0.0, 0.009], [0.0, 50.0], [0.0])["q_next"][1] == pytest.approx(0.01, abs=5e-4)
+
+
 @pytest.mark.parametrize("figures", MESHES.values(), ids=MESHES)
 def test_torque_is_the_slope_of_energy(figures: dict[str, float]):
     model = Model(turntable(40.0, **(figures | {"damping": 0.0})), "elastic")
