@@ -178,7 +178,8 @@ def with_stretches(robot: Robot) -> Robot:
         expected = f"the stiffness of at least one transmission, for transmission {ELASTIC!r}"
         raise bad(robot.source or robot.name, "elastic", None, expected)
     of = {elastic.rotor: elastic.stretch for elastic in robot.elastic}
-    bodies, massless = [], Inertial(0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
+    still = (0.0, 0.0, 0.0)
+    bodies, massless = [], Inertial(0.0, still, (still, still, still))
     for body in robot.bodies:
         bodies.append(body)
         if body.name in of:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 from linkages import four_bar
 
 from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Motor, Placement, Robot, load_robot
@@ -20,7 +19,7 @@ def elastic(robot: Robot, stiffness: float, **figures: float) -> Robot:
 
 
 def _about_z(name: str, moment: float, kind: str = "link") -> Body:
-    inertial = Inertial(1.0, (0.0, 0.0, 0.0), tuple(map(tuple, np.diag([moment] * 3).tolist())))
+    inertial = Inertial(1.0, (0.0, 0.0, 0.0), ((moment, 0.0, 0.0), (0.0, moment, 0.0), (0.0, 0.0, moment)))
     return Body(name, kind, None, Placement(), Joint("revolute", (0.0, 0.0, 1.0)), inertial)  # type: ignore[arg-type]
 
 

@@ -61,9 +61,7 @@ def test_gradients_go_through_meshes():
         sim.restore(keep)
         moved = sim.v.copy()
         moved[:, row] += amount
-        arrays = sim.snapshot()
-        arrays["v"] = moved
-        sim.restore(arrays)
+        sim.restore({**sim.snapshot(), "v": moved})
         sim.step(target)
         return np.hstack([sim.q[:, 7:], sim.v])
 
