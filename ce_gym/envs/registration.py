@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import gymnasium
 
+from ce_gym.envs.task.skills import SKILLED, SKILLS
 from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.errors import bad
 from ce_gym.model.mechanism import ELASTIC, LEVELS
@@ -30,17 +31,23 @@ def environment_ids() -> dict[str, dict[str, str]]:
     """
     ids = {}
     for robot in ROBOTS:
-        ids |= ids_of(f"ce_gym/{camel_case(robot)}", robot, robot in STRETCHING)
+        ids |= ids_of(f"ce_gym/{camel_case(robot)}", robot, robot in STRETCHING, tasks_of(robot))
     return ids
 
 
-def ids_of(stem: str, robot: str, stretches: bool) -> dict[str, dict[str, str]]:
+def tasks_of(robot: str) -> tuple[str, ...]:
+    """Return the tasks for which a robot that ships with the package has ids."""
+    return (*TASKS, *(skill for skill, robots in SKILLED.items() if robot in robots))
+
+
+def ids_of(stem: str, robot: str, stretches: bool, tasks: Iterable[str] = tuple(TASKS)) -> dict[str, dict[str, str]]:
     """Return the arguments of every id of a robot: `<stem><Task>[-<Level>]-v0`.
 
     Args:
         stem: What they begin with.
         robot: A name or a path.
         stretches: Whether it has elastic transmissions.
+        tasks: Names of tasks.
     """
     levels = (None, *LEVELS, ELASTIC) if stretches else (None, *LEVELS)
     return {
@@ -49,7 +56,7 @@ def ids_of(stem: str, robot: str, stretches: bool) -> dict[str, dict[str, str]]:
             "task": task,
             "transmission": level or "exact",
         }
-        for task in TASKS
+        for task in tasks
         for level in levels
     }
 
@@ -74,6 +81,6 @@ def register(ids: Mapping[str, Mapping[str, str]]) -> None:
             name,
             entry_point="ce_gym.envs.single:LeggedEnv",
             vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
-            max_episode_steps=TASKS[arguments["task"]].episode_length,
+            max_episode_steps={**TASKS, **SKILLS}[arguments["task"]].episode_length,
             kwargs=dict(arguments),
         )

@@ -3,7 +3,8 @@
 import pytest
 import yaml
 
-from ce_gym.envs.runtime.setup import make_program
+from ce_gym import load_robot
+from ce_gym.envs.runtime.setup import make_program, own_task
 from ce_gym.model import RobotError, assets_folder
 
 FOLDER = assets_folder() / "mini_cheetah"
@@ -35,6 +36,24 @@ def test_tasks_in_a_file(tmp_path, changes, message):
     with pytest.raises(RobotError, match=message) as caught:
         make_program(str(path), "velocity")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.InertiaWarning")
+def test_mappings_in_a_file(tmp_path):
+    own = {
+        "reward_weights": {"swerve": -0.2, "track_linear_velocity": {"weight": 2.0, "width": 0.1}},
+        "terminations": {"tilt": {"angle": 1.0}, "torso_contact": None},
+        "randomise": {"friction": [0.5, 1.0]},
+        "self_collisions": [["HR_knee_link", "FR_knee_link"]],
+    }
+    file = edited(tmp_path, tasks={"velocity": own}, capsules=None)
+    robot = load_robot(file)
+    task = own_task(robot, "velocity")
+    assert task.rewards["track_linear_velocity"] == {"weight": 2.0, "width": 0.1}
+    assert task.rewards["swerve"] == -0.2
+    assert task.terminations == {"tilt": {"angle": 1.0}, "torso_contact": {}}
+    assert task.randomise == {"friction": (0.5, 1.0)}
+    assert task.self_collisions == (("HR_knee_link", "FR_knee_link"),)
 
 
 @pytest.mark.filterwarnings("ignore::ce_gym.InertiaWarning")

@@ -16,12 +16,16 @@ from ce_gym.dynamics.model import Model
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.checks import checked_value, merged_rewards
+from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.sim.arguments import check, check_choice, check_whole
 from ce_gym.sim.devices import Device, device_named
+
+KNOWN = {**TASKS, **SKILLS}
+"""Every task by name."""
 
 
 class UnknownArgument(TypeError, ValueError):
@@ -94,7 +98,7 @@ def make_program(
         given = f"the Robot {robot.name!r}" if isinstance(robot, Robot) else repr(robot)
         raise ValueError(f"robot={given}; expected the name of a robot or a path to a file")
     check("contact_forces", contact_forces, isinstance(contact_forces, bool), "true or false")
-    check("task", task, task in tuple(TASKS), f"one of {', '.join(TASKS)}")
+    check("task", task, task in tuple(KNOWN), f"one of {', '.join(KNOWN)}")
     levels = (*LEVELS, ELASTIC)
     check("transmission", transmission, transmission in levels, f"one of {', '.join(levels)}")
     model = Model(robot, transmission)
@@ -118,17 +122,26 @@ def own_task(robot: Robot, task: str) -> Task:
     """
     file = robot.source or robot.name
     for name, _ in robot.tasks:
-        if name not in TASKS:
-            raise unknown(file, "tasks", name, TASKS, "the name of a task")
-    own = {key: value for name, group in robot.tasks if name == task for key, value in group}
-    wanted, groups = TASKS[task].contacts, {contact.group for contact in robot.contacts}
+        if name not in KNOWN:
+            raise unknown(file, "tasks", name, KNOWN, "the name of a task")
+    own = {key: _thawed(key, value) for name, group in robot.tasks if name == task for key, value in group}
+    wanted, groups = KNOWN[task].contacts, {contact.group for contact in robot.contacts}
     if not isinstance(wanted, str):  # tasks ask for knees, too, but not every robot has some
         own.setdefault("contacts", tuple(group for group in wanted if group in groups))
     try:
-        weights = merged_rewards("reward_weights", TASKS[task].rewards, dict(own.pop("reward_weights", ())))
-        return changed_task(replace(TASKS[task], rewards=weights), own)
+        weights = merged_rewards("reward_weights", KNOWN[task].rewards, dict(own.pop("reward_weights", ())))
+        return changed_task(replace(KNOWN[task], rewards=weights), own)
     except (ValueError, TypeError) as error:
         raise RobotError(f"{file}: tasks.{task}: {error}") from None
+
+
+def _thawed(key: str, value: Any) -> Any:
+    """Return a value of a robot's file with mappings instead of the pairs that make a robot hashable."""
+    if not isinstance(value, tuple) or key == "self_collisions":  # a list of pairs of names
+        return value
+    if not value or not all(isinstance(x, tuple) and len(x) == 2 and isinstance(x[0], str) for x in value):
+        return value
+    return {name: _thawed(name, item) for name, item in value}
 
 
 def changed_task(task: Task, changes: Mapping[str, Any]) -> Task:

@@ -135,7 +135,8 @@ class Stages:
         diverged = state["diverged"] > 0.5
         terminated = ca.logic_and(self._failed(s), ca.logic_not(diverged))
         after = {"action": clipped, "elapsed": state["elapsed"] + 1, "clock": state["clock"] + 1}
-        after["sums"] = state["sums"] + ca.vertcat(reward, *terms, *[m.number(s) for m in p.metric_terms.values()])
+        metrics = [self._summed(term, s, i) for i, term in enumerate(p.metric_terms.values(), 1 + len(terms))]
+        after["sums"] = ca.vertcat(state["sums"][: 1 + len(terms)] + ca.vertcat(reward, *terms), *metrics)
         after["failures"] = state["failures"] + diverged
         if "air_time" in state:
             after["air_time"] = ca.if_else(s.foot_contact, 0, state["air_time"] + p.control_dt)
@@ -230,21 +231,35 @@ class Stages:
     def _failed(self, s: TermContext) -> SX:
         return sum([term.number(s) for term in self.program.termination_terms.values()], SX(0)) > 0
 
+    def _summed(self, term: Term, s: TermContext, row: int) -> SX:
+        """Sum of a metric so far; of one that counts at the end of an episode a number whose mean is its value."""
+        value, elapsed = term.number(s), self.state["elapsed"] + 1
+        return value * elapsed if term.at_the_end else self.state["sums"][row] + value
+
     def _starting_pose(self, sampler: Sampler) -> SX:
-        """Positions near the standing pose, heading anywhere."""
-        standing = self.model.standing_q
+        """Positions near the standing pose or, if the task says so, above it and leaning; heading anywhere."""
+        standing = SX(self.model.standing_q)
         half_yaw = sampler.uniform(-np.pi / 2, np.pi / 2)
         layout = self.model.robot.layout
         still = SX(layout.joints - len(self.model.joint_links), 1)  # transmissions begin as they are at rest
         n = layout.nv - layout.base_nv - still.numel()
         noise = ca.vertcat(sampler.symmetric(n, self.task.reset_noise["joint_position"]), still)
         heading = ca.vertcat(ca.cos(half_yaw), 0, 0, ca.sin(half_yaw))
+        if self.task.start:
+            standing, heading = self._starting_place(standing, heading, sampler)
         balls = [
-            turned_by(SX(ca.DM(standing[row : row + 4])), noise[3 * i : 3 * i + 3])
-            for i, (row, _) in enumerate(layout.ball_turns)
+            turned_by(standing[row : row + 4], noise[3 * i : 3 * i + 3]) for i, (row, _) in enumerate(layout.ball_turns)
         ]
         joints = standing[layout.joints_q :] + noise[3 * layout.balls :]
         return ca.densify(ca.vertcat(standing[:3], heading, *balls, joints))
+
+    def _starting_place(self, standing: SX, heading: SX, sampler: Sampler) -> tuple[SX, SX]:
+        """Raise and tilt the base as the task's `start` asks for; return positions and the base's quaternion."""
+        height, lean = (self.task.start.get(name, (0.0, 0.0)) for name in ("height", "lean"))
+        raised = SX(standing)
+        raised[2] += sampler.uniform(*height)
+        about, angle = sampler.uniform(-np.pi, np.pi), sampler.uniform(*lean)
+        return raised, turned_by(heading, angle * ca.vertcat(ca.cos(about), ca.sin(about), 0))
 
     def _starting_velocity(self, sampler: Sampler) -> SX:
         """Velocities near rest."""

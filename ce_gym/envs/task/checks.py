@@ -9,7 +9,7 @@ from typing import Any, get_args
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.envs.task.tasks import Actions
+from ce_gym.envs.task.tasks import STARTS, Actions
 from ce_gym.envs.task.terrain_tiles import checked_terrain
 from ce_gym.sim.arguments import check, check_choice, check_whole, is_number
 
@@ -50,9 +50,11 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
         low, high = _pair(name, value)
         check(name, value, low >= 0 and low == int(low) and high == int(high), "two whole numbers, 0 or more")
         return int(low), int(high)
-    if name == "randomise":
+    if name in ("randomise", "start"):
         check(name, value, isinstance(value, Mapping), "pairs (low, high) by the name of a figure")
-        return {str(key): _pair(f"randomise[{key!r}]", pair) for key, pair in value.items()}
+        for key in value if name == "start" else ():
+            check(name, key, key in STARTS, f"one of {', '.join(STARTS)}")
+        return {str(key): _pair(f"{name}[{key!r}]", pair) for key, pair in value.items()}
     if name in TERMS:
         return _terms(name, value)
     if name in COUNTS:

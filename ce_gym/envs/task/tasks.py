@@ -64,6 +64,7 @@ class Task:
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
         reset_noise: Largest deviation from the standing pose at the start: of joints [rad], joint velocities [rad/s]
             and base velocities [rad/s and m/s].
+        start: Range of how an episode begins instead of in the standing pose, by name; see `STARTS`.
     """
 
     rewards: Mapping[str, float | Mapping[str, Any]]
@@ -101,6 +102,7 @@ class Task:
     reset_noise: Mapping[str, float] = field(
         default_factory=lambda: MappingProxyType({"joint_position": 0.1, "joint_velocity": 0.2, "base_velocity": 0.2})
     )
+    start: Mapping[str, Range] = field(default_factory=dict)
 
 
 RANDOMISED = {
@@ -115,6 +117,12 @@ RANDOMISED = {
     "com_shift": "shift of the base's centre of mass, each axis [m]; com_shift:BODY for another body",
 }
 """What can be drawn for each episode."""
+
+STARTS = {
+    "height": "of the base above its standing height [m]",
+    "lean": "angle of the base to upright, to any side [rad]",
+}
+"""What can be said of how episodes begin."""
 
 
 VELOCITY = Task(

@@ -188,6 +188,11 @@ class TermContext:
         return (2 * np.pi * self.control_dt / self._gait_period) * self._values["clock"]
 
     @property
+    def time(self) -> SX:
+        """Time since the episode began, up to the previous control step [s]."""
+        return self.control_dt * self._values["clock"]
+
+    @property
     def joint_positions(self) -> SX:
         """Independent joint positions [rad], shape (n_joints,)."""
         first = self.mechanism.robot.layout.joints_q

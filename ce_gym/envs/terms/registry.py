@@ -17,7 +17,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.terms import height_scan, metrics, observations, rewards, sensors, terminations
+from ce_gym.envs.terms import height_scan, metrics, observations, outcomes, rewards, sensors, skills, terminations
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.sim.arguments import is_number
 
@@ -34,10 +34,10 @@ def _functions_of(module: ModuleType) -> dict[str, Function]:
 
 
 OWN: dict[str, dict[str, Function]] = {
-    "reward": _functions_of(rewards),
+    "reward": _functions_of(rewards) | _functions_of(skills),
     "observation": _functions_of(observations) | _functions_of(height_scan) | _functions_of(sensors),
     "termination": _functions_of(terminations),
-    "metric": _functions_of(metrics),
+    "metric": _functions_of(metrics) | _functions_of(outcomes),
 }
 _added: dict[str, dict[str, Function]] = {kind: {} for kind in OWN}
 
@@ -64,6 +64,11 @@ class Term:
     def added(self) -> bool:
         """Whether it comes from a user."""
         return self.name in _added[self.kind]
+
+    @property
+    def at_the_end(self) -> bool:
+        """Whether a metric reports its value at the end of an episode instead of the mean."""
+        return self.function.__module__ == outcomes.__name__
 
     def __call__(self, s: TermContext) -> SX:
         """Trace the term.
