@@ -16,15 +16,18 @@ import interruption  # noqa: F401
 
 import argparse
 import json
+import math
 import re
 import shlex
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 from console import EPISODES, Parser, Table, add_json_argument, markdown, print_result, run, whole
 from effort import effort
-from evaluate import evaluate
+from evaluate import evaluate, own_figures
 from pictures import draw_curve
 from progress import read_curve
 from pushes import direction_name, push_envelope
@@ -44,24 +47,32 @@ from ce_gym.policies import (
 )
 
 
-def judged(policy: Policy, episodes: int, sim2sim_robots: int) -> dict[str, Any]:
+def judged(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[str] = LEVELS) -> dict[str, Any]:
     """Judge a policy for its card.
 
     Args:
         policy: With its record.
         episodes: Episodes on each level, and of each suite.
         sim2sim_robots: Robots in MuJoCo; 0 leaves that out.
+        levels: Levels besides that of training.
 
     Returns:
         seed: of everything, that which the weights give; levels: result of `evaluate` by level; suites, effort and
-        pushes, on the level of training; sim2sim, or sim2sim_missing, one line that says why there is none.
+        pushes, on the level of training; sim2sim, or sim2sim_missing, one line that says why there is none. Of a policy
+        that sees no commands there are no suites, pushes and sim2sim.
     """
     record, kwargs, seed = policy.record, policy.record["env_kwargs"], weights_seed(policy)
-    levels = {
+    found = {
         level: evaluate(policy, record["env"], episodes=episodes, seed=seed, **{**kwargs, "transmission": level})
         for level in LEVELS
+        if level in (record["transmission"], *levels)
     }
-    result: dict[str, Any] = {"seed": seed, "levels": levels, "effort": effort(policy, seed=seed, **kwargs)}
+    longest = gymnasium.spec(record["env"]).max_episode_steps or math.inf
+    seconds = min(10.0, longest * record["policy_spec"]["control_dt"])
+    result: dict[str, Any] = {"seed": seed, "levels": found}
+    result["effort"] = effort(policy, seconds=seconds, seed=seed, **kwargs)
+    if not found[record["transmission"]]["commanded"]:
+        return result | {"sim2sim_missing": "it sees no commands, by which simulations are compared"}
     result["suites"] = judge_suites(policy, episodes, seed, **kwargs)
     result["pushes"] = push_envelope(policy, seed=seed, **kwargs)
     if not sim2sim_robots:
@@ -146,11 +157,11 @@ def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, f
         f"# {name}",
         f"{markdown(facts)}\n\n{_how_to_repeat(record)}",
         *(["![Learning curve](curve.png)"] if curve else []),
-        f"## On every transmission level\n\n{_levels(record, result)}",
+        f"## On transmission levels\n\n{_levels(record, result)}",
         *_on_terrain(record, result["levels"]),
-        f"## By what is asked for\n\n{suite_table(result['suites'])}\n\nOn the level of training.",
+        *_asked_for(result),
         *([f"## Motors\n\n{_motors(result['effort'])}"] if result["effort"] else []),
-        f"## Pushes\n\n{_pushes(result['pushes'])}",
+        *([f"## Pushes\n\n{_pushes(result['pushes'])}"] if "pushes" in result else []),
         f"## In MuJoCo\n\n{_sim2sim(result)}",
         f"## Settings\n\n{markdown(settings)}",
     ]
@@ -165,15 +176,28 @@ def _how_to_repeat(record: dict[str, Any]) -> str:
 
 
 def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:
-    titles = ["judged on", "forward [m/s]", "sideways [m/s]", "yaw rate [rad/s]", "falls", "reward"]
-    keys = (("forward_error", ".3f"), ("lateral_error", ".3f"), ("yaw_rate_error", ".3f"), ("falls", ".1%"))
-    rows = [titles]
+    rows: Table = []
     for level, figures in result["levels"].items():
         own = " (trained)" if level == record["transmission"] else ""
-        rows.append([f"`{level}`{own}", *(f"{figures[key]:{form}}" for key, form in (*keys, ("reward", ".2f")))])
+        shown = _errors(figures) if figures["commanded"] else own_figures(figures)
+        rows = rows or [["judged on", *shown, "falls", "reward"]]
+        last = (f"{figures['falls']:.1%}", f"{figures['reward']:.2f}")
+        rows.append([f"`{level}`{own}", *(f"{figure:.3f}" for figure in shown.values()), *last])
     count, length = figures["episodes"], record["policy_spec"]["control_dt"]
-    errors = f"Mean absolute errors over every step of {count} episodes of the mean action; a step is {length:g} s."
-    return f"{markdown(rows)}\n\n{errors} Seed {result['seed']}: the first 32 bits of the SHA-256 of the weights."
+    said = "Mean absolute errors over every step" if figures["commanded"] else "Means, in SI units,"
+    said = f"{said} of {count} episodes of the mean action; a step is {length:g} s."
+    return f"{markdown(rows)}\n\n{said} Seed {result['seed']}: the first 32 bits of the SHA-256 of the weights."
+
+
+def _errors(figures: dict[str, Any]) -> dict[str, float]:
+    titles = {"forward [m/s]": "forward_error", "sideways [m/s]": "lateral_error", "yaw rate [rad/s]": "yaw_rate_error"}
+    return {title: figures[key] for title, key in titles.items()}
+
+
+def _asked_for(result: dict[str, Any]) -> list[str]:
+    """The section on suites of commands, if there are some."""
+    table = f"{suite_table(result['suites'])}\n\nOn the level of training." if "suites" in result else ""
+    return [f"## By what is asked for\n\n{table}"] if table else []
 
 
 def _on_terrain(record: dict[str, Any], levels: dict[str, dict[str, Any]]) -> list[str]:
@@ -191,7 +215,7 @@ def _motors(found: dict[str, Any]) -> str:
         if found[f"mean_{what}"] is not None:
             peak = f"{found[f'peak_{what}']:.0%} of its limit (`{found[f'peak_{what}_at']}`)"
             rows += [[f"mean {what} of a motor", f"{found[f'mean_{what}']:.0%} of its limit"], [f"peak {what}", peak]]
-    return f"{markdown(rows)}\n\nMechanical, at the rotors, every sub-step counted, on random commands."
+    return f"{markdown(rows)}\n\nMechanical, at the rotors, every sub-step counted."
 
 
 def _pushes(found: dict[str, Any]) -> str:
@@ -249,6 +273,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--robots", type=whole(0, 100_000), default=50, metavar="N", help="robots in MuJoCo; 0: none (default 50)"
     )
+    text = "levels to judge on besides that of training (default: all)"
+    parser.add_argument("--levels", nargs="*", choices=LEVELS, default=LEVELS, metavar="LEVEL", help=text)
     add_env_arguments(parser)
     add_json_argument(parser)
     args = parser.parse_args(argv)
@@ -264,7 +290,7 @@ def _work(args: argparse.Namespace) -> int:
     out = shelf() / name if args.ship else args.out or source.parent
     acted_in = {"env": environment_of(record, args.env), "env_kwargs": {**record["env_kwargs"], **dict(args.env_args)}}
     policy = Policy(actor, record | acted_in)
-    result = judged(policy, args.episodes, args.robots)
+    result = judged(policy, args.episodes, args.robots, args.levels)
     out.mkdir(parents=True, exist_ok=True)
     write_npz(actor, record, out / "policy.npz")
     if curve:

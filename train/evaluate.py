@@ -87,25 +87,24 @@ def evaluate(
         the length of the horizontal difference. falls, timed_out, diverged: fraction of episodes that ended early,
         that lasted to the end, and that were stopped because the state was no longer finite. episode_length [s],
         reward: means over episodes. episodes: their number. seed: what was used. levels, where the ground has some:
-        errors, falls and number of episodes of each. Other entries are means of what the task reports itself.
+        errors, falls and number of episodes of each. commanded: whether the policy sees commands; errors say nothing of
+        one that does not. Other entries are means of what the task reports itself, `metrics/...` and `reward/...`.
     """
     seed = weights_seed(model) if seed is None else seed
     envs = make_sb3_vec_env(env_id, episodes, seed, **everywhere(env_id, kwargs))
     try:
-        return play(model, envs) | {"seed": seed}
+        commanded = any("command" in block for block in envs.envs.unwrapped.observation_structure)
+        return play(model, envs) | {"seed": seed, "commanded": commanded}
     finally:
         envs.close()
 
 
 def report(result: dict[str, Any]) -> str:
     """The figures that matter, one per line; those of motors and pushes if they are there."""
-    rows = [
-        ("forward speed error", f"{result['forward_error']:.3f} m/s", "mean absolute, over every step"),
-        ("lateral speed error", f"{result['lateral_error']:.3f} m/s", ""),
-        ("yaw rate error", f"{result['yaw_rate_error']:.3f} rad/s", ""),
-        ("velocity error", f"{result['velocity_error']:.3f} m/s", "horizontal, mean length"),
+    rows = _error_rows(result) if result["commanded"] else _own_rows(result)
+    rows += [
         ("falls", f"{result['falls']:.1%}", f"of {result['episodes']} episodes, seed {result['seed']}"),
-        ("time-outs", f"{result['timed_out']:.1%}", "on its feet to the end"),
+        ("time-outs", f"{result['timed_out']:.1%}", "on its feet to the end" if result["commanded"] else ""),
         ("episode length", f"{result['episode_length']:.1f} s", "mean"),
         ("reward per episode", f"{result['reward']:.2f}", ""),
     ]
@@ -118,6 +117,27 @@ def report(result: dict[str, Any]) -> str:
 
 TABLES = {"levels": level_table, "suites": suite_table, "pushes": push_table}
 """What is shown below the figures, if it was judged."""
+
+
+def _error_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """How well commands are followed."""
+    return [
+        ("forward speed error", f"{result['forward_error']:.3f} m/s", "mean absolute, over every step"),
+        ("lateral speed error", f"{result['lateral_error']:.3f} m/s", ""),
+        ("yaw rate error", f"{result['yaw_rate_error']:.3f} rad/s", ""),
+        ("velocity error", f"{result['velocity_error']:.3f} m/s", "horizontal, mean length"),
+    ]
+
+
+def _own_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What the task reports itself."""
+    return [(name, f"{figure:.3f}", "mean over episodes") for name, figure in own_figures(result).items()]
+
+
+def own_figures(result: dict[str, Any]) -> dict[str, float]:
+    """Return what the task reports itself, by its name in words."""
+    found = {key: x for key, x in result.items() if key.startswith("metrics/")}
+    return {key.removeprefix("metrics/").replace("_", " "): x for key, x in found.items()}
 
 
 def _effort_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:

@@ -80,7 +80,7 @@ def test_what_no_command_repeats_is_said(run):
 def test_a_card_says_what_was_measured(run):
     record = load_policy(run).record
     figures = {"forward_error": 0.123, "lateral_error": 0.2, "yaw_rate_error": 0.3, "falls": 0.456, "reward": 7.0}
-    figures |= {"episodes": 12, "velocity_error": 0.321}
+    figures |= {"episodes": 12, "velocity_error": 0.321, "commanded": True}
     pushes = {"command": [0.5, 0, 0], "speeds": [1.0], "directions": [0.0], "survived": [[0.25]]}
     simulations = {"ce_gym, exact": figures, "MuJoCo, rotors as bodies": figures | {"falls": 0.02}}
     verdict = {"MuJoCo, rotors as bodies": {"passed": True}}
