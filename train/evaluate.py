@@ -93,7 +93,8 @@ def evaluate(
     seed = weights_seed(model) if seed is None else seed
     envs = make_sb3_vec_env(env_id, episodes, seed, **everywhere(env_id, kwargs))
     try:
-        commanded = any("command" in block for block in envs.envs.unwrapped.observation_structure)
+        native: Any = envs.envs.unwrapped
+        commanded = any("command" in block for block in native.observation_structure)
         return play(model, envs) | {"seed": seed, "commanded": commanded}
     finally:
         envs.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -13,7 +13,7 @@ from ce_gym.envs.registration import STRETCHING, camel_case
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
-from ce_gym.envs.task.tasks import Task
+from ce_gym.envs.task.tasks import STARTS, Task
 from ce_gym.envs.terms.registry import OWN
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 
@@ -22,6 +22,12 @@ GOALS = {
     "run": "Move forward as fast as it pays. `info` has the keys of Gymnasium's MuJoCo environments.",
     "stand": "Stand still while the base is pushed every two seconds.",
     "jump": "Be as high as possible in the second half of every second.",
+    "high_jump": "Jump as high as possible from standing, once, and stand again.",
+    "long_jump": "Fly as far as possible from standing, and stand again.",
+    "land": "Land from a metre above the standing height, and stand.",
+    "hop": "Hop on the first foot by a clock; no other foot may touch the ground after half a second.",
+    "recover": "Get up and stand, from any orientation.",
+    "backflip": "Turn backwards once in the air, and stand again.",
 }
 FIRST = {
     "transmission": (
@@ -125,7 +131,8 @@ def _observations(program: TaskProgram) -> str:
 
 
 def _rewards(task: Task) -> str:
-    rows = [(f"`{name}`", f"{weight:g}", *_meaning("reward", name)) for name, weight in task.rewards.items()]
+    weights = {name: own["weight"] if isinstance(own, Mapping) else own for name, own in task.rewards.items()}
+    rows = [(f"`{name}`", f"{weight:g}", *_meaning("reward", name)) for name, weight in weights.items()]
     said = "The sum over terms of weight times term times control step"
     said += "; a negative sum counts as zero." if task.only_positive else "."
     return f"{said}\n\n{table(('Term', 'Weight', 'Meaning', 'Unit'), rows)}"
@@ -134,14 +141,15 @@ def _rewards(task: Task) -> str:
 def _start(program: TaskProgram) -> str:
     noise, height = program.task.reset_noise, program.model.robot.pose.height
     angle, speed, base = (noise[key] for key in ("joint_position", "joint_velocity", "base_velocity"))
+    start = "".join(f" Then, {STARTS[k]}: {low:.3g} to {high:.3g}." for k, (low, high) in program.task.start.items())
     return (
         f"Upright in the standing pose, the base {height:.3g} m high, every joint off by up to {angle:g} rad, joint "
-        f"velocities up to {speed:g} rad/s, base velocities up to {base:g} rad/s and m/s, all drawn uniformly."
+        f"velocities up to {speed:g} rad/s, base velocities up to {base:g} rad/s and m/s, all drawn uniformly.{start}"
     )
 
 
 def _end(program: TaskProgram) -> str:
-    rows = [f"- `{name}`: {_meaning('termination', name)[0]}" for name in program.task.terminations]
+    rows = [f"- `{name}`: {_meaning('termination', name)[0]}" for name in program.task.terminations] or ["- nothing"]
     return "\n".join(
         [
             "Terminated, as a failure, when one of these holds at the end of a control step:",

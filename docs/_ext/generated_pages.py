@@ -23,7 +23,8 @@ from robot_page import picture, robot_page, shipped
 from sphinx.application import Sphinx
 
 from ce_gym import InertiaWarning, Model, load_robot, robots
-from ce_gym.envs.registration import ROBOTS
+from ce_gym.envs.registration import ROBOTS, tasks_of
+from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.formats.motors import motor_types
 
@@ -42,7 +43,7 @@ def write_pages(folder: Path) -> None:
         _write(folder / "robots" / f"{robot}.md", robot_page(robot, folder / "robots"))
     for robot in ROBOTS:
         drawn = (folder / "robots" / f"{robot}.png").exists()
-        for task in TASKS:
+        for task in tasks_of(robot):
             _write(folder / "environments" / f"{robot}_{task}.md", environment_page(robot, task, drawn))
     measured = "```{toctree}\n:hidden:\n\ntraining\n```\n" if (folder.parent / "training.md").exists() else ""
     _write(folder / "training.inc", measured)
@@ -59,12 +60,18 @@ def _environment_list() -> str:
     rows = [
         (
             f"[{title(robot)}](generated/robots/{robot}.md)",
-            *(f"[{t}](generated/environments/{robot}_{t}.md)" for t in TASKS),
+            *(_environment_link(robot, task) for task in TASKS),
+            ", ".join(_environment_link(robot, task) for task in tasks_of(robot) if task in SKILLS),
         )
         for robot in ROBOTS
     ]
-    pages = "\n".join(f"generated/environments/{robot}_{task}" for robot in ROBOTS for task in TASKS)
-    return f"{table(('', *(t.capitalize() for t in TASKS)), rows)}\n\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
+    pages = "\n".join(f"generated/environments/{robot}_{task}" for robot in ROBOTS for task in tasks_of(robot))
+    columns = ("", *(task.capitalize() for task in TASKS), "Skills")
+    return f"{table(columns, rows)}\n\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
+
+
+def _environment_link(robot: str, task: str) -> str:
+    return f"[{task.replace('_', ' ')}](generated/environments/{robot}_{task}.md)"
 
 
 def _robot_list() -> str:

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from ce_gym import InertiaWarning, Model, Robot, load_robot
 from ce_gym.diagnostics.transmission import TransmissionReport, report_levels
 from ce_gym.diagnostics.transmission_text import DROPPED
-from ce_gym.envs.registration import ROBOTS
-from ce_gym.envs.task.tasks import TASKS
+from ce_gym.envs.registration import ROBOTS, tasks_of
 from ce_gym.model.formats.reading import read_yaml
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.viewer import ViewerError
@@ -87,7 +86,7 @@ def _facts(robot: Robot, model: Model) -> list[tuple[str, str]]:
 def _environments(name: str) -> str:
     if name not in ROBOTS:
         return ""
-    links = [f"[{task}](../environments/{name}_{task}.md)" for task in TASKS]
+    links = [f"[{task.replace('_', ' ')}](../environments/{name}_{task}.md)" for task in tasks_of(name)]
     return f"Environments: {', '.join(links)}."
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from card import card, command, main, portable, short_name
 from evaluate import main as evaluate_main
+from evaluate import report
 from job import Job, jobs, parser
 from ppo import train
 from settings import config_file, load_settings
@@ -94,6 +95,23 @@ def test_a_card_says_what_was_measured(run):
     for words in (*measured, "99 s", ROBOT_ENV, "[32, 16]", "curve.png"):
         assert words in text, words
     assert "## Motors" not in text
+
+
+def test_a_card_of_a_policy_without_commands_has_the_task_s_own_figures(run):
+    record = load_policy(run).record
+    figures = {"metrics/longest_flight": 0.4321, "reward/flight": 0.9876, "forward_error": 0.123, "reward": 7.0}
+    figures |= {"falls": 0.456, "timed_out": 0.5, "diverged": 0.0, "episode_length": 2.5, "episodes": 12, "seed": 1}
+    figures["commanded"] = False
+    result = {"seed": 1, "levels": {"exact": figures}, "effort": {}, "sim2sim_missing": "no commands"}
+    text = card(record, result, [], short_name(record))
+    assert "| longest flight | falls" in text
+    for words, there in (("0.432", True), ("45.6%", True), ("no commands", True), ("0.123", False), ("Pushes", False)):
+        assert (words in text) == there, words
+    said = report(figures)
+    assert "longest flight" in said
+    assert "speed error" not in said
+    assert "forward speed error" in report({**figures, "commanded": True, "lateral_error": 0.0, "yaw_rate_error": 0.0}
+                                           | {"velocity_error": 0.0})  # fmt: skip
 
 
 def test_no_path_of_this_machine_is_shipped(run):
