@@ -64,8 +64,7 @@ def judged(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[
     record, kwargs, seed = policy.record, policy.record["env_kwargs"], weights_seed(policy)
     found = {
         level: evaluate(policy, record["env"], episodes=episodes, seed=seed, **{**kwargs, "transmission": level})
-        for level in LEVELS
-        if level in (record["transmission"], *levels)
+        for level in dict.fromkeys((*levels, record["transmission"]))
     }
     longest = gymnasium.spec(record["env"]).max_episode_steps or math.inf
     seconds = min(10.0, longest * record["policy_spec"]["control_dt"])
