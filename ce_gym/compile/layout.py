@@ -65,15 +65,18 @@ class Layout:
         """Byte at which each per-thread buffer starts; one vector is 64 bytes in either dtype."""
         offsets, end = {}, 0
         for buffer in self.buffers:
-            if buffer.kind != "tiles":
+            if buffer.kind != "tiles" and not buffer.within:
                 offsets[buffer.name] = end
                 end += ALIGNMENT * buffer.size
+        for buffer in self.buffers:
+            if buffer.within:
+                offsets[buffer.name] = offsets[buffer.within] + ALIGNMENT * buffer.start
         return offsets
 
     @cached_property
     def scratch_bytes(self) -> int:
         """Bytes of per-thread memory."""
-        return ALIGNMENT * sum(b.size for b in self.buffers if b.kind != "tiles")
+        return ALIGNMENT * sum(b.size for b in self.buffers if b.kind != "tiles" and not b.within)
 
 
 def layout_of(program: Program, dtype: str) -> Layout:

@@ -78,14 +78,15 @@ def _load(folder: Path | None, name: str, build: Callable[[], Program], dtype: s
 def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> tuple[dict, bytes]:
     """The calling convention as plain data, and object code."""
     from ce_gym.compile.lowering.tile import emit_tile
-    from ce_gym.compile.machine_code import compile_object
+    from ce_gym.compile.machine_code import compile_object, registers_per_vector
 
     started = time.perf_counter()
     program = build()
     check_program(program)
     layout = layout_of(program, dtype)
     with announced(f"{program.name} ({dtype})", folder, started):
-        code = compile_object(lambda builder, arguments: emit_tile(builder, program, layout, arguments))
+        parts = registers_per_vector() if program.compact else 1
+        code = compile_object(lambda builder, arguments: emit_tile(builder, program, layout, arguments, parts))
     return asdict(layout), code
 
 

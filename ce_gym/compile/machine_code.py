@@ -30,6 +30,13 @@ def host_cpu() -> tuple[str, str]:
     return binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
 
 
+@cache
+def registers_per_vector() -> int:
+    """Return how many of this CPU's registers 64 bytes take."""
+    features = host_cpu()[1].split(",")
+    return 1 if "+avx512f" in features else 2 if "+avx" in features else 4
+
+
 def compile_object(emit: Emit) -> bytes:
     """Compile the loop over tiles.
 

@@ -34,12 +34,16 @@ class Buffer:
             * `table`: array (rows, columns) of the kernel's dtype, at least 3 by 3, that all lanes share and only a
               `Lookup` reads; its shape is known when the kernel is called.
         dtype: of a `rows_*` array, `float32` or `float64`; empty means the kernel's own.
+        within: a buffer, not a `tiles` one, of which this one is a part, if it is one.
+        start: where in that buffer it starts.
     """
 
     name: str
     size: int
     kind: BufferKind
     dtype: str = ""
+    within: str = ""
+    start: int = 0
 
 
 @dataclass(frozen=True)
@@ -52,12 +56,15 @@ class Call:
         outputs: buffer of each function output; it may be an input's too, since all loads come before any store.
         only_if: a buffer of size 1; the call is skipped where it is zero in all lanes of a tile. To keep lanes
             independent of their neighbours it must change nothing in a lane where the buffer is zero.
+        times: how often the function is applied, to the next part each time of those buffers that are so many times as
+            large as what it takes or returns.
     """
 
     function: casadi.Function
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     only_if: str = ""
+    times: int = 1
 
 
 @dataclass(frozen=True)
@@ -139,12 +146,15 @@ class Program:
         buffers: all buffers the steps mention.
         steps: calls, look-ups and repeated ones, in the order of execution.
         skip_unless: a `tiles` buffer of size 1; a tile whose lanes are all zero there is skipped.
+        compact: whether code is small rather than wide: the lanes of a tile go through a call in as many parts as they
+            take registers, and results are not kept until its end. For what is too large for a level-2 cache.
     """
 
     name: str
     buffers: tuple[Buffer, ...]
     steps: tuple[Step | Repeat, ...]
     skip_unless: str = ""
+    compact: bool = False
 
     @property
     def calls(self) -> tuple[Call | Lookup, ...]:
@@ -169,6 +179,8 @@ def check_program(program: Program) -> None:
         raise ValueError(f"program {program.name!r}: buffer names must differ from each other")
     for buffer in program.buffers:
         _check_buffer(program.name, buffer)
+        if buffer.within:
+            _check_part(program.name, buffer, buffers)
     written = {b.name for b in program.buffers if b.kind in ("tiles", "rows_in", "random")}
     for number, call in enumerate(program.calls):
         read = call.inputs
@@ -184,6 +196,7 @@ def check_program(program: Program) -> None:
         if unset := [name for name in read if name not in written]:
             raise ValueError(f"{place}: reads {unset[0]!r}, expected an earlier call to write it first")
         written.update(call.outputs)
+        written.update(buffers[name].within for name in call.outputs)
     if unset := [b.name for b in program.buffers if b.name not in written and b.kind == "rows_out"]:
         raise ValueError(f"program {program.name!r}: no call writes the rows_out buffer {unset[0]!r}")
     for flag in program.flags:
@@ -210,6 +223,15 @@ def _check_buffer(program: str, buffer: Buffer) -> None:
     allowed = ("", "float32", "float64") if buffer.kind.startswith("rows") else ("",)
     if buffer.dtype not in allowed:
         raise ValueError(f"{place}: dtype {buffer.dtype!r}, expected one of {allowed} for {buffer.kind}")
+    if buffer.within and buffer.kind != "scratch":
+        raise ValueError(f"{place}: kind {buffer.kind!r}, expected 'scratch' for a part of {buffer.within!r}")
+
+
+def _check_part(program: str, part: Buffer, buffers: dict[str, Buffer]) -> None:
+    whole = buffers.get(part.within)
+    if whole is None or whole.kind == "tiles" or whole.within or not 0 <= part.start <= whole.size - part.size:
+        place = f"program {program!r}: buffer {part.name!r}"
+        raise ValueError(f"{place}: part of {part.within!r} from {part.start}, expected to lie within a buffer")
 
 
 def _check_call(place: str, call: Call, buffers: dict[str, Buffer]) -> None:
@@ -227,7 +249,7 @@ def _check_call(place: str, call: Call, buffers: dict[str, Buffer]) -> None:
             raise ValueError(f"{place}: {len(names)} {side} buffers, expected {count}")
         for position, name in enumerate(names):
             _check_lanes(f"{place}: {side}", name, buffers)
-            if buffers[name].size != numel(position):
+            if buffers[name].size not in (numel(position), call.times * numel(position)):
                 expected = f"{numel(position)} as {side} {position} of the function"
                 raise ValueError(f"{place}: buffer {name!r} has size {buffers[name].size}, expected {expected}")
 

@@ -171,6 +171,13 @@ def test_stages_that_disagree_are_refused():
         emit_source([one, two], "float64")
 
 
+def test_calls_of_parts_of_buffers_are_refused():
+    x = ca.SX.sym("x")
+    call = Call(ca.Function("f", [x], [x]), ("x",), ("x",), times=2)
+    with pytest.raises(NotImplementedError, match="program 'parts': calls of parts of buffers have no CUDA form"):
+        emit_source([Program("parts", (Buffer("x", 2, "tiles"),), (call,))], "float64")
+
+
 def test_a_long_function_with_several_callers_stands_once(needs_host_compiler):
     x = ca.SX.sym("x")
     y = x

@@ -2,6 +2,7 @@
 
 import os
 import time
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -249,3 +250,43 @@ def test_many_values_become_rows(dtype, rows):
     expected = 2 * values.transpose(0, 2, 1).reshape(-1, size)[:num_envs]
     np.testing.assert_array_equal(found[:num_envs], expected.astype(rows))
     assert not found[num_envs].any()
+
+
+@pytest.mark.parametrize("parts", [1, 2, 4])
+def test_a_compact_program_gives_the_same_bits(kernel, parts, monkeypatch):
+    monkeypatch.setattr("ce_gym.compile.machine_code.registers_per_vector", lambda: parts)
+    compact = load_kernel(f"compact {parts}", lambda: replace(pipeline(), compact=True), kernel.dtype)
+    expected = run(kernel, 21)
+    for name, values in run(compact, 21).items():
+        np.testing.assert_array_equal(values, expected[name])
+
+
+@pytest.mark.parametrize("compact", [False, True])
+def test_a_call_is_applied_to_part_after_part(compact):
+    """Of buffers that are so many times as large, and of one that is a part of another; the others are shared."""
+    x, shift = ca.SX.sym("x", 2), ca.SX.sym("shift")
+    apart = ca.Function("apart", [x, shift], [ca.vertcat(x[1] + shift, 2 * x[0], x[0] * x[1])])
+    swapped = ca.Function("swapped", [x], [ca.vertcat(x[1], x[0])])
+    ones = ca.Function("ones", [], [ca.SX.ones(10)])
+    buffers = (
+        Buffer("given", 6, "rows_in"),
+        Buffer("shift", 1, "rows_in"),
+        Buffer("result", 10, "rows_out"),
+        Buffer("tail", 9, "scratch", within="result", start=1),
+    )
+    steps = (
+        Call(ones, (), ("result",)),
+        Call(apart, ("given", "shift"), ("tail",), times=3),
+        Call(swapped, ("given",), ("given",), times=3),
+    )
+    program = Program("parts", buffers, steps[:2], compact=compact)
+    kernel, rng = load_kernel(f"parts {compact}", lambda: program), np.random.default_rng(0)
+    given, shift, result = rng.normal(size=(11, 6)), rng.normal(size=(11, 1)), np.zeros((11, 10))
+    kernel({"given": given, "shift": shift, "result": result}, 11)
+    pairs = given.reshape(11, 3, 2)
+    expected = np.stack([pairs[..., 1] + shift, 2 * pairs[..., 0], pairs[..., 0] * pairs[..., 1]], axis=2)
+    np.testing.assert_array_equal(result, np.hstack([np.ones((11, 1)), expected.reshape(11, 9)]))
+    in_place = replace(program, steps=(steps[0], steps[2], steps[1]))
+    kernel = load_kernel(f"parts in place {compact}", lambda: in_place)
+    kernel({"given": given, "shift": shift, "result": result}, 11)
+    np.testing.assert_array_equal(result[:, 1::3], pairs[..., 0] + shift)

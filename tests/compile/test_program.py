@@ -27,6 +27,11 @@ WRONG = {
     ),
     "expected different buffers": Program("p", (A,), (Call(ca.Function("t", [X], [X, X]), ("a",), ("a", "a")),)),
     "no call writes the rows_out buffer 'r'": Program("p", (Buffer("r", 3, "rows_out"),), ()),
+    "buffer 'b': kind 'tiles', expected 'scratch' for a part of 'a'": Program(
+        "p", (A, Buffer("b", 3, "tiles", "", "a")), ()
+    ),
+    "buffer 'b': part of 'a' from 0, expected to lie within": Program("p", (A, Buffer("b", 3, "scratch", "", "a")), ()),
+    "buffer 'c': part of 'b' from 2, expected to lie": Program("p", (B, Buffer("c", 2, "scratch", "", "b", 2)), ()),
     "skip_unless must name a tiles buffer of size 1": Program("p", (A,), (), skip_unless="a"),
 }
 

@@ -60,10 +60,12 @@ def emit_source(stages: Sequence[Program], dtype: str) -> Source:
 
     Raises:
         ValueError: when a stage is not well formed, or two disagree about a buffer.
-        NotImplementedError: for an operation without a CUDA form.
+        NotImplementedError: for an operation without a CUDA form, and for calls of parts of buffers.
     """
     for stage in stages:
         check_program(stage)
+        if any(b.within for b in stage.buffers) or any(isinstance(c, Call) and c.times > 1 for c in stage.calls):
+            raise NotImplementedError(f"program {stage.name!r}: calls of parts of buffers have no CUDA form")
     program = _merged(stages)
     layout = layout_of(program, dtype)
     text = _KernelText(program, layout)

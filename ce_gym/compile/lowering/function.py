@@ -1,11 +1,13 @@
 """One CasADi SX function as straight-line vector code.
 
 Every operation of the function's `graph` becomes one value, in the order that `ordering` chooses. Loads are emitted at
-first use and stores at the very end, so outputs may share their memory with inputs.
+first use and stores at the very end, so outputs may share their memory with inputs; where they do not, they can be
+stored as they come, and are not kept until the end.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 
 import casadi
@@ -17,7 +19,7 @@ from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 
 def lower_function(
-    v: VectorBuilder, function: casadi.Function, inputs: Sequence[Value], outputs: Sequence[Value]
+    v: VectorBuilder, function: casadi.Function, inputs: Sequence[Value], outputs: Sequence[Value], apart: bool = False
 ) -> None:
     """Emit `function` at the builder's position.
 
@@ -26,6 +28,7 @@ def lower_function(
         function: an SX function; sparse inputs and outputs are laid out densely, column by column.
         inputs: pointer to the first vector of each function input.
         outputs: pointer to the first vector of each function output; structural zeros are written as 0.
+        apart: whether no output shares memory with an input.
 
     Raises:
         NotImplementedError: for an operation that has no vector form.
@@ -51,15 +54,24 @@ def lower_function(
                 values[k] = loaded[place]
         return values[k]
 
-    for k in ordered(graph):
-        values[k] = lowering.operation(graph.ops[k], [value(a) for a in graph.operands[k]])
+    leave: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for k, op in enumerate(graph.ops):
         if op == casadi.OP_OUTPUT:
             which, nonzero = function.instruction_output(k)
-            results[which][places[which][nonzero]] = value(graph.operands[k][0])
-    for pointer, stored in zip(outputs, results, strict=True):
-        for position, result in enumerate(stored):
-            v.store(result, pointer, position)
+            leave[graph.operands[k][0]].append((which, places[which][nonzero]))
+    stored = set[tuple[int, int]]()
+    for k in ordered(graph):
+        values[k] = lowering.operation(graph.ops[k], [value(a) for a in graph.operands[k]])
+        for which, position in leave[k] if apart else ():
+            v.store(values[k], outputs[which], position)
+            stored.add((which, position))
+    for k, to in leave.items():
+        for which, position in to:
+            results[which][position] = value(k)
+    for which, pointer in enumerate(outputs):
+        for position, result in enumerate(results[which]):
+            if (which, position) not in stored:
+                v.store(result, pointer, position)
 
 
 def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:

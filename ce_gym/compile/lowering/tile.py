@@ -23,7 +23,7 @@ MANY = 512
 """Values per environment from which on rows are written block by block: so many exceed a level-1 cache."""
 
 
-def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...]) -> None:
+def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...], parts: int = 1) -> None:
     """Emit the work on one tile at the builder's position.
 
     Args:
@@ -32,8 +32,9 @@ def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tup
         layout: its calling convention.
         arguments: 64-bit integers: address of the address table, address of the repeat counts, address of this
             thread's scratch memory, number of the tile, number of environments.
+        parts: in how many parts lanes go through calls.
     """
-    work = _TileWork(builder, program, layout, arguments)
+    work = _TileWork(builder, program, layout, arguments, parts)
     if not program.skip_unless:
         work.emit()
         return
@@ -44,10 +45,13 @@ def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tup
 class _TileWork:
     """Addresses of one tile's buffers and the code that uses them."""
 
-    def __init__(self, builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...]) -> None:
+    def __init__(
+        self, builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...], parts: int
+    ) -> None:
         table, repeats, scratch, tile, num_envs = arguments
         self.builder, self.program, self.layout = builder, program, layout
         self.vectors = VectorBuilder(builder, layout.dtype)
+        self.parts = parts
         self.table = builder.inttoptr(table, INT.as_pointer())
         self.repeats = builder.inttoptr(repeats, INT.as_pointer())
         self.last_env = builder.sub(num_envs, INT(1))
@@ -207,25 +211,46 @@ class _TileWork:
         """Call one lowered function, if it is needed."""
         body = self.bodies.get(call.function) or self._body(call.function)
         self.bodies[call.function] = body
-        pointers = [self.lanes[name] for name in call.inputs + call.outputs]
         if not call.only_if:
-            self.builder.call(body, pointers)
+            self._call_body(call, body)
             return
         with self.builder.if_then(self.any_lane(call.only_if)):
-            self.builder.call(body, pointers)
+            self._call_body(call, body)
+
+    def _call_body(self, call: Call, body: ir.Function) -> None:
+        """Call it as often as it takes: for every part of the lanes, and of the buffers."""
+        b, parts, f = self.builder, self.parts, call.function
+        pointers = [self.lanes[name] for name in call.inputs + call.outputs]
+        if parts == call.times == 1:
+            b.call(body, pointers)
+            return
+        sizes = {buffer.name: buffer.size for buffer in self.layout.buffers}
+        numel = [f.numel_in(i) for i in range(f.n_in())] + [f.numel_out(i) for i in range(f.n_out())]
+        goes_on = [sizes[name] > n for name, n in zip(call.inputs + call.outputs, numel, strict=True)]
+        narrow = [b.bitcast(pointer, argument.type) for pointer, argument in zip(pointers, body.args, strict=True)]
+        with loop(b, INT(call.times), "time") as time, loop(b, INT(parts), "part") as part:
+            first = [b.mul(time, INT(n * parts)) if goes else INT(0) for n, goes in zip(numel, goes_on, strict=True)]
+            b.call(body, [b.gep(pointer, [b.add(at, part)]) for pointer, at in zip(narrow, first, strict=True)])
 
     def _body(self, function: casadi.Function) -> ir.Function:
         """A function's own LLVM function: one long block that the optimiser sees alone."""
-        pointer = self.vectors.float_type.as_pointer()
+        pointer = VectorBuilder(None, self.layout.dtype, self.parts).float_type.as_pointer()
         signature = ir.FunctionType(ir.VoidType(), [pointer] * (function.n_in() + function.n_out()))
         body = ir.Function(self.builder.module, signature, f"call_{len(self.bodies)}")
         body.linkage = "internal"
         body.attributes.add("noinline")
         body.attributes.alignstack = ALIGNMENT  # else spilled vectors straddle two cache lines each
-        vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype)
-        lower_function(vectors, function, body.args[: function.n_in()], body.args[function.n_in() :])
+        vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype, self.parts)
+        inputs, outputs = body.args[: function.n_in()], body.args[function.n_in() :]
+        lower_function(vectors, function, inputs, outputs, apart=self.program.compact and self._is_apart(function))
         vectors.builder.ret_void()
         return body
+
+    def _is_apart(self, function: casadi.Function) -> bool:
+        """Whether no call of a function overwrites what it reads."""
+        calls = [call for call in self.program.calls if isinstance(call, Call) and call.function is function]
+        roots = {b.name: b.within or b.name for b in self.program.buffers}
+        return not any({roots[x] for x in call.inputs} & {roots[x] for x in call.outputs} for call in calls)
 
     def _smaller(self, a: Value, b: Value) -> Value:
         return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)

@@ -24,18 +24,23 @@ class VectorBuilder:
 
     No instruction has fast-math flags: LLVM may not fuse, reorder or replace any; each operation is rounded by itself.
 
-    Attributes:
+    Args:
         builder: the llvmlite builder.
         dtype: `float64` or `float32`.
+        parts: in how many vectors a tile's lanes lie one after the other, of which this is about one.
+
+    Attributes:
+        builder, dtype, parts: as given.
         lanes: elements of a vector.
         bits: width of one float, 64 or 32.
         float_type, int_type: the vector type and the integer vector of the same shape.
     """
 
-    def __init__(self, builder: Builder, dtype: str):
+    def __init__(self, builder: Builder, dtype: str, parts: int = 1):
         self.builder = builder
         self.dtype = dtype
-        self.lanes = lane_count(dtype)
+        self.parts = parts
+        self.lanes = lane_count(dtype) // parts
         self.bits = 8 * np.dtype(dtype).itemsize
         scalar = ir.DoubleType() if self.bits == 64 else ir.FloatType()
         self.float_type = ir.VectorType(scalar, self.lanes)
@@ -128,11 +133,11 @@ class VectorBuilder:
 
     def load(self, base: Value, index: int) -> Value:
         """Vector `index` of an aligned buffer that starts at `base`."""
-        return self.builder.load(self.element(base, index), align=ALIGNMENT)
+        return self.builder.load(self.element(base, index), align=ALIGNMENT // self.parts)
 
     def store(self, value: Value, base: Value, index: int) -> None:
         """Write vector `index` of an aligned buffer that starts at `base`."""
-        self.builder.store(value, self.element(base, index), align=ALIGNMENT)
+        self.builder.store(value, self.element(base, index), align=ALIGNMENT // self.parts)
 
     def transposed(self, vectors: list[Value]) -> list[Value]:
         """Vector i of what is returned holds lane i of each, in their order; as many as there are lanes."""
@@ -191,7 +196,7 @@ class VectorBuilder:
 
     def element(self, base: Value, index: int) -> Value:
         """Address of vector `index`."""
-        return self.builder.gep(base, [ir.Constant(ir.IntType(64), index)], inbounds=True)
+        return self.builder.gep(base, [ir.Constant(ir.IntType(64), index * self.parts)], inbounds=True)
 
 
 @contextmanager
