@@ -90,10 +90,7 @@ class StepDerivatives:
         primal = primal_function(simulator.model.mechanism, simulator.options)
         self._parts = state_parts(primal)
         self.state_sizes = {n: simulator.model.nv if n == "q" else size for n, size in self._parts.items()}
-        others = {n: primal.numel_in(n) for n in ("target", "parameters") if n in primal.name_in()}
-        ends = np.cumsum([0, *self.state_sizes.values(), *others.values()])
-        names = [*self.state_sizes, *others]
-        self._columns = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(names)}
+        self._other_sizes = {n: primal.numel_in(n) for n in ("target", "parameters") if n in primal.name_in()}
 
     @property
     def n_recorded(self) -> int:
@@ -152,20 +149,25 @@ class StepDerivatives:
             Its gradient with respect to the first state, by part; to the target of each sub-step, first to last,
             (num_envs, n_targets) each; and to the declared parameters, (num_envs, n), in the order of declaration.
         """
-        now, none = self._weights(weights), np.zeros((self.simulator.num_envs, 0))
-        targets, parameters = list[NDArray](), none
-        for record in reversed(self.take() if records is None else records):
+        simulator, records = self.simulator, self.take() if records is None else records
+        n, parameters = simulator.num_envs, np.zeros((simulator.num_envs, self._size("parameters")))
+        now = _in_tiles(self._weights(weights), simulator.dtype)
+        targets = np.empty((sum(len(record.targets) for record in records), n, self._size("target")))
+        at, others = len(targets), {"parameters": parameters.copy()}
+        for record in reversed(records):
             for (arrays, target), parts in zip(reversed(self._states(record)), reversed(record.in_parts), strict=True):
-                found = self._gradient(arrays, target, now)
-                if parts is not None:
-                    for name, rows in self._through_parts(arrays, target, now, parts).items():
-                        found[name][parts] = rows
-                now = {name: found[name] for name in self.state_sizes}
-                targets.append(found.get("target", none))
-                parameters = parameters + found["parameters"] if parameters.size else found.get("parameters", none)
+                at -= 1
+                others["target"] = targets[at]
+                after = None if parts is None else self._rows(now, n)
+                self._go_back(arrays, target, now, others)
+                if parts is not None and after is not None:
+                    for name, rows in self._through_parts(arrays, target, after, parts).items():
+                        _overwrite((now | others)[name], rows, parts)
+                parameters += others["parameters"]
             if record.kept is not None:
-                now = {name: np.where(record.kept[:, None], value, 0.0) for name, value in now.items()}
-        return now, targets[::-1], parameters
+                for array in now.values():
+                    write_rows(array, 0.0, ~record.kept)
+        return self._rows(now, n), list(targets), parameters
 
     def gradient(self, target: ArrayLike, weights: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
         """Return the gradient of one sub-step from the present state, which stays as it is.
@@ -227,7 +229,7 @@ class StepDerivatives:
         """Return the gradient of a sub-step of those robots that made it in parts."""
         rows = {name: read_rows(array, self.simulator.num_envs)[chosen] for name, array in arrays.items()}
         target, now = target[chosen], {name: value[chosen] for name, value in weights.items()}
-        others = {name: np.zeros((len(target), self._size(name))) for name in self._columns if name not in now}
+        others = {name: np.zeros((len(target), size)) for name, size in self._other_sizes.items()}
         for part in reversed(_parts_of(self.simulator, rows, target)):
             found, taken = self._gradient(part.arrays, target, now), part.taken[:, None]
             now = {name: np.where(taken, found[name], value) for name, value in now.items()}
@@ -235,7 +237,7 @@ class StepDerivatives:
         return now | others
 
     def _size(self, name: str) -> int:
-        return self._columns[name].stop - self._columns[name].start
+        return self._other_sizes.get(name, 0)
 
     @cached_property
     def _kernel(self) -> Any:
@@ -272,12 +274,22 @@ class StepDerivatives:
     def _gradient(
         self, arrays: Mapping[str, NDArray], target: NDArray, weights: Mapping[str, NDArray]
     ) -> dict[str, NDArray]:
-        simulator, n = self.simulator, len(target)
-        sums = np.zeros((n, max(end.stop for end in self._columns.values())))
-        given = {f"w_{name}": np.ascontiguousarray(value) for name, value in weights.items()}
-        every = {**arrays, **given, **simulator._batch.tables, "target": target, "sums": sums}
-        self._kernel(every, n, num_threads=simulator.num_threads)
-        return {name: sums[:, columns] for name, columns in self._columns.items()}
+        n, now = len(target), _in_tiles(dict(weights), self.simulator.dtype)
+        others = {name: np.zeros((n, size)) for name, size in self._other_sizes.items()}
+        self._go_back(arrays, target, now, others)
+        return self._rows(now, n) | others
+
+    def _go_back(
+        self, arrays: Mapping[str, NDArray], target: NDArray, now: dict[str, NDArray], others: dict[str, NDArray]
+    ) -> None:
+        """Overwrite a gradient to the state after a sub-step, tiles, by that to the one before, and those to others."""
+        given = {f"w_{name}": array for name, array in now.items()}
+        given |= {f"by_{name}": rows for name, rows in others.items()}
+        every = {**arrays, **given, **self.simulator._batch.tables, "target": target}
+        self._kernel(every, len(target), num_threads=self.simulator.num_threads)
+
+    def _rows(self, now: dict[str, NDArray], n: int) -> dict[str, NDArray]:
+        return {name: read_rows(array, n).astype(float, copy=False) for name, array in now.items()}
 
     def _is_as_left(self, record: Record) -> bool:
         """Whether nobody has set robots or their figures since."""
@@ -352,6 +364,16 @@ def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray
         state |= {name: left[f"tried_{name}_next"] for name in state if f"tried_{name}_next" in left}
         progress = {name: left[f"{name}_next"] for name in progress}
     return parts
+
+
+def _overwrite(array: NDArray, rows: NDArray, chosen: NDArray[np.bool_]) -> None:
+    """Write rows of the chosen robots into an array of tiles or rows."""
+    if array.ndim == 2:
+        array[chosen] = rows
+        return
+    every = np.zeros((len(chosen), rows.shape[1]))
+    every[chosen] = rows
+    write_rows(array, every, chosen)
 
 
 def _in_tiles(rows: Mapping[str, NDArray], dtype: str) -> dict[str, NDArray]:

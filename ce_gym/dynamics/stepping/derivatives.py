@@ -41,13 +41,16 @@ def primal_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[s
     return (step_function if whole else iteration_function)(mechanism, options, outputs, follows=True)
 
 
-def adjoint_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
+def adjoint_function(
+    mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = (), leads_on: bool = False
+) -> ca.Function:
     """Trace the reverse mode of one iteration.
 
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
         outputs: Names among `OUTPUTS` that something depends on besides the state; each has weights `w_{name}`.
+        leads_on: Whether to return, too, what the iteration itself hands on: `iterate` and `unconverged`.
 
     Returns:
         Function (*inputs of `primal_function`, `w_{part}` of the state after the step, `sums`, `pending`, `active`,
@@ -85,8 +88,24 @@ def adjoint_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[
     counts = ca.logic_and(active, after["diverged_next"] < 0.5)
     left = {"sums_next": sums + ca.if_else(counts, whole, 0), "pending_next": ca.if_else(active, 0, pending)}
     left |= {"owed_next": ca.if_else(counts, back, 0)} if owed.numel() else {}
+    handed_on = ("iterate_next", "unconverged") if leads_on else ()
+    left |= {name: after[name] for name in handed_on if name in after}
     given = weights | {"sums": sums, "pending": pending, "active": active}
     return traced("adjoint", inputs | given | ({"owed": owed} if owed.numel() else {}), left)
+
+
+def first_adjoint_function(adjoint: ca.Function) -> ca.Function:
+    """Return the reverse mode of a first iteration that is the last, too: a tenth less than that of any iteration.
+
+    Returns:
+        Function of those inputs of `adjoint` that are not known then -> (`sums`, and what it leads on to).
+    """
+    known = {"iterate": 0, "sums": 0, "owed": 0, "pending": 1, "active": 1}
+    sizes = {name: adjoint.numel_in(name) for name in adjoint.name_in()}
+    inputs = {name: SX.sym(name, size) for name, size in sizes.items() if name not in known}
+    given = [inputs[name] if name in inputs else known[name] * SX.ones(size) for name, size in sizes.items()]
+    left = dict(zip(adjoint.name_out(), adjoint.call(given), strict=True))
+    return traced("first", inputs, {x: value for x, value in left.items() if x not in ("owed_next", "pending_next")})
 
 
 def state_parts(primal: ca.Function) -> dict[str, int]:

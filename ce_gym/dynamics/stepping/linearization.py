@@ -20,6 +20,8 @@ Featherstone 2008, section 6.5, for the factorisation.
 from __future__ import annotations
 
 from functools import cached_property
+from itertools import accumulate, groupby
+from typing import TypeAlias
 
 import casadi as ca
 
@@ -34,6 +36,8 @@ from ce_gym.model.mechanism import Mechanism
 
 REMEMBERED = ("load", "anchor")
 """Parts of a state besides positions and velocities whose derivatives are not zero: what contacts remember."""
+Block: TypeAlias = tuple[str, int, int]
+"""Directions one after the other: what they are changes of, the first place in it, and how many."""
 
 
 class Linearization(Equation):
@@ -71,10 +75,11 @@ class Linearization(Equation):
         others = self.remembered | {"target": self.given.target.numel()}
         return groups + [[(name, i) for i in range(n)] for name, n in others.items() if n]
 
-    @property
-    def directions(self) -> list[Direction]:
-        """Directions of all groups."""
-        return [direction for group in self.groups for direction in group]
+    @cached_property
+    def places(self) -> dict[str, int]:
+        """Where the directions of each part of the state, and the target, begin among all of them."""
+        sizes = {"q": self.nv, "v": self.nv, **self.remembered, "target": self.given.target.numel()}
+        return dict(zip((*sizes, "end"), accumulate(sizes.values(), initial=0), strict=True))
 
     @cached_property
     def _slope(self) -> SX:
@@ -129,10 +134,10 @@ class Linearization(Equation):
         """Trace how the equation of motion changes along directions, for an unchanged acceleration.
 
         Returns:
-            Function (*inputs, inertia, forces, slopes, drift) -> a column (nv,) for each direction.
+            Function (*inputs, inertia, forces, slopes, drift) -> a column (nv,) for each direction, block by block.
         """
         columns = self.to_own_axes(group, self.change(self.seeds(group)))
-        return traced("change", self.frozen, {f"change{i}": columns[:, i] for i in range(len(group))})
+        return traced("change", self.frozen, in_blocks("change", group, columns))
 
     def press_function(self, group: list[Direction]) -> ca.Function | None:
         """Trace what contacts add to that; to be called if a contact acts.
@@ -143,20 +148,25 @@ class Linearization(Equation):
         columns = self.to_own_axes(group, self.pressing(self.seeds(group)))
         if not columns.nnz():
             return None
-        changes = {f"change{i}": SX.sym("change", self.nv) for i in range(len(group))}
-        left = {f"{name}_next": change + columns[:, i] for i, (name, change) in enumerate(changes.items())}
+        added = in_blocks("change", group, columns)
+        changes = {name: SX.sym(name, column.numel()) for name, column in added.items()}
+        left = {f"{name}_next": change + added[name] for name, change in changes.items()}
         return traced("press", self.frozen | changes, left)
 
-    def solve_function(self) -> ca.Function:
+    def solve_function(self, first: bool = False) -> ca.Function:
         """Trace how the acceleration changes along one direction.
 
         Returns:
-            Function (factor, change, active, column) -> column (nv,), as it was where `active` is 0.
+            Function (factor, change, active, column) -> column (nv,), as it was where `active` is 0; in the first
+            iteration (factor, change) -> column.
         """
         change, column, active = SX.sym("change", self.nv), SX.sym("column", self.nv), SX.sym("active")
         factor = SX.sym("factor", self._factor.nnz())
         solved = solved_with(SX(self._factor, factor), self.order, -change)
-        given = {"factor": factor, "change": change, "active": active, "column": column}
+        given = {"factor": factor, "change": change}
+        if first:
+            return traced("solve", given, {"column": solved})
+        given |= {"active": active, "column": column}
         return traced("solve", given, {"column_next": ca.if_else(active, solved, column)})
 
     def slope_function(self) -> ca.Function:
@@ -169,38 +179,31 @@ class Linearization(Equation):
         return traced("slope", self.inputs, left)
 
     def end_function(self) -> ca.Function:
-        """Trace what the change of the acceleration does to the state after the step, along one direction.
+        """Trace how the state after the step changes along one direction.
 
         Returns:
-            Function (slope, column, gains) -> that of the state, positions in their tangent space, (size,). Only loads
-            depend on gains, those of the iteration before the last.
+            Function (slope, column, still, diverged, gains) -> that, positions in their tangent space, (size,); 0 for a
+            robot that has diverged. Only loads depend on gains, those of the iteration before the last.
         """
         slope, column = SX.sym("slope", self._slope.nnz()), SX.sym("column", self.nv)
         given, end = {"slope": slope, "column": column}, SX(self._slope.sparsity(), slope) @ column
+        given |= {"still": SX.sym("still", self.size), "diverged": SX.sym("diverged")}
         if self.keeps_gains:
             given |= {
                 "end_gained": SX.sym("gained", self._end_gained.nnz()),
                 "gains": SX.sym("gains", self.wrt["gains"].numel()),
             }
             end += SX(self._end_gained.sparsity(), given["end_gained"]) @ given["gains"]
-        return traced("end", given, {"end": end})
+        return traced("end", given, {"end": ca.if_else(given["diverged"], 0, end + given["still"])})
 
-    def gather_function(self) -> ca.Function:
-        """Trace the derivative of the step.
+    def still_function(self, group: list[Direction]) -> ca.Function:
+        """Trace how the state after the step changes along directions for an unchanged acceleration.
 
         Returns:
-            Function (*inputs, what `end_function` returns for each direction) -> ends, shape (size, directions), in the
-            order of q, v, what is remembered and the target; zeros for a robot that has diverged.
+            Function (*inputs) -> a column (size,) for each direction, block by block.
         """
-        ends = [SX.sym("end", self.size) for _ in self.directions]
-        still = [
-            self.to_own_axes(group, ca.jtimes(self.end_values, self.x, self.seeds(group))) for group in self.groups
-        ]
-        whole = self.tangent_after(ca.horzcat(*still)) + ca.horzcat(*ends)
-        places = {name: i for i, name in enumerate(("q", "v", *self.remembered, "target"))}
-        order = sorted(range(len(ends)), key=lambda i: (places[self.directions[i][0]], self.directions[i][1]))
-        whole = ca.if_else(self.given.diverged, 0, ca.densify(whole)[:, order])
-        return traced("gather", self.inputs | {f"end{i}": end for i, end in enumerate(ends)}, {"ends": whole})
+        columns = self.to_own_axes(group, ca.jtimes(self.end_values, self.x, self.seeds(group)))
+        return traced("still", self.inputs, in_blocks("still", group, self.tangent_after(columns)))
 
     def gains_function(self) -> ca.Function:
         """Trace what an iteration passes on to the next: how the gains in velocity change.
@@ -212,7 +215,7 @@ class Linearization(Equation):
         left = {"gained": packed(self._gained), "into": packed(self._into)}
         for g, group in enumerate(self.groups):
             direct = self.to_own_axes(group, ca.jtimes(self._gains, self.x, self.seeds(group)))
-            left |= {f"direct{g}_{i}": direct[:, i] for i in range(len(group))}
+            left |= in_blocks(f"direct{g}_", group, direct)
         return traced("gains", self.frozen, left)
 
     def pass_on_function(self) -> ca.Function:
@@ -257,3 +260,16 @@ class Linearization(Equation):
         seeds = SX(n, m)
         seeds[n - m :, :] = SX.eye(m)  # gains of the iteration before are the last that directions are changes of
         return ca.sparsify(self.change(seeds) + self.pressing(seeds))
+
+
+def blocks(group: list[Direction]) -> list[Block]:
+    """Return a group of directions as blocks: of each part of what a step is given, those one after the other."""
+    parts = [(name, [i for _, i in some]) for name, some in groupby(group, lambda direction: direction[0])]
+    return [(name, places[0], len(places)) for name, places in parts]
+
+
+def in_blocks(name: str, group: list[Direction], columns: SX) -> dict[str, SX]:
+    """Return columns of a group of directions, those of each block one below the other; names tell sizes, too."""
+    counts = [count for _, _, count in blocks(group)]
+    split = ca.horzsplit(ca.densify(columns), list(accumulate(counts, initial=0)))
+    return {f"{name}{j}_{count}": ca.vec(x) for j, (x, count) in enumerate(zip(split, counts, strict=True))}

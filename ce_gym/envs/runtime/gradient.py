@@ -77,7 +77,7 @@ class ControlStepGradient:
         scratch = [Buffer(name, size, "scratch") for name, size in self._sizes(steps).items() if name not in known]
         scratch = [buffer for buffer in scratch if buffer.name not in task.schema]
         name = f"{task.model.robot.name} {task.model.transmission} control step gradient"
-        return Program(name, tuple(state + own + scratch), tuple(steps))
+        return Program(name, tuple(state + own + scratch), tuple(steps), compact=True)
 
     def _sizes(self, steps: list[Step]) -> dict[str, int]:
         sizes: dict[str, int] = {}
