@@ -188,7 +188,7 @@ class FastPPO:
         for _ in range(s.epochs):
             order = self.rng.permutation(n)
             figures = [self._update(order[i : i + size], returns, F(entropy)) for i in range(0, n, size)]
-        means = np.mean(figures, axis=0).tolist()
+        means = self.average(np.mean(figures, axis=0)).tolist()
         result = {f"train/{name}": mean for name, mean in zip(FIGURES, means, strict=True)}
         spread = float(np.var(returns))
         unexplained = float(np.var(self.advantages)) / spread if spread else np.nan
@@ -225,25 +225,33 @@ class FastPPO:
 
         list((self.pool.map if self.threads > 1 else map)(work, range(SHARES), np.array_split(rows, SHARES)))
         self.updates += 1
-        gradient = self.gradients.sum(axis=0)
+        gradient = self.average(self.gradients.sum(axis=0))
         adam(self.theta, gradient, self.moments[0], self.moments[1], self.updates, self.rate, s.max_grad_norm)
         return figures.sum(axis=0)
+
+    def average(self, values: NDArray) -> NDArray:
+        """Average over all processes that learn this policy; there is one."""
+        return values
 
     def actor(self) -> Actor:
         """The layers that turn observations into mean actions, copies."""
         layers = layers_of(self.parts(self.theta)[0], self.actor_sizes)
         return Actor(tuple((weight.T.copy(), bias.copy()) for weight, bias in layers), self.settings.activation)
 
-    def state(self) -> dict[str, NDArray]:
-        """All that going on needs, as arrays: see `restore`."""
-        native: Any = self.envs.unwrapped
+    def learned(self) -> dict[str, NDArray]:
+        """All that going on needs but the state of the environments, as arrays."""
         facts = {
             "steps": self.steps, "updates": self.updates, "rate": self.rate, "rng": self.rng.bit_generator.state,
             "sizes": [self.actor_sizes.tolist(), self.critic_sizes.tolist()], "activation": self.settings.activation,
             "episodes": self.episodes.names,
         }  # fmt: skip
-        found = {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
-        found |= {f"observed_{i}": view for i, view in enumerate(self.observed)} | {"episodes": self.episodes.rows()}
+        return {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
+
+    def state(self) -> dict[str, NDArray]:
+        """All that going on needs, as arrays: see `restore`."""
+        native: Any = self.envs.unwrapped
+        views = {f"observed_{i}": view for i, view in enumerate(self.observed)}
+        found = self.learned() | views | {"episodes": self.episodes.rows()}
         if hasattr(native, "snapshot"):
             found |= {f"env/{name}": array for name, array in native.snapshot().items()}
         return found

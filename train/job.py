@@ -10,10 +10,12 @@ import contextlib
 import json
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium
@@ -272,10 +274,11 @@ def parser() -> argparse.ArgumentParser:
 
 def main(
     program: str,
-    train: Callable[[Job], Trained],
+    train: Callable[..., Trained],
     argv: list[str] | None = None,
     folder: str = "",
     settings: type = Settings,
+    options: Mapping[str, dict[str, Any]] = MappingProxyType({}),
 ) -> int:
     """Train every seed, evaluate each policy, and print its path.
 
@@ -285,9 +288,14 @@ def main(
         argv: Arguments of the command line.
         folder: Ends the names of folders, so that policies of different learners do not mix.
         settings: The learner's dataclass of settings.
+        options: The learner's own options of the command line, as argparse has them; `train` gets them by name.
     """
-    args = parser().parse_args(argv)
-    return run(program, lambda: _train_all(program, train, args, folder, settings))
+    line = parser()
+    for name, option in options.items():
+        line.add_argument(f"--{name}", **option)
+    args = line.parse_args(argv)
+    own = partial(train, **{name: getattr(args, name) for name in options})
+    return run(program, lambda: _train_all(program, own, args, folder, settings))
 
 
 def _train_all(

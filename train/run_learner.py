@@ -1,7 +1,7 @@
 """A training run of a learner over plain arrays, such as `fast_ppo.FastPPO`: from its environments to its files.
 
 A learner has `iterate`, `actor`, `state` and `restore`, and the attributes `steps`, `episodes`, `envs`, `step_seconds`
-and `collect_seconds`.
+and `collect_seconds`; one that works in other processes too has `processor_seconds`, their processor time [s].
 """
 
 from __future__ import annotations
@@ -26,21 +26,20 @@ from training_page import Present
 from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
 
 
-def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str) -> Trained:
+def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str, num_envs: int | None = None) -> Trained:
     """Train with a learner, and save the policy even if Ctrl-C ends training early.
 
     Args:
         kind: Makes the learner.
         job: The training run.
         name: Of the learner's file.
+        num_envs: Environments that the learner is given, if not those of the settings.
 
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
     make_folder(job.out)
-    options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
-    mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **job.settings.training}
-    envs = gymnasium.make_vec(job.env_id, num_envs=job.settings.num_envs, vectorization_mode=mode, **options)
+    envs = environments(job, num_envs)
     try:
         learner = kind(envs, job)
         if job.resume:
@@ -48,6 +47,15 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str) -> T
         return _learn(learner, job, name)
     finally:
         envs.close()
+
+
+def environments(job: Job, num_envs: int | None = None) -> VectorEnv:
+    """Return the environments of a training run, as many as its settings say if nothing else is asked for."""
+    options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
+    mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **job.settings.training}
+    return gymnasium.make_vec(
+        job.env_id, num_envs=num_envs or job.settings.num_envs, vectorization_mode=mode, **options
+    )
 
 
 def _learn(learner: Any, job: Job, name: str) -> Trained:
@@ -59,6 +67,7 @@ def _learn(learner: Any, job: Job, name: str) -> Trained:
 
     def record(finished: bool = False) -> dict[str, Any]:
         written = make_record(job, native, learner.steps, clock, ("numba",))
+        written["processor_seconds"] += getattr(learner, "processor_seconds", 0.0)
         return written | {"learner": name, "finished": finished, "shares": bar.shares}
 
     every = max(s.steps // CHECKPOINTS, 1)
