@@ -94,7 +94,8 @@ def evaluate(
     envs = make_sb3_vec_env(env_id, episodes, seed, **everywhere(env_id, kwargs))
     try:
         native: Any = envs.envs.unwrapped
-        commanded = any("command" in block for block in native.observation_structure)
+        blocks = getattr(native, "observation_structure", {"command": None})  # environments of others have none
+        commanded = any("command" in block for block in blocks)
         return play(model, envs) | {"seed": seed, "commanded": commanded}
     finally:
         envs.close()

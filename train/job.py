@@ -10,12 +10,11 @@ import contextlib
 import json
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import gymnasium
@@ -278,7 +277,7 @@ def main(
     argv: list[str] | None = None,
     folder: str = "",
     settings: type = Settings,
-    options: Mapping[str, dict[str, Any]] = MappingProxyType({}),
+    add_options: Callable[[argparse.ArgumentParser], None] | None = None,
 ) -> int:
     """Train every seed, evaluate each policy, and print its path.
 
@@ -288,13 +287,14 @@ def main(
         argv: Arguments of the command line.
         folder: Ends the names of folders, so that policies of different learners do not mix.
         settings: The learner's dataclass of settings.
-        options: The learner's own options of the command line, as argparse has them; `train` gets them by name.
+        add_options: Adds the learner's own options to the command line; `train` gets their values by name.
     """
     line = parser()
-    for name, option in options.items():
-        line.add_argument(f"--{name}", **option)
+    common = vars(line.parse_args([]))
+    if add_options:
+        add_options(line)
     args = line.parse_args(argv)
-    own = partial(train, **{name: getattr(args, name) for name in options})
+    own = partial(train, **{name: value for name, value in vars(args).items() if name not in common})
     return run(program, lambda: _train_all(program, own, args, folder, settings))
 
 

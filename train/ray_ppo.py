@@ -19,6 +19,7 @@ import interruption  # noqa: F401
 
 import socket
 import time
+from argparse import ArgumentParser
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import timedelta
@@ -43,14 +44,6 @@ PATIENCE = timedelta(seconds=60)
 
 ATTEMPTS = 3
 """How often an iteration is begun before the fault is taken for one that stays."""
-
-OPTIONS: dict[str, dict[str, Any]] = {
-    "workers": {"type": whole(1, 10_000), "default": 2, "metavar": "N", "help": "processes that learn (default 2)"},
-    "address": {
-        "metavar": "HOST:PORT",
-        "help": "Ray cluster, such as auto; --threads are then each worker's, otherwise they are shared among workers",
-    },
-}
 
 
 @dataclass(frozen=True)
@@ -205,9 +198,18 @@ def train(job: Job, workers: int, address: str | None) -> Trained:
         ray.shutdown()
 
 
+def add_options(parser: ArgumentParser) -> None:
+    """Add what other learners do not have."""
+    clusters = "Ray cluster, such as auto; --threads are then each worker's, otherwise they are shared among workers"
+    parser.add_argument(
+        "--workers", type=whole(1, 10_000), default=2, metavar="N", help="processes that learn (default 2)"
+    )
+    parser.add_argument("--address", metavar="HOST:PORT", help=clusters)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    return run_jobs("ray_ppo.py", train, argv, folder="-ray", options=OPTIONS)
+    return run_jobs("ray_ppo.py", train, argv, folder="-ray", add_options=add_options)
 
 
 if __name__ == "__main__":
