@@ -134,7 +134,9 @@ def test_deleted_rotors_are_gone(robot: Robot):
 
 
 def test_unknown_level_is_refused(robot: Robot):
-    with pytest.raises(RobotError, match=r"transmission 'rigid' does not exist; expected one of elastic, exact, coupled"):
+    with pytest.raises(
+        RobotError, match=r"transmission 'rigid' does not exist; expected one of elastic, exact, coupled"
+    ):
         Model(robot, "rigid")
 
 

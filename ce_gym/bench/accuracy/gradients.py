@@ -111,7 +111,8 @@ def judged(x: NDArray, value: NDArray, slope: NDArray) -> tuple[float, float, fl
     difference = (value - value[:, ::-1]) * x / (2 * SIGMA**2)
     first, zeroth = slope @ density, difference @ density
     scale = np.sqrt(np.mean(zeroth**2))
-    scatter = [np.sqrt(np.mean(e**2 @ density - (e @ density) ** 2)) / scale for e in (slope, difference)]
+    around = [e - (e @ density)[:, None] for e in (slope, difference)]
+    scatter = [np.sqrt(np.mean(e**2 @ density)) / scale for e in around]
     return float(np.sqrt(np.mean((first - zeroth) ** 2)) / scale), float(scatter[0]), float(scatter[1])
 
 
