@@ -17,6 +17,7 @@ import interruption  # noqa: F401
 
 # isort: split
 
+import json
 import socket
 import time
 from argparse import ArgumentParser
@@ -145,7 +146,10 @@ class RayPPO:
 
     def restore(self, state: dict[str, NDArray]) -> None:
         """Go on from a state; environments begin anew."""
-        self.learned = state
+        self.learned = {name: state[name] for name in ("facts", "theta", "moments")}
+        self.steps = json.loads(str(state["facts"]))["steps"]
+        self._stop()
+        self._attempt(lambda: None)
 
     def _attempt(self, work: Any) -> Any:
         """Do some work of all workers, who are started where they are not or no longer there."""
