@@ -46,6 +46,9 @@ from ce_gym.policies import (
     write_npz,
 )
 
+FINER = 5
+"""Sub-steps are that much shorter in one judgement: a policy may live on their length."""
+
 
 def judged(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[str] = LEVELS) -> dict[str, Any]:
     """Judge a policy for its card.
@@ -57,9 +60,10 @@ def judged(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[
         levels: Levels besides that of training.
 
     Returns:
-        seed: of everything, that which the weights give; levels: result of `evaluate` by level; suites, effort and
-        pushes, on the level of training; sim2sim, or sim2sim_missing, one line that says why there is none. Of a policy
-        that sees no commands there are no suites, pushes and sim2sim.
+        seed: of everything, that which the weights give; levels: result of `evaluate` by level; finer: the same on the
+        level of training with sub-steps `FINER` times shorter; suites, effort and pushes, on the level of training;
+        sim2sim, or sim2sim_missing, one line that says why there is none. Of a policy that sees no commands there are
+        no suites, pushes and sim2sim.
     """
     record, kwargs, seed = policy.record, policy.record["env_kwargs"], weights_seed(policy)
     found = {
@@ -69,6 +73,8 @@ def judged(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[
     longest = gymnasium.spec(record["env"]).max_episode_steps or math.inf
     seconds = min(10.0, longest * record["policy_spec"]["control_dt"])
     result: dict[str, Any] = {"seed": seed, "levels": found}
+    shorter = {**kwargs, **_shorter(record["policy_spec"])}
+    result["finer"] = evaluate(policy, record["env"], episodes=episodes, seed=seed, **shorter)
     result["effort"] = effort(policy, seconds=seconds, seed=seed, **kwargs)
     if not found[record["transmission"]]["commanded"]:
         return result | {"sim2sim_missing": "it sees no commands, by which simulations are compared"}
@@ -85,6 +91,12 @@ def judged(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[
     except ValueError as error:  # MuJoCo cannot express every robot
         why = " ".join(str(error).split()).replace(f"{shelf().parent}/", "")  # cards travel, folders do not
         return result | {"sim2sim_missing": why}
+
+
+def _shorter(spec: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of an environment whose control steps are as long, of `FINER` times as many sub-steps."""
+    dt = spec["physics_dt"] / FINER
+    return {"dt": dt, "n_substeps": round(spec["control_dt"] / dt)}
 
 
 def command(record: dict[str, Any]) -> str:
@@ -175,16 +187,19 @@ def _how_to_repeat(record: dict[str, Any]) -> str:
 
 
 def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:
+    level, spec = record["transmission"], record["policy_spec"]
+    found = {f"`{name}`" + " (trained)" * (name == level): each for name, each in result["levels"].items()}
+    found[f"`{level}`, sub-steps of {1e3 * _shorter(spec)['dt']:g} ms"] = result["finer"]
     rows: Table = []
-    for level, figures in result["levels"].items():
-        own = " (trained)" if level == record["transmission"] else ""
+    for name, figures in found.items():
         shown = _errors(figures) if figures["commanded"] else own_figures(figures)
         rows = rows or [["judged on", *shown, "falls", "reward"]]
         last = (f"{figures['falls']:.1%}", f"{figures['reward']:.2f}")
-        rows.append([f"`{level}`{own}", *(f"{figure:.3f}" for figure in shown.values()), *last])
-    count, length = figures["episodes"], record["policy_spec"]["control_dt"]
+        rows.append([name, *(f"{figure:.3f}" for figure in shown.values()), *last])
+    count, length = figures["episodes"], spec["control_dt"]
     said = "Mean absolute errors over every step" if figures["commanded"] else "Means, in SI units,"
-    said = f"{said} of {count} episodes of the mean action; a step is {length:g} s."
+    said = f"{said} of {count} episodes of the mean action; a step is {length:g} s"
+    said = f"{said}, of sub-steps of {spec['physics_dt'] * 1e3:g} ms."
     return f"{markdown(rows)}\n\n{said} Seed {result['seed']}: the first 32 bits of the SHA-256 of the weights."
 
 

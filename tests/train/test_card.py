@@ -88,10 +88,10 @@ def test_a_card_says_what_was_measured(run):
     sim2sim = {"simulations": simulations, "verdict": verdict}
     suites = {"standing": figures | {"falls": 0.789}}
     result = {"seed": 98765, "levels": {"exact": figures}, "effort": {}, "pushes": pushes, "sim2sim": sim2sim}
-    result |= {"suites": suites}
+    result |= {"suites": suites, "finer": figures | {"forward_error": 0.234}}
     curve = [{"steps": 1, "seconds": 98.7, "reward": 1.0, "length": 1.0}]
     text = card(record, result, curve, short_name(record))
-    measured = ("0.123", "45.6%", "78.9%", "98765", "25%", "2.0%", "passed")
+    measured = ("0.123", "`exact`, sub-steps of 1 ms | 0.234", "45.6%", "78.9%", "98765", "25%", "2.0%", "passed")
     for words in (*measured, "99 s", ROBOT_ENV, "[32, 16]", "curve.png"):
         assert words in text, words
     assert "## Motors" not in text
@@ -102,7 +102,7 @@ def test_a_card_of_a_policy_without_commands_has_the_task_s_own_figures(run):
     figures = {"metrics/longest_flight": 0.4321, "reward/flight": 0.9876, "forward_error": 0.123, "reward": 7.0}
     figures |= {"falls": 0.456, "timed_out": 0.5, "diverged": 0.0, "episode_length": 2.5, "episodes": 12, "seed": 1}
     figures["commanded"] = False
-    result = {"seed": 1, "levels": {"exact": figures}, "effort": {}, "sim2sim_missing": "no commands"}
+    result = {"seed": 1, "levels": {"exact": figures}, "finer": figures, "effort": {}, "sim2sim_missing": "no commands"}
     text = card(record, result, [], short_name(record))
     assert "| longest flight | falls" in text
     for words, there in (("0.432", True), ("45.6%", True), ("no commands", True), ("0.123", False), ("Pushes", False)):
