@@ -78,6 +78,14 @@ def test_mujoco_runs_the_same_scene():
     assert not armature.tied
 
 
+@pytest.mark.parametrize("integrator", [name for name in accuracy_curves.INTEGRATORS if name != "RK4"])
+def test_each_integrator_of_mujoco_comes_to_its_limit_at_first_order(integrator: str):
+    family = Family(short("stiff_1e3", 3), "armature", stiff=False)
+    limit = Peer(family, "RK4", 1000).run()
+    coarse, fine = (rms_error(family.scene, Peer(family, integrator, n).run(), limit) for n in (50, 200))
+    assert coarse / fine == pytest.approx(4.0, rel=0.2)
+
+
 def test_a_block_slides_as_far_as_coulomb_says():
     table = accuracy_coulomb.distance_table()
     finest = {row[:2]: row[-1] for row in table.rows}

@@ -92,6 +92,21 @@ def test_mujoco_on_two_threads_is_mujoco_on_one():
     np.testing.assert_array_equal(one, two)
 
 
+def test_mujocos_own_batches_come_to_the_same_states():
+    """So that rollouts stand for both."""
+    batches = pytest.importorskip("mujoco.batch")
+    from ce_gym.bench.peers import stand
+    from ce_gym.bench.speed import stepping
+
+    robot = load_robot("mini_cheetah")
+    ours = stepping.mujoco_batch(robot, "armature", 3, 1, 0.005)
+    control = np.repeat(stand.targets(robot, 3, 2, seed=0), 5, axis=1)
+    theirs = batches.Batch(ours.model, 3, nthread=1)
+    theirs.reset(keyframe=0)
+    found = theirs.rollout(control.shape[1], control, record=("qpos",))["qpos"]
+    np.testing.assert_array_equal(found, ours.trajectory(control)[:, :, 1 : 1 + ours.model.nq])
+
+
 def test_every_figure_of_a_small_robot(tmp_path):
     pytest.importorskip("mujoco")
     from ce_gym.bench.speed import batch as speed_batch

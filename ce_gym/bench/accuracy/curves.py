@@ -225,7 +225,7 @@ def peer_sides(scene: Scene, steps: Sequence[int], measured: Measured) -> list[S
     return sides
 
 
-INTEGRATORS = ("Euler", "implicitfast", "RK4")
+INTEGRATORS = ("Euler", "implicitfast", "discrete", "RK4")
 PEER_LIMIT = 1000
 """Steps to a hold from which MuJoCo's own limit is taken, compared with half as many; four times as many of a block."""
 MOST_STEPS_RK4 = 200

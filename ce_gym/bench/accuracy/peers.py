@@ -91,7 +91,7 @@ class Peer:
 
     Args:
         family: What it is.
-        integrator: "Euler", "implicitfast" or "RK4".
+        integrator: "Euler", "implicitfast", "discrete" or "RK4".
         per_hold: Steps to a hold.
     """
 

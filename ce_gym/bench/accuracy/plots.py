@@ -27,7 +27,7 @@ APPROXIMATE = ("ce_gym, armature or coupled, Euler", GREY, "o-")
 COLORS = {"": ORANGE, "exact": "#CC79A7", "stiff": RED}
 """MuJoCo's: without rotors, rotors as bodies or loops at its default, and held stiffly."""
 VARIANTS = {"": "without rotor bodies", "exact": "rotors and loops as equalities", "stiff": "the same, stiff"}
-MARKERS = {"Euler": "o", "implicitfast": "^", "RK4": "D"}
+MARKERS = {"Euler": "o", "implicitfast": "^", "discrete": "s", "RK4": "D"}
 
 
 def draw(measured: list[Measured], out: Path) -> Path:

@@ -17,7 +17,7 @@ from ce_gym.model import Robot
 SOLVERS = (("Newton", 100, 50), ("Newton", 4, 4), ("Newton", 3, 4), ("Newton", 2, 4), ("CG", 5, 4), ("PGS", 5, 4))
 """Solvers tried, with most iterations and most iterations of their line search."""
 
-INTEGRATORS = ("Euler", "implicitfast")
+INTEGRATORS = ("Euler", "implicitfast", "discrete")
 IMPEDANCES = (STIFF, None)
 """Tried for the equalities that stand for gears; None is MuJoCo's default."""
 
