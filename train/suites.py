@@ -79,7 +79,7 @@ def everywhere(env_id: str, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     given, changed = {**registered, **kwargs}, {}
     terrain = given.get("terrain", "flat")
     terrain = dict(terrain) if isinstance(terrain, Mapping) else {"kind": terrain}
-    if terrain.get("kind") != "flat":
+    if terrain.get("kind") not in ("flat", "map"):
         changed["terrain"] = terrain | {"curriculum": False}
     if "command_curriculum" in given:
         changed["command_curriculum"] = 1.0

@@ -41,7 +41,7 @@ class Curriculum:
     def __init__(self, task: Task) -> None:
         self.task, self.duration = task, task.episode_length * task.dt * task.n_substeps
         self.on_field = task.terrain["kind"] != "flat"
-        self.climbing = self.on_field and task.terrain["curriculum"]
+        self.climbing = self.on_field and task.terrain.get("curriculum", False)
         self.widening = task.command_curriculum < 1
         self.sizes = {"level": 1} if self.on_field else {}
         self.sizes |= {"walked": 2} if self.climbing else {}
@@ -65,7 +65,7 @@ class Curriculum:
 
     def level(self, state: dict[str, SX], sampler: Sampler, control_dt: float) -> SX:
         """Return the level of the terrain on which the next episode begins."""
-        count = self.task.terrain["levels"]
+        count = self.task.terrain.get("levels", 1)
         anywhere = ca.floor(sampler.uniform(0, count))
         if not self.climbing:
             return anywhere

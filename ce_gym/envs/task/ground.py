@@ -100,8 +100,10 @@ def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str,
 
 
 def starting_place(curriculum: Curriculum, level: SX, sampler: Sampler) -> SX:
-    """Return where an episode begins, x and y [m]: about the middle of a tile of a level, in any column."""
+    """Return where an episode begins, x and y [m]: about the middle of a tile of a level, or on a part of a map."""
     terrain = curriculum.task.terrain
+    if "begin" in terrain:
+        return ca.vertcat(*[sampler.uniform(low, high) for low, high in terrain["begin"]])
     column = ca.floor(sampler.uniform(0, terrain["columns"]))
     middle = terrain["size"] * (ca.vertcat(level, column) + 0.5)
     return middle + sampler.symmetric(2, PLATFORM / 2)

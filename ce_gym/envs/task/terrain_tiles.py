@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 
 from ce_gym.envs.task.terrain_kinds import BORDER, KINDS, PLATFORM, Tiles
+from ce_gym.envs.task.terrain_map import checked_map
 from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.terrain import Terrain
+from ce_gym.sim.terrain.files import MOST_HEIGHTS
 
 COMMON: dict[str, Any] = {"levels": 6, "columns": 4, "size": 8.0, "cell": 0.1, "curriculum": True}
 FINE = {**COMMON, "cell": 0.05}
@@ -36,16 +38,19 @@ def checked_terrain(value: Any) -> dict[str, Any]:
     """Return the ground of a task with all its arguments.
 
     Args:
-        value: A kind; a mapping with `kind` and other arguments, see `OWN`; or one with `kinds`, a mixture of columns:
-            by kind its share, or a mapping of `share` and arguments of its own.
+        value: A kind; a mapping with `kind` and other arguments, see `OWN`; one with `kinds`, a mixture of columns: by
+            kind its share, or a mapping of `share` and arguments of its own; or a height map, see `checked_map`.
 
     Raises:
         ValueError: One line that names the argument, its value and what was expected.
     """
+    value = {"kind": "map", "field": value} if isinstance(value, Terrain) else value
     given = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
     kind: Any = given.pop("kind", "mixed" if "kinds" in given else None)
-    known = isinstance(kind, str) and kind in OWN
-    check("terrain", value, known, f"{', '.join(map(repr, OWN))}, or a mapping with such a `kind`")
+    known = isinstance(kind, str) and kind in (*OWN, "map")
+    check("terrain", value, known, f"{', '.join(map(repr, OWN))}, a Terrain, or a mapping with such a `kind` or 'map'")
+    if kind == "map":
+        return checked_map(given)
     _check_arguments("terrain", kind, given, OWN[kind])
     if kind != "mixed":
         return {"kind": kind, **OWN[kind], **given}
@@ -97,15 +102,15 @@ def make_field(terrain: Mapping[str, Any]) -> Terrain:
     """Return the field of a task's ground; tile (level, column) has its middle at `(level + 1/2, column + 1/2) size`.
 
     Args:
-        terrain: What `checked_terrain` returns, not flat.
+        terrain: What `checked_terrain` returns, neither flat nor a map.
 
     Raises:
         ValueError: If the field has more heights than a kernel takes.
     """
     levels, columns, size, cell = (terrain[name] for name in ("levels", "columns", "size", "cell"))
     x, y = (cell * np.arange(math.ceil(round(n * size / cell, 6)) + 1) for n in (levels, columns))
-    if len(x) * len(y) > 2**24:
-        raise ValueError(f"terrain has {len(x) * len(y)} heights; expected at most {2**24}, so a longer `cell`")
+    if len(x) * len(y) > MOST_HEIGHTS:
+        raise ValueError(f"terrain has {len(x) * len(y)} heights; expected at most {MOST_HEIGHTS}, so a longer `cell`")
     level, column = np.minimum(x // size, levels - 1)[:, None], np.minimum(y // size, columns - 1)[None, :].astype(int)
     away = np.broadcast_arrays(x[:, None] - (level + 0.5) * size, y[None, :] - (column + 0.5) * size)
     difficulty = level / (levels - 1) * np.ones_like(column)
@@ -136,4 +141,6 @@ def _columns(terrain: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], l
 
 def field_of(terrain: Mapping[str, Any]) -> Terrain | None:
     """Return the field of a task's ground, None if that is flat; `terrain` is what `checked_terrain` returns."""
-    return None if terrain["kind"] == "flat" else make_field(terrain)
+    if terrain["kind"] == "flat":
+        return None
+    return terrain["field"] if terrain["kind"] == "map" else make_field(terrain)

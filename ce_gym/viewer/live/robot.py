@@ -63,7 +63,7 @@ class LiveRobot:
         self._values = ca.Function("values", [draw], [program.randomised.values(draw)])
         self.figures = {"friction": program.model.robot.material.friction, "added_mass": 0.0}
         ground = program.task.terrain
-        self._last_level = 0 if ground.get("curriculum", True) else ground["levels"] - 1
+        self._last_level = 0 if ground.get("curriculum", True) else ground.get("levels", 1) - 1
         self.reset(0)
 
     def reset(self, seed: int | None = None) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.sim.arguments import check
+from ce_gym.sim.arguments import check, is_number
+from ce_gym.sim.terrain.files import read_heights
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,7 @@ class Terrain:
     origin: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        heights = np.array(self.heights, dtype=float)
+        heights = np.array(self.heights, dtype=float, order="C")
         if heights.ndim != 2 or min(heights.shape) < 3:
             raise ValueError(f"heights has shape {heights.shape}; expected (rows, columns), 3 or more of each")
         if not _finite(heights):
@@ -54,6 +56,10 @@ class Terrain:
         object.__setattr__(self, "heights", heights)
         object.__setattr__(self, "cell", float(self.cell))
         object.__setattr__(self, "origin", (float(origin[0]), float(origin[1])))
+
+    def __repr__(self) -> str:
+        rows, columns = self.heights.shape
+        return f"Terrain({rows} x {columns} heights, cell={self.cell}, origin={self.origin})"
 
     @classmethod
     def flat(cls) -> Terrain:
@@ -134,6 +140,24 @@ class Terrain:
             raise ValueError(f"function returns shape {heights.shape}; expected {x.shape}")
         level = np.pad(np.broadcast_to(heights, x.shape), 1, mode="edge")
         return cls(level, cell, (centre[0] - half - cell, centre[1] - half - cell))
+
+    @classmethod
+    def from_file(cls, file: str | Path, cell: float, height: float = 1.0) -> Terrain:
+        """Return a height map with its middle at the world's origin, level beyond.
+
+        Args:
+            file: Heights [m] as a NumPy array `.npy`, rows along x and columns along y; or a picture that Pillow reads,
+                seen from above with x to the right and y up.
+            cell: Distance of the heights [m], a pixel of the picture.
+            height: Of white [m], or of the largest value of 16 bits; black is 0. For pictures only.
+
+        Raises:
+            ValueError: If the file cannot be read or a figure is out of range.
+        """
+        check("cell", cell, is_number(cell) and cell > 0, "a length above 0 m")
+        check("height", height, is_number(height), "a length in metres")
+        heights = np.pad(read_heights(file, height), 1, mode="edge")
+        return cls(heights, cell, tuple(-cell * (n - 1) / 2 for n in heights.shape))
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray:
         """Return the surface at places, as the compiled step sees it.

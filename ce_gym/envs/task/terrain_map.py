@@ -1,0 +1,51 @@
+"""A height map as the ground of a task, and where episodes begin on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ce_gym.sim.arguments import check, is_number
+from ce_gym.sim.terrain import Terrain
+
+ARGUMENTS = ("field", "file", "cell", "height", "begin")
+MARGIN = 1.0
+"""Episodes begin that far inside of a map, or a quarter of its length if that is less [m]."""
+
+
+def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the ground of a task on a map.
+
+    Args:
+        given: `field`, a `Terrain`, or `file`, with `cell` and `height`: see `Terrain.from_file`. `begin`, where
+            episodes begin: ranges of x and of y [m].
+
+    Returns:
+        `kind`, `field` and `begin`.
+
+    Raises:
+        ValueError: One line that names the argument, its value and what was expected.
+    """
+    for name, value in given.items():
+        check(f"terrain[{name!r}]", value, name in ARGUMENTS, f"one of {', '.join(ARGUMENTS)} for 'map'")
+    field, file = given.get("field"), given.get("file")
+    check("terrain", sorted(given), (field is None) != (file is None), "either a `field` or a `file` of a 'map'")
+    if field is None:
+        check("terrain['file']", file, isinstance(file, str), "a path")
+        field = Terrain.from_file(file, given.get("cell", 0.1), given.get("height", 1.0))
+    check("terrain['field']", field, isinstance(field, Terrain), "a Terrain")
+    begin = given.get("begin") or _inside(field)
+    check("terrain['begin']", begin, _are_ranges(begin), "two pairs (low, high), of x and of y [m]")
+    return {"kind": "map", "field": field, "begin": tuple((float(low), float(high)) for low, high in begin)}
+
+
+def _inside(field: Terrain) -> list[tuple[float, float]]:
+    ends = [(low, low + field.cell * (n - 1)) for low, n in zip(field.origin, field.heights.shape, strict=True)]
+    return [(low + min(MARGIN, (high - low) / 4), high - min(MARGIN, (high - low) / 4)) for low, high in ends]
+
+
+def _are_ranges(value: Any) -> bool:
+    pairs = isinstance(value, list | tuple) and len(value) == 2 and all(np.shape(pair) == (2,) for pair in value)
+    return pairs and all(is_number(low) and is_number(high) and low <= high for low, high in value)
