@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,7 +24,7 @@ HEIGHTS = np.random.default_rng(0).uniform(0.0, 0.05, (60, 40))
 def begun(terrain, n: int = 64) -> tuple[np.ndarray, ce_gym.Terrain]:
     """Positions of the base at the start of episodes, and the ground."""
     given = {"robot": TRIPOD, "terrain": terrain, "episode_length": 5, "max_episode_steps": 5}
-    envs = gymnasium.make_vec("ce_gym/MiniCheetahVelocity-v0", num_envs=n, **given).unwrapped
+    envs: Any = gymnasium.make_vec("ce_gym/MiniCheetahVelocity-v0", num_envs=n, **given).unwrapped
     envs.reset(seed=0)
     return envs.state()["q"], envs.batch.program.task.terrain["field"]
 
