@@ -30,9 +30,10 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     for name, value in given.items():
         check(f"terrain[{name!r}]", value, name in ARGUMENTS, f"one of {', '.join(ARGUMENTS)} for 'map'")
-    field, file = given.get("field"), given.get("file")
+    field: Any = given.get("field")
+    file: Any = given.get("file")
     check("terrain", sorted(given), (field is None) != (file is None), "either a `field` or a `file` of a 'map'")
-    if file is not None:
+    if field is None:
         check("terrain['file']", file, isinstance(file, str), "a path")
         field = Terrain.from_file(file, given.get("cell", 0.1), given.get("height", 1.0))
     check("terrain['field']", field, isinstance(field, Terrain), "a Terrain")
