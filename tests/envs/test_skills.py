@@ -91,6 +91,39 @@ def test_metrics_at_the_end_are_no_means(flight):
     np.testing.assert_allclose(flight["metrics/stood_after"], 0.02 * STEPS)
 
 
+def test_the_pitch_at_touch_down_is_that_at_the_end_of_the_longest_flight():
+    """A drop, then whatever bounces come of it; flights are found in the states by contact spheres."""
+    envs = gymnasium.make_vec(
+        ID, num_envs=ROBOTS, start={"height": [0.2, 0.6], "lean": [0.1, 0.6]}, terminations=(), push_period=0.0,
+        metrics=["touch_down_pitch"], max_episode_steps=40, autoreset_mode="SameStep",
+    )  # fmt: skip
+    envs.reset(seed=7)
+    model, states = envs.unwrapped.model, []
+    groups, radii = zip(*[(c.group, c.radius) for c in model.robot.contacts], strict=True)
+    legs = [i for i, group in enumerate(groups) if group in ("foot", "knee")]
+    for _ in range(40):
+        *_, infos = envs.step(np.zeros(envs.action_space.shape, np.float32))
+        states.append(envs.unwrapped.state())
+    found, flights = infos["episode_terms"]["metrics/touch_down_pitch"], np.zeros(ROBOTS)
+    for robot in range(ROBOTS):
+        lasted, best, pitch = 0, 0, 0.0
+        for state in states[:-1]:  # the last is the next episode's first
+            q = state["q"][robot]
+            heights = model.contact_points(q, np.zeros(model.nv))[0][legs, 2] - np.array(radii)[legs]
+            if (heights > 0).all():
+                lasted += 1
+                continue
+            if lasted > best:
+                up = rotations(q[3:7])[2]
+                best, pitch = lasted, abs(np.arctan2(up[0], up[2]))
+            flights[robot] += lasted > 0
+            lasted = 0
+        assert found[robot] == pytest.approx(pitch, abs=1e-9)
+    assert flights.max() > 1  # some bounce
+    assert 0.05 < found.mean() < 0.6
+    assert np.ptp(found) > 0.1
+
+
 def states(program, **changes) -> dict[str, np.ndarray]:
     """A robot that stands still, with some of its state changed."""
     state = {name: np.zeros(size) for name, size in program.state_sizes.items()}

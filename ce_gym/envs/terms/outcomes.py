@@ -61,6 +61,18 @@ def flights(s: TermContext) -> SX:
     return count
 
 
+def touch_down_pitch(s: TermContext) -> SX:
+    """How far the base was pitched from level, either way, where its longest flight ended [rad]; 0 without a flight."""
+    now, pitch = aloft(s), s.recall("pitch")
+    lasted, longest = s.recall("lasted"), s.recall("longest")
+    touched = ca.logic_and(ca.logic_not(now), lasted > longest)
+    pitch = ca.if_else(touched, ca.fabs(ca.atan2(s.up[0], s.up[2])), pitch)
+    s.keep("pitch", pitch)
+    s.keep("longest", ca.if_else(touched, lasted, longest))
+    s.keep("lasted", ca.if_else(now, lasted + s.control_dt, 0))
+    return pitch
+
+
 def distance(s: TermContext) -> SX:
     """Way of the base over the ground, turns included, in the direction in which it points [m]."""
     way = s.recall("way") + s.control_dt * s.base_linear_velocity[0]
