@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 GRAVITY = 9.81
 """For the weight in the cost of transport [m/s^2]."""
 
+TOLERANCE = 0.01
+"""Share of its largest torque by which a motor may exceed what it can give before that counts."""
+
 
 @dataclass(frozen=True)
 class Drives:
@@ -33,6 +36,7 @@ class Drives:
     Attributes:
         names: Of the motors' rotors, or of the joints.
         torque: Largest torque [N m], infinite if unknown, shape (n,).
+        stall, velocity: Where the torque-speed line begins [N m] and ends [rad/s], infinite if unknown, shape (n,).
         power: Largest mechanical power that torque limit and torque-speed line allow [W], shape (n,).
         speeds: Takes positions (nq, n) to `W`, column by column of the matrix (n_motors, n_joints) below each other.
         constant: `W` if it is the same in every position.
@@ -40,6 +44,8 @@ class Drives:
 
     names: tuple[str, ...]
     torque: Array
+    stall: Array
+    velocity: Array
     power: Array
     speeds: ca.Function
     constant: Array | None
@@ -62,6 +68,8 @@ class Drives:
         return cls(
             names=names,
             torque=np.array([torque for _, torque, _, _ in limits]),
+            stall=np.array([torque if stall is None else stall for _, torque, stall, _ in limits]),
+            velocity=np.array([speed for *_, speed in limits]),
             power=np.array([largest_power(torque, stall, speed) for _, torque, stall, speed in limits]),
             speeds=ca.Function("W", [symbols[0], *symbols[2:]], [ca.vec(W)]),
             constant=ca.evalf(W).full() if same else None,
@@ -82,6 +90,21 @@ class Drives:
         columns = ca.DM(self.speeds(q.T, *guess)).full()
         W = columns.reshape(yd.shape[1], len(self.names), len(q)).transpose(2, 1, 0)
         return np.einsum("nj,njm->nm", tau, np.linalg.pinv(W)), np.einsum("nmj,nj->nm", W, yd)
+
+    def beyond(self, tau: Array, speed: Array, before: Array) -> NDArray[np.bool_]:
+        """Return which motors give more than current and voltage allow at any speed of a sub-step, shape (n, n_motors).
+
+        Torques are means over a sub-step, in which an impact may turn a motor round: what it can give at the speed
+        at either end is no violation.
+
+        Args:
+            tau: Torques [N m], shape (n, n_motors).
+            speed: At the end of the sub-step [rad/s], shape (n, n_motors).
+            before: At its start, likewise.
+        """
+        slowest = np.minimum(np.sign(tau) * speed, np.sign(tau) * before)
+        allowed = np.clip(self.stall * (1 - slowest / self.velocity), 0, self.torque)
+        return np.abs(tau) > allowed + TOLERANCE * self.torque
 
 
 def largest_power(torque: float, stall: float | None, velocity: float) -> float:
@@ -109,6 +132,7 @@ class Sums:
         net: Of each motor, sum of powers, braking negative [W].
         peak_torque: Of each motor [N m].
         peak_power: Of each motor, driving [W].
+        beyond: Of each motor, sub-steps in which it gives more than it can.
     """
 
     count: int
@@ -118,9 +142,10 @@ class Sums:
     net: Array
     peak_torque: Array
     peak_power: Array
+    beyond: Array
 
-    def add(self, tau: Array, speed: Array, travelled: Array) -> None:
-        """Take one sub-step in; torques and speeds (n, n_motors), distances (n,)."""
+    def add(self, tau: Array, speed: Array, travelled: Array, beyond: Array) -> None:
+        """Take one sub-step in; torques, speeds and whether a motor gives more than it can (n, n_motors), ways (n,)."""
         power = tau * speed
         self.count += len(tau)
         self.distance += float(travelled.sum())
@@ -129,6 +154,7 @@ class Sums:
         self.net += power.sum(0)
         self.peak_torque = np.maximum(self.peak_torque, np.abs(tau).max(0, initial=0.0))
         self.peak_power = np.maximum(self.peak_power, power.max(0, initial=0.0))
+        self.beyond += beyond.sum(0)
 
 
 def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: int = 0, **kwargs: Any) -> dict:
@@ -148,13 +174,14 @@ def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: i
         back while braking being lost; cost_of_transport_net: the same with what they take back. seconds: watched, over
         all robots; speed: mean over the ground [m/s]; power: mean of all motors while they drive [W]. mean_torque,
         mean_power, peak_torque, peak_power: shares of the motors' limits, means over motors and the worst motor, whose
-        name is in peak_torque_at and peak_power_at; None where limits are unknown. motors: the same for each motor in
-        N m and W. An empty dictionary if the environment does not say how its control step is cut.
+        name is in peak_torque_at and peak_power_at; None where limits are unknown, and so is beyond_limits, the share
+        of motors' sub-steps in which they give more than they can, see `Drives.beyond`. motors: the same for each motor
+        in N m and W. An empty dictionary if the environment does not say how its control step is cut.
     """
     spec = policy.record["policy_spec"]
     if "physics_dt" not in spec:
         return {}
-    dt = spec["physics_dt"]
+    dt = kwargs.get("dt", spec["physics_dt"])
     hold, history = round(spec["control_dt"] / dt), spec["observation"]["history"]
     kwargs = {k: x for k, x in kwargs.items() if k not in ("critic", "obs_mode")}
     kwargs |= {"n_substeps": 1, "latency": (0, 0), "history": 1, "max_episode_steps": 10**9}
@@ -163,8 +190,10 @@ def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: i
         native: Any = envs.envs.unwrapped
         drives = Drives.of(native.model)
         n = len(drives.names)
-        sums = Sums(0, 0.0, *(np.zeros(n) for _ in range(5)))
+        sums = Sums(0, 0.0, *(np.zeros(n) for _ in range(6)))
         frame: Any = envs.reset()
+        q, v, tau = (native.batch.rows(name) for name in ("q", "v", "torque"))
+        _, spun = drives.at_motors(native.model, q, v[:, 6:], tau)
         seen, running = np.tile(frame, history), np.ones(episodes, bool)
         for _ in range(round(seconds / spec["control_dt"])):
             action, _ = policy.predict(seen)
@@ -176,7 +205,9 @@ def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: i
                 if not len(q):
                     return _result(sums, drives, native.model.total_mass, dt)
                 travelled = np.hypot(*(q[:, :2] - before[running]).T)
-                sums.add(*drives.at_motors(native.model, q, v[:, 6:], tau), travelled)
+                torque, speed = drives.at_motors(native.model, q, v[:, 6:], tau)
+                sums.add(torque, speed, travelled, drives.beyond(torque, speed, spun[running]))
+                spun[running] = speed
             seen = np.hstack([frame, seen[:, : seen.shape[1] - frame.shape[1]]])
         return _result(sums, drives, native.model.total_mass, dt)
     finally:
@@ -207,6 +238,7 @@ def _result(sums: Sums, drives: Drives, mass: float, dt: float) -> dict[str, Any
         result[name] = (float(share.max()) if peak else float(share.mean())) if known[name] else None
         if peak:
             result[f"{name}_at"] = drives.names[int(share.argmax())] if known[name] else None
+    result["beyond_limits"] = float(sums.beyond.mean() / count) if known["peak_power"] else None
     result["motors"] = {
         name: {key: float(values[i]) for key, values in per_motor.items()}
         | {f"{key}_limit": float(x[i]) if np.isfinite(x[i]) else None for key, x in limits.items()}

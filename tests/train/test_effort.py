@@ -52,6 +52,18 @@ def policy(target, **kwargs):
     return Policy(lambda obs: np.full((len(obs), 12), target, np.float32), record)
 
 
+def test_a_motor_is_beyond_its_limits_only_where_no_speed_of_the_sub_step_allows_its_torque():
+    drives = Drives.of(ce_gym.Model("mini_cheetah"))  # 3 N m, a line from there to 240 rad/s
+    cases = [  # torque, speed before, speed after, and whether that is too much
+        (3.0, 0.0, 0.0, False), (3.02, 0.0, 0.0, False), (3.1, 0.0, 0.0, True), (-3.1, 0.0, 0.0, True),
+        (3.0, 0.0, 200.0, False), (3.0, 200.0, 0.0, False), (3.0, 100.0, 200.0, True), (-3.0, 100.0, 200.0, False),
+        (-3.0, -100.0, -200.0, True), (1.76, 100.0, 200.0, False), (1.79, 100.0, 200.0, True),
+        (0.02, 300.0, 250.0, False), (0.04, 300.0, 250.0, True), (3.75, 95.0, -60.0, True),
+    ]  # fmt: skip
+    tau, before, after, wanted = (np.tile(np.array(column)[:, None], 12) for column in zip(*cases, strict=True))
+    np.testing.assert_array_equal(drives.beyond(tau, after, before), wanted)
+
+
 def test_a_robot_that_stands_costs_little_and_carries_its_weight():
     found = effort(policy(0.0), episodes=4, seconds=2.0)
     motors = found["motors"]
@@ -66,6 +78,7 @@ def test_a_robot_that_stands_costs_little_and_carries_its_weight():
     assert motors[found["peak_power_at"]]["peak_power"] == pytest.approx(found["peak_power"] * 3.0 * 240.0 / 4)
     assert found["power"] == pytest.approx(sum(m["mean_power"] for m in motors.values()))
     assert found["power"] < 5.0
+    assert found["beyond_limits"] == 0.0
     ratio = found["power"] / (8.912 * 9.81 * found["speed"])
     assert found["cost_of_transport"] == pytest.approx(ratio, rel=1e-3)
     assert found["cost_of_transport_net"] < found["cost_of_transport"]
