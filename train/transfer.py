@@ -134,7 +134,7 @@ def train_missing(args: argparse.Namespace) -> list[Path]:
             out, kwargs = folder / level / f"seed_{seed}", {**env_args, "transmission": level}
             policy, resume = out / "policy.zip", None
             if policy.exists():
-                record = _checked(policy, args.env, kwargs, seed, settings)
+                record = checked_record(policy, args.env, kwargs, seed, settings)
                 resume = None if record["finished"] else policy
             if not policy.exists() or resume:
                 print(f"training on {level}, seed {seed}, {settings.steps:,} steps -> {out}", file=sys.stderr)
@@ -145,8 +145,12 @@ def train_missing(args: argparse.Namespace) -> list[Path]:
     return policies
 
 
-def _checked(policy: Path, env: str, kwargs: dict[str, Any], seed: int, settings: Settings) -> dict[str, Any]:
-    """The record of a policy trained earlier, if it is the one asked for."""
+def checked_record(policy: Path, env: str, kwargs: dict[str, Any], seed: int, settings: Settings) -> dict[str, Any]:
+    """Return the record of a policy trained earlier, if it is the one asked for.
+
+    Raises:
+        PolicyError: If it was trained in another way.
+    """
     record = load_policy(policy).record
     asked = {"env": env, "transmission": kwargs["transmission"], "seed": seed, "env_kwargs": kwargs}
     asked["settings"] = json.loads(json.dumps(settings.as_dict()))
