@@ -144,7 +144,7 @@ class Sums:
     peak_power: Array
     beyond: Array
 
-    def add(self, tau: Array, speed: Array, travelled: Array, beyond: Array) -> None:
+    def add(self, tau: Array, speed: Array, travelled: Array, beyond: NDArray[np.bool_]) -> None:
         """Take one sub-step in; torques, speeds and whether a motor gives more than it can (n, n_motors), ways (n,)."""
         power = tau * speed
         self.count += len(tau)

@@ -169,9 +169,9 @@ def train_one(study: Study, key: tuple[str, str, int], runs: Path, threads: int,
     return load_policy(policy) if done.record["steps"] >= settings.steps else None
 
 
-def judge_one(study: Study, task: Trial, policy: Policy) -> dict[str, float]:
-    """Return all figures of a policy, by column."""
-    found: dict[str, float] = {}
+def judge_one(study: Study, task: Trial, policy: Policy) -> dict[str, float | None]:
+    """Return all figures of a policy, by column; None for one that does not exist, as the cost of no way."""
+    found: dict[str, float | None] = {}
     for where, way in study.judged.items():
         kwargs = {**policy.record["env_kwargs"], **way.env_args, "num_threads": 1}
         result = evaluate(policy, task.env, episodes=way.episodes, metrics=task.metrics, **kwargs)
@@ -217,7 +217,7 @@ def _work(args: argparse.Namespace) -> int:
             print(f"study.py: stopped with {len(rows)} runs done; the same command goes on", file=sys.stderr)
             return 130
         found = judge_one(study, study.tasks[key[0]], policy)
-        said = {name: f"{x:.{DIGITS}g}" for name, x in found.items()}
+        said = {name: f"{x:.{DIGITS}g}" for name, x in found.items() if x is not None}
         about = (*key, policy.record["steps"], policy.record["processor_seconds"])
         rows.append(dict(zip(RUN, map(str, about), strict=True)) | said)
         write_rows(args.table, study, rows)
