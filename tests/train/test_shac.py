@@ -14,12 +14,15 @@ from card import command
 from job import Job, jobs, parser
 from networks import KINDS, make_work, outputs
 from pathwise import back_through
-from settings import SettingsError, config_file, load_settings
+from settings import SettingsError, config_file, load_env_args, load_settings
 from shac import SHAC, Settings, train
 from test_fast_ppo import parameters
 from test_networks import close, make_network, run
 from tripod import TRIPOD
 
+from ce_gym import environment_ids
+from ce_gym.envs.differentiable import _roughness
+from ce_gym.envs.runtime.setup import make_program
 from ce_gym.policies import PolicyError, load_policy
 
 ROBOT = "ce_gym/MiniCheetahVelocity-v0"
@@ -120,6 +123,16 @@ def test_the_policy_squashes_its_actions(tmp_path):
     *_, (identity, bias) = trained.model.act.layers
     np.testing.assert_array_equal(identity, np.eye(2))
     assert not bias.any()
+
+
+@pytest.mark.parametrize("path", sorted(Settings.folder.glob("*_*.yaml")), ids=lambda path: path.stem)
+def test_rewards_of_every_shipped_file_have_a_gradient(path):
+    settings, ids = load_settings(path, kind=Settings), environment_ids()
+    assert settings.num_envs * settings.rollout % settings.minibatches == 0
+    kwargs = next(kwargs for env_id, kwargs in ids.items() if config_file(env_id, Settings.folder) == path)
+    program = make_program(**(kwargs | load_env_args(path) | settings.training))
+    rough = {name: _roughness(program.stages, term) for name, term in program.reward_terms.items()}
+    assert set(rough.values()) <= {"", "kinks"}, rough
 
 
 def test_wrong_settings_are_one_line():
