@@ -38,7 +38,7 @@ from ce_gym.policies import Policy, load_policy, parse_yaml
 Row = dict[str, str]
 
 RUN = ("task", "arm", "seed", "steps", "processor [s]")
-"""Columns that say what a run was, its time since it was last gone on with; those of figures follow, `where: figure`."""
+"""Columns that say what a run was, time since it was last gone on with; those of figures follow, `where: figure`."""
 
 DIGITS = 6
 
