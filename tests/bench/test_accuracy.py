@@ -142,7 +142,8 @@ def test_writes_picture_and_tables(tmp_path, monkeypatch):
     assert {path.name for path in (tmp_path / "new").iterdir()} == {"accuracy.png", "accuracy.csv", "accuracy.md"}
     with (tmp_path / "new" / "accuracy.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * (4 + 9)  # ours, and MuJoCo with armature, rotors and rotors held stiffly
+    peers = 3 * len(accuracy_curves.INTEGRATORS)  # MuJoCo with armature, rotors and rotors held stiffly
+    assert len(rows) == 2 * (4 + peers)
     exact = [float(row["error against the truth"]) for row in rows if row["method"] == "rk4"]
     assert exact[1] < exact[0] / 100
     assert all(float(row["time per simulated second [s]"]) > 0 for row in rows)
