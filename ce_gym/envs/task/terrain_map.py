@@ -32,7 +32,8 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
         check(f"terrain[{name!r}]", value, name in ARGUMENTS, f"one of {', '.join(ARGUMENTS)} for 'map'")
     field: Any = given.get("field")
     file: Any = given.get("file")
-    check("terrain", sorted(given), (field is None) != (file is None), "either a `field` or a `file` of a 'map'")
+    one = (field is None) != (file is None)
+    check("terrain", {"kind": "map", **given}, one, "either a `field` or a `file` of a 'map'")
     if field is None:
         check("terrain['file']", file, isinstance(file, str), "a path")
         field = Terrain.from_file(file, given.get("cell", 0.1), given.get("height", 1.0))
