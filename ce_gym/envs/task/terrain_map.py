@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.terrain import Terrain
 
@@ -38,7 +36,9 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
         check("terrain['file']", file, isinstance(file, str), "a path")
         field = Terrain.from_file(file, given.get("cell", 0.1), given.get("height", 1.0))
     check("terrain['field']", field, isinstance(field, Terrain), "a Terrain")
-    begin = given.get("begin") or _inside(field)
+    alone = file is not None or not {"cell", "height"} & given.keys()
+    check("terrain", {"kind": "map", **given}, alone, "`cell` and `height` with a `file` only")
+    begin = _inside(field) if given.get("begin") is None else given["begin"]
     check("terrain['begin']", begin, _are_ranges(begin), "two pairs (low, high), of x and of y [m]")
     return {"kind": "map", "field": field, "begin": tuple((float(low), float(high)) for low, high in begin)}
 
@@ -49,5 +49,10 @@ def _inside(field: Terrain) -> list[tuple[float, float]]:
 
 
 def _are_ranges(value: Any) -> bool:
-    pairs = isinstance(value, list | tuple) and len(value) == 2 and all(np.shape(pair) == (2,) for pair in value)
-    return pairs and all(is_number(low) and is_number(high) and low <= high for low, high in value)
+    pairs = isinstance(value, list | tuple) and len(value) == 2
+    return pairs and all(_is_range(pair) for pair in value)
+
+
+def _is_range(pair: Any) -> bool:
+    numbers = isinstance(pair, list | tuple) and len(pair) == 2 and all(map(is_number, pair))
+    return numbers and pair[0] <= pair[1]
