@@ -14,14 +14,32 @@ from ce_gym.model import load_robot
 from ce_gym.model.mechanism import LEVELS
 
 LEGS = ("FL", "FR", "RL", "RR")
+SIDES = ("left", "right")
 GO = 1.11842e-4 * 6.33**2
+GEARED = GO * (20 / 9) ** 2
+M107 = {15: 0.063259741, 24: 0.160478022}
 BERKELEY = {"hr": 6.9e-5, "haa": 6.9e-5, "hfe": 9.4e-5, "kfe": 1.5e-4, "ffe": 6.9e-5, "faa": 6.1e-6}
-ROBOTS = {
-    "go1": (13.100528, {"hip": GO, "thigh": GO, "calf": GO * 1.5**2}, LEGS),
-    "go2": (16.087, {"hip": GO, "thigh": GO, "calf": GO * 1.917**2}, LEGS),
-    "berkeley_humanoid": (16.0567651, {joint: 81 * J for joint, J in BERKELEY.items()}, ("ll", "lr")),
+H1 = {
+    **dict.fromkeys(("hip_yaw", "hip_roll", "hip_pitch"), M107[15]),
+    "knee": M107[24],
+    **dict.fromkeys(("ankle", "shoulder_pitch", "shoulder_roll"), GEARED),
+    **dict.fromkeys(("shoulder_yaw", "elbow"), GO),
 }
-"""Mass [kg], reflected inertia of a leg's joints [kg m^2], legs."""
+
+
+def limbs(names: tuple[str, ...], joints: dict[str, float]) -> dict[str, float]:
+    """The same figures of joints for each limb."""
+    return {f"{name}_{joint}": value for name in names for joint, value in joints.items()}
+
+
+ROBOTS = {
+    "go1": (13.100528, limbs(LEGS, {"hip": GO, "thigh": GO, "calf": GO * 1.5**2})),
+    "go2": (16.087, limbs(LEGS, {"hip": GO, "thigh": GO, "calf": GO * 1.917**2})),
+    "anymal_c": (52.13485, limbs(("LF", "RF", "LH", "RH"), dict.fromkeys(("HAA", "HFE", "KFE"), 0.06))),
+    "h1": (59.338, limbs(SIDES, H1) | {"torso": M107[15]}),
+    "berkeley_humanoid": (16.0567651, limbs(("ll", "lr"), {joint: 81 * J for joint, J in BERKELEY.items()})),
+}
+"""Mass [kg], published armature of joints [kg m^2]."""
 
 
 def free(robot, folder: Path) -> Path:
@@ -46,9 +64,8 @@ def test_mujoco_finds_the_same_mass_matrix_and_accelerations(name, tmp_path):
     from mujoco_peer import compare
 
     robot = load_robot(name)
-    armature = {f"{leg}_{joint}": value for leg in ROBOTS[name][2] for joint, value in ROBOTS[name][1].items()}
-    assert set(armature) == set(robot.independent)
-    compare(free(robot, tmp_path), robot, "armature", armature=armature)
+    assert set(ROBOTS[name][1]) == set(robot.independent)
+    compare(free(robot, tmp_path), robot, "armature", armature=ROBOTS[name][1])
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -56,7 +73,7 @@ def test_it_stands_on_its_feet_and_has_what_tasks_need(name):
     robot = load_robot(name)
     assert not missing(robot)
     assert robot.total_mass == pytest.approx(ROBOTS[name][0], abs=1e-6)
-    assert len(robot.motors) == len(list(robot.rotors())) == len(robot.independent) == 12
+    assert len(robot.motors) == len(list(robot.rotors())) == len(robot.independent) == len(ROBOTS[name][1])
     assert all(np.isfinite(motor.torque) and np.isfinite(motor.velocity) for motor in robot.motors)
     model = Model(robot)
     points = model.contact_points(model.standing_q, np.zeros(model.nv))[0]
@@ -75,9 +92,8 @@ def test_levels_differ_in_what_rotors_do(name):
     M = {level: model.mass_matrix(q) for level, model in models.items()}
     assert np.linalg.eigvalsh(M["exact"])[0] > 0.0
     assert np.abs(M["coupled"] - M["armature"]).max() < 1e-12, "every gear drives one joint"
-    reflected = {f"{leg}_{joint}": J for leg in ROBOTS[name][2] for joint, J in ROBOTS[name][1].items()}
     added = np.diag(M["armature"] - M["none"])[6:]
-    np.testing.assert_allclose(added, [reflected[joint] for joint in robot.independent], rtol=1e-6)
+    np.testing.assert_allclose(added, [ROBOTS[name][1][joint] for joint in robot.independent], rtol=1e-6)
     assert np.abs(M["exact"] - M["armature"])[:6, 6:].max() > 1e-4, "rotors couple to the base"
 
 
@@ -92,7 +108,7 @@ def test_g1_s_motors_turn_ankles_through_rods_and_all_others_directly():
     exact = models["exact"]
     q, at = exact.standing_q, exact.joint_links
     added = (models["armature"].mass_matrix(q) - models["none"].mass_matrix(q))[6:, 6:]
-    for side in ("left", "right"):
+    for side in SIDES:
         for joint, motor in G1_LEG.items():
             row = at.index(f"{side}_{joint}")
             assert added[row, row] == pytest.approx(G1_MOTORS[motor], rel=1e-6)
