@@ -11,7 +11,10 @@ from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.errors import bad
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 
-ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1", "go1", "go2", "anymal_c", "g1", "h1", "berkeley_humanoid")
+ROBOTS = (
+    *("mini_cheetah", "mit_humanoid", "tello", "jvrc1"),
+    *("go1", "go2", "anymal_c", "spot", "g1", "h1", "berkeley_humanoid"),
+)
 """Robots that ship with the package and have what the tasks ask for."""
 STRETCHING = ("mini_cheetah",)
 """Those of them whose files say how transmissions give way, and which so have the elastic level."""

@@ -46,7 +46,7 @@ def free(robot, folder: Path) -> Path:
     """Write the robot's URDF, less what has no mass, on a floating joint, for MuJoCo."""
     text = Path(robot.source).with_suffix(".urdf").read_text()
     text = re.sub(
-        r'  <link name="\w+_crank_\d">.*?</link>\n|  <joint name="\w+_crank_\d_joint".*?</joint>\n',
+        r'  <link name="\w+_(crank_\d|nut)">.*?</link>\n|  <joint name="\w+_(crank_\d|nut)_joint".*?</joint>\n',
         "",
         text,
         flags=re.S,
@@ -127,14 +127,44 @@ def test_g1_s_motors_turn_ankles_through_rods_and_all_others_directly():
     )
 
 
-def test_mujoco_finds_g1_without_its_rotors(tmp_path):
+@pytest.mark.parametrize(("name", "mass"), [("g1", 33.341142), ("spot", 50.34)])
+def test_mujoco_finds_robots_with_rods_without_their_rotors(name, mass, tmp_path):
     pytest.importorskip("mujoco")
     from mujoco_peer import compare
 
-    robot = load_robot("g1")
-    assert robot.total_mass == pytest.approx(33.341142, abs=1e-6)
+    robot = load_robot(name)
+    assert robot.total_mass == pytest.approx(mass, abs=1e-6)
     assert not missing(robot)
     compare(free(robot, tmp_path), robot, "none", spread=0.1)
+
+
+SPOT_KNEE = {
+    -2.7929: 24.776718,
+    -2.411030: 46.174873,
+    -2.003702: 64.346268,
+    -1.596374: 74.496147,
+    -1.443626: 75.490677,
+    -1.189046: 73.107742,
+    -0.781718: 58.139503,
+    -0.247100: 20.401667,
+}
+"""Published turns of the motor for one of the knee, by the knee's angle [rad]: Isaac Lab's spot.py."""
+
+
+def test_spot_s_screws_and_rods_have_the_published_ratios():
+    models = {level: Model("spot", level) for level in ("exact", "armature", "none")}
+    model = models["exact"]
+    assert not len(model.guess), "a rod that ends on a slider has a formula"
+    legs = [name.removesuffix("_kn") for name in model.joint_links if name.endswith("_kn")]
+    knees = [6 + model.joint_links.index(f"{leg}_kn") for leg in legs]
+    nuts = [6 + model.spanning_names.index(f"{leg}_nut") for leg in legs]
+    for angle, ratio in SPOT_KNEE.items():
+        q, v = model.standing_q, np.zeros(model.nv)
+        q[[1 + knee for knee in knees]], v[knees] = angle, 1.0
+        turns = 2 * np.pi / 3e-3 * model.spanning(q, v)[1][nuts]
+        np.testing.assert_allclose(np.abs(turns), ratio, atol=2e-5)
+        added = np.diag(models["armature"].mass_matrix(q) - models["none"].mass_matrix(q))
+        np.testing.assert_allclose(added[knees], 1.41e-5 * ratio**2, rtol=2e-6)
 
 
 def test_g1_s_ankles_close_over_their_whole_range():

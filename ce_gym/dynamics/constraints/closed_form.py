@@ -3,6 +3,7 @@
 | shape                                     | example                         | solution                              |
 |-------------------------------------------|---------------------------------|---------------------------------------|
 | one row, affine in its one unknown        | `gamma(y)` of a user            | division                              |
+| one row, `A z^2 + B z + C`                | a rod that ends on a slider     | one root, on the reference branch     |
 | one row, `P sin wz + Q cos wz + R`        | a rod that ends on a crank      | one `atan2`, on the reference branch  |
 | two rows, two revolute unknowns, in plane | a pin that closes a four-bar    | the same, then a second `atan2`       |
 
@@ -55,10 +56,12 @@ class Sample:
 
 def solve_single(row: SX, z: SX, sample: Sample) -> SX | None:
     """Return `z` that makes a row vanish, as an expression of the other symbols; None if there is no formula."""
-    first, second = _derivatives(row, z, 2)
-    d1, d2 = sample.at_random(first, second)
+    first, second, third = _derivatives(row, z, 3)
+    d1, d2, d3 = sample.at_random(first, second, third)
     if np.abs(d2).max() <= _SAME * np.abs(d1).max():
         return -ca.substitute(row, z, SX(0)) / ca.substitute(first, z, SX(0))
+    if np.abs(d3).max() <= _SAME * np.abs(d2).max():
+        return _solve_quadratic(row, z, sample)
     return _solve_sine(row, z, sample)
 
 
@@ -123,6 +126,18 @@ def sine_coefficients(row: SX, z: SX, sample: Sample) -> tuple[SX, SX, SX, float
         return None
     P, Q = (ca.substitute(x, z, SX(0)) for x in (first / w, -second / w**2))
     return P, Q, ca.substitute(row, z, SX(0)) - Q, w
+
+
+def _solve_quadratic(row: SX, z: SX, sample: Sample) -> SX:
+    """Solve `A z^2 + B z + C = 0` on the side of the reference pose.
+
+    The derivative of the row is `+-sqrt(B^2 - 4 A C)` at its two roots, so that its sign tells them apart. The root
+    vanishes at a singularity and is not a number beyond.
+    """
+    first, second = _derivatives(row, z, 2)
+    A, B, C = (ca.substitute(x, z, SX(0)) for x in (second / 2, first, row))
+    side = math.copysign(1.0, sample.at_reference(first))
+    return (side * ca.sqrt(B * B - 4 * A * C) - B) / (2 * A)
 
 
 def _solve_sine(row: SX, z: SX, sample: Sample) -> SX | None:
