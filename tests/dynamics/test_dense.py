@@ -16,7 +16,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 TOLERANCE = 1e-9
 LINKAGES = {"crank-rocker": four_bar, "spatial four-bar": spatial_four_bar, "rod leg": rod_leg}
 STATES = 6
-SERIAL = ("go1", "go2", "anymal_c", "h1", "berkeley_humanoid")  # as Mini Cheetah, in other figures; MuJoCo checks those
+# As Mini Cheetah, in other figures; MuJoCo checks those.
+SERIAL = ("go1", "go2", "anymal_c", "h1", "t1", "berkeley_humanoid")
 
 
 class Case:
