@@ -57,7 +57,7 @@ def test_kernel_and_expression_are_one_step(method: str):
     dt = 0.005 if not isinstance(plan.end, Rates) else 2e-4
     outputs = (*OUTPUTS, "error") if plan.estimates else OUTPUTS
     q, v, target = start()
-    sim = Simulator(model, len(q), dt, method=method, motors="limited", outputs=outputs)
+    sim = Simulator(model, len(q), dt, method=method, motors="limited", outputs=outputs, retry=0)
     sim.set_state(q, v)
     function = step_function(model.mechanism, sim.options, outputs)
     names = ("q", "v", "load", "anchor", "diverged")

@@ -17,6 +17,8 @@ from ce_gym.model.mechanism import Mechanism
 
 LARGEST_MOVE = 0.5
 """A step is made in parts if it moves a joint by more [rad or m]."""
+FAST, LARGEST_FAST_MOVE = 40.0, 0.2
+"""The same of a joint that is faster than [rad/s or m/s], as hardly a motor turns one. See docs/numerics.md."""
 PROGRESS = ("part", "left", "unfinished")
 """Fraction of the step that is tried, 0 for a robot that is through; fraction ahead; whether it goes on. 1 at first."""
 
@@ -36,12 +38,17 @@ def judging_function() -> ca.Function:
     """Trace whether a part that was tried is anything but a whole step with a good end.
 
     Returns:
-        Function (tried_diverged, tried_moved, part) -> (unfinished).
+        Function (tried_diverged, tried_moved, part, dt) -> (unfinished).
     """
-    given = {name: SX.sym(name) for name in ("tried_diverged", f"tried_{MOVED}", "part")}
-    diverged, moved, part = given.values()
-    good = ca.logic_and(ca.logic_and(moved <= LARGEST_MOVE, part >= 1), diverged < 0.5)
+    given = {name: SX.sym(name) for name in ("tried_diverged", f"tried_{MOVED}", "part", "dt")}
+    diverged, moved, part, dt = given.values()
+    good = ca.logic_and(ca.logic_and(near(moved, dt), part >= 1), diverged < 0.5)
     return traced("judge", given, {"unfinished": ca.logic_not(good)})
+
+
+def near(moved: SX, dt: SX) -> SX:
+    """Return whether the fastest joint has not moved too far in a step; 0 for NaN."""
+    return moved <= ca.fmin(ca.fmax(FAST * dt, LARGEST_FAST_MOVE), LARGEST_MOVE)
 
 
 def mending_function(
@@ -69,7 +76,7 @@ def mending_function(
     given = {name: SX.sym(name) for name in (f"tried_{MOVED}", "part", "left", "retries", "dt")}
     moved, part, left, retries, dt = given.values()
 
-    unfit = ca.logic_or(tried["diverged"] > 0.5, ca.logic_not(moved <= LARGEST_MOVE))
+    unfit = ca.logic_or(tried["diverged"] > 0.5, ca.logic_not(near(moved, part * dt)))
     divisible = ca.logic_and(part > 1.5 * 0.5**options.retry, old["diverged"] < 0.5)
     refused = ca.logic_and(unfit, divisible)
     taken = ca.logic_and(part > 0, ca.logic_not(refused))
