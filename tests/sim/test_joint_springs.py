@@ -65,6 +65,28 @@ def test_a_dependent_joint_is_damped():
     assert sim.v[0, 0] == pytest.approx(2.0 * np.exp(-9 * damping / (10 * INERTIA) * time), rel=1e-9)
 
 
+def thrown_against_stops(speed: float, slow: dict, fast: dict) -> np.ndarray:
+    """Position, speed and energy of the slow wheel of two, geared three to one, in each of twenty steps."""
+    gear = LinearConstraint("gear", (("fast", 1.0), ("slow", -3.0)))
+    robot = Robot("geared", (wheel("slow", **slow), wheel("fast", **fast)), (gear,), independent=("slow",))
+    sim, found = ce_gym.Simulator(ce_gym.Model(robot), control="torque", contacts=(), outputs=("energy",)), []
+    sim.set_state([0.05], [speed])
+    for _ in range(20):
+        sim.step([0.0])
+        found.append((sim.q[0, 0], sim.v[0, 0], sim.energy.sum()))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("speed", "furthest"), [(8.0, 0.2), (-8.0, -0.1)])
+def test_a_dependent_joint_has_its_stops(speed: float, furthest: float):
+    """Those of the fast wheel are the slow one's at a third of the angle, and nine times as stiff."""
+    at_slow = thrown_against_stops(speed, {"position": (-0.1, 0.2), "torque": 18.0}, {})
+    at_fast = thrown_against_stops(speed, {}, {"position": (-0.3, 0.6), "torque": 2.0})
+    np.testing.assert_allclose(at_fast, at_slow, rtol=1e-12, atol=1e-12)
+    way = np.abs(at_fast[:, 0]).max()
+    assert abs(furthest) < way < abs(furthest) + 0.1, "beyond, where the stop acts, and held"
+
+
 def test_a_ball_joint_has_a_spring():
     robot = Robot("ball", (wheel("ball", type="ball", stiffness=STIFFNESS),))
     time, frequency, axis = 0.7, np.sqrt(STIFFNESS / INERTIA), np.array([0.6, 0.0, 0.8])

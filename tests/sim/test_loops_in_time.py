@@ -91,6 +91,26 @@ def test_a_singularity_freezes_the_robot():
     assert not simulator.diverged.any()
 
 
+def flailing(robot: Robot) -> int:
+    """Return how many of 256 robots without rotors diverge in 3 s under random torques of 1.5 times the limits."""
+    model, rng = Model(robot, "none"), np.random.default_rng(0)
+    simulator = Simulator(model, 256, DT, control="torque")
+    limit = 1.5 * np.array([robot.body(joint).joint.torque for joint in model.joint_links])
+    for _ in range(150):
+        simulator.step(rng.uniform(-limit, limit, (256, len(limit))), 4)
+    return int(simulator.diverged.sum())
+
+
+def test_stops_of_cranks_hold_where_stops_of_feet_do_not():
+    """They grow stiff towards the dead centre of a loop, past which a foot on the spring of its own stop is thrown."""
+    robot, unlimited = load_robot("tello"), (-np.inf, np.inf)
+    bodies = tuple(
+        replace(body, joint=replace(body.joint, position=unlimited)) if "crank" in body.name else body
+        for body in robot.bodies
+    )
+    assert flailing(robot) == 0 < flailing(replace(robot, bodies=bodies))
+
+
 def test_a_start_that_cannot_be_closed_is_refused():
     model = Model(replace(turning(), independent=("crank",)))
     simulator = Simulator(model, 2, DT, control="torque")

@@ -1,4 +1,4 @@
-"""Viscous friction, stops and springs of the joints, taken one step ahead."""
+"""Viscous friction, stops and springs of the joints, dependent ones included, taken one step ahead."""
 
 from __future__ import annotations
 
@@ -52,33 +52,41 @@ def ball_forces(robot: Robot, q: SX, v: SX, dt: float) -> JointForce:
 
 
 def yielding_joints(mechanism: Mechanism) -> list[tuple[int, Joint, str]]:
-    """Return joints with one coordinate that have springs, and dependent ones that are damped.
+    """Return joints with one coordinate that have springs, and dependent ones that are damped or have stops.
 
-    Each with the index of its cluster and the name of the body it moves; damping of others is in `passive_forces`.
+    Each with the index of its cluster and the name of the body it moves; for damping and stops of others see
+    `passive_forces`.
     """
     robot, found = mechanism.robot, []
     for k, cluster in enumerate(mechanism.tree.clusters):
         for name in cluster.bodies:
             joint = robot.body(name).joint
-            if joint.nv == 1 and (joint.stiffness or (joint.damping and name not in robot.independent)):
+            follows = name not in robot.independent and (joint.damping or any(map(math.isfinite, joint.position)))
+            if joint.nv == 1 and (joint.stiffness or follows):
                 found.append((k, joint, name))
     return found
 
 
 def yielding_forces(mechanism: Mechanism, kinematics: Kinematics, dt: float) -> list[JointForce]:
-    """Return springs of joints with one coordinate, and viscous friction of dependent ones, on the independent joints.
+    """Return springs of joints with one coordinate, and viscous friction and stops of dependent ones.
 
-    With `W` its row of the constraint Jacobian a joint moves at `W yd`, and its torque is `W^T tau` to those.
+    With `W` its row of the constraint Jacobian a joint moves at `W yd`, and its torque on the independent joints is
+    `W^T tau`. Near the end of a loop's reach `W` grows without bound, and with it what a stop there can resist: no stop
+    of an independent joint could.
     """
-    found, layout = [], mechanism.robot.layout
+    robot, found, layout = mechanism.robot, [], mechanism.robot.layout
     for k, joint, name in yielding_joints(mechanism):
         coordinates = kinematics.coordinates[k]
         assert coordinates is not None
         way, row = SX(1, layout.joints), coordinates.index[name]
         way[[row - layout.joints_v for row in kinematics.rows[k]]] = coordinates.G[row, :]
-        damping = (0.0 if name in mechanism.robot.independent else joint.damping) + dt * joint.stiffness
-        tau = -joint.stiffness * (coordinates.q[row] - joint.springref) - damping * coordinates.qd[row]
-        found.append(JointForce(tau * way.T, dt * damping * (way.T @ way)))
+        q, qd, follows = coordinates.q[row], coordinates.qd[row], name not in robot.independent
+        damping = (joint.damping if follows else 0.0) + dt * joint.stiffness
+        tau, slope = -joint.stiffness * (q - joint.springref) - damping * qd, dt * damping
+        if follows:
+            push, more = _stop(q, qd, joint.position, *limit_stiffness(robot, name), dt)
+            tau, slope = tau + push, slope + more
+        found.append(JointForce(tau * way.T, slope * (way.T @ way)))
     return found
 
 

@@ -19,6 +19,7 @@ from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.recursion.derived import kinetic_and_potential
 from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
 from ce_gym.dynamics.stepping.step import meeting_pairs, touching
+from ce_gym.model.description import Robot
 
 
 def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
@@ -47,19 +48,31 @@ def contact_energy(scene: Scene, state: State) -> SX:
 
 
 def spring_energy(scene: Scene, state: State) -> SX:
-    """Return the energy of the springs of joints with one coordinate [J]."""
+    """Return the energy of the springs of joints with one coordinate, and of the stops of dependent ones [J]."""
     total, yielding = SX(0), yielding_joints(scene.mechanism)
     if yielding:
         kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
         for k, joint, name in yielding:
             coordinates = kinematics.coordinates[k]
             assert coordinates is not None
-            total += joint.stiffness * (coordinates.position(name) - joint.springref) ** 2 / 2
+            angle = coordinates.position(name)
+            total += joint.stiffness * (angle - joint.springref) ** 2 / 2
+            if name not in scene.mechanism.robot.independent:
+                total += stop_energy(scene.mechanism.robot, name, angle)
     return total
 
 
+def stop_energy(robot: Robot, name: str, angle: SX) -> SX:
+    """Return the energy of the stops of a joint with one coordinate, at an angle [rad] or a way [m], in J."""
+    (low, high), beyond = robot.body(name).joint.position, SX(0)
+    for bound, side in ((low, 1.0), (high, -1.0)):
+        if math.isfinite(bound):
+            beyond += ca.fmax(side * (bound - angle), 0)
+    return limit_stiffness(robot, name)[0] * beyond**2 / 2
+
+
 def joint_energy(scene: Scene, state: State, target: SX) -> SX:
-    """Return the energy of the stops of the joints, and of position control [J]."""
+    """Return the energy of the stops of independent and ball joints, and of position control [J]."""
     robot, total = scene.mechanism.robot, SX(0)
     y = state.q[robot.layout.joints_q :]
     for name, (row, _) in zip(robot.balls, robot.layout.ball_turns, strict=True):
@@ -69,11 +82,7 @@ def joint_energy(scene: Scene, state: State, target: SX) -> SX:
             beyond = ca.fmax(ca.norm_2(turned) - joint.position[1], 0)
             total += limit_stiffness(robot, name)[0] * beyond**2 / 2
     for i, name in enumerate(robot.independent):
-        low, high = robot.body(name).joint.position
-        beyond = (ca.fmax(low - y[i], 0) if math.isfinite(low) else 0) + (
-            ca.fmax(y[i] - high, 0) if math.isfinite(high) else 0
-        )
-        total += limit_stiffness(robot, name)[0] * beyond**2 / 2
+        total += stop_energy(robot, name, y[i])
     if scene.options.control == "position":
         kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
         at = seen_joints(scene.mechanism, kinematics) @ y

@@ -16,7 +16,6 @@ sensors and textures act on nothing and are passed over.
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -88,7 +87,6 @@ def read_robot(
         body.name for body in with_rotors(tree.bodies, constraints, tree.moved_by.values()) if body.kind == "rotor"
     ]
     independent = choose_independent(source, tree, spinning)
-    _report_stops(source, tree, independent)
     gains = read_actuators(source, tree, independent)
     contacts, material, lowest = read_contacts(source, tree)
     _add_shapes(source, tree)
@@ -126,14 +124,6 @@ def _ratios(gears: Section, tree: MjcfTree, driven: Collection[str]) -> dict[str
         if ratio == 0.0:
             raise bad(gears.file, gears.key(joint), ratio, "a number other than 0")
     return ratios
-
-
-def _report_stops(source: MjcfSource, tree: MjcfTree, independent: Collection[str]) -> None:
-    moved = set(tree.moved_by.values()) - set(independent)
-    for body in tree.bodies:
-        tied = body.name in moved and body.kind == "link" and body.joint.type != "ball"
-        if tied and any(map(math.isfinite, body.joint.position)):
-            source.leave_out("the stop of joint {}, which follows from others", body.name)
 
 
 def _name(source: MjcfSource, path: Path) -> str:
