@@ -42,7 +42,7 @@ FIRST = {
 }
 """Arguments that are not attributes of a task: default and meaning."""
 
-CAPITALS = {"mit": "MIT", "jvrc1": "JVRC-1"}
+CAPITALS = {"mit": "MIT", "jvrc1": "JVRC-1", "anymal": "ANYmal"}
 
 
 def environment_page(robot: str, task: str, drawn: bool) -> str:
