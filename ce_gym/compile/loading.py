@@ -86,7 +86,9 @@ def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> t
     layout = layout_of(program, dtype)
     with announced(f"{program.name} ({dtype})", folder, started):
         parts = registers_per_vector() if program.compact else 1
-        code = compile_object(lambda builder, arguments: emit_tile(builder, program, layout, arguments, parts))
+        code = compile_object(
+            lambda builder, arguments: emit_tile(builder, program, layout, arguments, parts), not program.compact
+        )
     return asdict(layout), code
 
 

@@ -37,11 +37,13 @@ def registers_per_vector() -> int:
     return 1 if "+avx512f" in features else 2 if "+avx" in features else 4
 
 
-def compile_object(emit: Emit) -> bytes:
+def compile_object(emit: Emit, thorough: bool = True) -> bytes:
     """Compile the loop over tiles.
 
     Args:
         emit: emits its body.
+        thorough: whether all of LLVM's passes are run, or only the one that simplifies instruction by instruction. In
+            long functions without branches the others find little and take as long as giving out registers.
 
     Returns:
         An object file that defines the one function `run`.
@@ -52,8 +54,19 @@ def compile_object(emit: Emit) -> bytes:
     tuning = binding.create_pipeline_tuning_options(speed_level=OPTIMISATION)
     tuning.loop_vectorization = tuning.slp_vectorization = False  # the code is made of vectors already
     passes = binding.create_pass_builder(machine, tuning)
-    passes.getModulePassManager().run(module, passes)
+    if thorough:
+        passes.getModulePassManager().run(module, passes)
+    else:
+        _simplify(module, passes)
     return machine.emit_object(module)
+
+
+def _simplify(module: binding.ModuleRef, passes: binding.PassBuilder) -> None:
+    manager = binding.create_new_function_pass_manager()
+    manager.add_instruction_combine_pass()
+    for function in module.functions:
+        if not function.is_declaration:
+            manager.run(function, passes)
 
 
 def load_object(code: bytes) -> MachineCode:

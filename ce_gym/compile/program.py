@@ -147,7 +147,8 @@ class Program:
         steps: calls, look-ups and repeated ones, in the order of execution.
         skip_unless: a `tiles` buffer of size 1; a tile whose lanes are all zero there is skipped.
         compact: whether code is small rather than wide: the lanes of a tile go through a call in as many parts as they
-            take registers, and results are not kept until its end. For what is too large for a level-2 cache.
+            take registers, and results are not kept until its end; it is compiled with fewer passes. For what is too
+            large for a level-2 cache.
     """
 
     name: str
