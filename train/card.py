@@ -11,6 +11,7 @@ which the other programs find it. Uses public names of ce_gym only, and no name 
 from __future__ import annotations
 
 import interruption  # noqa: F401
+import single_blas  # noqa: F401
 
 # isort: split
 

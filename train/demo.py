@@ -9,6 +9,7 @@ Uses public names of ce_gym only.
 from __future__ import annotations
 
 import interruption  # noqa: F401
+import single_blas  # noqa: F401
 
 # isort: split
 

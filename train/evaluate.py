@@ -10,6 +10,7 @@ task.
 from __future__ import annotations
 
 import interruption  # noqa: F401
+import single_blas  # noqa: F401
 
 # isort: split
 

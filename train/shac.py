@@ -12,6 +12,7 @@ train/config/shac. They may change the task (`env_args`: a policy is judged with
 from __future__ import annotations
 
 import interruption  # noqa: F401
+import single_blas  # noqa: F401
 
 # isort: split
 

@@ -11,6 +11,7 @@ of ce_gym only, and no name of a robot or task.
 from __future__ import annotations
 
 import interruption  # noqa: F401
+import single_blas  # noqa: F401
 
 # isort: split
 
