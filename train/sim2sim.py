@@ -12,6 +12,7 @@ public names of ce_gym only, and no name of a robot or task.
 from __future__ import annotations
 
 import interruption  # noqa: F401
+import single_blas  # noqa: F401
 
 # isort: split
 

@@ -77,6 +77,14 @@ def thrown_against_stops(speed: float, slow: dict, fast: dict) -> np.ndarray:
     return np.array(found)
 
 
+def test_a_passive_joint_has_its_stops():
+    """Whether its file says no torque or 0, which is what passive joints of URDF files have."""
+    stop = {"position": (-0.3, 0.6)}
+    found = [thrown_against_stops(2.0, {}, {**stop, "torque": torque}) for torque in (np.inf, 0.0, 20.0)]
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
+
+
 @pytest.mark.parametrize(("speed", "furthest"), [(8.0, 0.2), (-8.0, -0.1)])
 def test_a_dependent_joint_has_its_stops(speed: float, furthest: float):
     """Those of the fast wheel are the slow one's at a third of the angle, and nine times as stiff."""

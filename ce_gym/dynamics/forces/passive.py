@@ -91,9 +91,12 @@ def yielding_forces(mechanism: Mechanism, kinematics: Kinematics, dt: float) -> 
 
 
 def limit_stiffness(robot: Robot, name: str) -> tuple[float, float]:
-    """Return stiffness [N m/rad] and damping [N m s/rad] of a joint's stops: full torque at 0.02 rad, well damped."""
+    """Return stiffness [N m/rad] and damping [N m s/rad] of a joint's stops: full torque at 0.02 rad, well damped.
+
+    Passive joints have no torque to go by, infinite or 0 in their files.
+    """
     torque = robot.body(name).joint.torque
-    stiffness = 50.0 * torque if math.isfinite(torque) else 1e3
+    stiffness = 50.0 * torque if 0.0 < torque < math.inf else 1e3
     return stiffness, stiffness / LIMIT_FREQUENCY
 
 
