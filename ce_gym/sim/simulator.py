@@ -76,7 +76,7 @@ class Simulator:
             of links that are neither adjacent nor in each other in the standing pose, or pairs of names.
         seldom: Contacts, as in `contacts`, that are computed only where they are near the ground, such as "knee"; while
             they are not near, that saves their time.
-        retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move by more than
+        retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move too far, see
             `ce_gym.dynamics.stepping.parts.LARGEST_MOVE`; it alone then makes the sub-step in parts.
         device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
 

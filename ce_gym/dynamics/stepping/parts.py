@@ -47,7 +47,7 @@ def judging_function() -> ca.Function:
 
 
 def near(moved: SX, dt: SX) -> SX:
-    """Return whether the fastest joint has not moved too far in a step; 0 for NaN."""
+    """Return whether the fastest joint moved no further in a step than it may [rad or m]; 0 for NaN."""
     return moved <= ca.fmin(ca.fmax(FAST * dt, LARGEST_FAST_MOVE), LARGEST_MOVE)
 
 
