@@ -40,7 +40,12 @@ HIGH_JUMP = replace(
 
 LONG_JUMP = replace(
     HIGH_JUMP,
-    rewards={**HIGH_JUMP.rewards, "new_height": {"weight": 4.0, "most": 0.3}, "new_distance": 12.0},
+    rewards={
+        **HIGH_JUMP.rewards,
+        "new_height": {"weight": 4.0, "most": 0.3},
+        "new_distance": 12.0,
+        "standing": {"weight": 10.0, "begin": 1.0},  # with less it lands, crouches and stays there
+    },
     metrics=("longest_flight", "apex", "stands"),
 )
 
@@ -127,8 +132,8 @@ SKILLS: Mapping[str, Task] = MappingProxyType(
 SKILLED: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "high_jump": ("mini_cheetah", "mit_humanoid", "tello"),
-        "long_jump": ("mini_cheetah", "mit_humanoid"),
-        "land": ("mini_cheetah", "mit_humanoid", "tello"),
+        "long_jump": ("mini_cheetah", "go2", "mit_humanoid"),
+        "land": ("mini_cheetah", "go2", "mit_humanoid", "tello"),
         "hop": ("mit_humanoid",),
         "recover": ("mini_cheetah",),
         "backflip": ("mini_cheetah",),
