@@ -27,6 +27,7 @@ from typing import Any
 
 import gymnasium
 from console import EPISODES, Parser, Table, add_json_argument, markdown, print_result, run, whole
+from crossing import cross, crossing_table
 from effort import effort
 from evaluate import evaluate, own_figures
 from pictures import draw_curve
@@ -63,8 +64,9 @@ def judged(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[
     Returns:
         seed: of everything, that which the weights give; levels: result of `evaluate` by level; finer: the same on the
         level of training with sub-steps `FINER` times shorter; suites, effort and pushes, on the level of training;
-        sim2sim, or sim2sim_missing, one line that says why there is none. Of a policy that sees no commands there are
-        no suites, pushes and sim2sim.
+        crossing, where the ground has levels, see `crossing.cross`; sim2sim, or
+        sim2sim_missing, one line that says why there is none. Of a policy that sees no commands there are no suites,
+        crossing, pushes and sim2sim.
     """
     record, kwargs, seed = policy.record, policy.record["env_kwargs"], weights_seed(policy)
     found = {
@@ -81,6 +83,8 @@ def judged(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[
         return result | {"sim2sim_missing": "it sees no commands, by which simulations are compared"}
     result["suites"] = judge_suites(policy, episodes, seed, **kwargs)
     result["pushes"] = push_envelope(policy, seed=seed, **kwargs)
+    if found[record["transmission"]].get("levels"):
+        result["crossing"] = cross(policy, episodes, seed, **kwargs)
     if not sim2sim_robots:
         return result | {"sim2sim_missing": "not asked for"}
     try:
@@ -119,7 +123,7 @@ def command(record: dict[str, Any]) -> str:
     kwargs = dict(record["env_kwargs"])
     if level := kwargs.pop("transmission", None):
         words += ["--transmission", level]
-    if "critic" in kwargs and kwargs.pop("obs_mode", None) == "dict":
+    if isinstance(kwargs.get("critic"), list) and kwargs.pop("obs_mode", None) == "dict":
         words += ["--critic", *kwargs.pop("critic")]
     for key, value in kwargs.items():
         words += ["--env-arg", f"{key}={json.dumps(value)}"]
@@ -171,6 +175,7 @@ def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, f
         *(["![Learning curve](curve.png)"] if curve else []),
         f"## On transmission levels\n\n{_levels(record, result)}",
         *_on_terrain(record, result["levels"]),
+        *_crossing(result),
         *_asked_for(result),
         *([f"## Motors\n\n{_motors(result['effort'])}"] if result["effort"] else []),
         *([f"## Pushes\n\n{_pushes(result['pushes'])}"] if "pushes" in result else []),
@@ -221,6 +226,13 @@ def _on_terrain(record: dict[str, Any], levels: dict[str, dict[str, Any]]) -> li
     return [f"## On every level of the ground\n\n{level_table(found)}"] if found else []
 
 
+def _crossing(result: dict[str, Any]) -> list[str]:
+    """The section on who crosses the ground, if that was judged."""
+    said = "Robots that walk straight ahead, by the mean action, and get there without a fall; see `train/crossing.py`."
+    table = crossing_table(result["crossing"]) if "crossing" in result else ""
+    return [f"## Across the ground\n\n{table}\n\n{said}"] if table else []
+
+
 def _motors(found: dict[str, Any]) -> str:
     rows: Table = [["", ""], ["mean speed", f"{found['speed']:.2f} m/s"], ["power", f"{found['power']:.0f} W"]]
     if found["cost_of_transport"] is not None:
@@ -253,15 +265,14 @@ def _sim2sim(result: dict[str, Any]) -> str:
     return f"{markdown(rows)}\n\nRandom commands, one for each robot; `python train/sim2sim.py` says what is asked for."
 
 
-def short_name(record: dict[str, Any]) -> str:
-    """The name under which a policy is shipped.
+def short_name(record: dict[str, Any], task: str | None = None) -> str:
+    """The name under which a policy is shipped; `task` stands there instead of the name of its task.
 
     Raises:
         PolicyError: If the record says nothing that can be the name of a folder.
     """
-    name = "_".join(
-        str(x) for x in (*(record["policy_spec"].get(key) for key in ("robot", "task")), record["transmission"])
-    )
+    spec = record["policy_spec"]
+    name = "_".join(str(x) for x in (spec.get("robot"), task or spec.get("task"), record["transmission"]))
     if not re.fullmatch(r"[\w-]+", name):
         raise PolicyError(f"policy_spec: robot, task and level {name!r}; expected letters, digits, _ and - only")
     return name
@@ -282,6 +293,7 @@ def main(argv: list[str] | None = None) -> int:
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--out", type=Path, metavar="FOLDER", help="where to write (default: the run's folder)")
     where.add_argument("--ship", action="store_true", help="write to assets/policies/<robot>_<task>_<level>")
+    parser.add_argument("--task", metavar="NAME", help="in the policy's name, such as stairs (default: the task's)")
     parser.add_argument(
         "--episodes", type=EPISODES, default=2048, metavar="N", help="episodes on each level (default 2048)"
     )
@@ -301,7 +313,7 @@ def _work(args: argparse.Namespace) -> int:
     source = locate_policy(args.run)
     actor, record = read_actor(source)
     record, curve = portable(record), read_curve(source.parent / "curve.csv")
-    name = short_name(record)
+    name = short_name(record, args.task)
     out = shelf() / name if args.ship else args.out or source.parent
     acted_in = {"env": environment_of(record, args.env), "env_kwargs": {**record["env_kwargs"], **dict(args.env_args)}}
     policy = Policy(actor, record | acted_in)

@@ -4,7 +4,7 @@ By the mean action, from a seed that the weights give. Uses public names of ce_g
 task.
 
     python train/evaluate.py runs/mini_cheetah_velocity --transmission armature
-    python train/evaluate.py policy.onnx --suites --pushes --json result.json
+    python train/evaluate.py policy.onnx --suites --pushes --crossing --json result.json
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from console import EPISODES, Parser, add_json_argument, print_result, run, whole
+from crossing import cross, crossing_table
 from effort import effort
 from episodes import play
 from pushes import push_envelope, push_table
@@ -118,7 +119,7 @@ def report(result: dict[str, Any]) -> str:
     return "\n\n".join(["\n".join(lines), *tables])
 
 
-TABLES = {"levels": level_table, "suites": suite_table, "pushes": push_table}
+TABLES = {"levels": level_table, "crossing": crossing_table, "suites": suite_table, "pushes": push_table}
 """What is shown below the figures, if it was judged."""
 
 
@@ -182,6 +183,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--pushes", action="store_true", help="also push it, from all sides, harder and harder")
     text = "also judge it on commands that jump, standing, turning in place, going backwards, and pushed"
     parser.add_argument("--suites", action="store_true", help=text)
+    text = "also count who walks 8 m straight ahead without a fall, by level of the ground"
+    parser.add_argument("--crossing", action="store_true", help=text)
     add_env_arguments(parser)
     add_arguments(parser, episodes=2048)
     args = parser.parse_args(argv)
@@ -198,6 +201,8 @@ def _judge(args: argparse.Namespace) -> int:
         result["effort"] = found
     if args.suites:
         result["suites"] = judge_suites(model, args.episodes, seed, **kwargs)
+    if args.crossing:
+        result["crossing"] = cross(model, args.episodes, seed, **kwargs)
     if args.pushes:
         result["pushes"] = push_envelope(model, seed=seed, **kwargs)
     print_result(result, report(result), args.json)

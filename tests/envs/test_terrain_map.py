@@ -101,6 +101,7 @@ def test_heights_in_any_order_of_memory_are_one_terrain():
         ({"file": "hill.npy", "height": "1"}, "height='1'; expected a length"),
         ({"file": "hill.npy", "levels": 3}, r"terrain\['levels'\]=3; expected one of field, file"),
         ({"file": "hill.npy", "begin": [[1, 0], [0, 0]]}, r"two pairs \(low, high\)"),
+        ({"file": "hill.npy", "begin": [[90, 99], [0, 0]]}, r"begin'\].*; expected x within the map"),
         ({"file": "hill.npy", "begin": []}, r"two pairs \(low, high\)"),
         ({"file": "hill.npy", "begin": [[0, [1]], [0, 0]]}, r"two pairs \(low, high\)"),
         ({"field": [[0.0]]}, "expected a Terrain"),

@@ -40,12 +40,19 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
     check("terrain", {"kind": "map", **given}, alone, "`cell` and `height` with a `file` only")
     begin = _inside(field) if given.get("begin") is None else given["begin"]
     check("terrain['begin']", begin, _are_ranges(begin), "two pairs (low, high), of x and of y [m]")
+    for axis, (low, high), (first, last) in zip("xy", begin, _ends(field), strict=True):
+        inside = first <= low and high <= last
+        check("terrain['begin']", begin, inside, f"{axis} within the map, {first:g} to {last:g} m")
     return {"kind": "map", "field": field, "begin": tuple((float(low), float(high)) for low, high in begin)}
 
 
 def _inside(field: Terrain) -> list[tuple[float, float]]:
-    ends = [(low, low + field.cell * (n - 1)) for low, n in zip(field.origin, field.heights.shape, strict=True)]
-    return [(low + min(MARGIN, (high - low) / 4), high - min(MARGIN, (high - low) / 4)) for low, high in ends]
+    return [(low + min(MARGIN, (high - low) / 4), high - min(MARGIN, (high - low) / 4)) for low, high in _ends(field)]
+
+
+def _ends(field: Terrain) -> list[tuple[float, float]]:
+    """Return where the heights of a field begin and end along x and along y [m]."""
+    return [(low, low + field.cell * (n - 1)) for low, n in zip(field.origin, field.heights.shape, strict=True)]
 
 
 def _are_ranges(value: Any) -> bool:
