@@ -54,7 +54,7 @@ def write_video(
     fps = min(fps or usual, 1 / rollout.dt)
     model = model or load_model(rollout)
     width, height = size
-    picture = Picture(model, rollout.q[0], width=width, height=height, terrain=rollout.ground)
+    picture = Picture(model, _as_on_a_plane(rollout, model), width=width, height=height, terrain=rollout.ground)
     fresh = path.with_name(f".{path.name}")  # a film is whole or not there
     film = writer(str(fresh), size, fps=fps, macro_block_size=2, ffmpeg_log_level="error", **encoding)
     try:
@@ -86,6 +86,14 @@ def check_video(path: Path, size: tuple[int, int]) -> None:
             raise ViewerError(
                 f"size {size[0]} x {size[1]}: expected even numbers from {SMALLEST} to {LARGEST} [pixels]"
             )
+
+
+def _as_on_a_plane(rollout: Rollout, model: Any) -> NDArray[np.float64]:
+    """Return the first positions of a rollout as they were if its ground were the plane z = 0, shape (nq,)."""
+    q = rollout.q[0].copy()
+    if rollout.ground is not None and model.robot.floating:
+        q[2] -= rollout.ground.at(*q[:2])[0]
+    return q
 
 
 def _pictures(rollout: Rollout, picture: Picture, fps: float) -> Iterator[NDArray[np.uint8]]:

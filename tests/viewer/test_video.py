@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hopper import StandIn, make_robot, make_rollout
 
+from ce_gym import Terrain
 from ce_gym.__main__ import main
 from ce_gym.viewer import ViewerError, write_video
 
@@ -76,3 +77,17 @@ def test_what_is_no_video_is_told_first(name: str, size: tuple[int, int], words:
 def test_several_robots_are_no_video(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["play", "mini_cheetah_velocity", "--robots", "2", "--video", "two.gif"]) == 2
     assert "--video with 2 robots: expected one" in capsys.readouterr().err
+
+
+def test_the_camera_finds_a_robot_that_begins_high_up(tmp_path: Path) -> None:
+    """A film of a robot on a plateau is that of the robot on a plain."""
+
+    def film(height: float) -> np.ndarray:
+        rollout = make_rollout(3)
+        plateau = Terrain.from_function(lambda x, y: height + 0 * x, 0.5, 40.0)
+        raised = make_rollout(3, q=rollout.q + [0, 0, height, 0, 0, 0], ground=plateau)
+        file = write_video(raised, tmp_path / f"{height}.gif", size=SIZE, model=StandIn(make_robot()))
+        with Image.open(file) as pictures:
+            return np.asarray(pictures.convert("RGB"), float)
+
+    assert np.abs(film(2.0) - film(0.0)).mean() < 1

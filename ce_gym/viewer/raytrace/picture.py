@@ -63,7 +63,7 @@ class Picture:
 
     Args:
         model: The robot and its forward kinematics.
-        q: Positions in a typical pose, shape (nq,); they set how far the camera is away.
+        q: Positions in a typical pose on the plane z = 0, shape (nq,); they set how far the camera is away.
         width: Of the picture [pixels].
         height: Of the picture [pixels].
         terrain: The ground, the plane z = 0 if None.
