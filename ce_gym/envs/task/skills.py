@@ -19,7 +19,7 @@ HIGH_JUMP = replace(
     VELOCITY,
     rewards={
         "new_height": 20.0,
-        "standing": {"weight": 2.0, "begin": 1.2},
+        "standing": {"weight": 10.0, "begin": 1.2},  # with less it lands, crouches and stays there
         "survive": 0.5,
         "orientation": -2.0,
         "swerve": -0.1,
@@ -44,7 +44,7 @@ LONG_JUMP = replace(
         **HIGH_JUMP.rewards,
         "new_height": {"weight": 4.0, "most": 0.3},
         "new_distance": 12.0,
-        "standing": {"weight": 10.0, "begin": 1.0},  # with less it lands, crouches and stays there
+        "standing": {"weight": 10.0, "begin": 1.0},
     },
     metrics=("longest_flight", "apex", "stands"),
 )
@@ -131,7 +131,7 @@ SKILLS: Mapping[str, Task] = MappingProxyType(
 
 SKILLED: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "high_jump": ("mini_cheetah", "mit_humanoid", "tello"),
+        "high_jump": ("mini_cheetah", "go2", "mit_humanoid", "tello"),
         "long_jump": ("mini_cheetah", "go2", "mit_humanoid"),
         "land": ("mini_cheetah", "go2", "mit_humanoid", "tello"),
         "hop": ("mit_humanoid",),
