@@ -42,6 +42,7 @@ from ce_gym.policies import (
     PolicyError,
     add_env_arguments,
     environment_of,
+    keep_map,
     locate_policy,
     read_actor,
     shelf,
@@ -320,6 +321,7 @@ def _work(args: argparse.Namespace) -> int:
     result = judged(policy, args.episodes, args.robots, args.levels)
     out.mkdir(parents=True, exist_ok=True)
     write_npz(actor, record, out / "policy.npz")
+    keep_map(record["env_kwargs"], out)
     if curve:
         draw_curve(curve, name, out / "curve.png")
     (out / "card.md").write_text(card(record, result, curve, name), encoding="utf-8")

@@ -25,7 +25,7 @@ from suites import EVALUATION_SEED
 from transfer import summary, table, transfer
 
 from ce_gym import usable_cores
-from ce_gym.policies import add_env_arg, load_policy
+from ce_gym.policies import add_env_arg, keep_map, load_policy, with_map
 from ce_gym.viewer import Rollout, walk, write_html
 
 ENV = "ce_gym/MiniCheetahVelocity-v0"
@@ -39,7 +39,7 @@ def obtain_policy(args: argparse.Namespace) -> Path:
     resume, asked = None, (args.env, {**load_env_args(path), **dict(args.env_args)})
     if policy.exists() and not args.fresh:
         record = load_policy(policy).record
-        same = (record["env"], record["env_kwargs"]) == asked
+        same = (record["env"], record["env_kwargs"]) == (args.env, with_map(asked[1], policy))
         if record.get("finished") and same:
             print(f"Using the policy trained earlier: {policy}, {record['steps']:,} steps. --fresh trains a new one.")
             return policy
@@ -54,7 +54,9 @@ def obtain_policy(args: argparse.Namespace) -> Path:
     print(
         f"{begin}: {args.env}, {settings.steps:,} steps or {args.minutes:g} minutes. Ctrl-C stops and keeps the policy."
     )
-    return _announce(train(job))
+    trained = train(job)
+    keep_map(job.env_kwargs, args.out)
+    return _announce(trained)
 
 
 def _announce(trained: Trained) -> Path:

@@ -24,7 +24,7 @@ from settings import NETWORK, Settings, SettingsError, config_file, load_env_arg
 from training_page import TrainingPage
 
 from ce_gym import usable_cores
-from ce_gym.policies import PolicyError, add_env_arg, environment_of, load_policy, locate_policy
+from ce_gym.policies import PolicyError, add_env_arg, environment_of, keep_map, load_policy, locate_policy
 
 CHECKPOINTS = 10
 """Checkpoints per training run."""
@@ -313,6 +313,7 @@ def _train_each(program: str, train: Callable[[Job], Trained], wanted: list[Job]
 
     for job in wanted:
         make_folder(job.out)
+        keep_map(job.env_kwargs, job.out)
         print(f"training {job.env_id}, seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", flush=True)
         trained = train(job)
         print(f"saved {trained.policy} after {trained.record['steps']:,} steps", flush=True)

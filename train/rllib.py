@@ -32,7 +32,7 @@ from run_folder import make_folder
 from settings import Settings, SettingsError, config_file, load_env_args, load_settings
 
 import ce_gym  # noqa: F401  (registers the environments in this process)
-from ce_gym.policies import Actor, add_env_arg
+from ce_gym.policies import Actor, add_env_arg, keep_map
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
@@ -175,6 +175,7 @@ def _work(args: argparse.Namespace) -> int:
     steps = train(algo, s.steps, 60.0 * args.minutes)
     out = args.out or Path("runs") / f"{path.stem}-rllib"
     make_folder(out)
+    keep_map(kwargs, out)
     algo.save_to_path(str((out / "checkpoint").resolve()))
     record = _record(one.unwrapped, args.env, kwargs, s, steps)
     write(to_onnx(actor_of(algo, s.activation), record), record, out / "policy.onnx")

@@ -30,7 +30,7 @@ from run_folder import make_folder
 from settings import Settings, config_file, load_env_args, load_settings
 
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
-from ce_gym.policies import Actor, add_env_arg, load_policy
+from ce_gym.policies import Actor, add_env_arg, keep_map, load_policy
 
 
 def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str, Any]:
@@ -125,6 +125,7 @@ def _work(args: argparse.Namespace) -> int:
     settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
     out = args.out or Path("runs") / f"{path.stem}-rsl_rl"
     make_folder(out)
+    keep_map(kwargs, out)
     training = {**kwargs, **settings.training}
     envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **training)
     runner = train(envs, settings, args.seed, out)

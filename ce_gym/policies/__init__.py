@@ -5,6 +5,7 @@ from ce_gym.policies.arguments import add_env_arg, add_env_arguments, checked_ar
 from ce_gym.policies.environments import environment_of
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.files import RECORD_KEY, load_policy, read_actor, write_npz
+from ce_gym.policies.height_maps import keep_map, with_map
 from ce_gym.policies.places import WHERE, find_policy, locate_policy, shelf, shipped_policies
 from ce_gym.policies.weights import read_weights
 
@@ -21,6 +22,7 @@ __all__ = [
     "checked_arguments",
     "environment_of",
     "find_policy",
+    "keep_map",
     "load_policy",
     "locate_policy",
     "parse_yaml",
@@ -28,5 +30,6 @@ __all__ = [
     "read_weights",
     "shelf",
     "shipped_policies",
+    "with_map",
     "write_npz",
 ]

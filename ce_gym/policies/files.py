@@ -25,6 +25,7 @@ from ce_gym.policies.archive import read_json, read_npz
 from ce_gym.policies.arguments import CHOSEN
 from ce_gym.policies.environments import shown
 from ce_gym.policies.errors import LevelWarning, PolicyError
+from ce_gym.policies.height_maps import with_map
 from ce_gym.policies.places import locate_policy
 from ce_gym.policies.weights import read_weights
 
@@ -189,6 +190,7 @@ def _checked(record: Any, file: Path) -> dict[str, Any]:
         raise PolicyError(
             f"{file}: activation: {_shortened(record['activation'])}; expected one of {', '.join(ACTIVATIONS)}"
         )
+    record["env_kwargs"] = with_map(record["env_kwargs"], file)
     return record
 
 

@@ -29,11 +29,11 @@ def find_policy(path: str | Path) -> Path | None:
     """Return the file of a policy, None if `path` means none; see `locate_policy`."""
     path = Path(path)
     if path.suffix in FORMATS:
-        return path if _is_file(path) and not _is_other_npz(path) else None
+        return path if is_file(path) and not _is_other_npz(path) else None
     folders = [path, *([shelf() / path, shelf() / f"{path}_exact"] if len(path.parts) == 1 else [])]
     files = [folder / f"policy{suffix}" for folder in folders for suffix in FORMATS]
     files += [path.with_name(f"{path.name}.zip")] if path.name else []
-    return next((file for file in files if _is_file(file)), None)
+    return next((file for file in files if is_file(file)), None)
 
 
 def locate_policy(path: str | Path) -> Path:
@@ -53,8 +53,8 @@ def locate_policy(path: str | Path) -> Path:
     return file
 
 
-def _is_file(path: Path) -> bool:
-    """Whether there is a regular file; a path that no system would take means none."""
+def is_file(path: Path) -> bool:
+    """Return whether there is a regular file; a path that no system would take means none."""
     try:
         return path.is_file()
     except (OSError, ValueError):

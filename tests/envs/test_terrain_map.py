@@ -90,8 +90,11 @@ def test_heights_in_any_order_of_memory_are_one_terrain():
     ("terrain", "said"),
     [
         ({}, "either a `field` or a `file`"),
-        ({"file": "no.npy"}, "file='no.npy'; expected a file with a height map"),
-        ({"file": "/dev/zero"}, "file='/dev/zero'; expected a file"),
+        (
+            {"file": "no.npy"},
+            r"terrain\['file'\]='no.npy'; expected a file .*, looked for in '/.*' and beside a policy.*copy",
+        ),
+        ({"file": "/dev/zero"}, r"file'\]='/dev/zero'; expected a file with a height map; copy"),
         ({"file": "text.png"}, "cannot identify image file"),
         ({"file": "text.npy"}, "expected an array of heights"),
         ({"file": "row.npy"}, r"an array \(rows, columns\) of numbers"),

@@ -15,7 +15,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from stander import BIAS, record, stander, write_small, write_zip
+from stander import BIAS, ENV, record, stander, write_small, write_zip
 
 import ce_gym
 from ce_gym.policies import (
@@ -24,6 +24,7 @@ from ce_gym.policies import (
     LevelWarning,
     PolicyError,
     find_policy,
+    keep_map,
     load_policy,
     locate_policy,
     read_actor,
@@ -248,3 +249,37 @@ def test_the_record_survives(tmp_path: Path) -> None:
     for (weight, bias), (same_weight, same_bias) in zip(actor.layers, stander().layers, strict=True):
         np.testing.assert_array_equal(weight, same_weight)
         np.testing.assert_array_equal(bias, same_bias)
+
+
+def test_a_policy_finds_its_height_map_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, run = tmp_path / "here", tmp_path / "there" / "run"
+    here.mkdir()
+    kwargs = {"terrain": {"kind": "map", "file": "maps/hill.npy", "cell": 0.5}}
+    for file in ("policy.npz", "checkpoints/policy_100.npz"):
+        write_small(run / file, env_kwargs=kwargs)
+    monkeypatch.chdir(tmp_path)
+    assert load_policy(run).record["env_kwargs"] == kwargs
+    with pytest.raises(ValueError, match=r"terrain\['file'\]='maps/hill.npy'; expected .* looked for in '/.*' and"):
+        gymnasium.make(ENV, **load_policy(run).record["env_kwargs"])
+
+    (tmp_path / "maps").mkdir()
+    hill = np.outer(np.hanning(20), np.ones(12))
+    np.save(tmp_path / "maps/hill.npy", hill)
+    for _ in range(2):  # the copy of a resumed run is already there
+        keep_map(load_policy(run).record["env_kwargs"], run)
+    keep_map({"terrain": "rough"}, run)
+    monkeypatch.chdir(here)
+    for file in (run, run / "checkpoints/policy_100.npz", Path("../there/run/policy.npz")):
+        found = load_policy(file).record["env_kwargs"]
+        assert found == {"terrain": {**kwargs["terrain"], "file": found["terrain"]["file"]}}
+        np.testing.assert_array_equal(np.load(found["terrain"]["file"]), hill)
+    assert sorted(file.name for file in run.iterdir()) == ["checkpoints", "hill.npy", "policy.npz"]
+
+
+@pytest.mark.parametrize(
+    "terrain", [3, "map", {"file": 3}, {"file": ""}, {"file": "\0"}, {"file": ".."}, {"file": "a" * 5000}]
+)
+def test_a_record_with_any_terrain_is_read(terrain: object, tmp_path: Path) -> None:
+    kwargs = {"terrain": terrain}
+    assert load_policy(write_small(tmp_path / "policy.npz", env_kwargs=kwargs)).record["env_kwargs"] == kwargs
+    keep_map(kwargs, tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ce_gym.sim.arguments import check, is_number
@@ -34,6 +35,7 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
     check("terrain", {"kind": "map", **given}, one, "either a `field` or a `file` of a 'map'")
     if field is None:
         check("terrain['file']", file, isinstance(file, str), "a path")
+        check("terrain['file']", file, Path(file).is_file(), _where(file))
         field = Terrain.from_file(file, given.get("cell", 0.1), given.get("height", 1.0))
     check("terrain['field']", field, isinstance(field, Terrain), "a Terrain")
     alone = file is not None or not {"cell", "height"} & given.keys()
@@ -44,6 +46,14 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
         inside = first <= low and high <= last
         check("terrain['begin']", begin, inside, f"{axis} within the map, {first:g} to {last:g} m")
     return {"kind": "map", "field": field, "begin": tuple((float(low), float(high)) for low, high in begin)}
+
+
+def _where(file: str) -> str:
+    """Return what was expected of a file that is not there, and what to do."""
+    places = (
+        "" if Path(file).is_absolute() else f", looked for in {str(Path.cwd())!r} and beside a policy that names it"
+    )
+    return f"a file with a height map{places}; copy it there or name another `file`"
 
 
 def _inside(field: Terrain) -> list[tuple[float, float]]:
