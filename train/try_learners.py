@@ -36,7 +36,7 @@ LEARNERS = {
     "torchrl": (["torchrl"], ["others/torchrl_ppo.py"]),
     "torchrl_vector": (["torchrl"], ["others/torchrl_ppo.py", "--vector"]),
     "skrl": (["skrl[torch]"], ["others/skrl_ppo.py"]),
-    "rsl_rl": (["rsl-rl-lib>=5.5,<6", "onnx"], ["rsl_rl_ppo.py", *SMALL]),
+    "rsl_rl": (["ce_gym[train]", "rsl-rl-lib>=5.5,<6", "onnx"], ["rsl_rl_ppo.py", *SMALL]),
     "rllib": (["ray[rllib]>=2.60", "torch", "onnx"], ["rllib.py", *SMALL, "--env-runners", "0"]),
     "ppo": (["ce_gym[train]"], ["ppo.py", *SMALL]),
     "fast_ppo": (["ce_gym[fast]"], ["fast_ppo.py", *SMALL]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import zipfile
 from pathlib import Path
 
@@ -48,8 +49,10 @@ def locate_policy(path: str | Path) -> Path:
     """
     file = find_policy(path)
     if file is None:
-        known = ", ".join(shipped_policies()) or "none yet"
-        raise PolicyError(f"{path}: no such policy; expected {WHERE} (there are: {known})")
+        known = shipped_policies()
+        close = difflib.get_close_matches(str(path), [*(name.removesuffix("_exact") for name in known), *known], n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"there are: {', '.join(known) or 'none yet'}"
+        raise PolicyError(f"{path}: no such policy; expected {WHERE} ({hint})")
     return file
 
 

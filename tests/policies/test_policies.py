@@ -121,6 +121,8 @@ def test_names_folders_and_files_are_policies(tmp_path: Path, monkeypatch: pytes
         assert find_policy(name) is None
     with pytest.raises(PolicyError, match=r"cat: no such policy; expected a file .* \(there are: dog_walk_exact\)"):
         locate_policy("cat")
+    with pytest.raises(PolicyError, match=r"dog_wlak: no such policy; .* \(did you mean 'dog_walk'\?\)"):
+        locate_policy("dog_wlak")
 
 
 def test_what_training_wrote_goes_before_older_copies_of_it(tmp_path: Path) -> None:
