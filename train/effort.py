@@ -56,7 +56,7 @@ class Drives:
         robot, exact = model.robot, ce_gym.Model(model.robot, "exact")
         limits = [(motor.rotor, motor.torque, motor.stall, motor.velocity) for motor in robot.motors]
         if not limits:
-            joints = [(name, robot.body(name).joint) for name in robot.independent]
+            joints = [(name, robot.body(name).joint) for name in robot.driven]
             limits = [(name, joint.torque, None, joint.velocity) for name, joint in joints]
         names = tuple(name for name, *_ in limits)
         function = exact.casadi_function("spanning")

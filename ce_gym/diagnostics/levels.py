@@ -103,7 +103,7 @@ def level_row(model: Model, level: str, M: Mapping[str, Array], feet: Array) -> 
     """
     base = model.robot.layout.joints_v
     (H, turn), (H_level, turn_level) = (in_flight(M[one], base) for one in ("exact", level))
-    kp = dict(model.robot.gains.kp)
+    kp = dict(model.robot.gains.kp) | {name: model.robot.body(name).joint.stiffness for name in model.robot.passive}
     springs = np.array([kp.get(name, 0.0) for name in model.joint_links])
     springs = springs if (springs > 0).all() else np.diagonal(H, axis1=1, axis2=2).mean(0)
     torque = np.abs(np.linalg.eigvals(np.linalg.solve(H, H_level - H)).real).max(-1)

@@ -215,7 +215,7 @@ def _add_shape(element: ET.Element, shape: Shape) -> None:
 def _add_actuators(root: ET.Element, robot: Robot) -> None:
     kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
     actuators = ET.SubElement(root, "actuator")
-    for name in robot.independent:
+    for name in robot.driven:
         gains = {"kp": text(kp.get(name, 0.0)), "kv": text(kd.get(name, 0.0))}
         actuator = ET.SubElement(actuators, "position", {"name": name, "joint": name, **gains})
         torque = robot.body(name).joint.torque
@@ -234,4 +234,4 @@ def _add_standing_pose(root: ET.Element, robot: Robot, standing: Mapping[str, fl
         else:
             qpos.append(standing[name])
     key = ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="stand", qpos=text(qpos))
-    key.set("ctrl", text([standing[name] for name in robot.independent]))
+    key.set("ctrl", text([standing[name] for name in robot.driven]))

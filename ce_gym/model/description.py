@@ -261,7 +261,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Gains:
-    """Joint-space PD gains, pairs (body, value) for every independent joint.
+    """Joint-space PD gains, pairs (body, value) for every independent joint but passive ones.
 
     Attributes:
         kp: Position gains [N m/rad or N/m].
@@ -333,6 +333,20 @@ class Robot:
         """The independent joints, which come first in `independent`, without stretches of transmissions."""
         stretches = {body.name for body in self.bodies if body.kind == "stretch"}
         return tuple(name for name in self.independent if name not in stretches)
+
+    @property
+    def passive(self) -> tuple[str, ...]:
+        """The independent joints that springs alone move: they have one, and the largest torque of an actuator is 0.
+
+        They have positions and speeds as the others have, entries in targets that nothing follows, and no gains.
+        """
+        sprung = {body.name for body in self.bodies if body.joint.stiffness and body.joint.torque == 0.0}
+        return tuple(name for name in self.commanded if name in sprung)
+
+    @property
+    def driven(self) -> tuple[str, ...]:
+        """The commanded joints that are not passive."""
+        return tuple(name for name in self.commanded if name not in self.passive)
 
     @property
     def floating(self) -> bool:

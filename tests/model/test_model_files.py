@@ -49,6 +49,24 @@ def test_yaml_says_what_urdf_cannot(write_robot):
     assert robot.floating
 
 
+SPRUNG = (
+    (
+        '<origin xyz="0 0 -0.2"/><axis',
+        '<origin xyz="0 0 -0.2"/><limit lower="-1" upper="1" effort="0" velocity="0"/><axis',
+    ),
+    ("gains:", "joint_stiffness: {shank: 30}\ngains:"),
+)
+
+
+def test_gains_are_of_joints_that_are_driven(write_robot):
+    """One number is for all but a spring, which a pattern does not fit; a spring that has one is refused."""
+    robot = load_robot(write_robot(*SPRUNG, ("kd: {thigh: 1, shank: 2}", 'kd: {"*": 1}')))
+    assert (robot.passive, robot.gains.kp, robot.gains.kd) == (("shank",), (("thigh", 20.0),), (("thigh", 1.0),))
+    with pytest.raises(RobotError, match=r"gains\.kd\.shank is 2\.0: expected none for a passive joint") as caught:
+        load_robot(write_robot(*SPRUNG))
+    assert "\n" not in str(caught.value)
+
+
 def test_dry_friction_of_joints_is_the_urdf_s_where_the_yaml_is_silent(write_robot, load_urdf):
     plain = load_urdf(
         link("a", block()), link("b", block()), joint("continuous", "a", "b", '<dynamics friction="0.3"/>')

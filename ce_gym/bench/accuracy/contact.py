@@ -153,7 +153,7 @@ def _rates(model: Model, q: SX, v: SX, s: SX, target: SX) -> tuple[SX, SX, SX, l
     torques = []
     for i, name in enumerate(robot.independent):
         joint = robot.body(name).joint
-        asked = kp[name] * (target[i] - q[7 + i]) - kd[name] * v[6 + i]
+        asked = kp.get(name, 0.0) * (target[i] - q[7 + i]) - kd.get(name, 0.0) * v[6 + i]
         torques.append(ca.fmin(joint.torque, ca.fmax(-joint.torque, asked)) - joint.damping * v[6 + i])
     tau = ca.vertcat(SX(6, 1), *torques)
     v_rate = model.casadi_function("forward_dynamics_with_wrenches")(q, v, tau, ca.vertcat(*wrenches))

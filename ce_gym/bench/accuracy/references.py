@@ -109,7 +109,7 @@ class _Constrained:
             kp, kd = dict(scene.robot.gains.kp), dict(scene.robot.gains.kd)
             y = positions(scene, self.model, qpos)[7 if scene.robot.floating else 0 :]
             for i, (name, dof) in enumerate(zip(scene.robot.independent, self.dofs, strict=True)):
-                force[dof] += kp[name] * (scene.drive[hold, i] - y[i]) - kd[name] * qvel[dof]
+                force[dof] += kp.get(name, 0.0) * (scene.drive[hold, i] - y[i]) - kd.get(name, 0.0) * qvel[dof]
         return force
 
     def _jacobian(self, qpos: Array) -> Array:

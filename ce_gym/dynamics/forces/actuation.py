@@ -40,7 +40,7 @@ def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
     robot, model = mechanism.robot, MOTORS[options.motors]
     motors = robot.motors if model.at_motors or options.control.startswith("motor") else ()
     ends = [model.limits(motor, SX.sym("speed"), SX(1), 1.0) for motor in motors]
-    joints = [robot.body(name).joint.torque for name in robot.independent]
+    joints = [math.inf if name in robot.passive else robot.body(name).joint.torque for name in robot.independent]
     limited = any(map(math.isfinite, joints)) or any(end is not None for end in ends)
     answering = any(ca.sparsify(slope).nnz() for end in ends if end is not None for _, slope in end)
     asked = options.control.endswith("position") and limited
@@ -50,10 +50,12 @@ def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
 
 def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce:
     """Return what the motors are asked for at the joints: a torque, or a proportional-derivative position control."""
+    robot = scene.mechanism.robot
+    works = SX(ca.DM([float(name not in robot.passive) for name in robot.commanded]))
     if scene.options.control == "torque":
-        return JointForce(target, SX(target.shape[0], target.shape[0]))
-    damping = scene.figures.kd + dt * scene.figures.kp
-    return JointForce(scene.figures.kp * (target - y) - damping * yd, ca.diag(dt * damping))
+        return JointForce(works * target, SX(target.shape[0], target.shape[0]))
+    kp, damping = works * scene.figures.kp, works * (scene.figures.kd + dt * scene.figures.kp)
+    return JointForce(kp * (target - y) - damping * yd, ca.diag(dt * damping))
 
 
 def seen_joints(mechanism: Mechanism, kinematics: Kinematics) -> SX:
@@ -102,7 +104,7 @@ def within_joint_limits(scene: Scene, force: SaturatedForce, rows: list[int], it
     robot, strength = scene.mechanism.robot, scene.figures.strength
     for row in rows:
         limit = robot.body(robot.independent[row]).joint.torque
-        if not math.isinf(limit):
+        if not (math.isinf(limit) or robot.independent[row] in robot.passive):
             asked, still = JointForce(force.tau[row], force.slope[row, :] @ seen), SX(1, seen.shape[1])
             ends = JointForce(strength * limit, still), JointForce(-strength * limit, still)
             one = force.limited[row] = Saturation.about(iterate, row, asked, *ends)

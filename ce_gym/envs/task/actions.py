@@ -46,14 +46,14 @@ class ActionMap:
         robot = mechanism.robot
         self.control: Control = CONTROL[task.actions]
         self.targets = target_names(mechanism, self.control)
-        acting = {n for n in robot.commanded if any(fnmatch(n, p) for p in task.action_joints)}
+        acting = {n for n in robot.driven if any(fnmatch(n, p) for p in task.action_joints)}
         if self.control.startswith("motor"):
             rotors = {motor.rotor for motor in robot.motors}
             clusters = [cluster for cluster in mechanism.tree.clusters if acting & set(cluster.independent)]
             acting = {name for cluster in clusters for name in cluster.bodies if name in rotors}
         self.moved = [i for i, name in enumerate(self.targets) if name in acting]
         if not self.moved:
-            expected = f"patterns of joints among {robot.commanded}"
+            expected = f"patterns of joints among {robot.driven}"
             if self.control.startswith("motor"):
                 expected = f"{expected} that motors drive, for actions={task.actions!r}"
             raise ValueError(f"action_joints={task.action_joints!r}; expected {expected}")

@@ -75,7 +75,7 @@ def base_height(s: TermContext) -> SX:
 def torques(s: TermContext) -> SX:
     """Motor torques as shares of the joints' largest [-], shape (n_joints,)."""
     limits = [s.mechanism.robot.body(name).joint.torque for name in s.mechanism.robot.commanded]
-    return s.torque / np.array([limit if np.isfinite(limit) else 100.0 for limit in limits])
+    return s.torque / np.array([limit if 0 < limit < np.inf else 100.0 for limit in limits])
 
 
 def contact_forces(s: TermContext) -> SX:

@@ -254,7 +254,9 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
         _check_joint_values(robot, file, key, pairs)
         for joint, gain in pairs:
             check_not_negative(file, f"{key}.{joint}", gain)
-        for joint in robot.independent:
+            if joint in robot.passive:
+                raise bad(file, f"{key}.{joint}", gain, "none for a passive joint: it has a spring and a torque of 0")
+        for joint in robot.driven:
             if pairs and joint not in dict(pairs):
                 raise bad(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")
 

@@ -85,7 +85,7 @@ def charts(run: PosedRollout) -> Charts:
             signals[name] = column
             limits |= {name: limit} if np.isfinite(limit) else {}
     paths = body_paths(robot, run.path)
-    largest = np.array([body.joint.torque for body in bodies])
+    largest = np.array([body.joint.torque or np.inf for body in bodies])  # a passive joint has 0 of 0
     effort = np.abs(torques) / largest if torques.shape[1] else np.empty((len(rows), 0))
     return Charts(signals, commanded, limits, effort, tuple(paths[name] for name in joints))
 

@@ -121,10 +121,10 @@ def _material(section: Section) -> ContactMaterial:
 
 
 def _gains(section: Section, robot: Robot) -> Gains:
-    """Return the gains of every independent joint, from one number for all or a number for each name or pattern."""
+    """Return the gains of every driven joint, from one number for all or a number for each name or pattern."""
     section.allow("kp", "kd")
-    below = {key: _among(getattr(robot.gains, key), robot.independent) for key in ("kp", "kd")}
-    return Gains(**{**below, **{key: _for_each(section, key, robot.independent) for key in section}})
+    below = {key: _among(getattr(robot.gains, key), robot.driven) for key in ("kp", "kd")}
+    return Gains(**{**below, **{key: _for_each(section, key, robot.driven) for key in section}})
 
 
 def _for_each(section: Section, key: str, joints: tuple[str, ...]) -> tuple[tuple[str, float], ...]:

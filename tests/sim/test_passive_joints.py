@@ -1,0 +1,74 @@
+"""Joints that springs alone move: no target of whatever kind moves them, and no gain, action or actuator is theirs."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ce_gym
+from ce_gym.dynamics.forces.scene import target_names
+from ce_gym.envs.task.actions import ActionMap
+from ce_gym.envs.task.tasks import TASKS
+from ce_gym.export.mjcf import to_mjcf
+from ce_gym.model import Body, Gains, Inertial, Joint, LinearConstraint, Motor, Placement, Robot
+
+STIFFNESS, INERTIA = 3.0, 0.02
+SPRING = {"stiffness": STIFFNESS, "springref": 0.3, "torque": 0.0}
+
+
+def wheel(name: str, kind: str = "link", spin: float = INERTIA, **joint) -> Body:
+    """A wheel about a vertical axis."""
+    inertia = tuple(map(tuple, np.diag([spin] * 3).tolist()))
+    return Body(name, kind, None, Placement(), Joint("revolute", **joint), Inertial(0.5, (0.0, 0.0, 0.0), inertia))
+
+
+def pair(**blade) -> Robot:
+    """A wheel with a motor behind a gear of six, and beside it a blade, a spring's unless told otherwise."""
+    bodies = (wheel("blade", **(SPRING | blade)), wheel("arm", torque=30.0), wheel("rotor", "rotor", 1e-4))
+    gear = LinearConstraint("rotor", (("rotor", 1.0), ("arm", -6.0)))
+    gains = Gains((("arm", 20.0),), (("arm", 1.0),))
+    return Robot("pair", bodies, (gear,), ("blade", "arm"), motors=(Motor("rotor", 5.0),), gains=gains)
+
+
+def test_a_spring_and_a_torque_of_0_make_a_joint_passive():
+    robot = pair()
+    assert (robot.passive, robot.driven, robot.commanded) == (("blade",), ("arm",), ("blade", "arm"))
+    for blade in ({"stiffness": 0.0}, {"torque": 2.0}, {"torque": np.inf}):
+        assert pair(**blade).passive == (), blade
+
+
+@pytest.mark.parametrize("level", ce_gym.LEVELS)
+@pytest.mark.parametrize("control", ["position", "torque", "motor_position", "motor_torque"])
+@pytest.mark.parametrize("motors", ["ideal", "limited"])
+def test_no_target_moves_it(level: str, control: str, motors: str):
+    """It swings as in closed form whatever it is told, even by a gain that is declared; the arm does as it is told."""
+    model = ce_gym.Model(pair(), level)
+    parameters = ("kp",) if control == "position" else ()
+    options = {"control": control, "motors": motors, "contacts": (), "outputs": (), "parameters": parameters}
+    sim = ce_gym.Simulator(model, dt=1e-3, method="extrapolated", **options)
+    sim.set_state([0.5, 0.0], np.zeros(2))
+    if parameters:
+        sim.set_parameter("kp", [50.0, 20.0])
+    names = target_names(model.mechanism, control)
+    sim.step([7.0 if name == "blade" else 1.0 for name in names], 200)
+    assert sim.q[0, 0] == pytest.approx(0.3 + 0.2 * np.cos(np.sqrt(STIFFNESS / INERTIA) * 0.2), abs=1e-3)
+    assert sim.q[0, 1] > 0.02
+
+
+def test_it_has_no_action():
+    """At the joints, where it has a place among targets, as at the motors."""
+    mechanism = ce_gym.Model(pair()).mechanism
+    for kind in ("joint_pd", "joint_torque", "motor_pd", "motor_torque"):
+        actions = ActionMap(mechanism, replace(TASKS["stand"], actions=kind))
+        assert [actions.targets[i] for i in actions.moved] == ["rotor" if kind.startswith("motor") else "arm"]
+    with pytest.raises(ValueError, match=r"expected patterns of joints among \('arm',\)"):
+        ActionMap(mechanism, replace(TASKS["stand"], action_joints=("blade",)))
+
+
+def test_mjcf_has_no_actuator_of_it():
+    root = ET.fromstring(to_mjcf(pair(), "none"))
+    assert [actuator.get("joint") for actuator in root.iter("position")] == ["arm"]
+    assert len(root.find("keyframe/key").get("ctrl").split()) == 1
