@@ -322,6 +322,9 @@ def test_the_live_page_is_the_same_and_a_narrow_window_keeps_all(twins: list[Rol
     assert boxes["plots"]["bottom"] <= boxes["bar"]["top"]
 
 
+SCAN = [(x, y) for x in (-0.4, 0.1, 0.6) for y in (-0.3, 0.0, 0.3)]
+
+
 @pytest.fixture(scope="module")
 def on_stones(twins: list[Rollout], tmp_path_factory: pytest.TempPathFactory):
     """The first robot and its ghost on rough ground."""
@@ -330,8 +333,9 @@ def on_stones(twins: list[Rollout], tmp_path_factory: pytest.TempPathFactory):
     raised = []
     for twin in twins:
         q = twin.q.copy()
+        q[:, 3], q[:, 6] = np.cos(0.25), np.sin(0.25)
         q[:, 2] += ground.at(q[:, 0], q[:, 1])[:, 0]
-        raised.append(replace(twin, q=q, ground=ground))
+        raised.append(replace(twin, q=q, ground=ground, scan=SCAN))
     file = write_html(raised, tmp_path_factory.mktemp("stones") / "stones.html", spacing=0.0)
     with Chromium(file.as_uri() + "#t=1", size=(700, 500)) as browser:
         browser.until("fields.length === 1")
@@ -349,6 +353,28 @@ def test_the_ground_is_where_the_model_says(on_stones) -> None:
     np.testing.assert_allclose(followed, bases)
     same = "node('/world/ground').object.matrixWorld.equals(node('/world/0').object.matrixWorld)"
     assert browser.run(f"(() => {{ viewer.scene.updateMatrixWorld(); return {same}; }})()")
+
+
+def test_the_height_scan_is_on_the_ground_and_turns_with_the_heading(on_stones, tmp_path: Path) -> None:
+    browser, ground = on_stones
+    dots = np.reshape(browser.run("Array.from(fields[0].dots.geometry.attributes.position.array)"), (-1, 3))
+    x, y, z, w = browser.run("node(fields[0].bodies[0]).object.quaternion.toArray()")
+    base = browser.run("node(fields[0].bodies[0]).object.position.toArray()")
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    turned = np.array(SCAN) @ [[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]]
+    np.testing.assert_allclose(dots[:, :2], base[:2] + turned, atol=1e-5)
+    half = ground.cell / 2  # what is drawn has a vertex at each of these distances
+    low = ground.origin + half * np.floor((dots[:, :2] - ground.origin) / half)
+    s, t = (dots[:, :2] - low).T / half
+    z00, z01, z10, z11 = (ground.at(*(low + half * np.array(c)).T)[:, 0] for c in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    expected = (1 - s) * ((1 - t) * z00 + t * z01) + s * ((1 - t) * z10 + t * z11)
+    np.testing.assert_allclose(dots[:, 2], expected + 0.01, atol=1e-5)
+    assert np.ptp(expected) > 0.01
+    with_dots = pixels(browser, tmp_path / "dots.png")
+    browser.run("fields[0].dots.visible = false; viewer.set_dirty()")
+    without = pixels(browser, tmp_path / "none.png")
+    browser.run("fields[0].dots.visible = true; viewer.set_dirty()")
+    assert (np.abs(with_dots - without).max(-1) > 40).sum() > 20
 
 
 def test_the_ground_is_seen_and_its_relief(on_stones, tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def height_scan(
     Raises:
         ValueError: One line that names the parameter, its value and what was expected.
     """
-    grid = _grid(size, spacing, centre)
+    grid = grid_points(size, spacing, centre)
     _check("around", around, around in ("base", "feet"), "'base' or 'feet'")
     for name, value in (("clip", clip), ("drift", drift), ("shift", shift)):
         _check(name, value, value >= 0, "a length from 0 m on")
@@ -71,7 +71,7 @@ def height_scan(
     return scale * reading
 
 
-def _grid(size: Sequence[float], spacing: float, centre: Sequence[float]) -> NDArray:
+def grid_points(size: Sequence[float], spacing: float, centre: Sequence[float]) -> NDArray:
     """Points of a grid about its middle [m], shape (2, n), the second coordinate changing first."""
     for name, value, least in (("size", size, 0.0), ("centre", centre, -np.inf)):
         numbers = isinstance(value, Sequence) and len(value) == 2 and all(_number(x) and x >= least for x in value)

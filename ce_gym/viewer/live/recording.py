@@ -28,6 +28,7 @@ class LiveRecording:
                 robot.dt,
                 label=robot.model.transmission,
                 terrain=robot.terrain,
+                scan=robot.scan,
             )
             for robot in robots
         ]

@@ -14,6 +14,7 @@ from ce_gym.dynamics.model import Model
 from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.sim.batch import Snapshot
 from ce_gym.viewer.rollouts.driving import made
+from ce_gym.viewer.rollouts.scan import scan_points
 
 Array = NDArray[np.float64]
 Act = Callable[[Any], NDArray[np.float32]]
@@ -45,6 +46,7 @@ class LiveRobot:
         model: The robot.
         dt: Length of a control step [s].
         terrain: The ground, None where it is flat.
+        scan: Where its height scan looks, see `Rollout.scan`.
         command_range: Bounds of the commands that the task draws, shape (3, 2).
 
     Raises:
@@ -58,6 +60,7 @@ class LiveRobot:
         self._act = act or (lambda _: np.zeros((1, program.n_actions), np.float32))
         self.model: Model = program.model
         self.dt, self.terrain = native.dt, field_of(program.task.terrain)
+        self.scan = scan_points(program)
         self.command_range = np.array(program.task.command_range, float)
         draw = SX.sym("draw", program.randomised.n_draws)
         self._values = ca.Function("values", [draw], [program.randomised.values(draw)])

@@ -43,7 +43,7 @@ class Runner:
         self.session = Session(setup.robots())
         first = self.session.robots[0]
         self.offered = policies_for(first.model.robot.name, [setup.policy])
-        self.scene = MovingScene(first.model, first.model.standing_q, count=2, terrain=first.terrain)
+        self.scene = MovingScene(first.model, first.model.standing_q, 2, first.terrain, first.scan)
         self.feed, self._requests, self._notice = Feed(), queue.SimpleQueue[Callable[[Session], None]](), ""
         self._rate, self._ended = 1.0, threading.Event()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="live")
@@ -110,7 +110,7 @@ class Runner:
             elif robot is not robots[0]:
                 robot.write(*robots[0].state())
         self.session.take(robots)
-        self.scene.stand_on(robots[0].terrain)
+        self.scene.stand_on(robots[0].terrain, robots[0].scan)
         self._setup, self._notice = wanted, ""
         for robot in old:
             robot.close()

@@ -68,8 +68,43 @@ function drawField(mesh) {
   };
   mesh.material.customProgramCacheKey = () => `field of ${count}`;
   mesh.material.needsUpdate = true;  // it may have been drawn before
-  fields.push({ mesh, places, bodies: field.bodies });
+  const dots = field.scan && drawScan(mesh, field);
+  fields.push({ mesh, places, bodies: field.bodies, dots });
   viewer.set_dirty();
+}
+
+// Points of a height scan, on the field.
+function drawScan(mesh, field) {
+  const geometry = new MeshCat.THREE.BufferGeometry();
+  geometry.setAttribute("position", new MeshCat.THREE.BufferAttribute(new Float32Array(3 * field.scan.length), 3));
+  const look = new MeshCat.THREE.PointsMaterial({ color: field.color, size: 5, sizeAttenuation: false });
+  const dots = new MeshCat.THREE.Points(geometry, look);
+  dots.frustumCulled = false;
+  mesh.add(dots);
+  return dots;
+}
+
+// Height of what is drawn of a field, between its vertices.
+function heightOf(mesh, x, y) {
+  const field = mesh.userData.field, columns = 2 * field.columns - 3, rows = 2 * field.rows - 3;
+  const vertices = mesh.geometry.attributes.position.array, step = field.cell / 2;
+  const along = (at, first, count) => Math.min(Math.max((at - first) / step - 1, 0), count - 1.001);
+  const u = along(x, field.origin[0], rows), w = along(y, field.origin[1], columns);
+  const i = Math.floor(u), j = Math.floor(w), s = u - i, t = w - j;
+  const z = (a, b) => vertices[3 * ((i + a) * columns + j + b) + 2];
+  return (1 - s) * ((1 - t) * z(0, 0) + t * z(0, 1)) + s * ((1 - t) * z(1, 0) + t * z(1, 1));
+}
+
+// The grid turns with the heading of the base, not with roll and pitch.
+function moveScan({ mesh, dots, bodies }) {
+  const base = node(bodies[0]).object, ahead = new MeshCat.THREE.Vector3(1, 0, 0).applyQuaternion(base.quaternion);
+  const length = Math.hypot(ahead.x, ahead.y) || 1, c = ahead.x / length, s = ahead.y / length;
+  const place = dots.geometry.attributes.position;
+  mesh.userData.field.scan.forEach(([forward, left], i) => {
+    const x = base.position.x + c * forward - s * left, y = base.position.y + s * forward + c * left;
+    place.setXYZ(i, x, y, heightOf(mesh, x, y) + 0.01);  // above the ground, to be seen
+  });
+  place.needsUpdate = true;
 }
 
 // Lets the ground follow the robots' bases. Objects with images appear some time after their commands.
@@ -81,4 +116,5 @@ function moveFields() {
   for (const { places, bodies } of fields) {
     bodies.forEach((path, i) => { const { x, y } = node(path).object.position; places[i].set(x, y); });
   }
+  fields.filter(field => field.dots).forEach(moveScan);
 }

@@ -19,6 +19,7 @@ TILE = 1.0  # edge of the square that the ground's image repeats over [m]
 GROUND_MARGIN = 45.0  # beyond it the sky's dome hides the ground anyway [m]
 SKY_RADIUS = 45.0
 FIELD_OF_VIEW = 35.0  # vertical [degrees]
+SCAN_COLOR = (0.80, 0.30, 0.75)
 FADING = 0.4  # from this share of what is drawn of it, ground that is not flat fades into the horizon
 STEEP = 0.5  # how much darker than level ground a vertical face of it is, besides light and shadow
 
@@ -72,7 +73,14 @@ def camera_commands(place: NDArray[np.float64]) -> Iterator[Command]:
     yield three.set_property(lens, "position", [x, z, -y])  # this node of meshcat's has y up
 
 
-def field_command(path: str, ground: Terrain, bodies: Sequence[str], reach: float, fading: float = FADING) -> Command:
+def field_command(
+    path: str,
+    ground: Terrain,
+    bodies: Sequence[str],
+    reach: float,
+    fading: float = FADING,
+    scan: Sequence[Sequence[float]] = (),
+) -> Command:
     """Return the command that draws ground that is not flat; `ground.js` gives it its shape.
 
     Args:
@@ -81,8 +89,11 @@ def field_command(path: str, ground: Terrain, bodies: Sequence[str], reach: floa
         bodies: Scene paths of the bodies around which it is drawn.
         reach: How far around them [m].
         fading: Share of that from which on it fades into the horizon.
+        scan: Points of a height scan about the first body, see `Rollout.scan`.
     """
     data = {**as_json(ground), "bodies": list(bodies), "reach": float(reach), "fading": fading, "steep": STEEP}
+    if scan:
+        data |= {"scan": [list(point) for point in scan], "color": three.hex_color(SCAN_COLOR)}
     return _tiled(path, three.plane(TILE, TILE), np.eye(4), userData={"field": data})
 
 

@@ -18,6 +18,7 @@ from ce_gym.viewer.page.scene import GHOST_OPACITY, GHOST_TINTS
 from ce_gym.viewer.rollouts.ground_patch import around, level, reach
 
 Array = NDArray[np.float64]
+Scan = Sequence[Sequence[float]]
 
 WORLD, SURROUNDINGS = "/world", "/surroundings"
 BLOCK = 4.0  # edge of the squares of the world that share a piece of ground that is not flat [m]
@@ -31,12 +32,15 @@ class MovingScene:
         q: Positions in a typical pose, shape (nq,); they set how far the camera is away.
         count: How many there are.
         terrain: The ground, the plane z = 0 if None.
+        scan: Where the first robot's height scan looks, see `Rollout.scan`.
 
     Attributes:
         paths: Scene path of each body, by name, for each robot.
     """
 
-    def __init__(self, model: PosedModel, q: Array, count: int = 1, terrain: Terrain | None = None) -> None:
+    def __init__(
+        self, model: PosedModel, q: Array, count: int = 1, terrain: Terrain | None = None, scan: Scan = ()
+    ) -> None:
         self.robot = model.robot
         self.paths = [body_paths(self.robot, f"{WORLD}/{index}") for index in range(count)]
         self._index = {body.name: model.body_names.index(body.name) for body in self.robot.bodies}
@@ -45,11 +49,11 @@ class MovingScene:
         low, high = extent(self.robot, positions[order], rotations[order])
         self._radius = max(float(np.linalg.norm(high - low)) / 2, 0.05)
         self._middle, self._height = (low + high)[:2] / 2, float(low[2] + high[2]) / 2
-        self.stand_on(terrain)
+        self.stand_on(terrain, scan)
 
-    def stand_on(self, terrain: Terrain | None) -> None:
-        """Change the ground."""
-        self._terrain = terrain
+    def stand_on(self, terrain: Terrain | None, scan: Scan = ()) -> None:
+        """Change the ground, and where the first robot's height scan looks."""
+        self._terrain, self._scan = terrain, scan
         self._block: tuple[int, int] | None = None  # the piece of ground that the page has
 
     def commands(self) -> list[str]:
@@ -100,6 +104,6 @@ class MovingScene:
             return None
         block = BLOCK * np.array([[row, column], [row + 1, column + 1]])
         ground, root = around(self._terrain, block), self.paths[0][self.robot.bodies[0].name]
-        command = field_command(f"{WORLD}/ground", ground, [root], reach(ground, block))
+        command = field_command(f"{WORLD}/ground", ground, [root], reach(ground, block), scan=self._scan)
         self._block = (row, column)
         return json.dumps(command).encode()

@@ -139,12 +139,12 @@ def _fields(runs: Sequence[PosedRollout], poses: Sequence[Array], spacing: float
         for index, run in enumerate(runs):
             far = min(spacing / 2, reach(grounds[index], run.middle))
             piece = around(grounds[index], run.middle, far)
-            yield field_command(f"{ROOT}/ground_{index}", piece, [bases[index]], far, fading=0.8)
+            yield field_command(f"{ROOT}/ground_{index}", piece, [bases[index]], far, 0.8, run.rollout.scan)
             yield three.set_transform(f"{ROOT}/ground_{index}", poses[index])
         return
     everywhere = np.concatenate([run.middle for run in runs])
     widest = max(grounds, key=lambda ground: reach(ground, everywhere))
-    yield field_command(f"{ROOT}/ground", widest, bases, reach(widest, runs[0].middle))
+    yield field_command(f"{ROOT}/ground", widest, bases, reach(widest, runs[0].middle), scan=runs[0].rollout.scan)
     yield three.set_transform(f"{ROOT}/ground", poses[0])
 
 

@@ -27,6 +27,7 @@ class Recorder:
         contact_names: Which contacts the forces belong to; empty means all of the robot's.
         signal_names: Of what else is recorded for plots.
         terrain: The ground, of which the part around the robot's path is kept; None if it is flat.
+        scan: Where a height scan looks, see `Rollout.scan`.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Recorder:
         contact_names: Sequence[str] = (),
         signal_names: Sequence[str] = (),
         terrain: Terrain | None = None,
+        scan: Sequence[Sequence[float]] = (),
     ) -> None:
         self._terrain = terrain
         self._fixed: dict[str, Any] = {
@@ -50,6 +52,7 @@ class Recorder:
             "info": dict(info or {}),
             "contact_names": tuple(contact_names),
             "signal_names": tuple(signal_names),
+            "scan": tuple(scan),
         }
         self._frames: list[dict[str, Any]] = []
 

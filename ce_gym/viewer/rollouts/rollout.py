@@ -58,6 +58,7 @@ class Rollout:
         contact_names: Which contacts the forces belong to, for simulations of some contacts only; empty means all of
             the robot's, in its order.
         ground: The ground around the robot's path, see `rollouts.ground_patch.around`; None if flat.
+        scan: Where the robot's height scan looks, ahead of and to the left of its base [m], a pair for each point.
     """
 
     robot: str
@@ -75,6 +76,7 @@ class Rollout:
     info: Mapping[str, str] = field(default_factory=dict)
     contact_names: Sequence[str] = ()
     ground: Terrain | None = None
+    scan: Sequence[Sequence[float]] = ()
 
     def __post_init__(self) -> None:
         frames = np.size(self.times)
@@ -93,6 +95,7 @@ class Rollout:
         if named and found and named != found:
             raise RolloutError(f"contact_names has {named} names; contact_forces has {found} contacts")
         object.__setattr__(self, "signal_names", tuple(self.signal_names))
+        object.__setattr__(self, "scan", _pairs(self.scan))
         if len(self.signal_names) != self.signals.shape[1]:
             raise RolloutError(
                 f"signal_names has {len(self.signal_names)} names; signals has {self.signals.shape[1]} columns"
@@ -124,6 +127,7 @@ class Rollout:
             "info": {str(key): str(value) for key, value in self.info.items()},
             "contact_names": list(self.contact_names),
             "signal_names": list(self.signal_names),
+            **({"scan": [list(point) for point in self.scan]} if self.scan else {}),
         }
         ground: dict[str, Any] = {}
         if self.ground is not None:
@@ -164,6 +168,13 @@ def _numbers(name: str, value: Any) -> Array:
         return np.asarray(value, float)
     except (TypeError, ValueError):
         raise RolloutError(f"{name} is not an array of numbers") from None
+
+
+def _pairs(points: Any) -> tuple[tuple[float, float], ...]:
+    found = _numbers("scan", points)
+    if found.size and (found.ndim != 2 or found.shape[1] != 2 or not np.isfinite(found).all()):
+        raise RolloutError(f"scan has shape {found.shape}; expected finite x and y of each point")
+    return tuple((float(x), float(y)) for x, y in found.reshape(-1, 2))
 
 
 def _check_array(name: str, value: Array, ndim: int, frames: int) -> None:
@@ -221,7 +232,7 @@ def _read_header(entry: NDArray[Any]) -> dict[str, Any]:
             raise RolloutError(
                 f"header key {key!r} is {header.get(key)!r}; expected {getattr(kind, '__name__', 'a number')}"
             )
-    return {key: header[key] for key in expected} | {"ground": header.get("ground")}
+    return {key: header[key] for key in expected} | {"ground": header.get("ground"), "scan": header.get("scan", [])}
 
 
 def _read_ground(figures: Any, numbers: Any) -> Terrain | None:
