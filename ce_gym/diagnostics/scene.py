@@ -226,7 +226,7 @@ def left_out(whole: SubStep) -> Iterator[tuple[str, SubStep]]:
     changes |= {"ground='field'": {"ground": "field"}}
     if options.material.dissipation is None:
         changes["dissipation of the material"] = {"material": replace(options.material, dissipation=1.0)}
-    for name in (name.replace("BODY", robot.bodies[0].name) for name in PARAMETERS):
+    for name in (name.replace("BODY", robot.bodies[0].name) for name in PARAMETERS if "ROTOR" not in name):
         changes[f"parameter {name!r}"] = {"parameters": tuple(dict.fromkeys((*options.parameters, name)))}
     for name, change in changes.items():
         if any(getattr(options, key) != value for key, value in change.items()):

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
 BASE, ARM = "plate", "forearm"
 NAMES = [name.replace("BODY", body) for name in PARAMETERS for body in (BASE, ARM)[: 1 + ("BODY" in name)]]
+NAMES = [name.replace("ROTOR", "elbow_rotor") for name in NAMES if "drive_stiffness:" not in name]
 
 
 @pytest.fixture(scope="module")
@@ -135,18 +136,62 @@ def test_ballast(tripod: Robot, states, body: str):
     assert_different(results(only, states), results(other, states))
 
 
+@pytest.mark.parametrize("figure", ["damping", "friction"])
+@pytest.mark.parametrize("whose", ["motor", "joint"])
+def test_losses_of_motors_and_joints(tripod: Robot, states, whose: str, figure: str):
+    values = (3e-3, 7e-3) if whose == "motor" else (0.05, 0.13)
+    if whose == "motor":
+        each = zip(tripod.motors, values, strict=True)
+        other = replace(tripod, motors=tuple(replace(motor, **{figure: value}) for motor, value in each))
+    else:
+        own = dict(zip(tripod.independent, values, strict=True))
+        joints = (replace(b.joint, **{figure: own[b.name]}) if b.name in own else b.joint for b in tripod.bodies)
+        other = replace(tripod, bodies=tuple(replace(b, joint=j) for b, j in zip(tripod.bodies, joints, strict=True)))
+    ours = results(tripod, states, values={f"{whose}_{figure}": values}, motors="limited")
+    assert_same(ours, results(other, states, motors="limited"))
+    assert_different(ours, results(tripod, states, motors="limited"))
+
+
+def test_link_inertia_is_that_about_the_centre_of_mass(tripod: Robot, states):
+    inertial = tripod.body(ARM).inertial
+    other = with_inertial(tripod, ARM, inertia=tuple(map(tuple, (1.4 * np.array(inertial.inertia)).tolist())))
+    ours = results(tripod, states, values={f"link_inertia:{ARM}": 1.4})
+    assert_same(ours, results(other, states))
+    both = {f"link_inertia:{ARM}": 1.4, f"added_mass:{ARM}": 0.4}
+    heavy = with_inertial(other, ARM, mass=inertial.mass + 0.4)
+    assert_same(results(tripod, states, values=both), results(heavy, states))
+    assert_different(ours, results(tripod, states))
+
+
+def test_stiffness_of_one_drive():
+    leg = load_robot("mini_cheetah")
+    one = next(elastic for elastic in leg.elastic if elastic.rotor == "HR_knee_rotor")
+    others = (replace(e, stiffness=1.3 * e.stiffness) if e is one else e for e in leg.elastic)
+    soft, rng = Model(replace(leg, elastic=tuple(others)), "elastic"), np.random.default_rng(0)
+    model = Model(leg, "elastic")
+    q, v = model.standing_q + np.r_[np.zeros(19), rng.normal(0, 0.05, 12)], rng.normal(0, 1.0, model.nv)
+    plain = StepOptions(0.002, control="torque")
+    declared = step_function(model.mechanism, replace(plain, parameters=("drive_stiffness:HR_knee_rotor",)))
+    given = {"q": q, "v": v, "diverged": 0.0, "target": np.zeros(12)}
+    ours, theirs = declared(**given, parameters=1.3)["v_next"], step_function(soft.mechanism, plain)(**given)["v_next"]
+    np.testing.assert_allclose(ours.full(), theirs.full(), rtol=1e-9, atol=1e-9)
+    assert np.abs((ours - declared(**given, parameters=1.0)["v_next"]).full()).max() > 1e-3
+
+
 @pytest.mark.parametrize("level", ["exact", "coupled", "armature"])
-def test_rotor_inertia_is_that_of_the_spin(tripod: Robot, states, level: str):
+@pytest.mark.parametrize("which", ["all", "one"])
+def test_rotor_inertia_is_that_of_the_spin(tripod: Robot, states, level: str, which: str):
     """The factor acts on what a rotor holds against being spun up; as a load of its carrier it stays what it is."""
     factor, other = 1.5, tripod
-    for rotor in tripod.rotors():
+    for rotor in list(tripod.rotors())[1 if which == "one" else 0 :]:
         axis, tensor = np.array(rotor.joint.axis), np.array(rotor.inertial.inertia)
         more = (factor - 1) * (axis @ tensor @ axis) * np.outer(axis, axis)
         other = with_inertial(other, rotor.name, inertia=tuple(map(tuple, (tensor + more).tolist())))
         R = np.array(rotor.placement.rotation)
         kept = np.array(other.body(rotor.parent).inertial.inertia) - R @ more @ R.T
         other = with_inertial(other, rotor.parent, inertia=tuple(map(tuple, kept.tolist())))
-    ours = results(tripod, states, level, {"rotor_inertia": factor})
+    name = "rotor_inertia" if which == "all" else "rotor_inertia:elbow_rotor"
+    ours = results(tripod, states, level, {name: factor})
     assert_same(ours, results(other, states, level))
     assert_different(ours, results(tripod, states, level))
 

@@ -20,9 +20,10 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction
+from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction, rubs
 from ce_gym.dynamics.forces.law import JointForce
 from ce_gym.dynamics.forces.motors import MOTORS, MotorModel
+from ce_gym.dynamics.forces.parameters import rubbing_as_declared
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
 from ce_gym.dynamics.recursion.kinematics import Kinematics
@@ -37,14 +38,14 @@ def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
     and 1 once there is an iterate. It is needed if there are limits and what they limit, or the limits themselves,
     answers to accelerations.
     """
-    robot, model = mechanism.robot, MOTORS[options.motors]
+    robot, model = rubbing_as_declared(mechanism, options.parameters).robot, MOTORS[options.motors]
     motors = robot.motors if model.at_motors or options.control.startswith("motor") else ()
     ends = [model.limits(motor, SX.sym("speed"), SX(1), 1.0) for motor in motors]
     joints = [math.inf if name in robot.passive else robot.body(name).joint.torque for name in robot.independent]
     limited = any(map(math.isfinite, joints)) or any(end is not None for end in ends)
     answering = any(ca.sparsify(slope).nnz() for end in ends if end is not None for _, slope in end)
     asked = options.control.endswith("position") and limited
-    rubbing = any(model.friction(motor) for motor in motors)
+    rubbing = any(rubs(model.friction(motor)) for motor in motors)
     return len(joints) + (1 + rubbing) * len(motors) + 1 if asked or answering or rubbing else 0
 
 
@@ -192,13 +193,13 @@ def deliver(
         damping = model.damping(motor, speed[i])
         tau[i] -= damping * speed[i]
         own[i, i] += dt * damping
-        if friction := model.friction(motor):
+        if rubs(friction := model.friction(motor)):
             last = iterate.numel() - 1  # before it, the frictions of all motors, as many as there are before those
             one = dry_friction(friction, speed[i], turning[i, :], dt, iterate, (last + yd.numel()) // 2 + place)
             force.limited[(last + yd.numel()) // 2 + place] = one
             tau[i] += one.given
             own[i, i] += ca.if_else(one.free, dt * friction / STICK_SPEED, 0)
-            sticks.append(one.free)
+            sticks.append(ca.logic_and(one.free, friction > 0) if isinstance(friction, SX) else one.free)
     if len(sticks) == len(motors) == len(rows):
         all_stick = SX(ca.sum1(ca.vertcat(*sticks)) > len(sticks) - 0.5)
         force.held |= dict.fromkeys(rows, all_stick)

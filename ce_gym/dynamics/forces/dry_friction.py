@@ -14,6 +14,7 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.law import JointForce
+from ce_gym.dynamics.forces.parameters import rubbing_as_declared
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.mechanism import Mechanism
@@ -44,6 +45,11 @@ class Rubbing:
     friction: dict[str, float]
 
     @property
+    def declared(self) -> bool:
+        """Whether some of it is a parameter, which may turn out to be 0: no friction holds nothing."""
+        return any(isinstance(friction, SX) for friction in self.friction.values())
+
+    @property
     def count(self) -> int:
         """How many torques its friction has."""
         return 1 if len(self.rows) == 1 else len(self.friction)
@@ -54,14 +60,25 @@ def rubbing_clusters(mechanism: Mechanism) -> list[Rubbing]:
     robot, found = mechanism.robot, []
     for k, cluster in enumerate(mechanism.tree.clusters):
         joints = {name: robot.body(name).joint for name in cluster.bodies}
-        friction = {name: joint.friction for name, joint in joints.items() if joint.type != "free" and joint.friction}
+        friction = {name: joint.friction for name, joint in joints.items() if joint.type != "free" and rubs(joint.friction)}
         if friction:
             found.append(Rubbing(k, [robot.independent.index(name) for name in cluster.independent], friction))
     return found
 
 
-def friction_count(mechanism: Mechanism) -> int:
-    """Return the size of the iterate of the joints' dry friction: its torques, and 1 once there is an iterate."""
+def rubs(friction: float | SX) -> bool:
+    """Return whether something has dry friction: a number that is not 0, or a symbol that may not be."""
+    return isinstance(friction, SX) or bool(friction)
+
+
+def friction_count(mechanism: Mechanism, declared: tuple[str, ...] = ()) -> int:
+    """Return the size of the iterate of the joints' dry friction: its torques, and 1 once there is an iterate.
+
+    Args:
+        mechanism: The robot.
+        declared: Names of the scene's parameters, of which the joints' friction may be one.
+    """
+    mechanism = rubbing_as_declared(mechanism, declared)
     count = sum(rubbing.count for rubbing in rubbing_clusters(mechanism))
     return count + 1 if count else 0
 
@@ -100,7 +117,8 @@ class JointFriction:
                 way[cluster.rows] = own
                 one = dry_friction(friction, way @ self.yd, way, self.dt, iterate, place)
                 force.limited[place] = one
-                sticks = ca.logic_and(one.free, ca.logic_not(last))
+                acts = one.free if not cluster.declared else ca.logic_and(one.free, friction > 0)
+                sticks = ca.logic_and(acts, ca.logic_not(last))
                 force.tau += way.T @ ca.if_else(last, ca.fmax(-friction, ca.fmin(friction, one.expected)), one.given)
                 force.slope += way.T @ ca.if_else(sticks, self.dt * friction / STICK_SPEED, 0) @ way
                 if name in self.mechanism.robot.independent:

@@ -35,8 +35,8 @@ class MotorModel(Protocol):
         """Return the viscous damping of a motor [N m s/rad]."""
         ...
 
-    def friction(self, motor: Motor) -> float:
-        """Return the dry friction of a motor [N m]."""
+    def friction(self, motor: Motor) -> float | SX:
+        """Return the dry friction of a motor [N m]; the number 0 if it has none."""
         ...
 
 
@@ -88,7 +88,7 @@ class Limited:
         """Return the motor's damping, whatever its speed."""
         return SX(motor.damping)
 
-    def friction(self, motor: Motor) -> float:
+    def friction(self, motor: Motor) -> float | SX:
         """Return the motor's dry friction."""
         return motor.friction
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,7 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX, skew
 from ce_gym.dynamics.forces.contact import Compliance
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
-from ce_gym.model.mechanism import Mechanism, MovingBody
+from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 PARAMETERS = {
     "gravity": "acceleration of free fall in the world [m/s^2], 3",
@@ -24,14 +26,21 @@ PARAMETERS = {
     "kd": "velocity gains of the joints [N m s/rad or N s/m], n_joints",
     "motor_strength": "factor on motor torques and their limits [-], 1",
     "rotor_inertia": "factor on the spin inertia of symmetric rotors [-], 1",
+    "rotor_inertia:ROTOR": "the same of one rotor [-], 1",
     "ratio": "factor on the gear ratios: how far rotors turn for a motion of the joints [-], 1",
     "drive_stiffness": "factor on the stiffness of elastic transmissions [-], 1",
     "drive_damping": "factor on their damping [-], 1",
     "backlash": "factor on their backlash [-], 1",
+    "drive_stiffness:ROTOR": "factor on the stiffness of the elastic transmission of one rotor [-], 1",
+    "motor_damping": "viscous friction of the rotors of limited motors [N m s/rad], n_motors",
+    "motor_friction": "dry friction of the rotors of limited motors [N m], n_motors",
+    "joint_damping": "viscous friction of the joints [N m s/rad or N s/m], n_joints",
+    "joint_friction": "dry friction of the joints [N m or N], n_joints",
+    "link_inertia:BODY": "factor on the moments of inertia of a body about its centre of mass [-], 1",
     "added_mass:BODY": "mass added at the centre of mass of a body [kg], 1",
     "com_shift:BODY": "shift of the centre of mass of a body, in its frame [m], 3",
 }
-"""What can be declared, with unit and size; BODY stands for the name of a link."""
+"""What can be declared, with unit and size; BODY stands for the name of a link, ROTOR for that of a rotor."""
 
 
 @dataclass
@@ -78,13 +87,21 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
         "drive_stiffness": np.ones(1),
         "drive_damping": np.ones(1),
         "backlash": np.ones(1),
+        "motor_damping": np.array([motor.damping for motor in robot.motors]),
+        "motor_friction": np.array([motor.friction for motor in robot.motors]),
+        "joint_damping": np.array([robot.body(name).joint.damping for name in robot.commanded]),
+        "joint_friction": np.array([robot.body(name).joint.friction for name in robot.commanded]),
     }
     links = [body.name for body in robot.bodies if body.kind == "link"]
     plain |= {f"added_mass:{link}": np.zeros(1) for link in links}
     plain |= {f"com_shift:{link}": np.zeros(3) for link in links}
+    plain |= {f"link_inertia:{link}": np.ones(1) for link in links}
+    plain |= {f"rotor_inertia:{rotor.name}": np.ones(1) for rotor in robot.rotors()}
+    plain |= {f"drive_stiffness:{elastic.rotor}": np.ones(1) for elastic in robot.elastic}
     for name in names:
         if name not in plain:
-            raise ValueError(f"parameters={name!r}; expected one of {', '.join(PARAMETERS)}, BODY being a link")
+            expected = f"one of {', '.join(PARAMETERS)}, BODY being a link, ROTOR a rotor"
+            raise ValueError(f"parameters={name!r}; expected {expected}")
     if "ratio" in names:
         check_ratios(robot)
     return {name: plain[name] for name in names}
@@ -139,12 +156,38 @@ def with_parameters(mechanism: Mechanism, names: tuple[str, ...], values: SX) ->
     """Return a mechanism with symbols in place of the figures that are declared parameters."""
     given = _split(mechanism.robot, mechanism.robot.material, names, values)
     bodies = {name: _with_ballast(body, mechanism.robot, given) for name, body in mechanism.bodies.items()}
-    factor = given.get("rotor_inertia")
-    spins = mechanism.spins
-    if factor is not None:
-        spins = tuple(tuple(replace(spin, inertia=spin.inertia * factor) for spin in group) for group in spins)
+    spins = tuple(tuple(_with_factor(spin, given) for spin in group) for group in mechanism.spins)
     ratio, gravity = given.get("ratio", mechanism.ratio), given.get("gravity", mechanism.gravity)
-    return replace(mechanism, bodies=bodies, spins=spins, gravity=gravity, ratio=ratio)
+    robot = with_drives(mechanism.robot, given)
+    return replace(mechanism, robot=robot, bodies=bodies, spins=spins, gravity=gravity, ratio=ratio)
+
+
+def with_drives(robot: Robot, given: Mapping[str, SX]) -> Robot:
+    """Return a robot with numbers or symbols for the friction of motors and joints, and the stiffness of drives.
+
+    Args:
+        robot: The robot.
+        given: Parameters by name; those of other kinds are passed over.
+    """
+    changed: dict[str, Any] = {}
+    if motors := _each(robot.motors, given, {"motor_damping": "damping", "motor_friction": "friction"}):
+        changed["motors"] = motors
+    joints = [robot.body(name).joint for name in robot.commanded]
+    if rubbing := _each(joints, given, {"joint_damping": "damping", "joint_friction": "friction"}):
+        moved = dict(zip(robot.commanded, rubbing, strict=True))
+        changed["bodies"] = tuple(replace(b, joint=moved.get(b.name, b.joint)) for b in robot.bodies)
+    if any(name.startswith("drive_stiffness:") for name in given):
+        factors = [given.get(f"drive_stiffness:{elastic.rotor}", 1.0) for elastic in robot.elastic]
+        both = zip(robot.elastic, factors, strict=True)
+        changed["elastic"] = tuple(replace(elastic, stiffness=elastic.stiffness * factor) for elastic, factor in both)
+    return replace(robot, **changed) if changed else robot
+
+
+def rubbing_as_declared(mechanism: Mechanism, names: tuple[str, ...]) -> Mechanism:
+    """Return a mechanism in which whatever has dry friction by declared parameters has some."""
+    n = {"motor_friction": len(mechanism.robot.motors), "joint_friction": len(mechanism.robot.commanded)}
+    given = {name: SX.ones(n[name]) for name in names if name in n}
+    return replace(mechanism, robot=with_drives(mechanism.robot, given)) if given else mechanism
 
 
 def check_ratios(robot: Robot) -> None:
@@ -165,16 +208,39 @@ def _split(robot: Robot, material: ContactMaterial, names: tuple[str, ...], valu
     return dict(zip(names, ca.vertsplit(values, np.cumsum([0, *sizes]).tolist()), strict=True)) if names else {}
 
 
+def _each(things: Sequence[Any], given: Mapping[str, SX], fields: Mapping[str, str]) -> tuple[Any, ...]:
+    """Return motors or joints, each with its own entry of the parameters that stand for fields; none if none is given."""
+    if not given.keys() & fields.keys():
+        return ()
+    for name, field in fields.items():
+        if name in given:
+            things = [replace(thing, **{field: given[name][i]}) for i, thing in enumerate(things)]
+    return tuple(things)
+
+
+def _with_factor(spin: Spin, given: Mapping[str, SX]) -> Spin:
+    names = [name for name in ("rotor_inertia", f"rotor_inertia:{spin.rotor}") if name in given]
+    for name in names:
+        spin = replace(spin, inertia=spin.inertia * given[name])
+    return spin
+
+
 def _with_ballast(body: MovingBody, robot: Robot, given: dict[str, SX]) -> MovingBody:
-    """Add mass and move the centre of mass; the moments of inertia about it stay."""
-    added, shift = given.get(f"added_mass:{body.name}"), given.get(f"com_shift:{body.name}")
-    if added is None and shift is None:
+    """Add mass and move the centre of mass, which leaves the moments of inertia about it; these have a factor."""
+    figures = ("added_mass", "com_shift", "link_inertia")
+    added, shift, factor = (given.get(f"{figure}:{body.name}") for figure in figures)
+    if added is None and shift is None and factor is None:
         return body
     inertial = robot.body(body.name).inertial
     mass, com = inertial.mass, SX(inertial.com)
-    before = _point_mass(mass, com)
-    after = _point_mass(mass + (added if added is not None else 0), com + (shift if shift is not None else 0))
-    inertia = SX(ca.sparsify(ca.DM(body.inertia))) + after - before
+    inertia = SX(ca.sparsify(ca.DM(body.inertia)))
+    if added is not None or shift is not None:
+        before = _point_mass(mass, com)
+        after = _point_mass(mass + (added if added is not None else 0), com + (shift if shift is not None else 0))
+        inertia = inertia + after - before
+    if factor is not None:
+        own = SX(ca.sparsify(ca.DM(np.array(inertial.inertia))))
+        inertia = inertia + ca.diagcat((factor - 1) * own, SX(3, 3))
     return replace(body, inertia=inertia)  # type: ignore[arg-type]
 
 

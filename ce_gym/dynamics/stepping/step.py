@@ -234,7 +234,8 @@ def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
     pairs = Frictionless.iterations if options.self_collisions else 0
     limited = ITERATIONS if limit_count(mechanism, options) else 0
     meshes = MESH_ITERATIONS if mesh_count(mechanism) else 0
-    return max(contacts, pairs, limited, meshes, STICK_ITERATIONS if friction_count(mechanism) else 0)
+    rubbing = STICK_ITERATIONS if friction_count(mechanism, options.parameters) else 0
+    return max(contacts, pairs, limited, meshes, rubbing)
 
 
 def first_iterate(scene: Scene) -> SX:
@@ -245,7 +246,7 @@ def first_iterate(scene: Scene) -> SX:
 def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many numbers an iteration leaves for the next."""
     touches = len(options.contacts) + len(colliding(mechanism.robot, options.self_collisions))
-    of_joints = limit_count(mechanism, options) + friction_count(mechanism) + mesh_count(mechanism)
+    of_joints = limit_count(mechanism, options) + friction_count(mechanism, options.parameters) + mesh_count(mechanism)
     return Contact.size * touches + of_joints
 
 
