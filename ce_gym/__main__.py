@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from ce_gym.identify.command import add_identify_command
 from ce_gym.policies import add_env_arg
 from ce_gym.viewer.cli import add_play_command, add_view_command
 from ce_gym.viewer.console import Parser, examples, print_anything
@@ -32,6 +33,7 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
   python -m ce_gym live POLICY           drive, push and throw it in a browser
   python -m ce_gym watch RUN             see how training goes: curves, and the present policy
   python -m ce_gym view walk.npz         show recorded rollouts, several side by side or as ghosts
+  python -m ce_gym identify ROBOT LOG    rotor inertia, friction, delay from a log of commands and encoders
   python -m ce_gym bench                 benchmarks, in a clone of the repository
 
 Each has --help. In Python: gymnasium.make("ce_gym:ce_gym/MiniCheetahVelocity-v0")."""
@@ -115,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     add_view_command(commands)
     add_live_command(commands)
     add_watch_command(commands)
+    add_identify_command(commands)
     commands.add_parser("bench", help="benchmarks, in a clone of the repository; without a name, the list of them")
     return parser
 

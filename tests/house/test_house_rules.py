@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "adapters": {"envs"},
     "policies": {"model"},
     "viewer": {"model", "dynamics", "sim", "envs", "policies"},
+    "identify": {"model", "dynamics", "compile", "sim", "viewer"},
     "bench": {
         "model", "dynamics", "compile", "export", "sim", "envs", "diagnostics", "adapters", "policies", "viewer"
     },
@@ -32,7 +33,7 @@ MAY_IMPORT = {
 LAYERS = {
     "model": "errors table frames assets constraints coordinates description clusters mechanism checks"
     " generators formats load listing",
-    "model/formats": "text_file reading placement standing rotor_rule rotor_links hinges motors collections"
+    "model/formats": "text_file reading placement identified standing rotor_rule rotor_links hinges motors collections"
     " contact_shapes urdf mjcf yaml",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
@@ -44,6 +45,7 @@ LAYERS = {
     "export": "joint_ties mjcf_text mjcf_equalities mjcf mujoco_model mujoco_coordinates mujoco_batch mujoco_twin"
     " guesses new_robot",
     "viewer": "errors console meshes rollouts page raytrace video server feed window renderers live watch cli",
+    "identify": "log held figures shots fit separable estimate excite overlay page command",
     "bench": "measure peers instructions soak digests fuzz speed throughput paper accuracy stability"
     " gpu exactness __main__",
 }
@@ -152,7 +154,7 @@ def test_only_one_file_asks_for_what_some_operating_system_lacks():
 
 def test_import_is_light():
     """No learner, no viewer, no compiler is imported before it is needed."""
-    heavy = ("torch", "meshcat", "stable_baselines3", "mujoco", "llvmlite")
+    heavy = ("torch", "meshcat", "stable_baselines3", "mujoco", "llvmlite", "scipy")
     code = f"import ce_gym, sys; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -60,7 +60,7 @@ def rubbing_clusters(mechanism: Mechanism) -> list[Rubbing]:
     robot, found = mechanism.robot, []
     for k, cluster in enumerate(mechanism.tree.clusters):
         joints = {name: robot.body(name).joint for name in cluster.bodies}
-        friction = {name: joint.friction for name, joint in joints.items() if joint.type != "free" and rubs(joint.friction)}
+        friction = {n: joint.friction for n, joint in joints.items() if joint.type != "free" and rubs(joint.friction)}
         if friction:
             found.append(Rubbing(k, [robot.independent.index(name) for name in cluster.independent], friction))
     return found

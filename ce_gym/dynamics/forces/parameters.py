@@ -209,7 +209,7 @@ def _split(robot: Robot, material: ContactMaterial, names: tuple[str, ...], valu
 
 
 def _each(things: Sequence[Any], given: Mapping[str, SX], fields: Mapping[str, str]) -> tuple[Any, ...]:
-    """Return motors or joints, each with its own entry of the parameters that stand for fields; none if none is given."""
+    """Return motors or joints, each with its entry of the parameters that stand for fields; none without them."""
     if not given.keys() & fields.keys():
         return ()
     for name, field in fields.items():

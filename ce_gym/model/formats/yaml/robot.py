@@ -11,10 +11,12 @@ from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
+from ce_gym.model.assets import assets_folder
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.constraints import Constraint
 from ce_gym.model.description import Body, ContactMaterial, Gains, Pose, Robot
 from ce_gym.model.errors import bad, unknown
+from ce_gym.model.formats.identified import with_identified
 from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
 from ce_gym.model.formats.standing import with_limits
@@ -34,7 +36,10 @@ _KEYS = (
 
 def robot_from_yaml(path: Path) -> Robot:
     """Read a robot's YAML file and the URDF or MJCF file it names."""
-    file = read_yaml(path).allow(*_KEYS)
+    file = read_yaml(path)
+    if "identified" in file:
+        return _over(path, file.allow("robot", "identified", "notes"))
+    file.allow(*_KEYS)
     links = read_links(path, file)
     below = links.robot
     file.texts("sources")  # for readers of the file; only its form is checked
@@ -69,6 +74,18 @@ def robot_from_yaml(path: Path) -> Robot:
     if "material" in file:
         robot = replace(robot, material=_material(file.section("material")))
     robot = replace(robot, pose=_pose(file.section("pose"), robot), gains=_gains(file.section("gains"), robot))
+    check_robot(robot)
+    return robot
+
+
+def _over(path: Path, file: Section) -> Robot:
+    """Return the robot of another file, with figures that were identified."""
+    name = file.text("robot")
+    beside = path.parent / name if name.endswith((".yaml", ".yml")) else assets_folder() / name / f"{name}.yaml"
+    if beside.resolve() == path.resolve() or "identified" in read_yaml(beside):
+        raise bad(file.file, "robot", name, "a robot file without identified figures of its own")
+    robot = with_identified(robot_from_yaml(beside), file.section("identified"))
+    robot = replace(robot, source=str(path), notes=(*robot.notes, *file.texts("notes")))
     check_robot(robot)
     return robot
 

@@ -1,0 +1,20 @@
+"""Figures of a robot from logs of its commands and encoders: rotor inertia, friction, stiffness, delay, link inertia."""
+
+from ce_gym.identify.estimate import Identified, identify
+from ce_gym.identify.excite import chirps, simulate_log
+from ce_gym.identify.log import Log, LogError, read_log
+from ce_gym.identify.overlay import overlay, report
+from ce_gym.identify.page import page
+
+__all__ = [
+    "Identified",
+    "Log",
+    "LogError",
+    "chirps",
+    "identify",
+    "overlay",
+    "page",
+    "read_log",
+    "report",
+    "simulate_log",
+]

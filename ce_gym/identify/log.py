@@ -1,0 +1,148 @@
+"""Logs: what was commanded and what encoders read, from CSV files whose columns say what they are.
+
+    time, command:HR_hip_rotor, angle:HR_hip_rotor, speed:HR_hip_rotor, ...
+
+`time` [s] is evenly spaced. `command:NAME` holds from its row to the next; NAME is a joint (the link that it moves) or,
+for control at the motors, a rotor. `angle:NAME` [rad or m] and `speed:NAME` are measured at the time of the row, of any
+joint or rotor. Columns `torque:NAME` are passed over.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ce_gym.model.errors import RobotError, printable
+from ce_gym.model.formats.text_file import read_text
+
+Array = NDArray[np.float64]
+KINDS = ("command", "angle", "speed", "torque")
+LARGEST_LOG = 2**30
+"""Largest log [bytes]."""
+JITTER = 0.1
+"""How far the time from row to row may be from the mean, relative to it."""
+
+
+class LogError(RobotError):
+    """A log that cannot be used; the message is one line: file, column, row."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """Commands and measurements, evenly spaced in time.
+
+    Attributes:
+        dt: Time from row to row [s].
+        commanded: What each command is for, by joint or rotor.
+        commands: Shape (T, n_commands) [rad, m, N m or N].
+        measured: Pairs ("angle" or "speed", joint or rotor).
+        values: What was measured, shape (T, n_measured) [rad, m, rad/s or m/s].
+        source: The file, for messages.
+    """
+
+    dt: float
+    commanded: tuple[str, ...]
+    commands: Array
+    measured: tuple[tuple[str, str], ...]
+    values: Array
+    source: str = "log"
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write it as a CSV file; return its path."""
+        names = [f"command:{name}" for name in self.commanded] + [f"{kind}:{name}" for kind, name in self.measured]
+        rows = np.column_stack([np.arange(len(self.values)) * self.dt, self.commands, self.values])
+        header = ",".join(["time", *names])
+        np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=header, comments="")
+        return Path(path)
+
+
+def read_log(path: str | os.PathLike[str]) -> Log:
+    """Read a log.
+
+    Args:
+        path: A CSV file, see above.
+
+    Raises:
+        LogError: It is missing, or a column or a row of it is wrong; one line that says where.
+    """
+    file = str(path)
+    try:
+        lines = read_text(Path(path), "a CSV file", LARGEST_LOG).splitlines()
+    except RobotError as error:
+        raise LogError(str(error)) from None
+    rows = csv.reader(lines)
+    header = [cell.strip().lstrip("\ufeff") for cell in next(rows, [])]
+    kinds = _kinds(file, header)
+    table = _numbers(file, header, rows)
+    dt = _spacing(file, table[:, kinds.index(("time", ""))])
+    commands = [i for i, (kind, _) in enumerate(kinds) if kind == "command"]
+    measured = [i for i, (kind, _) in enumerate(kinds) if kind in ("angle", "speed")]
+    names = tuple(kinds[i][1] for i in commands)
+    return Log(dt, names, table[:, commands], tuple(kinds[i] for i in measured), table[:, measured], file)
+
+
+def _kinds(file: str, header: list[str]) -> list[tuple[str, str]]:
+    """Return kind and name of each column."""
+    kinds = []
+    for i, column in enumerate(header):
+        kind, colon, name = column.partition(":")
+        if column != "time" and not (colon and name and kind in KINDS):
+            expected = "time, or command:, angle:, speed: or torque: and the name of a joint or rotor"
+            raise LogError(f"{file}: column {i + 1} is {column[:60]!r}: expected {expected}")
+        if column in header[:i]:
+            raise LogError(f"{file}: column {i + 1} is {printable(column)} again: expected each once")
+        kinds.append((kind, name))
+    there = {kind for kind, _ in kinds}
+    for kind, what in (("time", "time"), ("command", "command:NAME"), ("angle", "angle:NAME")):
+        if kind not in there:
+            raise LogError(f"{file}: no column {what}: expected a header such as time,command:NAME,angle:NAME")
+    return kinds
+
+
+def _numbers(file: str, header: list[str], rows: csv.reader) -> Array:  # type: ignore[valid-type]
+    """Return the rows below the header as numbers."""
+    table = []
+    try:
+        for row in rows:
+            if not row:
+                continue
+            if len(row) != len(header):
+                raise LogError(f"{file}: row {rows.line_num} has {len(row)} cells: expected {len(header)}")
+            try:
+                table.append([float(cell) for cell in row])
+            except ValueError:
+                table.append([_number(file, rows.line_num, *pair) for pair in zip(header, row, strict=True)])
+            if not all(map(math.isfinite, table[-1])):
+                table[-1] = [_number(file, rows.line_num, *pair) for pair in zip(header, row, strict=True)]
+    except csv.Error as error:
+        raise LogError(f"{file}: row {rows.line_num}: {error}: expected commas between numbers") from None
+    if len(table) < 100:
+        raise LogError(f"{file}: {len(table)} rows: expected at least 100")
+    return np.array(table)
+
+
+def _number(file: str, row: int, column: str, cell: str) -> float:
+    try:
+        number = float(cell)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise LogError(f"{file}: row {row}, column {printable(column)} is {cell[:40]!r}: expected a finite number")
+    return number
+
+
+def _spacing(file: str, time: Array) -> float:
+    steps = np.diff(time)
+    dt = float(np.median(steps))
+    wrong = np.flatnonzero(np.abs(steps - dt) > JITTER * abs(dt)) if dt > 0 else np.flatnonzero(steps <= 0)
+    if wrong.size:
+        k = int(wrong[0])
+        expected = f"evenly spaced rows, {dt:.6g} s apart" if dt > 0 else "times that grow"
+        raise LogError(f"{file}: row {k + 3}, column time is {time[k + 1]:.9g}: expected {expected}")
+    return float((time[-1] - time[0]) / len(steps))

@@ -1,0 +1,90 @@
+"""Figures that were identified from logs, laid over another robot file: `robot:` and `identified:`.
+
+Each is what the parameter of the simulator of the same name is: factors on inertia and stiffness, friction in its unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ce_gym.model.description import Body, Robot
+from ce_gym.model.errors import bad, unknown
+from ce_gym.model.formats.placement import mat3
+from ce_gym.model.formats.reading import Section
+
+KINDS = (
+    *("rotor_inertia", "motor_damping", "motor_friction", "joint_damping", "joint_friction", "link_inertia"),
+    *("added_mass", "drive_stiffness"),
+)
+
+
+def with_identified(robot: Robot, section: Section) -> Robot:
+    """Return a robot with figures of a section, by kind and by rotor, joint or link.
+
+    Raises:
+        RobotError: There is no such kind, or the robot has none of that name.
+    """
+    section.allow(*KINDS)
+    for kind, part in section.sections():
+        for name, value in part.numbers():
+            if name not in (known := _owners(robot, kind)):
+                raise unknown(section.file, part.path, name, known, "what has such a figure")
+            if kind != "added_mass" and not (value > 0 or (value == 0 and kind.split("_")[0] in ("motor", "joint"))):
+                raise bad(section.file, part.key(name), value, "more than 0, or 0 for friction")
+            robot = _with(robot, kind, name, value)
+    return robot
+
+
+def _owners(robot: Robot, kind: str) -> tuple[str, ...]:
+    if kind == "rotor_inertia":
+        return tuple(rotor.name for rotor in robot.rotors())
+    if kind.startswith("motor"):
+        return tuple(motor.rotor for motor in robot.motors)
+    if kind.startswith("joint"):
+        return robot.commanded
+    if kind == "drive_stiffness":
+        return tuple(elastic.rotor for elastic in robot.elastic)
+    return tuple(body.name for body in robot.bodies if body.kind == "link")
+
+
+def _with(robot: Robot, kind: str, name: str, value: float) -> Robot:
+    figure = kind.split("_")[1]
+    if kind.startswith("motor"):
+        return replace(robot, motors=_changed(robot.motors, "rotor", name, {figure: value}))
+    if kind == "drive_stiffness":
+        old = next(elastic.stiffness for elastic in robot.elastic if elastic.rotor == name)
+        return replace(robot, elastic=_changed(robot.elastic, "rotor", name, {"stiffness": value * old}))
+    body = robot.body(name)
+    if kind.startswith("joint"):
+        return _with_body(robot, replace(body, joint=replace(body.joint, **{figure: value})))
+    inertial = body.inertial
+    if kind == "added_mass":
+        return _with_body(robot, replace(body, inertial=replace(inertial, mass=inertial.mass + value)))
+    if kind == "link_inertia":
+        scaled = mat3(value * np.array(inertial.inertia))
+        return _with_body(robot, replace(body, inertial=replace(inertial, inertia=scaled)))
+    return _with_spin(robot, body, value)
+
+
+def _with_spin(robot: Robot, rotor: Body, factor: float) -> Robot:
+    """Scale a rotor's moment about its axis; as a load of the body that carries it, it stays what it is."""
+    axis, inertia = np.array(rotor.joint.axis), np.array(rotor.inertial.inertia)
+    more = (factor - 1) * (axis @ inertia @ axis) * np.outer(axis, axis)
+    robot = _with_body(robot, replace(rotor, inertial=replace(rotor.inertial, inertia=mat3(inertia + more))))
+    if rotor.parent is None:
+        return robot
+    carrier, turn = robot.body(rotor.parent), np.array(rotor.placement.rotation)
+    rest = mat3(np.array(carrier.inertial.inertia) - turn @ more @ turn.T)
+    return _with_body(robot, replace(carrier, inertial=replace(carrier.inertial, inertia=rest)))
+
+
+def _with_body(robot: Robot, body: Body) -> Robot:
+    return replace(robot, bodies=tuple(body if old.name == body.name else old for old in robot.bodies))
+
+
+def _changed(things: tuple[Any, ...], key: str, name: str, fields: Mapping[str, float]) -> tuple[Any, ...]:
+    return tuple(replace(thing, **fields) if getattr(thing, key) == name else thing for thing in things)
