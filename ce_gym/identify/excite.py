@@ -28,7 +28,8 @@ def chirps(n: int, seconds: float, dt: float, low: float = 0.2, high: float = 4.
         n: Number of joints.
         seconds: How long.
         dt: Time from row to row [s].
-        low, high: Frequencies at the ends of a sweep [Hz].
+        low: Frequency at one end of a sweep [Hz].
+        high: At the other [Hz].
         period: Length of a sweep [s]; then it goes back.
 
     Returns:

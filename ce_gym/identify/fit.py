@@ -1,4 +1,4 @@
-"""Nonlinear least squares by multiple shooting: figures are common to all windows, initial states are each window's own.
+"""Least squares by multiple shooting: figures are common to all windows, initial states are each window's own.
 
 Initial states are eliminated (variable projection, Golub and Pereyra 1973; Jacobian by Kaufman 1975): at figures x each
 window's state is what fits it best, and residuals and their derivatives are projected onto what no initial state can
@@ -95,7 +95,7 @@ class Problem:
 
     def _at(self, x: Array) -> tuple[Array, Array]:
         if self._known is None or self._known[0] != x.tobytes():
-            for _ in range(1 if self._settled else 8):
+            for _ in range(3 if self._settled else 8):
                 self._improve_states(x)
             self._settled = True
             self._known = (x.tobytes(), *self._evaluate(x))

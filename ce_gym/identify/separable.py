@@ -1,4 +1,4 @@
-"""What data can tell of figures: the covariance of estimates, and a line for each direction in which they say little."""
+"""What data can tell of figures: the covariance of estimates, and a line for each that they say little of."""
 
 from __future__ import annotations
 

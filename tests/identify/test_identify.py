@@ -1,0 +1,158 @@
+"""Identification finds what was planted, knows how well, says what it cannot tell, and refuses bad logs in one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ce_gym import Model, Robot, RobotError, Simulator, load_robot
+from ce_gym.identify import Identified, Log, LogError, identify, overlay, page, read_log, report, simulate_log
+from ce_gym.identify.fit import correlation_time
+from ce_gym.identify.held import held
+
+pytest.importorskip("scipy")
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+
+PLANTED = {
+    "rotor_inertia:HR_hip_rotor": 0.8,
+    "rotor_inertia:HR_knee_rotor": 1.3,
+    "motor_friction:HR_abad_rotor": 0.03,
+    "motor_friction:HR_hip_rotor": 0.04,
+    "motor_friction:HR_knee_rotor": 0.05,
+    "delay": 0.0043,
+}
+KINDS = ("rotor_inertia", "motor_friction", "delay")
+
+
+@pytest.fixture(scope="module")
+def leg() -> Robot:
+    return held(load_robot("mini_cheetah"), ["HR_knee_link"])
+
+
+@pytest.fixture(scope="module")
+def log(leg: Robot) -> Log:
+    return simulate_log(leg, 12.0, planted=PLANTED, noise=2e-4)
+
+
+@pytest.fixture(scope="module")
+def found(leg: Robot, log: Log) -> Identified:
+    return identify(leg, log, kinds=KINDS)
+
+
+def test_planted_figures_are_found(found: Identified):
+    for name, value in PLANTED.items():
+        assert found[name] == pytest.approx(value, rel=0.02), name
+    assert (found.std / np.abs(found.values)).max() < 0.02
+    assert found.cannot_tell == ()
+
+
+def test_held_out_error_is_that_of_the_encoders(found: Identified):
+    assert found.held_out.max() < 1.3 * 2e-4
+    assert found.held_out_before.min() > 5 * found.held_out.max()
+
+
+def test_a_first_rotor_and_its_link_cannot_be_separated(leg: Robot, log: Log):
+    names = [f"link_inertia:HR_{n}_link" for n in ("hip", "knee")]
+    names += [f"rotor_inertia:HR_{n}_rotor" for n in ("hip", "knee")]
+    found = identify(leg, log, kinds=("rotor_inertia", "link_inertia", "motor_friction", "delay"), fixed=names)
+    assert len(found.cannot_tell) == 1
+    assert found.cannot_tell[0].startswith(
+        "the data cannot separate rotor_inertia:HR_abad_rotor from link_inertia:HR_abad_link: correlation -1.0"
+    )
+
+
+def test_what_is_written_loads_and_is_the_same_robot(found: Identified, tmp_path: Path):
+    """The overlay, as a robot of its own, moves as the simulator does with the figures as parameters."""
+    path = tmp_path / "found.yaml"
+    path.write_text(overlay(found, "mini_cheetah"))
+    laid, plain = Model(held(load_robot(path), ["HR_knee_link"])), Model(found.robot)
+    written = [f for f in found.figures if f.kind != "delay"]
+    names = tuple(dict.fromkeys(figure.parameter for figure in written))
+    ours = Simulator(plain, 1, 0.001, motors="limited", parameters=names)
+    for name in names:
+        mine = [(f.entry, found[f.name]) for f in written if f.parameter == name]
+        ours.set_parameter(name, [value for _, value in sorted(mine)])
+    theirs = Simulator(laid, 1, 0.001, motors="limited")
+    bare = Simulator(plain, 1, 0.001, motors="limited")
+    for sim in (ours, theirs, bare):
+        sim.step(plain.standing_q + 0.3, 50)
+    np.testing.assert_allclose(theirs.q, ours.q, rtol=0, atol=1e-7)  # eight digits are written
+    assert np.abs(bare.q - ours.q).max() > 1e-3
+
+
+def test_report_and_page_name_every_figure(found: Identified):
+    text, shown = report(found), page(found)
+    for name in PLANTED:
+        assert name in text
+        assert name in shown
+    assert shown.count("<svg") == 3
+
+
+def test_a_log_is_read_as_it_was_saved(log: Log, tmp_path: Path):
+    read = read_log(log.save(tmp_path / "log.csv"))
+    assert (read.commanded, read.measured) == (log.commanded, log.measured)
+    assert read.dt == pytest.approx(log.dt)
+    np.testing.assert_allclose(read.values, log.values, atol=1e-8)
+
+
+GOOD = "time,command:a,angle:a\n" + "".join(f"{k / 100},0,0\n" for k in range(120))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (GOOD.replace("angle:a", "angel:a"), r"column 3 is 'angel:a': expected time, or command:"),
+        (GOOD.replace("angle:a", "command:a"), r"column 3 is command:a again"),
+        (GOOD.replace("angle:a", "torque:a"), r"no column angle:NAME"),
+        (GOOD.replace("0.5,0,0", "0.5,0,x"), r"row 52, column angle:a is 'x': expected a finite number"),
+        (GOOD.replace("0.5,0,0", "0.5,nan,0"), r"row 52, column command:a is 'nan'"),
+        (GOOD.replace("0.5,0,0", "0.5,0"), r"row 52 has 2 cells: expected 3"),
+        (GOOD.replace("0.5,0,0", "0.52,0,0"), r"row 52, column time is 0.52: expected evenly spaced rows"),
+        (GOOD[: GOOD.index("0.5,0,0")], r"50 rows: expected at least 100"),
+        ("", r"no column time"),
+    ],
+)
+def test_bad_logs_are_one_line(text: str, message: str, tmp_path: Path):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(LogError, match=message) as error:
+        read_log(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_logs_that_do_not_fit_the_robot(leg: Robot, log: Log):
+    with pytest.raises(LogError, match="no column command:HR_knee_link: expected one for each of"):
+        identify(leg, replace(log, commanded=log.commanded[:2], commands=log.commands[:, :2]))
+    with pytest.raises(LogError, match="no column tells where HR_knee_link is"):
+        identify(leg, replace(log, measured=log.measured[:2], values=log.values[:, :2]))
+    with pytest.raises(LogError, match="rows: expected at least"):
+        identify(leg, log, window=4.0)
+    with pytest.raises(RobotError, match="figure is 'colour': expected a kind of figure"):
+        identify(leg, log, kinds=("colour",))
+
+
+def test_correlation_in_time():
+    """Of white noise 1, of a first-order process (1 + a) / (1 - a)."""
+    rng, a = np.random.default_rng(0), 0.6
+    white = rng.normal(size=(200, 100, 3))
+    assert correlation_time(white) == pytest.approx(1.0, abs=0.05)
+    colored = np.zeros_like(white)
+    for k in range(1, 100):
+        colored[:, k] = a * colored[:, k - 1] + white[:, k]
+    assert correlation_time(colored[:, 20:]) == pytest.approx((1 + a) / (1 - a), rel=0.1)
+
+
+def test_bad_overlays_are_one_line(tmp_path: Path):
+    path = tmp_path / "over.yaml"
+    for text, message in (
+        ("{rotor_inertia: {knee: 1.1}}", "identified.rotor_inertia is 'knee'"),
+        ("{rotor_inertia: {HR_hip_rotor: -1}}", "identified.rotor_inertia.HR_hip_rotor is -1"),
+        ("{colour: {HR_hip_rotor: 1}}", "identified is 'colour'"),
+    ):
+        path.write_text(f"robot: mini_cheetah\nidentified: {text}\n")
+        with pytest.raises(RobotError, match=message):
+            load_robot(path)
