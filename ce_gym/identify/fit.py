@@ -62,6 +62,7 @@ class Problem:
         noise: Array,
     ) -> None:
         self.shots, self.windows, self.states, self.noise = shots, windows, states.copy(), noise.copy()
+        self.guess = states.copy()
         self.scale = np.array([figure.scale for figure in shots.figures])
         rows = windows.first[:, None] + np.arange(windows.length + 1)
         self.measured = shots.log.values[rows]
@@ -95,12 +96,22 @@ class Problem:
 
     def _at(self, x: Array) -> tuple[Array, Array]:
         if self._known is None or self._known[0] != x.tobytes():
+            self._start_again(x)
             for _ in range(3 if self._settled else 8):
                 self._improve_states(x)
             self._settled = True
             self._known = (x.tobytes(), *self._evaluate(x))
             self.evaluations += 1
         return self._known[1:]
+
+    def _start_again(self, x: Array) -> None:
+        """Put limbs back to the first guess in windows where that fits better than where other figures led them."""
+        states = np.stack([self.states, self.guess])
+        read = self.shots(np.tile(x * self.scale, (2, 1)), states, self.windows.first, self.windows.length)
+        for c in self.limbs:
+            costs = (((read - self.measured) / self.noise)[..., self.channels[c]] ** 2).sum((2, 3))
+            back = np.ix_(np.flatnonzero(costs[1] < costs[0]), self.state_rows[c])
+            self.states[back] = self.guess[back]
 
     def _improve_states(self, x: Array) -> None:
         """Make a step of Levenberg and Marquardt's for each limb of each window, where it is for the better."""
