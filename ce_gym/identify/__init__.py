@@ -1,4 +1,4 @@
-"""Figures of a robot from logs of commands and encoders: rotor inertia, friction, stiffness, delay, link inertia."""
+"""Figures of a robot from logs of commands and encoders: rotor inertia, friction, delay, link inertia."""
 
 from ce_gym.identify.estimate import Identified, identify
 from ce_gym.identify.excite import chirps, simulate_log

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.viewer.console import examples
 
 CONTROLS = ("position", "torque", "motor_position", "motor_torque")
@@ -32,9 +33,7 @@ def add_identify_command(subparsers: Any) -> None:
         "--simulate", type=float, metavar="SECONDS", help="write LOG instead, of the robot under chirps"
     )
     parser.add_argument("--control", choices=CONTROLS, default="position", help="what commands mean (default position)")
-    parser.add_argument(
-        "--transmission", default="exact", metavar="LEVEL", help="exact (default), elastic, armature ..."
-    )
+    parser.add_argument("--transmission", default="exact", choices=LEVELS, help=f"{', '.join(LEVELS)} (default exact)")
     parser.add_argument("--figures", nargs="+", metavar="KIND", help="what to seek, such as rotor_inertia delay")
     parser.add_argument("--fix", nargs="+", default=[], metavar="NAME", help="figures that are known")
     parser.add_argument("--window", type=float, default=0.5, metavar="SECONDS", help="pieces of the log (default 0.5)")

@@ -16,7 +16,7 @@ from ce_gym.dynamics.forces.scene import target_names
 from ce_gym.dynamics.model import Model
 from ce_gym.identify.figures import Figure, default_kinds, sought
 from ce_gym.identify.fit import Problem, Windows, correlation_time, noise_of, solve
-from ce_gym.identify.held import held, limbs_of
+from ce_gym.identify.held import held_model, limbs_of
 from ce_gym.identify.log import Log, LogError
 from ce_gym.identify.separable import inseparable
 from ce_gym.identify.shots import Settings, Shots
@@ -91,7 +91,7 @@ def identify(
         robot: A description, a name or a path.
         log: What was commanded and measured.
         control: What commands mean: "position", "torque", "motor_position" or "motor_torque", as for `Simulator`.
-        transmission: Level of the simulation.
+        transmission: Level of the simulation; not "elastic".
         kinds: What is sought, some of `ce_gym.identify.figures.KINDS`; by default spin inertia, friction, links'
             moments of inertia and the delay.
         fixed: Names of figures that are known, such as "rotor_inertia:HR_hip_rotor".
@@ -103,7 +103,7 @@ def identify(
 
     Raises:
         LogError: The log does not fit the robot.
-        RobotError: There are no such figures, or SciPy is missing.
+        RobotError: There are no such figures or level, or SciPy is missing.
 
     Source: multiple shooting by Bock 1983; variable projection by Golub and Pereyra 1973.
     """
@@ -111,9 +111,7 @@ def identify(
     if importlib.util.find_spec("scipy") is None:
         raise RobotError("identify needs SciPy; pip install 'ce_gym[identify]'")
     described = robot if isinstance(robot, Robot) else load_robot(robot)
-    model = Model(held(described, [*log.commanded, *(name for _, name in log.measured)]), transmission)
-    if model.nq != model.nv:
-        raise RobotError(f"{described.name}: identify: expected joints about or along one axis, no ball joints")
+    model = held_model(described, [*log.commanded, *(name for _, name in log.measured)], transmission)
     figures = sought(model.robot, kinds or default_kinds(model.robot), fixed, longest_delay)
     log = _ordered(model, log, control)
     shots = Shots(model, log, figures, Settings(control, substep, method, usable_cores()))

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.dynamics.forces.scene import target_names
-from ce_gym.dynamics.model import Model
 from ce_gym.identify.figures import Figure, sought
-from ce_gym.identify.held import held
+from ce_gym.identify.held import held_model
 from ce_gym.identify.log import Log
 from ce_gym.identify.shots import Settings, Shots
 from ce_gym.model import Robot, load_robot
@@ -66,7 +65,7 @@ def simulate_log(
         dt: Time from row to row [s].
         amplitude: Of chirps about the standing pose [rad or m]; of torques if that is what is controlled [N m or N].
         control: "position" or "torque" for joints, "motor_position" or "motor_torque" for motors.
-        transmission: Level.
+        transmission: Level; not "elastic".
         planted: Figures by name, such as {"rotor_inertia:HR_hip_rotor": 1.3, "delay": 0.004}.
         noise: Of encoders, at the joints [rad or m].
         resolution: Of encoders [rad or m]; 0 for none.
@@ -75,7 +74,7 @@ def simulate_log(
         seed: Of the noise.
     """
     described = robot if isinstance(robot, Robot) else load_robot(robot)
-    model = Model(held(described, [body.name for body in described.bodies]), transmission)
+    model = held_model(described, [body.name for body in described.bodies], transmission)
     names = target_names(model.mechanism, control)  # type: ignore[arg-type]
     commands = amplitude * chirps(len(names), seconds, dt, high=high)
     if control == "position":

@@ -18,7 +18,6 @@ KINDS = {
     "joint_friction": "dry friction of each joint [N m or N]",
     "link_inertia": "factor on each link's moments of inertia about its centre of mass",
     "added_mass": "mass added to each link [kg]",
-    "drive_stiffness": "factor on the stiffness of each elastic transmission",
     "delay": "from a command to the motors [s], one for all",
 }
 """What can be sought."""
@@ -107,11 +106,10 @@ def _of_kind(robot: Robot, kind: str, longest_delay: float) -> list[Figure]:
     limb = limbs_of(robot)
     if kind == "delay":
         return [Figure(kind, "", longest_delay / 10, 0.0, longest_delay, longest_delay / 3, -1)]
-    if kind in ("rotor_inertia", "link_inertia", "drive_stiffness"):
+    if kind in ("rotor_inertia", "link_inertia"):
         names = {
             "rotor_inertia": [body.name for body in robot.rotors()],
             "link_inertia": [body.name for body in robot.bodies if body.kind == "link"],
-            "drive_stiffness": [elastic.rotor for elastic in robot.elastic],
         }[kind]
         return [Figure(kind, name, 1.0, 0.02, 50.0, 1.0, limb[name]) for name in names]
     if kind == "added_mass":

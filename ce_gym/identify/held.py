@@ -5,9 +5,31 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 
+from ce_gym.dynamics.model import Model
 from ce_gym.model.description import Body, Pose, Robot
+from ce_gym.model.errors import RobotError, unknown
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.frames import Placement
+from ce_gym.model.mechanism import LEVELS
+
+
+def held_model(robot: Robot, names: Collection[str], transmission: str) -> Model:
+    """Return the model of a robot that hangs in the air.
+
+    Args:
+        robot: The robot.
+        names: As for `held`.
+        transmission: Level of the simulation.
+
+    Raises:
+        RobotError: The level has coordinates that no encoder of the log tells, or a joint turns about all axes.
+    """
+    if transmission not in LEVELS:
+        raise unknown("identify", "transmission", transmission, LEVELS, "a level at which nothing stretches")
+    model = Model(held(robot, names), transmission)
+    if model.nq != model.nv:
+        raise RobotError(f"{robot.name}: identify: expected joints about or along one axis, no ball joints")
+    return model
 
 
 def held(robot: Robot, names: Collection[str]) -> Robot:

@@ -34,7 +34,8 @@ def page(found: Identified, shown: int = 4) -> str:
         plots.append(_plot(times[:shown], [curve[:shown, :, k] for curve in curves]))
     title = html.escape(f"{found.robot.name}: identified from {found.log.source}")
     return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+        '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>{title}</title><style>{STYLE}</style>"
         f"<h1>{title}</h1><pre>{html.escape(report(found))}</pre><p>Windows that were not fitted:{keys}</p>"
         + "".join(plots)
         + "</html>\n"

@@ -34,7 +34,7 @@ def leg() -> Robot:
 
 @pytest.fixture(scope="module")
 def log(leg: Robot) -> Log:
-    return simulate_log(leg, 12.0, planted=PLANTED, noise=2e-4)
+    return simulate_log(leg, 8.0, planted=PLANTED, noise=2e-4, substep=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,8 @@ def found(leg: Robot, log: Log) -> Identified:
 def test_planted_figures_are_found(found: Identified):
     for name, value in PLANTED.items():
         assert found[name] == pytest.approx(value, rel=0.02), name
+        low, high = found.intervals[[figure.name for figure in found.figures].index(name)]
+        assert abs(found[name] - value) < high - low, name  # 3.9 standard deviations
     assert (found.std / np.abs(found.values)).max() < 0.02
     assert found.cannot_tell == ()
 
@@ -52,6 +54,17 @@ def test_planted_figures_are_found(found: Identified):
 def test_held_out_error_is_that_of_the_encoders(found: Identified):
     assert found.held_out.max() < 1.3 * 2e-4
     assert found.held_out_before.min() > 5 * found.held_out.max()
+
+
+def test_friction_and_mass_of_joints_without_motors():
+    planted = {"joint_friction:shank_driver": 0.03, "joint_damping:thigh": 0.02, "added_mass:foot": 0.05}
+    log = simulate_log("planar_leg_linkage", 4.0, planted=planted, noise=1e-4, substep=1e-3)
+    links = [b.name for b in load_robot("planar_leg_linkage").bodies if b.kind == "link"]
+    fixed = [f"added_mass:{name}" for name in links if name != "foot"]
+    found = identify("planar_leg_linkage", log, kinds=("joint_friction", "joint_damping", "added_mass"), fixed=fixed)
+    for figure, value, std in zip(found.figures, found.values, found.std, strict=True):
+        assert abs(value - planted.get(figure.name, 0.0)) < 4 * std + 1e-4 * figure.scale, figure.name
+        assert std < 0.1 * planted.get(figure.name, np.inf), figure.name
 
 
 def test_a_first_rotor_and_its_link_cannot_be_separated(leg: Robot, log: Log):
@@ -131,6 +144,8 @@ def test_logs_that_do_not_fit_the_robot(leg: Robot, log: Log):
         identify(leg, replace(log, measured=log.measured[:2], values=log.values[:, :2]))
     with pytest.raises(LogError, match="rows: expected at least"):
         identify(leg, log, window=4.0)
+    with pytest.raises(RobotError, match="transmission is 'elastic': expected a level at which nothing stretches"):
+        identify(leg, log, transmission="elastic")
     with pytest.raises(RobotError, match="figure is 'colour': expected a kind of figure"):
         identify(leg, log, kinds=("colour",))
 

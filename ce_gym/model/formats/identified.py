@@ -1,6 +1,6 @@
 """Figures that were identified from logs, laid over another robot file: `robot:` and `identified:`.
 
-Each is what the parameter of the simulator of the same name is: factors on inertia and stiffness, friction in its unit.
+Each is what the parameter of the simulator of the same name is: factors on inertia, friction in its unit.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from ce_gym.model.formats.placement import mat3
 from ce_gym.model.formats.reading import Section
 
 KINDS = (
-    *("rotor_inertia", "motor_damping", "motor_friction", "joint_damping", "joint_friction", "link_inertia"),
-    *("added_mass", "drive_stiffness"),
+    *("rotor_inertia", "motor_damping", "motor_friction", "joint_damping", "joint_friction"),
+    *("link_inertia", "added_mass"),
 )
 
 
@@ -46,8 +46,6 @@ def _owners(robot: Robot, kind: str) -> tuple[str, ...]:
         return tuple(motor.rotor for motor in robot.motors)
     if kind.startswith("joint"):
         return robot.commanded
-    if kind == "drive_stiffness":
-        return tuple(elastic.rotor for elastic in robot.elastic)
     return tuple(body.name for body in robot.bodies if body.kind == "link")
 
 
@@ -55,9 +53,6 @@ def _with(robot: Robot, kind: str, name: str, value: float) -> Robot:
     figure = kind.split("_")[1]
     if kind.startswith("motor"):
         return replace(robot, motors=_changed(robot.motors, "rotor", name, {figure: value}))
-    if kind == "drive_stiffness":
-        old = next(elastic.stiffness for elastic in robot.elastic if elastic.rotor == name)
-        return replace(robot, elastic=_changed(robot.elastic, "rotor", name, {"stiffness": value * old}))
     body = robot.body(name)
     if kind.startswith("joint"):
         return _with_body(robot, replace(body, joint=replace(body.joint, **{figure: value})))
