@@ -143,7 +143,7 @@ class Problem:
             Q = np.linalg.qr(by_state[c])[0]
             both = both - Q @ (np.swapaxes(Q, 1, 2) @ both)
             self.residual[..., chosen] = both[..., -1].reshape(*base.shape[:2], -1)
-            R = np.linalg.qr(both.reshape(-1, both.shape[2]), mode="r")
+            R: Array = np.linalg.qr(both.reshape(-1, both.shape[2]), mode="r")  # type: ignore[assignment]
             block = np.zeros((len(R), P + 1))
             block[:, mine], block[:, P] = R[:, :-1], R[:, -1]
             blocks.append(block)
@@ -185,7 +185,7 @@ def solve(problem: Problem, x: Array, low: Array, high: Array) -> Any:
     return least_squares(
         problem.residuals,
         x,
-        problem.jacobian,
+        problem.jacobian,  # type: ignore[arg-type]
         (low, high),
         method="trf",
         x_scale="jac",
