@@ -2,11 +2,13 @@
 
 from ce_gym.identify.estimate import Identified, identify
 from ce_gym.identify.excite import chirps, simulate_log
+from ce_gym.identify.figures import Figure
 from ce_gym.identify.log import Log, LogError, read_log
 from ce_gym.identify.overlay import overlay, report
 from ce_gym.identify.page import page
 
 __all__ = [
+    "Figure",
     "Identified",
     "Log",
     "LogError",

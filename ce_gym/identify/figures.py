@@ -33,7 +33,8 @@ class Figure:
         kind: One of `KINDS`.
         of: The rotor, joint or link that has it; empty for the delay.
         start: Where the search begins.
-        low, high: Bounds.
+        low: Lower bound.
+        high: Upper bound.
         scale: What is large for it: differences are taken over a small part of it.
         limb: Number of the limb that it acts on; -1 for all.
         entry: Its place in a parameter of the simulator that has a number for each motor or joint.

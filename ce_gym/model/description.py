@@ -336,7 +336,7 @@ class Robot:
 
     @property
     def passive(self) -> tuple[str, ...]:
-        """The independent joints that springs alone move: they have one, and the largest torque of an actuator is 0.
+        """The independent joints that springs alone move, as they have one and the largest torque of an actuator is 0.
 
         They have positions and speeds as the others have, entries in targets that nothing follows, and no gains.
         """
