@@ -24,6 +24,8 @@ from ce_gym.dynamics.algebra.spatial import SX
 
 _POINTS = 12
 _SAME = 1e-8
+_FAR = 1.0
+"""Angles whose reference is farther from zero [rad] are counted from it, lest they jump half a turn from zero."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,7 @@ def solve_pair(rows: tuple[SX, SX], unknowns: tuple[SX, SX], sample: Sample) -> 
             continue
         solution = solve_single(ca.sumsqr(e) - ca.sumsqr(C), z1, sample)
         if solution is not None:
-            second = ca.atan2(-ca.dot(S, e), -ca.dot(C, e))
-            second = _unwound(second, sample.value_of(z2), 1.0)
+            second = _near(-ca.dot(S, e), -ca.dot(C, e), sample.value_of(z2))
             return tuple(  # type: ignore[return-value]
                 solution if z is z1 else ca.substitute(second, z1, solution) for z in unknowns
             )
@@ -152,7 +153,7 @@ def _solve_sine(row: SX, z: SX, sample: Sample) -> SX | None:
     P, Q, R, w = coefficients
     side = math.copysign(1.0, sample.at_reference(ca.jacobian(row, z)))
     d = side * ca.sqrt(P * P + Q * Q - R * R)
-    return _unwound(ca.atan2(-R * P - d * Q, -R * Q + d * P), w * sample.value_of(z), w)
+    return _near(-R * P - d * Q, -R * Q + d * P, w * sample.value_of(z)) / w
 
 
 def sine_derivatives(coefficients: tuple[SX, SX, SX, float], z: SX, zd: SX, others: SX, rates: SX) -> tuple[SX, SX, SX]:
@@ -170,10 +171,12 @@ def sine_derivatives(coefficients: tuple[SX, SX, SX, float], z: SX, zd: SX, othe
     return slope, w * (P * c - Q * s), bias
 
 
-def _unwound(angle: SX, reference: float, w: float) -> SX:
-    """Add the whole turns that bring an angle from `atan2` near its reference, and divide by `w`."""
-    turns = round(reference / (2 * math.pi))
-    return (angle + 2 * math.pi * turns) / w if turns else angle / w
+def _near(S: SX, C: SX, reference: float) -> SX:
+    """Return the angle of (C, S) within half a turn of a reference; `atan2` alone jumps half a turn from zero."""
+    if abs(reference) < _FAR:
+        return ca.atan2(S, C)
+    s, c = math.sin(reference), math.cos(reference)
+    return reference + ca.atan2(c * S - s * C, c * C + s * S)
 
 
 def solve_block(A: SX, b: SX) -> tuple[SX, SX]:
