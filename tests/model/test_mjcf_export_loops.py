@@ -105,8 +105,9 @@ def spatial_loop() -> Robot:
 
 
 MADE = {"slider_crank": slider_crank, "ball_loop": ball_loop, "world_loop": world_loop, "spatial_loop": spatial_loop}
-SHIPPED = ("tello", "tello_with_arms", "four_bar", "six_bar", "planar_leg_linkage")
-VARYING = ("tello", "tello_with_arms", "slider_crank")  # the diagonal of the reflected inertia varies with the pose
+SHIPPED = ("tello", "tello_with_arms", "cassie", "four_bar", "six_bar", "planar_leg_linkage")
+# The diagonal of the reflected inertia varies with the pose:
+VARYING = ("tello", "tello_with_arms", "cassie", "slider_crank")
 CASES = [
     pytest.param(name, level, id=f"{name}-{level}")
     for name in (*SHIPPED, *MADE)
