@@ -7,18 +7,12 @@ turns with the heading of the base and stays level whatever its roll and pitch.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
-from typing import Any
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.terms.context import TermContext
-
-MOST_POINTS = 2000
-"""In one scan."""
+from ce_gym.envs.terms.grid import check, grid_points
 
 
 def height_scan(
@@ -54,11 +48,11 @@ def height_scan(
         ValueError: One line that names the parameter, its value and what was expected.
     """
     grid = grid_points(size, spacing, centre)
-    _check("around", around, around in ("base", "feet"), "'base' or 'feet'")
+    check("around", around, around in ("base", "feet"), "'base' or 'feet'")
     for name, value in (("clip", clip), ("drift", drift), ("shift", shift)):
-        _check(name, value, value >= 0, "a length from 0 m on")
-    _check("dropout", dropout, 0 <= dropout < 1, "a share from 0 up to 1")
-    _check("delay", delay, isinstance(delay, int) and 0 <= delay <= 100, "a whole number from 0 to 100")
+        check(name, value, value >= 0, "a length from 0 m on")
+    check("dropout", dropout, 0 <= dropout < 1, "a share from 0 up to 1")
+    check("delay", delay, isinstance(delay, int) and 0 <= delay <= 100, "a whole number from 0 to 100")
     seen = _late(s, _seen_from(s, around), delay)
     heading, centres = seen[:2], ca.reshape(seen[2:], 3, -1)
     turned = ca.horzcat(heading, ca.vertcat(-heading[1], heading[0])) @ ca.DM(grid)
@@ -69,18 +63,6 @@ def height_scan(
     if dropout:
         reading = ca.if_else(s.chance(reading.numel()) < dropout, 0, reading)
     return scale * reading
-
-
-def grid_points(size: Sequence[float], spacing: float, centre: Sequence[float]) -> NDArray:
-    """Points of a grid about its middle [m], shape (2, n), the second coordinate changing first."""
-    for name, value, least in (("size", size, 0.0), ("centre", centre, -np.inf)):
-        numbers = isinstance(value, Sequence) and len(value) == 2 and all(_number(x) and x >= least for x in value)
-        _check(name, value, numbers, "two lengths [m]")
-    _check("spacing", spacing, spacing > 0, "a length above 0 m")
-    counts = [int(round(length / spacing, 6)) + 1 for length in size]
-    _check("size", size, counts[0] * counts[1] <= MOST_POINTS, f"at most {MOST_POINTS} points")
-    x, y = (spacing * (np.arange(n) - (n - 1) / 2) + c for n, c in zip(counts, centre, strict=True))
-    return np.stack([along.ravel() for along in np.meshgrid(x, y, indexing="ij")])
 
 
 def _seen_from(s: TermContext, around: str) -> SX:
@@ -101,12 +83,3 @@ def _late(s: TermContext, now: SX, delay: int) -> SX:
     before = ca.if_else(s.begins, ca.repmat(now, delay, 1), before)
     s.keep("seen", ca.vertcat(now, before)[: before.numel()])
     return before[-now.numel() :]
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-
-
-def _check(name: str, value: Any, valid: bool, expected: str) -> None:
-    if not valid:
-        raise ValueError(f"observation term 'height_scan': {name}={value!r}; expected {expected}")

@@ -5,7 +5,8 @@ from __future__ import annotations
 from inspect import signature
 
 from ce_gym.envs.runtime.program import TaskProgram
-from ce_gym.envs.terms.height_scan import grid_points, height_scan
+from ce_gym.envs.terms.grid import grid_points
+from ce_gym.envs.terms.height_scan import height_scan
 
 Points = tuple[tuple[float, float], ...]
 
