@@ -20,7 +20,7 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -281,8 +281,11 @@ def short_name(record: dict[str, Any], task: str | None = None) -> str:
 
 def portable(record: dict[str, Any]) -> dict[str, Any]:
     """A record without paths of the machine it was written on."""
-    resumed = record.get("resumed_from")
-    return record | {"resumed_from": Path(resumed).name if resumed else None}
+    resumed, kwargs = record.get("resumed_from"), dict(record["env_kwargs"])
+    terrain = kwargs.get("terrain")
+    if isinstance(terrain, Mapping) and "file" in terrain:  # a copy lies beside the policy
+        kwargs["terrain"] = {**terrain, "file": Path(terrain["file"]).name}
+    return record | {"resumed_from": Path(resumed).name if resumed else None, "env_kwargs": kwargs}
 
 
 def main(argv: list[str] | None = None) -> int:

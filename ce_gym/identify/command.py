@@ -51,11 +51,15 @@ def run(args: argparse.Namespace) -> int:
     from ce_gym.identify.page import page
 
     if args.simulate is not None:
+        _check_new("LOG", args.log, [Path(args.robot)])
         _check_range("--simulate", args.simulate, 1.0, 3600.0)
         known = {"control": args.control, "transmission": args.transmission}
         print(simulate_log(args.robot, args.simulate, **known).save(args.log))
         return 0
     _check_range("--window", args.window, 0.01, 60.0)
+    out, shown = args.out or args.log.with_suffix(".yaml"), args.html or args.log.with_suffix(".html")
+    for option, file in (("--out", out), ("--html", shown)):
+        _check_new(option, file, [Path(args.robot), args.log])
     found = identify(
         args.robot,
         read_log(args.log),
@@ -66,15 +70,21 @@ def run(args: argparse.Namespace) -> int:
         window=args.window,
     )
     print(report(found))
-    out = args.out or args.log.with_suffix(".yaml")
     base = args.robot
     if base.endswith((".yaml", ".yml")):
         base = os.path.relpath(base, out.resolve().parent)
     out.write_text(overlay(found, base), encoding="utf-8")
-    shown = args.html or args.log.with_suffix(".html")
     shown.write_text(page(found), encoding="utf-8")
     print(f"{out}\n{shown}")
     return 0
+
+
+def _check_new(option: str, file: Path, read: list[Path]) -> None:
+    """Refuse to write over what is read."""
+    from ce_gym.model import RobotError
+
+    if any(file.resolve() == other.resolve() for other in read):
+        raise RobotError(f"identify: {option} {file}: would replace what is read; expected another name")
 
 
 def _check_range(option: str, value: float, low: float, high: float) -> None:

@@ -21,8 +21,11 @@ from ce_gym.identify.log import Log, LogError
 from ce_gym.identify.separable import inseparable
 from ce_gym.identify.shots import Settings, Shots
 from ce_gym.model import Robot, RobotError, load_robot
+from ce_gym.model.errors import unknown
 
 Array = NDArray[np.float64]
+LARGEST_ANGLE = 12.6
+"""Of a joint [rad], two turns: what is larger is in degrees."""
 NORMAL_95 = 1.959964
 """95 % of a normal distribution are within so many standard deviations."""
 
@@ -111,6 +114,7 @@ def identify(
     if importlib.util.find_spec("scipy") is None:
         raise RobotError("identify needs SciPy; pip install 'ce_gym[identify]'")
     described = robot if isinstance(robot, Robot) else load_robot(robot)
+    _check_names(described, log)
     model = held_model(described, [*log.commanded, *(name for _, name in log.measured)], transmission)
     figures = sought(model.robot, kinds or default_kinds(model.robot), fixed, longest_delay)
     log = _ordered(model, log, control)
@@ -146,6 +150,20 @@ def identify(
         log=log,
         processor_time=time.process_time() - began,
     )
+
+
+def _check_names(robot: Robot, log: Log) -> None:
+    """Refuse names that the robot does not have, and angles that are no joint's in radians or that never change."""
+    names = tuple(body.name for body in robot.bodies)
+    rotors = {rotor.name for rotor in robot.rotors()}
+    for name in (*log.commanded, *(name for _, name in log.measured)):
+        if name not in names:
+            raise unknown(str(log.source), "column", name, names, "a joint, by the link that it moves, or a rotor")
+    for (kind, name), column in zip(log.measured, log.values.T, strict=True):
+        if kind == "angle" and name not in rotors and (most := np.abs(column).max()) > LARGEST_ANGLE:
+            raise LogError(f"{log.source}: angle:{name}: up to {most:.4g}: expected radians, {LARGEST_ANGLE:g} at most")
+    if not np.ptp(log.values, axis=0).any():
+        raise LogError(f"{log.source}: nothing that was measured ever changes: expected a robot that moves")
 
 
 def _ordered(model: Model, log: Log, control: str) -> Log:

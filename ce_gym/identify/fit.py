@@ -210,6 +210,8 @@ def correlation_time(residual: Array) -> float:
         residual: Shape (W, L, n).
     """
     total, power = 1.0, float((residual**2).sum())
+    if power == 0:
+        return total
     for lag in range(1, residual.shape[1] // 2):
         rho = float((residual[:, :-lag] * residual[:, lag:]).sum()) / power
         if rho < 3 / np.sqrt(residual.size):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +37,18 @@ def overlay(found: Identified, robot: str) -> str:
         found: What was identified.
         robot: Name of a robot of the package, or path of a YAML file as the new file will see it.
     """
-    lines = [f"# Identified from {Path(found.log.source).name}; estimate and standard deviation.", f"robot: {robot}"]
+    lines = [
+        f"# Identified from {Path(found.log.source).name}; estimate and standard deviation.",
+        f"robot: {json.dumps(robot)}",
+    ]
     delay = [(f, v) for f, v in zip(found.figures, found.values, strict=True) if f.kind == "delay"]
     notes = [f"commands reach the motors after {v:.6g} s, identified" for _, v in delay]
     notes += list(found.cannot_tell)
     if notes:
         lines += ["notes:", *(f'  - "{note}"' for note in notes)]
-    lines.append("identified:")
-    for kind in dict.fromkeys(figure.kind for figure in found.figures if figure.kind != "delay"):
+    kinds = dict.fromkeys(figure.kind for figure in found.figures if figure.kind != "delay")
+    lines.append("identified:" if kinds else "identified: {}")
+    for kind in kinds:
         lines.append(f"  {kind}:")
         for figure, value, std in zip(found.figures, found.values, found.std, strict=True):
             if figure.kind == kind:

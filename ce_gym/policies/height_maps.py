@@ -18,7 +18,8 @@ def with_map(env_kwargs: Mapping[str, Any], policy: Path) -> dict[str, Any]:
         policy: File of the policy; the copy is beside it, or one folder above, as for checkpoints.
     """
     name = _map_of(env_kwargs)
-    copies = [folder / Path(name).name for folder in (policy.parent, policy.parent.parent) if name]
+    folders = [policy.parent, *([policy.parent.parent] if policy.parent.name in ("checkpoints", "present") else [])]
+    copies = [folder / Path(name).name for folder in folders if name]
     copy = next((file for file in copies if is_file(file)), None)
     return {**env_kwargs, **({"terrain": {**env_kwargs["terrain"], "file": str(copy)}} if copy else {})}
 

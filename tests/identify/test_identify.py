@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Robot, RobotError, Simulator, load_robot
+from ce_gym.__main__ import main
 from ce_gym.identify import Identified, Log, LogError, identify, overlay, page, read_log, report, simulate_log
 from ce_gym.identify.fit import correlation_time
 from ce_gym.identify.held import held
@@ -142,12 +143,44 @@ def test_logs_that_do_not_fit_the_robot(leg: Robot, log: Log):
         identify(leg, replace(log, commanded=log.commanded[:2], commands=log.commands[:, :2]))
     with pytest.raises(LogError, match="no column tells where HR_knee_link is"):
         identify(leg, replace(log, measured=log.measured[:2], values=log.values[:, :2]))
+    with pytest.raises(RobotError, match=r"column is 'HR_kneelink': .*did you mean 'HR_knee_link'"):
+        identify(leg, replace(log, commanded=("HR_kneelink", *log.commanded[1:])))
+    with pytest.raises(LogError, match="expected radians"):
+        identify(leg, replace(log, values=np.degrees(log.values)))
+    with pytest.raises(LogError, match="nothing that was measured ever changes"):
+        identify(leg, replace(log, values=0 * log.values))
     with pytest.raises(LogError, match="rows: expected at least"):
         identify(leg, log, window=4.0)
     with pytest.raises(RobotError, match="transmission is 'elastic': expected a level at which nothing stretches"):
         identify(leg, log, transmission="elastic")
     with pytest.raises(RobotError, match="figure is 'colour': expected a kind of figure"):
         identify(leg, log, kinds=("colour",))
+
+
+def test_nothing_that_is_read_is_replaced(log: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "leg.yaml").write_text("robot: mini_cheetah\nidentified: {}\n")
+    log.save(tmp_path / "leg.csv")
+    robot, file = str(tmp_path / "leg.yaml"), str(tmp_path / "leg.csv")
+    for words in ([robot, file], ["mini_cheetah", file, "--html", file], [robot, robot, "--simulate", "2"]):
+        assert main(["identify", *words]) == 2
+        assert "would replace what is read" in capsys.readouterr().err
+    assert (tmp_path / "leg.yaml").read_text().startswith("robot: mini_cheetah")
+
+
+def test_factors_are_those_of_the_parameters_in_any_order(tmp_path: Path):
+    """A link's factor is one on what its file has, whatever its rotor's does to it."""
+    parts = "rotor_inertia: {HR_knee_rotor: 1.3}", "link_inertia: {HR_hip_link: 2}"
+    inertias = []
+    for i, order in enumerate((parts, parts[::-1])):
+        (tmp_path / f"{i}.yaml").write_text(f"robot: mini_cheetah\nidentified: {{{', '.join(order)}}}\n")
+        inertias.append(np.array(load_robot(tmp_path / f"{i}.yaml").body("HR_hip_link").inertial.inertia))
+    np.testing.assert_array_equal(*inertias)
+    before = load_robot("mini_cheetah")
+    rotor = before.body("HR_knee_rotor")
+    axis = np.array(rotor.joint.axis)
+    spin = axis @ np.array(rotor.inertial.inertia) @ axis
+    doubled = 2 * np.array(before.body("HR_hip_link").inertial.inertia)
+    assert np.trace(inertias[0]) == pytest.approx(np.trace(doubled) - 0.3 * spin, rel=1e-12)
 
 
 def test_correlation_in_time():

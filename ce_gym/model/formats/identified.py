@@ -16,9 +16,9 @@ from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import mat3
 from ce_gym.model.formats.reading import Section
 
-KINDS = (
-    *("rotor_inertia", "motor_damping", "motor_friction", "joint_damping", "joint_friction"),
+KINDS = (  # in the order in which they are laid over: a link's factor is one on what the file has
     *("link_inertia", "added_mass"),
+    *("rotor_inertia", "motor_damping", "motor_friction", "joint_damping", "joint_friction"),
 )
 
 
@@ -29,7 +29,7 @@ def with_identified(robot: Robot, section: Section) -> Robot:
         RobotError: There is no such kind, or the robot has none of that name.
     """
     section.allow(*KINDS)
-    for kind, part in section.sections():
+    for kind, part in sorted(section.sections(), key=lambda named: KINDS.index(named[0])):
         for name, value in part.numbers():
             if name not in (known := _owners(robot, kind)):
                 raise unknown(section.file, part.path, name, known, "what has such a figure")

@@ -82,6 +82,9 @@ def _over(path: Path, file: Section) -> Robot:
     """Return the robot of another file, with figures that were identified."""
     name = file.text("robot")
     beside = path.parent / name if name.endswith((".yaml", ".yml")) else assets_folder() / name / f"{name}.yaml"
+    if not beside.is_file():
+        known = sorted(file.stem for file in assets_folder().glob("*/*.yaml") if file.stem == file.parent.name)
+        raise unknown(file.file, "robot", name, known, "a robot of the package or a YAML file beside this one")
     if beside.resolve() == path.resolve() or "identified" in read_yaml(beside):
         raise bad(file.file, "robot", name, "a robot file without identified figures of its own")
     robot = with_identified(robot_from_yaml(beside), file.section("identified"))
