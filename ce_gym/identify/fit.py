@@ -73,7 +73,6 @@ class Problem:
         self.own = {c: np.flatnonzero(of_figures == c) for c in self.limbs}
         self.common = np.flatnonzero(of_figures == -1)
         self.residual = np.zeros_like(self.measured)
-        self.evaluations = 0
         self._known: tuple[bytes, Array, Array] | None = None
         self._settled = False
 
@@ -101,7 +100,6 @@ class Problem:
                 self._improve_states(x)
             self._settled = True
             self._known = (x.tobytes(), *self._evaluate(x))
-            self.evaluations += 1
         return self._known[1:]
 
     def _start_again(self, x: Array) -> None:
@@ -133,7 +131,6 @@ class Problem:
 
     def _evaluate(self, x: Array) -> tuple[Array, Array]:
         base, by_state, by_figure = self._simulate(x, figures=True)
-        self.simulated = base
         blocks, P = [], len(x)
         for c in self.limbs:
             chosen = self.channels[c]
