@@ -18,7 +18,7 @@ from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
     "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "adaptive",
-    "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness",
+    "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness", "growth", "all", "stale",
 )  # fmt: skip
 
 

@@ -6,8 +6,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ce_gym.bench import instructions
-from ce_gym.bench.paper import tracking
+from ce_gym.bench.paper import instructions, tracking
 from ce_gym.model import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")

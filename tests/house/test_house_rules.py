@@ -46,8 +46,7 @@ LAYERS = {
     " guesses new_robot",
     "viewer": "errors console meshes rollouts page raytrace video server feed window renderers live watch cli",
     "identify": "log held figures shots fit separable estimate excite overlay page command",
-    "bench": "measure peers instructions soak digests fuzz speed throughput paper accuracy stability"
-    " gpu exactness __main__",
+    "bench": "measure peers soak digests fuzz speed throughput paper accuracy stability gpu exactness page __main__",
 }
 """What a folder consists of, bottom first: a module imports from its own layer and from those below."""
 MOST_MODULES = 14

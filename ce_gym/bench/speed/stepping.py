@@ -52,6 +52,7 @@ def operations(model: Model, dtype: str, dt: float) -> int:
 
 def bytes_per_robot(model: Model, dtype: str, dt: float) -> int:
     """Return the memory that one more robot of a Simulator takes [B]."""
+    Simulator(model, 8, dt, dtype)  # loads the kernel, whose memory is not the robots'
     sizes = []
     for num_envs in (1024, 2048):
         tracemalloc.start()
