@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from collections.abc import Iterable
+from collections.abc import Collection
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> Report:
     return report
 
 
-def joints(lengths: Iterable[int], rounds: int, report: Report) -> None:
+def joints(lengths: Collection[int], rounds: int, report: Report) -> None:
     """Let a chain on a floating base grow: instructions at every level, times beside peers, time to compile."""
     rows: list[tuple[Cell, ...]] = []
     for n in shown(lengths, "joints"):
@@ -86,7 +86,7 @@ def joints(lengths: Iterable[int], rounds: int, report: Report) -> None:
         report.requirements.append(Requirement(claim, f"{measured:.5f}", measured >= LEAST_R2))
 
 
-def tied(sizes: Iterable[int]) -> Table:
+def tied(sizes: Collection[int]) -> Table:
     """Let one cluster grow in two parallel chains of 16 links: instructions, beside those of the chains untied."""
     rows: list[tuple[Cell, ...]] = []
     for size in shown(sizes, "clusters"):
@@ -98,7 +98,7 @@ def tied(sizes: Iterable[int]) -> Table:
     return Table("Forward dynamics of two chains of 16 links, tied at a depth", columns, tuple(rows))
 
 
-def contacts(numbers: Iterable[int], dt: float, rounds: int) -> Table:
+def contacts(numbers: Collection[int], dt: float, rounds: int) -> Table:
     """Let the spheres under a plate grow: time of a sub-step beside MuJoCo's."""
     rows: list[tuple[Cell, ...]] = []
     for n in shown(numbers, "contacts"):
@@ -112,7 +112,7 @@ def contacts(numbers: Iterable[int], dt: float, rounds: int) -> Table:
     return Table("Sub-step of a plate against the spheres that it stands on, one core", columns, tuple(rows))
 
 
-def crowd(robot: Robot, sizes: Iterable[int], dt: float, rounds: int) -> Table:
+def crowd(robot: Robot, sizes: Collection[int], dt: float, rounds: int) -> Table:
     """Let the batch grow: time of one robot's sub-step on one core, and memory."""
     model = Model(robot)
     rows: list[tuple[Cell, ...]] = []
