@@ -18,15 +18,14 @@ from ce_gym.model.description import (
     Capsule,
     ContactMaterial,
     ContactSphere,
-    Elasticity,
     Gains,
     Inertial,
     Joint,
-    Motor,
     Pose,
     Robot,
     Shape,
 )
+from ce_gym.model.drives import DriveFriction, Elasticity, Motor
 from ce_gym.model.errors import InertiaWarning, LossyImportWarning, RobotError
 from ce_gym.model.formats.hinges import coincident_hinges
 from ce_gym.model.frames import IDENTITY, ZERO, Mat3, Placement, Vec3
@@ -42,6 +41,7 @@ __all__ = [
     "Constraint",
     "ContactMaterial",
     "ContactSphere",
+    "DriveFriction",
     "Elasticity",
     "FunctionConstraint",
     "Gains",

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from ce_gym.model.constraints import Constraint
 from ce_gym.model.coordinates import Layout, placed, sizes
+from ce_gym.model.drives import Elasticity, Motor
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
 
 
@@ -183,65 +184,6 @@ class ContactMaterial:
     slip_speed: float = 1e-3
     bristle: float = 5e4
     dissipation: float | None = None
-
-
-@dataclass(frozen=True)
-class Motor:
-    """An electric motor that turns a rotor.
-
-    Attributes:
-        rotor: Name of the rotor body.
-        torque: Largest torque at the rotor, as the current allows [N m].
-        velocity: No-load speed of the rotor [rad/s].
-        stall: Torque at standstill, as the voltage allows, where the torque-speed line starts [N m]; `torque` if None.
-        damping: Viscous friction of the rotor [N m s/rad].
-        friction: Dry friction of the rotor [N m].
-    """
-
-    rotor: str
-    torque: float = float("inf")
-    velocity: float = float("inf")
-    stall: float | None = None
-    damping: float = 0.0
-    friction: float = 0.0
-
-
-def stretch_of(rotor: str) -> str:
-    """Return the name of the coordinate by which the transmission of a rotor stretches, if it is elastic."""
-    return f"{rotor}_stretch"
-
-
-@dataclass(frozen=True)
-class Elasticity:
-    """How the transmission of a rotor gives way: gear mesh, belt or series spring. All figures are the rotor's.
-
-    The stretch is how far the rotor is ahead of where the joints that it drives would have it. What a data sheet says
-    of the output is divided by the square of the gear ratio if it is a stiffness, multiplied by the ratio if an angle.
-
-    Attributes:
-        rotor: Name of the rotor body.
-        stiffness: [N m/rad].
-        damping: [N m s/rad].
-        backlash: Play: how far the rotor turns from one flank to the other, the joints held [rad].
-        preload: Of a belt: the torque at which one of its strands goes slack, beyond which it is half as stiff [N m];
-            infinite for what pulls and pushes alike.
-    """
-
-    rotor: str
-    stiffness: float
-    damping: float = 0.0
-    backlash: float = 0.0
-    preload: float = float("inf")
-
-    @property
-    def stretch(self) -> str:
-        """Name of its coordinate."""
-        return stretch_of(self.rotor)
-
-    @property
-    def linear(self) -> bool:
-        """Whether its torque is proportional to the stretch."""
-        return not self.backlash and self.preload == float("inf")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Where robots are found: by name in the assets folder, or by path."""
+"""Where robots are found: by name in the assets folder, or by path; and a table of those in the folder."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from ce_gym.model.assets import assets_folder, robots
+from ce_gym.model.clusters import cluster_tree
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, unknown
 from ce_gym.model.formats.collections import downloaded, is_in_collection
@@ -15,6 +16,10 @@ from ce_gym.model.formats.urdf.graph import UrdfGraph
 from ce_gym.model.formats.urdf.plus import robot_from_graph
 from ce_gym.model.formats.urdf.tree import Base
 from ce_gym.model.formats.yaml.robot import robot_from_yaml
+from ce_gym.model.table import Cell, table_text
+
+COLUMNS = ("robot", "base", "bodies", "joints", "rotors", "clusters", "mass [kg]")
+"""Of `robot_table`."""
 
 
 def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = None) -> Robot:
@@ -70,3 +75,21 @@ def _asset(name: str) -> Path:
     if name not in robots():
         raise unknown(str(assets_folder()), "robot", name, robots(), "the name of a robot")
     return assets_folder() / name / f"{name}.yaml"
+
+
+def robot_table() -> str:
+    """Return a line for each robot: base, bodies with rotors, independent joints, rotors, clusters, mass."""
+    return table_text(COLUMNS, [robot_row(load_robot(name)) for name in robots()])
+
+
+def robot_row(robot: Robot) -> tuple[Cell, ...]:
+    """Return the figures of one robot, in the order of `COLUMNS`."""
+    return (
+        robot.name,
+        "floating" if robot.floating else "fixed",
+        len(robot.bodies),
+        len(robot.independent),
+        len(list(robot.rotors())),
+        len(cluster_tree(robot).clusters),
+        robot.total_mass,
+    )

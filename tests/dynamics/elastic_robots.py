@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from linkages import four_bar
 
-from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Motor, Placement, Robot, load_robot
-from ce_gym.model.description import Elasticity, Gains
+from ce_gym.model import Body, Elasticity, Inertial, Joint, LinearConstraint, Motor, Placement, Robot, load_robot
+from ce_gym.model.description import Gains
 
 RATIO, LINK, ROTOR = 8.0, 0.02, 1e-5
 """Of the turntable: gear ratio, and moments of inertia of link and rotor [kg m^2]."""

@@ -31,8 +31,8 @@ MAY_IMPORT = {
 }  # fmt: skip
 """What the modules of a folder may import from other folders."""
 LAYERS = {
-    "model": "errors table frames assets constraints coordinates description clusters mechanism checks"
-    " generators formats load listing",
+    "model": "errors table frames assets constraints coordinates drives description clusters mechanism checks"
+    " generators formats load",
     "model/formats": "text_file reading placement identified standing rotor_rule rotor_links hinges motors collections"
     " contact_shapes urdf mjcf yaml",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ce_gym.model import load_robot, robots
-from ce_gym.model.listing import COLUMNS, robot_row, robot_table
+from ce_gym.model.load import COLUMNS, robot_row, robot_table
 from ce_gym.model.table import table_text
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator
-from ce_gym.model import load_robot
+from ce_gym.model import DriveFriction, load_robot
 
 DT = 0.01
 
@@ -35,3 +35,47 @@ def test_a_leg_is_held_to_the_bit(dtype: str):
     sim = Simulator(held_leg(1.01), 1, DT, dtype, control="torque", motors="limited", outputs=())
     sim.step(np.zeros(5), 100)
     assert np.abs(sim.q - start).max() > 1e-3
+
+
+def loaded_leg(share: float) -> tuple[Model, np.ndarray]:
+    """That leg with friction in proportion to what its gears and belts carry, and torques of half of what holds it."""
+    robot = load_robot("mit_humanoid_leg")
+    model = Model(robot)
+    half = 0.5 * model.bias_force(model.standing_q, np.zeros(5))
+    friction = DriveFriction(load_motor=1 / (3 * share), load_external=1 / (3 * share))
+    motors = tuple(replace(motor, drive_friction=friction) for motor in robot.motors)
+    return Model(replace(robot, motors=motors)), half
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_leg_is_held_by_friction_under_load(dtype: str):
+    """Motors at half of what it takes, and friction that takes the other half: the same bars, from the first step."""
+    model, half = loaded_leg(0.99)
+    sim = Simulator(model, 1, DT, dtype, control="torque", motors="limited", outputs=())
+    start = sim.q.copy()
+    sim.step(half, 60_000)
+    np.testing.assert_array_equal(sim.q, start)
+    assert np.abs(sim.v).max() < 1e-4
+    model, half = loaded_leg(1.01)
+    sim = Simulator(model, 1, DT, dtype, control="torque", motors="limited", outputs=())
+    sim.step(half, 100)
+    assert np.abs(sim.q - start).max() > 1e-3
+
+
+def test_robots_with_friction_under_load_keep_to_themselves():
+    """In a batch, whose tiles iterate together, each does what it does alone, bit for bit; held, slipping, driven."""
+    model, half = loaded_leg(0.99)
+    rng = np.random.default_rng(0)
+    targets = half * rng.uniform(0.0, 2.5, (8, 5))
+    speeds = rng.uniform(-1.0, 1.0, (8, 5)) * (np.arange(8) % 2)[:, None]
+
+    def moved(chosen: list[int]) -> np.ndarray:
+        sim = Simulator(model, len(chosen), DT, control="torque", motors="limited", outputs=())
+        sim.set_state(np.tile(model.standing_q, (len(chosen), 1)), speeds[chosen])
+        for _ in range(40):
+            sim.step(targets[chosen])
+        return sim.q.copy()
+
+    together = moved(list(range(8)))
+    for i in range(8):
+        np.testing.assert_array_equal(together[i], moved([i])[0])

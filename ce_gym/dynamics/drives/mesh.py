@@ -25,7 +25,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.law import JointForce, Motion, is_moment
 from ce_gym.dynamics.forces.scene import Scene
-from ce_gym.model.description import Elasticity
+from ce_gym.model.drives import Elasticity
 from ce_gym.model.mechanism import Mechanism
 
 MESH_ITERATIONS = 5

@@ -15,19 +15,21 @@ control is symmetric and takes no energy from nowhere.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction, rubs
-from ce_gym.dynamics.forces.law import JointForce
-from ce_gym.dynamics.forces.motors import MOTORS, MotorModel
+from ce_gym.dynamics.forces.law import JointForce, is_moment
+from ce_gym.dynamics.forces.motors import MOTORS, MotorModel, loaded_motors, most_friction
 from ce_gym.dynamics.forces.parameters import rubbing_as_declared
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
 from ce_gym.dynamics.recursion.kinematics import Kinematics
-from ce_gym.model.description import Motor
+from ce_gym.model.drives import Motor
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -45,7 +47,7 @@ def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
     limited = any(map(math.isfinite, joints)) or any(end is not None for end in ends)
     answering = any(ca.sparsify(slope).nnz() for end in ends if end is not None for _, slope in end)
     asked = options.control.endswith("position") and limited
-    rubbing = any(rubs(model.friction(motor)) for motor in motors)
+    rubbing = any(rubs(model.friction(motor)) or model.drive_friction(motor) for motor in motors)
     return len(joints) + (1 + rubbing) * len(motors) + 1 if asked or answering or rubbing else 0
 
 
@@ -71,12 +73,32 @@ def seen_joints(mechanism: Mechanism, kinematics: Kinematics) -> SX:
     for cluster in actuated_clusters(mechanism, kinematics) if n > nj else ():
         d = len(cluster.joints)
         if cluster.rows[d:]:
-            seen[cluster.joints, cluster.rows[d:]] = _effort_matrix(cluster.W[:, :d]).T @ cluster.W[:, d:]
+            seen[cluster.joints, cluster.rows[d:]] = effort_matrix(cluster.W[:, :d]).T @ cluster.W[:, d:]
     return ca.sparsify(seen)
 
 
+HOLD = 100.0
+"""Dry friction of a rotor at rest of which nobody knows yet what it carries [N m]."""
+Carried: TypeAlias = Mapping[int, tuple[SX, SX, SX]]
+"""Torque of a motor, what all else does to its rotor [N m], and whether both are known, by the places of motors whose
+friction goes by them."""
+
+
+def carried_by(mechanism: Mechanism, options: StepOptions, torques: SX) -> Carried:
+    """Return torques that motors carry, by their places, of a column as `State.carried` is."""
+    places = loaded_motors(mechanism.robot, options.motors)
+    return {place: (torques[i], torques[len(places) + i], torques[-1]) for i, place in enumerate(places)}
+
+
 def motor_forces(
-    scene: Scene, kinematics: Kinematics, asked: JointForce, yd: SX, dt: float, iterate: SX, seen: SX
+    scene: Scene,
+    kinematics: Kinematics,
+    asked: JointForce,
+    yd: SX,
+    dt: float,
+    iterate: SX,
+    seen: SX,
+    carried: Carried,
 ) -> SaturatedForce:
     """Return what the motors deliver of what they are asked for at the joints, which they see as `seen` has it."""
     strength = scene.figures.strength
@@ -87,9 +109,9 @@ def motor_forces(
         return _lifted(within_joint_limits(scene, at_joints, joints, iterate, seen), seen)
     actuated, force = actuated_clusters(scene.mechanism, kinematics), _lifted(at_joints, seen)
     for cluster in actuated:
-        rows, to_motors = cluster.joints, _effort_matrix(cluster.W[:, : len(cluster.joints)])
+        rows, to_motors = cluster.joints, effort_matrix(cluster.W[:, : len(cluster.joints)])
         shares = JointForce(to_motors @ at_joints.tau[rows], to_motors @ at_joints.slope[rows, rows] @ to_motors.T)
-        deliver(model, force, shares, cluster, yd, strength, dt, iterate)
+        deliver(model, force, shares, cluster, yd, strength, dt, iterate, carried)
     driven = {row for cluster in actuated for row in cluster.joints}
     left = [row for row in joints if row not in driven]
     return within_joint_limits(scene, force, left, iterate, SX.eye(yd.numel()))
@@ -120,6 +142,7 @@ class Actuated:
     """A cluster with motors at one state.
 
     Attributes:
+        index: Of the cluster.
         rows: Its rows of `y`, d of them.
         joints: Those of them that are no stretches, which come first.
         motors: Its motors.
@@ -129,6 +152,7 @@ class Actuated:
             actuation of arXiv:2311.13732); torques of motors go the other way, `tau = W^T tau_m`.
     """
 
+    index: int
     rows: list[int]
     joints: list[int]
     motors: list[Motor]
@@ -141,9 +165,8 @@ def actuated_clusters(mechanism: Mechanism, kinematics: Kinematics) -> list[Actu
     """Return the clusters with motors."""
     first, count = mechanism.robot.layout.joints_v, len(mechanism.robot.commanded)
     found = []
-    for cluster, rows, coordinates in zip(
-        mechanism.tree.clusters, kinematics.rows, kinematics.coordinates, strict=True
-    ):
+    clusters = zip(mechanism.tree.clusters, kinematics.rows, kinematics.coordinates, strict=True)
+    for k, (cluster, rows, coordinates) in enumerate(clusters):
         places = [i for i, motor in enumerate(mechanism.robot.motors) if motor.rotor in cluster.bodies]
         motors = [mechanism.robot.motors[i] for i in places]
         if motors and coordinates is not None:
@@ -151,7 +174,7 @@ def actuated_clusters(mechanism: Mechanism, kinematics: Kinematics) -> list[Actu
             W = ca.sparsify(coordinates.G[turning, :])
             mine = [row - first for row in rows]
             joints = [row for row in mine if row < count]
-            found.append(Actuated(mine, joints, motors, places, coordinates.q[turning], W))
+            found.append(Actuated(k, mine, joints, motors, places, coordinates.q[turning], W))
     return found
 
 
@@ -164,6 +187,7 @@ def deliver(
     strength: SX,
     dt: float,
     iterate: SX,
+    carried: Carried,
 ) -> None:
     """Limit the torques that motors of a cluster are asked for, take friction off each, and carry the sum to `force`.
 
@@ -176,12 +200,13 @@ def deliver(
         strength: Of all motors, as a multiple of what they should have.
         dt: Length of the step [s].
         iterate: From the iteration before, shape (limit_count,).
+        carried: What friction under load goes by.
     """
     W, motors, rows = cluster.W, cluster.motors, cluster.rows
     speed, tau, slope = W @ yd[rows], SX(asked.tau), asked.slope
     turning = SX(len(motors), yd.numel())
     turning[:, rows] = W
-    free, own, sticks = SX.eye(len(motors)), SX(len(motors), len(motors)), []
+    free, own, sticks, windings = SX.eye(len(motors)), SX(len(motors), len(motors)), [], []
     for i, (motor, place) in enumerate(zip(motors, cluster.places, strict=True)):
         if (limits := model.limits(motor, speed[i], strength, dt)) is not None:
             (high, forwards), (low, backwards) = limits
@@ -190,10 +215,16 @@ def deliver(
             force.limited[yd.numel() + place] = one
             tau[i], free[i, i] = one.given, one.free
             own[i, i] = ca.if_else(one.at_high, forwards, ca.if_else(one.at_low, backwards, 0))
+        windings.append((place, tau[i], own[i, i]))
         damping = model.damping(motor, speed[i])
         tau[i] -= damping * speed[i]
         own[i, i] += dt * damping
-        if rubs(friction := model.friction(motor)):
+        drive = model.drive_friction(motor)
+        friction = most_friction(model.friction(motor), drive, speed[i], carried.get(place, ())[:2])
+        if place in carried and not is_moment(dt):
+            known = ca.logic_or(carried[place][2], ca.fabs(speed[i]) > STICK_SPEED)
+            friction = ca.if_else(known, friction, HOLD)
+        if rubs(friction):
             last = iterate.numel() - 1  # before it, the frictions of all motors, as many as there are before those
             one = dry_friction(friction, speed[i], turning[i, :], dt, iterate, (last + yd.numel()) // 2 + place)
             force.limited[(last + yd.numel()) // 2 + place] = one
@@ -203,10 +234,13 @@ def deliver(
     if len(sticks) == len(motors) == len(rows):
         all_stick = SX(ca.sum1(ca.vertcat(*sticks)) > len(sticks) - 0.5)
         force.held |= dict.fromkeys(rows, all_stick)
-    force.tau[rows], force.slope[rows, rows] = W.T @ tau, W.T @ (free @ slope @ free + own) @ W
+    answer = free @ slope @ free
+    for i, (place, given, at_limit) in enumerate(windings):
+        force.windings[place] = JointForce(given, answer[i, :] @ turning + at_limit * turning[i, :])
+    force.tau[rows], force.slope[rows, rows] = W.T @ tau, W.T @ (answer + own) @ W
 
 
-def _effort_matrix(W: SX) -> SX:
+def effort_matrix(W: SX) -> SX:
     """Return the matrix that takes joint torques to motor torques: inverse of `W^T`, least squares if not square."""
     n, d = W.shape
     if n == d:

@@ -11,7 +11,8 @@ from typing import Protocol, TypeAlias
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.model.description import Motor
+from ce_gym.model.description import Robot
+from ce_gym.model.drives import DriveFriction, Motor
 
 Line: TypeAlias = tuple[SX, SX]
 """A torque [N m] at the present speed, and how it falls with the rotor's acceleration [kg m^2]."""
@@ -39,6 +40,10 @@ class MotorModel(Protocol):
         """Return the dry friction of a motor [N m]; the number 0 if it has none."""
         ...
 
+    def drive_friction(self, motor: Motor) -> DriveFriction | None:
+        """Return what it has more of it at rest and under load; None if it has none."""
+        ...
+
 
 class Ideal:
     """Motors that deliver what joints are asked for up to the joints' limits, at any speed and without loss."""
@@ -57,6 +62,10 @@ class Ideal:
     def friction(self, motor: Motor) -> float:
         """Return none."""
         return 0.0
+
+    def drive_friction(self, motor: Motor) -> None:
+        """Return none."""
+        return None
 
 
 class Limited:
@@ -92,6 +101,49 @@ class Limited:
         """Return the motor's dry friction."""
         return motor.friction
 
+    def drive_friction(self, motor: Motor) -> DriveFriction | None:
+        """Return the motor's own."""
+        return motor.drive_friction
+
 
 MOTORS: dict[str, MotorModel] = {"ideal": Ideal(), "limited": Limited()}
 """All models, by the name that `Simulator(motors=...)` takes."""
+
+
+def loaded_motors(robot: Robot, model: str) -> list[int]:
+    """Return the places of the motors whose friction depends on torques, by the name of the model of the motors."""
+    frictions = [MOTORS[model].drive_friction(motor) for motor in robot.motors]
+    return [i for i, friction in enumerate(frictions) if friction is not None and friction.loaded]
+
+
+def most_friction(constant: float | SX, drive: DriveFriction | None, speed: SX, carried: tuple[SX, ...]) -> float | SX:
+    """Return the largest dry friction of a motor [N m], see `DriveFriction`.
+
+    Args:
+        constant: What it has at any speed and load [N m].
+        drive: What it has besides.
+        speed: Of the rotor [rad/s].
+        carried: Torque of the motor and what all else does to the rotor [N m]; empty if no friction depends on them.
+    """
+    if drive is None:
+        return constant
+    total, at_rest = SX(0), SX(drive.stribeck)
+    if carried:
+        motor, other = carried
+        total += ca.fabs(drive.load_motor * motor - drive.load_external * other)
+        at_rest += ca.fabs(drive.stribeck_load_motor * motor - drive.stribeck_load_external * other)
+        losses = 1 / drive.efficiency - 1, 1 - drive.backdriving_efficiency
+        total += _by_direction(motor, other, *[loss * ca.fabs(other) for loss in losses])
+        squares = drive.stribeck_square_external * other**2, drive.stribeck_square_motor * motor**2
+        at_rest += _by_direction(motor, other, *squares)
+    if ca.sparsify(at_rest).nnz():
+        total += at_rest * ca.exp(-((ca.fabs(speed) / drive.stribeck_speed) ** drive.stribeck_exponent))
+    return constant + drive.factor * total
+
+
+def _by_direction(motor: SX, other: SX, driving: SX, driven: SX) -> SX:
+    """Return one of two where a motor carries something, as it drives or is driven back; else 0."""
+    if not ca.sparsify(ca.vertcat(driving, driven)).nnz():
+        return SX(0)
+    ahead = ca.fabs(motor) - ca.fabs(other)
+    return ca.if_else(motor * other <= 0, ca.if_else(ahead > 0, driving, ca.if_else(ahead < 0, driven, 0)), 0)

@@ -14,6 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX, skew
 from ce_gym.dynamics.forces.contact import Compliance
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
+from ce_gym.model.drives import Motor
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 PARAMETERS = {
@@ -34,6 +35,7 @@ PARAMETERS = {
     "drive_stiffness:ROTOR": "factor on the stiffness of the elastic transmission of one rotor [-], 1",
     "motor_damping": "viscous friction of the rotors of limited motors [N m s/rad], n_motors",
     "motor_friction": "dry friction of the rotors of limited motors [N m], n_motors",
+    "drive_friction": "factor on what friction of limited motors has more of at rest and under load [-], 1",
     "joint_damping": "viscous friction of the joints [N m s/rad or N s/m], n_joints",
     "joint_friction": "dry friction of the joints [N m or N], n_joints",
     "link_inertia:BODY": "factor on the moments of inertia of a body about its centre of mass [-], 1",
@@ -89,6 +91,7 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
         "backlash": np.ones(1),
         "motor_damping": np.array([motor.damping for motor in robot.motors]),
         "motor_friction": np.array([motor.friction for motor in robot.motors]),
+        "drive_friction": np.ones(1),
         "joint_damping": np.array([robot.body(name).joint.damping for name in robot.commanded]),
         "joint_friction": np.array([robot.body(name).joint.friction for name in robot.commanded]),
     }
@@ -172,6 +175,8 @@ def with_drives(robot: Robot, given: Mapping[str, SX]) -> Robot:
     changed: dict[str, Any] = {}
     if motors := _each(robot.motors, given, {"motor_damping": "damping", "motor_friction": "friction"}):
         changed["motors"] = motors
+    if "drive_friction" in given:
+        changed["motors"] = tuple(_with_rubbing(motor, given["drive_friction"]) for motor in motors or robot.motors)
     joints = [robot.body(name).joint for name in robot.commanded]
     if rubbing := _each(joints, given, {"joint_damping": "damping", "joint_friction": "friction"}):
         moved = dict(zip(robot.commanded, rubbing, strict=True))
@@ -216,6 +221,11 @@ def _each(things: Sequence[Any], given: Mapping[str, SX], fields: Mapping[str, s
         if name in given:
             things = [replace(thing, **{field: given[name][i]}) for i, thing in enumerate(things)]
     return tuple(things)
+
+
+def _with_rubbing(motor: Motor, factor: SX) -> Motor:
+    drive = motor.drive_friction
+    return motor if drive is None else replace(motor, drive_friction=replace(drive, factor=drive.factor * factor))
 
 
 def _with_factor(spin: Spin, given: Mapping[str, SX]) -> Spin:

@@ -89,12 +89,14 @@ class SaturatedForce(JointForce):
         size: Of its iterate: the expected torques, and last `count`.
         limited: The torques that are kept within limits, at their places in the iterate.
         held: Rows of `y` that dry friction holds, each with 1 if it does, else 0.
+        windings: Torques of motors, by their places, before what they lose.
         count: Above 0, which says that there is an iterate.
     """
 
     size: int
     limited: dict[int, Saturation] = field(default_factory=dict)
     held: dict[int, SX] = field(default_factory=dict)
+    windings: dict[int, JointForce] = field(default_factory=dict)
     count: SX | int = 1
 
     def check(self, motion: Motion) -> SX:

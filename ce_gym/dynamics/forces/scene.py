@@ -7,6 +7,7 @@ from typing import Literal
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import reference_guess
+from ce_gym.dynamics.forces.motors import loaded_motors
 from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactMaterial
@@ -90,6 +91,8 @@ class State:
         anchor: Horizontal deflections of the contacts' bristles, world axes [m], shape (2 n_contacts,); empty without.
         dependent: Where the dependent coordinates that no formula gives will be, roughly, shape (n_guess,).
         pressed: Force between each pair of capsules over the last step [N], shape (n_pairs,).
+        carried: Over the last step the torque of each motor whose friction depends on it, then what all else did to
+            each of their rotors [N m], and 1; zeros where there was no step before, shape (2 n_loaded + 1,).
     """
 
     q: SX
@@ -98,6 +101,7 @@ class State:
     anchor: SX
     dependent: SX
     pressed: SX
+    carried: SX
 
     def items(self) -> list[tuple[str, SX]]:
         """Return the parts that are there, by name."""
@@ -126,6 +130,8 @@ def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
     sizes = {"q": layout.nq, "v": layout.nv, "load": n}
     sizes |= {"anchor": 2 * n if options.material.bristle > 0 else 0, "dependent": len(reference_guess(mechanism))}
     sizes["pressed"] = len(colliding(mechanism.robot, options.self_collisions))
+    loaded = loaded_motors(mechanism.robot, options.motors)
+    sizes["carried"] = 2 * len(loaded) + 1 if loaded else 0
     return {name: size for name, size in sizes.items() if size}
 
 

@@ -31,7 +31,7 @@ from ce_gym.dynamics.constraints.cluster_constraints import (
     loop_coordinates,
 )
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.description import stretch_of
+from ce_gym.model.drives import stretch_of
 from ce_gym.model.mechanism import Mechanism, MovingBody
 
 

@@ -19,8 +19,9 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.drives.load import carried_after, carried_now
 from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretching
-from ce_gym.dynamics.forces.actuation import limit_count
+from ce_gym.dynamics.forces.actuation import carried_by, limit_count
 from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground
 from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
 from ce_gym.dynamics.forces.friction import FRICTION
@@ -29,7 +30,7 @@ from ce_gym.dynamics.forces.motor_control import Motors
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.passive import ball_forces, passive_forces, yielding_forces
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
-from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
+from ce_gym.dynamics.forces.scene import Scene, State, StepOptions, state_sizes
 from ce_gym.dynamics.forces.self_collision import Frictionless, LinearPair, Pair, meeting, pressed_on, settled
 from ce_gym.dynamics.recursion.ce_aba import (
     BodyTerms,
@@ -59,6 +60,8 @@ class Solved:
         motors: What the motors deliver to the joints.
         friction: Dry friction of the joints, one or none.
         meshes: Of the transmissions that stretch, one or none.
+        carried: What friction under load went by, as `State.carried` is.
+        inertia: Of clusters, without what acts on their coordinates, shape (d, d) each.
     """
 
     kinematics: Kinematics
@@ -69,6 +72,8 @@ class Solved:
     motors: SaturatedForce
     friction: list[SaturatedForce]
     meshes: list[MeshForce]
+    carried: SX
+    inertia: dict[int, SX]
 
 
 def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Solved:
@@ -79,8 +84,8 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
         state: At the start of the step.
         target: Targets or torques of what `target_names` says, shape (n_targets,).
         dt: Length of the step [s].
-        iterate: From the iteration before: of contacts, pairs, motors, joints' dry friction, meshes of transmissions,
-            shape (iterate_size,).
+        iterate: From the iteration before: of contacts, pairs, motors, joints' dry friction, meshes of transmissions
+            and what motors carry, shape (iterate_size,).
     """
     mechanism, acting = scene.mechanism, acting_forces(scene, state, target, dt, iterate)
     kinematics, contacts, gravity = acting.kinematics, acting.contacts, acting.gravity
@@ -94,7 +99,7 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
         vdot, a = settled(mechanism, kinematics, articulation, momentum, acting.pairs, forces)
     else:
         vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
-    return acting.solved(vdot, a)
+    return acting.solved(vdot, a, articulation.inertia)
 
 
 @dataclass
@@ -111,6 +116,7 @@ class Acting:
         joints: Those and what the joints do by themselves.
         couples: What steadies the bodies of ball joints, body axes [N m], shape (3,) each, by name.
         gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
+        carried: What friction under load goes by, as `State.carried` is.
     """
 
     kinematics: Kinematics
@@ -122,12 +128,19 @@ class Acting:
     joints: JointTerms
     couples: dict[str, SX]
     gravity: dict[str, SX]
+    carried: SX
 
-    def solved(self, vdot: SX, a: dict[str, SX]) -> Solved:
-        """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each."""
+    def solved(self, vdot: SX, a: dict[str, SX], inertia: dict[int, SX] | None = None) -> Solved:
+        """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each.
+
+        Args:
+            vdot: The acceleration.
+            a: Of the bodies.
+            inertia: Of clusters; if it is not known, what motors carry stays what it was.
+        """
         motion = Motion(vdot[vdot.numel() - self.motors.tau.numel() :], a, self.gravity)
         laws = self.contacts, self.pairs, self.motors, self.friction, self.meshes
-        return Solved(self.kinematics, vdot, motion, *laws)
+        return Solved(self.kinematics, vdot, motion, *laws, self.carried, inertia or {})
 
 
 def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Acting:
@@ -136,11 +149,13 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     y, yd = state.q[layout.joints_q :], state.v[layout.joints_v :]
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
 
-    laws, driven = touching(scene, kinematics, state, dt), Motors(scene, kinematics, y, yd, target, dt)
+    laws, unloaded = touching(scene, kinematics, state, dt), iterate.numel() - state.carried.numel()
+    carried = carried_now(state, iterate[unloaded:])
+    driven = Motors(scene, kinematics, y, yd, target, dt, carried_by(mechanism, scene.options, carried))
     meeting = meeting_pairs(scene, kinematics, state, dt)
     rubbing = JointFriction(mechanism, kinematics, yd, dt)
     sizes = [law.size for law in (*laws, *meeting, driven, rubbing)]
-    *of_contacts, of_motors, of_friction, of_meshes = split(iterate, sizes)
+    *of_contacts, of_motors, of_friction, of_meshes = split(iterate[:unloaded], sizes)
     contacts = [law.linearise(part) for law, part in zip(laws, of_contacts, strict=False)]
     pairs = [law.linearise(part) for law, part in zip(meeting, of_contacts[len(laws) :], strict=True)]
     motors = driven.linearise(of_motors)
@@ -153,7 +168,7 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     joints = on_coordinates(mechanism, of_balls, of_joints)
     couples = {} if is_moment(dt) else steadying_couples(mechanism, kinematics, dt)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    return Acting(kinematics, contacts, pairs, motors, friction, meshes, joints, couples, gravity)
+    return Acting(kinematics, contacts, pairs, motors, friction, meshes, joints, couples, gravity, carried)
 
 
 @dataclass
@@ -203,18 +218,22 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         anchor=stacked(anchors) if state.anchor.numel() else state.anchor,
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
         pressed=stacked([ca.fmax(pair.normal_after(pair.gain(motion)), 0) for pair in solved.pairs]),
+        carried=carried_after(scene, kinematics, motors, solved.inertia, motion) if solved.inertia else solved.carried,
     )
     touches = [*solved.contacts, *solved.pairs]
     unconverged = ca.sum1(stacked([c.check(motion) for c in touches])) > 0
     for force in (*saturated, *solved.meshes):
         unconverged = ca.logic_or(force.check(motion), unconverged)
+    if solved.carried.numel():
+        unconverged = ca.logic_or(unconverged, solved.carried[-1] < 0.5)
     of_contacts = stacked([c.next_iterate(motion) for c in touches])
     # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of motors are fixed
     # points by themselves.
     of_contacts = ca.if_else(unconverged, of_contacts, iterate[: of_contacts.numel()])
     of_friction = stacked([force.next_iterate(motion) for force in solved.friction])
     of_meshes = stacked([force.next_iterate(motion) for force in solved.meshes])
-    end = iterate.numel() - of_meshes.numel()
+    of_carried = ca.if_else(unconverged, after.carried, solved.carried)
+    end = iterate.numel() - of_meshes.numel() - of_carried.numel()
     of_friction = ca.if_else(unconverged, of_friction, iterate[end - of_friction.numel() : end])
     return Stepped(
         state=after,
@@ -223,7 +242,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         torque=(motors.tau - motors.slope @ motion.ydd)[: len(scene.mechanism.robot.commanded)],
         contact_forces=ca.horzcat(SX(3, 0), *[R @ c.force_after(gain) for R, c, gain in contacts]),
         unconverged=unconverged,
-        iterate=ca.vertcat(of_contacts, motors.next_iterate(motion), of_friction, of_meshes),
+        iterate=ca.vertcat(of_contacts, motors.next_iterate(motion), of_friction, of_meshes, of_carried),
         error=SX(0),
     )
 
@@ -247,7 +266,7 @@ def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many numbers an iteration leaves for the next."""
     touches = len(options.contacts) + len(colliding(mechanism.robot, options.self_collisions))
     of_joints = limit_count(mechanism, options) + friction_count(mechanism, options.parameters) + mesh_count(mechanism)
-    return Contact.size * touches + of_joints
+    return Contact.size * touches + of_joints + state_sizes(mechanism, options).get("carried", 0)
 
 
 def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:

@@ -58,6 +58,7 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
             _moved(plan.end, before, list(parts.values()), dt, layout),
             load=first.state.load,
             pressed=first.state.pressed,
+            carried=first.state.carried,
         )
     else:
         after = combined(plan, {name: part.state for name, part in parts.items()}, layout)
@@ -104,7 +105,7 @@ def _from_flat(flat: SX, like: State, layout: Layout) -> State:
         q[i : i + 4] = q[i : i + 4] / ca.norm_2(q[i : i + 4])
     if layout.floating:
         v = ca.vertcat(v[:3], quaternion_to_rotation(q[3:7]).T @ v[3:6], v[6:])
-    return State(q=q, v=v, load=like.load, anchor=anchor, dependent=like.dependent, pressed=like.pressed)
+    return replace(like, q=q, v=v, anchor=anchor)
 
 
 def _rate(state: State, solved: Solved, layout: Layout) -> SX:

@@ -13,7 +13,10 @@ from ce_gym.envs.task.tasks import RANDOMISED, Range
 from ce_gym.model.description import Robot
 from ce_gym.sim.arguments import check
 
-FACTORS = ("stiffness", "kp", "kd", "motor_strength", "rotor_inertia", "ratio")
+FACTORS = (
+    *("stiffness", "kp", "kd", "motor_strength", "rotor_inertia", "ratio"),
+    *("motor_damping", "motor_friction", "drive_friction"),
+)
 """Figures whose ranges are factors on what the robot has."""
 
 

@@ -113,6 +113,9 @@ RANDOMISED = {
     "motor_strength": "factor on motor torques and limits [-]",
     "rotor_inertia": "factor on the spin inertia of rotors [-]",
     "ratio": "factor on the gear ratios [-]",
+    "motor_damping": "factor on the viscous friction of each motor, limited ones [-]",
+    "motor_friction": "factor on the dry friction of each motor, limited ones [-]",
+    "drive_friction": "factor on what that is more at rest and under load [-]",
     "added_mass": "mass added to the base [kg]; added_mass:BODY for another body",
     "com_shift": "shift of the base's centre of mass, each axis [m]; com_shift:BODY for another body",
 }

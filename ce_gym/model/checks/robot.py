@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
+from dataclasses import fields
 from fnmatch import fnmatch
 from functools import cache
 
@@ -26,6 +27,7 @@ from ce_gym.model.checks.constraint import check_constraint
 from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Robot
+from ce_gym.model.drives import DriveFriction
 from ce_gym.model.errors import InertiaWarning, bad, unknown
 
 MOST_BODIES = 500
@@ -211,6 +213,24 @@ def _check_motors(robot: Robot, file: str) -> None:
                 raise bad(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
         if motor.velocity == 0.0:
             raise bad(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
+        if motor.drive_friction is not None:
+            _check_drive_friction(motor.drive_friction, file, f"motors.{motor.rotor}.friction")
+
+
+def _check_drive_friction(friction: DriveFriction, file: str, key: str) -> None:
+    for field in fields(friction):
+        value, name = getattr(friction, field.name), f"{key}.{field.name}"
+        if field.name.endswith("efficiency"):
+            if not 0.0 <= value <= 1.0 or (field.name == "efficiency" and value == 0.0):
+                raise bad(file, name, value, "a share of at most 1")
+        elif field.name in ("stribeck_speed", "stribeck_exponent"):
+            if not value > 0.0:
+                raise bad(file, name, value, "more than 0")
+        else:
+            check_not_negative(file, name, value)
+    at_rest = [f.name for f in fields(friction) if f.name.startswith("stribeck") and f.default == 0.0]
+    if math.isinf(friction.stribeck_speed) and any(getattr(friction, name) for name in at_rest):
+        raise bad(file, f"{key}.stribeck_speed", None, "the speed at which what is added at rest falls [rad/s]")
 
 
 def _check_elastic(robot: Robot, file: str) -> None:

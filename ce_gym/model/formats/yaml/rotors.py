@@ -8,10 +8,12 @@ then it is a thin disc that its carrier's published figures count (`rotor_links.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 from ce_gym.model.constraints import LinearConstraint
-from ce_gym.model.description import Body, Elasticity, Inertial, Joint, Motor
+from ce_gym.model.description import Body, Inertial, Joint
+from ce_gym.model.drives import DriveFriction, Elasticity, Motor
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.motors import MotorType, motor_type
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, symmetric, vec3
@@ -25,6 +27,9 @@ from ce_gym.model.frames import Placement, Vec3
 _KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
 _ELASTIC_KEYS = ("stiffness", "damping", "backlash", "preload")
 _MOTOR_KEYS = ("torque", "velocity", "stall", "damping", "friction")
+_FRICTION_KEYS = tuple(field.name for field in fields(DriveFriction))
+_BOTH_KEYS = ("load", "stribeck_load")
+"""Stand for the share of the motor's torque and that of all else, equal."""
 
 
 def read_motors(section: Section) -> tuple[dict[str, MotorType], tuple[Motor, ...]]:
@@ -37,9 +42,24 @@ def read_motors(section: Section) -> tuple[dict[str, MotorType], tuple[Motor, ..
         if "use" in motor:
             used[rotor] = motor_type(motor.text("use"), motor.file, motor.key("use"))
             figures = used[rotor].limits()
-        given = {key: motor.number(key) for key in motor if key != "use"}
-        motors.append(Motor(rotor, **{**figures, **given}))
+        figures |= {key: motor.number(key) for key in motor if key not in ("use", "friction")}
+        motors.append(Motor(rotor, **figures, **_friction(motor)))
     return used, tuple(motors)
+
+
+def _friction(motor: Section) -> dict[str, Any]:
+    """Return what a motor has of dry friction: a number, or a mapping with what depends on speed and load."""
+    if not isinstance(motor.get("friction", None), dict):
+        return {"friction": motor.number("friction", 0.0)}
+    section = motor.section("friction").allow("coulomb", *_BOTH_KEYS, *_FRICTION_KEYS)
+    figures = {key: section.number(key) for key in section if key in _FRICTION_KEYS}
+    for both in (key for key in _BOTH_KEYS if key in section):
+        for key in (f"{both}_motor", f"{both}_external"):
+            if key in section:
+                raise bad(section.file, section.key(key), section.get(key), f"none beside {both!r}, which is both")
+            figures[key] = section.number(both)
+    more = {"drive_friction": DriveFriction(**figures)} if figures else {}
+    return {"friction": section.number("coulomb", 0.0)} | more
 
 
 def read_elastic(section: Section, bodies: Iterable[Body]) -> tuple[Elasticity, ...]:

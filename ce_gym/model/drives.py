@@ -1,0 +1,119 @@
+"""What drives joints: motors, what rubs in them, and transmissions that give way; all figures are the rotor's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class DriveFriction:
+    """How much more dry friction a drive has at rest and under load. All figures are the rotor's.
+
+    With `tau_m` the torque of the motor, `tau_e` what all else does to the rotor, of opposite signs where it has to
+    carry something, and `s = exp(-|speed / stribeck_speed|^stribeck_exponent)`, its dry friction is at most
+
+        friction + factor (|load_motor tau_m - load_external tau_e| + E
+            + s (stribeck + |stribeck_load_motor tau_m - stribeck_load_external tau_e| + Q)).
+
+    If they are of opposite signs and the motor drives, `|tau_m| > |tau_e|`, it is `Q = stribeck_square_external
+    tau_e^2` and `E = (1 / efficiency - 1) |tau_e|`; if it is driven back, `Q = stribeck_square_motor tau_m^2` and `E =
+    (1 - backdriving_efficiency) |tau_e|`. Without E these are the models M2 to M6 of Duclusaud, Passault, Padois
+    and Ly, "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025 (arXiv:2410.08650).
+
+    Attributes:
+        stribeck: What is added at rest [N m].
+        stribeck_speed: Speed at which that has fallen to 37 % [rad/s].
+        stribeck_exponent: How abruptly it falls; 2 for a Gaussian.
+        load_motor, load_external: Shares of torques [-].
+        stribeck_load_motor, stribeck_load_external: The same of what is added at rest [-].
+        stribeck_square_motor, stribeck_square_external: Shares of their squares in it [1/(N m)].
+        efficiency: Share of the motor's torque that moves a load at a steady speed, without all the above [-].
+        backdriving_efficiency: Share of a load that reaches the motor as it is driven back; 0 for self-locking [-].
+        factor: On all of this [-].
+    """
+
+    stribeck: float = 0.0
+    stribeck_speed: float = float("inf")
+    stribeck_exponent: float = 2.0
+    load_motor: float = 0.0
+    load_external: float = 0.0
+    stribeck_load_motor: float = 0.0
+    stribeck_load_external: float = 0.0
+    stribeck_square_motor: float = 0.0
+    stribeck_square_external: float = 0.0
+    efficiency: float = 1.0
+    backdriving_efficiency: float = 1.0
+    factor: float = 1.0
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """What multiplies torques, or squares of them; none of it is negative."""
+        of_speed = self.stribeck_load_motor, self.stribeck_load_external
+        squares = self.stribeck_square_motor, self.stribeck_square_external
+        return self.load_motor, self.load_external, *of_speed, *squares
+
+    @property
+    def loaded(self) -> bool:
+        """Whether it depends on torques."""
+        return any(self.shares) or self.efficiency < 1 or self.backdriving_efficiency < 1
+
+
+@dataclass(frozen=True)
+class Motor:
+    """An electric motor that turns a rotor.
+
+    Attributes:
+        rotor: Name of the rotor body.
+        torque: Largest torque at the rotor, as the current allows [N m].
+        velocity: No-load speed of the rotor [rad/s].
+        stall: Torque at standstill, as the voltage allows, where the torque-speed line starts [N m]; `torque` if None.
+        damping: Viscous friction of the rotor [N m s/rad].
+        friction: Dry friction of the rotor [N m].
+        drive_friction: What depends on speed and load besides; None for nothing.
+    """
+
+    rotor: str
+    torque: float = float("inf")
+    velocity: float = float("inf")
+    stall: float | None = None
+    damping: float = 0.0
+    friction: float = 0.0
+    drive_friction: DriveFriction | None = None
+
+
+def stretch_of(rotor: str) -> str:
+    """Return the name of the coordinate by which the transmission of a rotor stretches, if it is elastic."""
+    return f"{rotor}_stretch"
+
+
+@dataclass(frozen=True)
+class Elasticity:
+    """How the transmission of a rotor gives way: gear mesh, belt or series spring. All figures are the rotor's.
+
+    The stretch is how far the rotor is ahead of where the joints that it drives would have it. What a data sheet says
+    of the output is divided by the square of the gear ratio if it is a stiffness, multiplied by the ratio if an angle.
+
+    Attributes:
+        rotor: Name of the rotor body.
+        stiffness: [N m/rad].
+        damping: [N m s/rad].
+        backlash: Play: how far the rotor turns from one flank to the other, the joints held [rad].
+        preload: Of a belt: the torque at which one of its strands goes slack, beyond which it is half as stiff [N m];
+            infinite for what pulls and pushes alike.
+    """
+
+    rotor: str
+    stiffness: float
+    damping: float = 0.0
+    backlash: float = 0.0
+    preload: float = float("inf")
+
+    @property
+    def stretch(self) -> str:
+        """Name of its coordinate."""
+        return stretch_of(self.rotor)
+
+    @property
+    def linear(self) -> bool:
+        """Whether its torque is proportional to the stretch."""
+        return not self.backlash and self.preload == float("inf")
