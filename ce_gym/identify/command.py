@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from ce_gym.identify.estimate import identify
     from ce_gym.identify.excite import simulate_log
     from ce_gym.identify.log import read_log
-    from ce_gym.identify.overlay import overlay, report
+    from ce_gym.identify.overlay import check_base, overlay, report
     from ce_gym.identify.page import page
 
     if args.simulate is not None:
@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
     out, shown = args.out or args.log.with_suffix(".yaml"), args.html or args.log.with_suffix(".html")
     for option, file in (("--out", out), ("--html", shown)):
         _check_new(option, file, [Path(args.robot), args.log])
+    check_base(args.robot)
     found = identify(
         args.robot,
         read_log(args.log),

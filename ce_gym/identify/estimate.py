@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,64 +14,20 @@ from numpy.typing import NDArray
 from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.forces.scene import target_names
 from ce_gym.dynamics.model import Model
-from ce_gym.identify.figures import Figure, default_kinds, sought
-from ce_gym.identify.fit import Problem, Windows, correlation_time, noise_of, solve
-from ce_gym.identify.held import held_model, limbs_of
+from ce_gym.identify.figures import default_kinds, sought
+from ce_gym.identify.fit import Problem, solve
+from ce_gym.identify.found import NORMAL_95, Identified
+from ce_gym.identify.held import held_model
 from ce_gym.identify.log import Log, LogError
-from ce_gym.identify.separable import inseparable
+from ce_gym.identify.separable import Held, correlation_time, covariance_of, hold, known_badly
 from ce_gym.identify.shots import Settings, Shots
+from ce_gym.identify.windows import PARTS, Windows, cut, first_states, noise_of_encoders
 from ce_gym.model import Robot, RobotError, load_robot
 from ce_gym.model.errors import unknown
 
 Array = NDArray[np.float64]
 LARGEST_ANGLE = 12.6
 """Of a joint [rad], two turns: what is larger is in degrees."""
-NORMAL_95 = 1.959964
-"""95 % of a normal distribution are within so many standard deviations."""
-
-
-@dataclass(frozen=True)
-class Identified:
-    """What a log says of a robot.
-
-    Attributes:
-        robot: The robot as the log has it, before.
-        figures: What was sought.
-        values: Estimates, in the units of the figures, shape (P,).
-        std: Their standard deviations, shape (P,).
-        covariance: Of the estimates, shape (P, P).
-        cannot_tell: A line for each direction in which the data say too little.
-        noise: Standard deviation of what is left of each measurement, in its unit, shape (n_measured,).
-        correlation: By how much correlation of it in time makes variances larger; they are.
-        held_out: Root mean square error of each measurement in windows that were not fitted, shape (n_measured,).
-        held_out_before: The same with the figures as they were.
-        curves: Times [s], measured, simulated before and after, of windows held out, shapes (W, L), (W, L, n) thrice.
-        log: The log.
-        processor_time: Of all of it [s].
-    """
-
-    robot: Robot
-    figures: tuple[Figure, ...]
-    values: Array
-    std: Array
-    covariance: Array
-    cannot_tell: tuple[str, ...]
-    noise: Array
-    correlation: float
-    held_out: Array
-    held_out_before: Array
-    curves: tuple[Array, Array, Array, Array]
-    log: Log
-    processor_time: float
-
-    @property
-    def intervals(self) -> Array:
-        """95 % confidence intervals, shape (P, 2)."""
-        return np.stack([self.values - NORMAL_95 * self.std, self.values + NORMAL_95 * self.std], axis=1)
-
-    def __getitem__(self, name: str) -> float:
-        """Return the estimate of a figure by its name."""
-        return float(self.values[[figure.name for figure in self.figures].index(name)])
 
 
 def identify(
@@ -119,29 +75,25 @@ def identify(
     figures = sought(model.robot, kinds or default_kinds(model.robot), fixed, longest_delay)
     log = _ordered(model, log, control)
     shots = Shots(model, log, figures, Settings(control, substep, method, usable_cores()))
-    fitted, kept = _windows(log, window, longest_delay, held_out)
-    problem = _problem(shots, fitted, _noise_of_encoders(log))
-    scale = problem.scale
-    low, high = (np.array([getattr(f, side) for f in figures]) / scale for side in ("low", "high"))
-    x = np.array([figure.start for figure in figures]) / scale
-    start = x.copy()
-    for _ in range(2):  # the second time with the noise that the first one found
-        x = solve(problem, x, low, high).x
-        problem.noise = np.maximum(noise_of(problem), 1e-12)
-        problem.forget()
-    J = problem.jacobian(x)
+    fitted, kept = cut(log, window, longest_delay, held_out)
+    problem, x, held = _search(shots, fitted)
+    free, scale = problem.free, problem.scale[problem.free]
     correlation = correlation_time(problem.residual)
-    covariance, lines = inseparable(J, x, figures, correlation)
-    covariance = covariance * np.outer(scale, scale)
-    curves, errors = _held_out(shots, kept, problem.noise, (start, x))
-    std = np.sqrt(np.diag(covariance))
+    known = covariance_of(problem.jacobian(x), correlation)
+    covariance = np.zeros((len(figures), len(figures)))
+    covariance[np.ix_(free, free)] = known * np.outer(scale, scale)
+    values, std = problem.values(x), np.sqrt(np.diag(covariance))
+    ends = {f.name: (v - NORMAL_95 * s, v + NORMAL_95 * s) for f, v, s in zip(figures, values, std, strict=True)}
+    before = np.array([figure.start for figure in figures])
+    curves, errors = _held_out(shots, kept, problem.noise, (before, values))
     return Identified(
         robot=described,
         figures=tuple(figures),
-        values=x * scale,
+        values=values,
         std=std,
         covariance=covariance,
-        cannot_tell=lines,
+        held=tuple(which.figure.name for which in held),
+        cannot_tell=(*(which.line(ends) for which in held), *known_badly(known, x, [figures[i] for i in free])),
         noise=problem.noise,
         correlation=correlation,
         held_out=errors[1],
@@ -150,6 +102,47 @@ def identify(
         log=log,
         processor_time=time.process_time() - began,
     )
+
+
+def _search(shots: Shots, windows: Windows) -> tuple[Problem, Array, list[Held]]:
+    """Return a problem, the free figures that fit best, over their scales, and what is held.
+
+    In short windows errors stay small and so does what friction makes of them, stick or slip: there the search goes
+    first, for figures, states and noise to begin with.
+    """
+    x = np.array([figure.start / figure.scale for figure in shots.figures])
+    short = Problem(shots, windows.parts(), first_states(shots, windows.parts()), noise_of_encoders(shots.log))
+    x = solve(short, x, 1e-3)
+    short.weigh(x)
+    problem = Problem(shots, windows, short.states[::PARTS], short.noise)
+    held: list[Held] = []
+    while True:
+        x = solve(problem, x, 1e-6)
+        problem.weigh(x)
+        figures, correlation = [shots.figures[i] for i in problem.free], correlation_time(problem.residual)
+        more, left, x = hold(problem.jacobian(x), x, figures, correlation)
+        if not more:
+            return problem, x, held
+        held += more
+        problem.free = problem.free[left]
+        problem.forget()
+
+
+def _held_out(
+    shots: Shots, windows: Windows, noise: Array, both: Sequence[Array]
+) -> tuple[tuple[Array, Array, Array, Array], list[Array]]:
+    """Return curves, and errors with the figures before and after; initial states are fitted in either case."""
+    read, errors = [], []
+    for values in both:
+        states = first_states(shots, windows.parts())
+        for pieces in (windows.parts(), windows):
+            problem = Problem(shots, pieces, states, noise)
+            problem.improve_states(values / problem.scale, 4)
+            states = problem.states[::PARTS]
+        read.append(shots(values[None], problem.states[None], windows.first, windows.length)[0])
+        errors.append(np.sqrt(((read[-1] - problem.measured) ** 2).mean(axis=(0, 1))))
+    times = windows.rows * shots.log.dt
+    return (times, problem.measured, *read), errors  # type: ignore[return-value]
 
 
 def _check_names(robot: Robot, log: Log) -> None:
@@ -178,53 +171,3 @@ def _ordered(model: Model, log: Log, control: str) -> Log:
             raise LogError(f"{log.source}: column command:{name}: expected {expected}")
     columns = [log.commanded.index(name) for name in names]
     return replace(log, commanded=names, commands=log.commands[:, columns])
-
-
-def _windows(log: Log, window: float, longest_delay: float, held_out: float) -> tuple[Windows, Windows]:
-    """Return windows to fit and windows to judge by, at the end of the log."""
-    length, first = max(8, round(window / log.dt)), int(np.ceil(longest_delay / log.dt)) + 1
-    starts = np.arange(first, len(log.values) - length, length)
-    kept = max(1, round(held_out * len(starts)))
-    if len(starts) - kept < 4:
-        raise LogError(f"{log.source}: {len(log.values)} rows: expected at least {first + 7 * length} for such windows")
-    return Windows(starts[:-kept], length), Windows(starts[-kept:], length)
-
-
-def _problem(shots: Shots, windows: Windows, noise: Array) -> Problem:
-    robot, log = shots.model.robot, shots.log
-    limb = limbs_of(robot)
-    of_states = [limb[name] for name in robot.independent] * 2
-    return Problem(shots, windows, [limb[n] for _, n in log.measured], of_states, _states(shots, windows), noise)
-
-
-def _states(shots: Shots, windows: Windows) -> Array:
-    """Return a first guess of states, shape (W, nq + nv): parabolas through the angles at the start of each window."""
-    n = min(windows.length, max(6, round(0.02 / shots.log.dt)))
-    rows = windows.first[:, None] + np.arange(n)
-    powers = np.vander(np.arange(n) * shots.log.dt, 3, increasing=True)
-    fit = np.einsum("pt,wtn->wpn", np.linalg.pinv(powers), shots.log.values[rows])
-    q = shots.encoders.positions(fit[:, 0])
-    ahead = shots.encoders.positions(fit[:, 0] + 1e-3 * fit[:, 1])
-    return np.hstack([q, (ahead - q) / 1e-3])
-
-
-def _noise_of_encoders(log: Log) -> Array:
-    """Return a first guess of noise: what third differences have, of which smooth motion has little."""
-    return np.maximum(np.diff(log.values, 3, axis=0).std(axis=0) / np.sqrt(20.0), 1e-9)
-
-
-def _held_out(
-    shots: Shots, windows: Windows, noise: Array, both: Sequence[Array]
-) -> tuple[tuple[Array, Array, Array, Array], list[Array]]:
-    """Return curves, and errors with the figures before and after; initial states are fitted in either case."""
-    read, errors = [], []
-    problem = _problem(shots, windows, noise)
-    for x in both:
-        problem.states = _states(shots, windows)
-        for _ in range(4):
-            problem._improve_states(x)
-        values = (x * problem.scale)[None]
-        read.append(shots(values, problem.states[None], windows.first, windows.length)[0])
-        errors.append(np.sqrt(((read[-1] - problem.measured) ** 2).mean(axis=(0, 1))))
-    times = (windows.first[:, None] + np.arange(windows.length + 1)) * shots.log.dt
-    return (times, problem.measured, *read), errors  # type: ignore[return-value]

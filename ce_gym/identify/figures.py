@@ -32,6 +32,7 @@ class Figure:
     Attributes:
         kind: One of `KINDS`.
         of: The rotor, joint or link that has it; empty for the delay.
+        nominal: What the robot's file has.
         start: Where the search begins.
         low: Lower bound.
         high: Upper bound.
@@ -42,6 +43,7 @@ class Figure:
 
     kind: str
     of: str
+    nominal: float
     start: float
     low: float
     high: float
@@ -106,17 +108,17 @@ def sought(robot: Robot, kinds: Sequence[str], fixed: Sequence[str] = (), longes
 def _of_kind(robot: Robot, kind: str, longest_delay: float) -> list[Figure]:
     limb = limbs_of(robot)
     if kind == "delay":
-        return [Figure(kind, "", longest_delay / 10, 0.0, longest_delay, longest_delay / 3, -1)]
+        return [Figure(kind, "", 0.0, longest_delay / 10, 0.0, longest_delay, longest_delay / 3, -1)]
     if kind in ("rotor_inertia", "link_inertia"):
         names = {
             "rotor_inertia": [body.name for body in robot.rotors()],
             "link_inertia": [body.name for body in robot.bodies if body.kind == "link"],
         }[kind]
-        return [Figure(kind, name, 1.0, 0.02, 50.0, 1.0, limb[name]) for name in names]
+        return [Figure(kind, name, 1.0, 1.0, 0.02, 50.0, 1.0, limb[name]) for name in names]
     if kind == "added_mass":
         links = [body for body in robot.bodies if body.kind == "link"]
         masses = [(body.name, body.inertial.mass) for body in links]
-        return [Figure(kind, name, 0.0, -0.95 * m, 20 * m, m, limb[name]) for name, m in masses if m > 0]
+        return [Figure(kind, name, 0.0, 0.0, -0.95 * m, 20 * m, m, limb[name]) for name, m in masses if m > 0]
     return _losses(robot, kind, limb)
 
 
@@ -134,5 +136,5 @@ def _losses(robot: Robot, kind: str, limb: dict[str, int]) -> list[Figure]:
         if figure == "damping":
             large /= min(velocity, 100.0) if velocity > 0 else 10.0
         large = max(large, value)
-        found.append(Figure(kind, name, max(value, 0.1 * large), 0.0, 1e4 * large, large, limb[name], i))
+        found.append(Figure(kind, name, value, max(value, 0.1 * large), 0.0, 1e4 * large, large, limb[name], i))
     return found

@@ -3,41 +3,26 @@
 Initial states are eliminated (variable projection, Golub and Pereyra 1973; Jacobian by Kaufman 1975): at figures x each
 window's state is what fits it best, and residuals and their derivatives are projected onto what no initial state can
 explain. What is left is compressed to a triangle, R of QR, which has the same normal equations; SciPy's trust region
-minimises it. Derivatives are differences over the batch. Limbs do not feel each other, so that a figure, or a
-coordinate, of each can be changed in the same candidate.
+minimises it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.identify.differences import Differences
 from ce_gym.identify.shots import Shots
+from ce_gym.identify.windows import Windows
 
 Array = NDArray[np.float64]
-STEP = 1e-4
-"""Of differences in figures, relative to their scale."""
-STATE_STEPS = 1e-5, 1e-3
-"""Of differences in initial positions [rad or m] and velocities."""
 LARGEST_STEPS = 0.01, 0.3
 """Of initial positions and velocities that data hardly tell, as of a joint that sticks."""
+DAMPINGS = 0.0, 0.03, 1.0, 30.0
+"""Of Levenberg and Marquardt's steps, relative to the diagonal: where joints stick and slip, full steps often fail."""
 
-
-@dataclass(frozen=True)
-class Windows:
-    """Windows of a log.
-
-    Attributes:
-        first: Rows where they start, shape (W,).
-        length: [rows]
-    """
-
-    first: NDArray[np.int64]
-    length: int
+SETTLED = 1e-5
+"""Steps of initial states that help less than that, relative to the sum of squares, are the last."""
 
 
 class Problem:
@@ -46,172 +31,130 @@ class Problem:
     Args:
         shots: Simulates windows.
         windows: Which.
-        limb_of_channel: Number of the limb that each measured quantity is on.
-        limb_of_state: The same for each row of [q; v].
         states: First guess of initial states, shape (W, nq + nv).
         noise: Standard deviation of each measured quantity, shape (n_measured,).
+
+    Attributes:
+        free: Places of the figures that are fitted; the others are what the robot's file has.
+        residual: What is left at the last figures, over the noise, projected, shape (W, length + 1, n_measured).
     """
 
-    def __init__(
-        self,
-        shots: Shots,
-        windows: Windows,
-        limb_of_channel: Sequence[int],
-        limb_of_state: Sequence[int],
-        states: Array,
-        noise: Array,
-    ) -> None:
+    def __init__(self, shots: Shots, windows: Windows, states: Array, noise: Array) -> None:
         self.shots, self.windows, self.states, self.noise = shots, windows, states.copy(), noise.copy()
-        self.guess = states.copy()
+        self.guess, self.free = states.copy(), np.arange(len(shots.figures))
         self.scale = np.array([figure.scale for figure in shots.figures])
-        rows = windows.first[:, None] + np.arange(windows.length + 1)
-        self.measured = shots.log.values[rows]
-        self.limbs = sorted(set(limb_of_channel))
-        self.channels = {c: np.flatnonzero(np.array(limb_of_channel) == c) for c in self.limbs}
-        self.state_rows = {c: np.flatnonzero(np.array(limb_of_state) == c) for c in self.limbs}
-        of_figures = np.array([figure.limb for figure in shots.figures])
-        self.own = {c: np.flatnonzero(of_figures == c) for c in self.limbs}
-        self.common = np.flatnonzero(of_figures == -1)
+        self.measured = shots.log.values[windows.rows]
         self.residual = np.zeros_like(self.measured)
+        self._differences = Differences(shots, windows)
+        self.limbs = self._differences.limbs
         self._known: tuple[bytes, Array, Array] | None = None
         self._settled = False
 
-    @property
-    def freedom(self) -> int:
-        """Measurements less what is fitted to them."""
-        return self.measured.size - self.states.size - len(self.scale)
+    def values(self, x: Array) -> Array:
+        """Return all figures in their units, shape (P,), at free ones over their scales."""
+        values = np.array([figure.nominal for figure in self.shots.figures])
+        values[self.free] = x * self.scale[self.free]
+        return values
+
+    def weigh(self, x: Array) -> None:
+        """Take the noise from what is left at x, over measurements less what is fitted to them."""
+        self.residuals(x)
+        freedom = self.measured.size - self.states.size - len(x)
+        squares = (self.residual**2).mean(axis=(0, 1)) * self.measured.size / freedom
+        self.noise = np.maximum(self.noise * np.sqrt(squares), 1e-12)
+        self.forget()
 
     def forget(self) -> None:
-        """Evaluate anew where it was evaluated last, as when the noise is known better."""
+        """Evaluate anew where it was evaluated last, as when other figures are free."""
         self._known = None
 
     def residuals(self, x: Array) -> Array:
-        """Return compressed residuals at figures over their scales, for `least_squares`."""
+        """Return compressed residuals at free figures over their scales, for `least_squares`."""
         return self._at(x)[0]
 
     def jacobian(self, x: Array) -> Array:
-        """Return their derivatives, shape (m, P)."""
+        """Return their derivatives, shape (m, len(x))."""
         return self._at(x)[1]
 
     def _at(self, x: Array) -> tuple[Array, Array]:
         if self._known is None or self._known[0] != x.tobytes():
-            self._start_again(x)
-            for _ in range(3 if self._settled else 8):
-                self._improve_states(x)
+            self._choose(x, np.stack([self.states, self.guess]))
+            self.improve_states(x, 3 if self._settled else 8)
             self._settled = True
             self._known = (x.tobytes(), *self._evaluate(x))
         return self._known[1:]
 
-    def _start_again(self, x: Array) -> None:
-        """Put limbs back to the first guess in windows where that fits better than where other figures led them."""
-        states = np.stack([self.states, self.guess])
-        read = self.shots(np.tile(x * self.scale, (2, 1)), states, self.windows.first, self.windows.length)
-        for c in self.limbs:
-            costs = (((read - self.measured) / self.noise)[..., self.channels[c]] ** 2).sum((2, 3))
-            back = np.ix_(np.flatnonzero(costs[1] < costs[0]), self.state_rows[c])
-            self.states[back] = self.guess[back]
+    def improve_states(self, x: Array, steps: int) -> None:
+        """Make steps of Levenberg and Marquardt's while they help, those that fit best for each limb of each window."""
+        least = np.repeat(1 / np.square(LARGEST_STEPS), (self.shots.model.nq, self.shots.model.nv))
+        for _ in range(steps):
+            base, by_state = self._differences.by_states(self.values(x), self.states)
+            new = np.tile(self.states, (1 + len(DAMPINGS), 1, 1))
+            for c in self.limbs.numbers:
+                rows, r = self.limbs.states[c], self._weighed(self.measured - base, c)
+                J = by_state[c] / self._noise_of(c)
+                JT = np.swapaxes(J, 1, 2)
+                normal = JT @ J + np.diag(least[rows])
+                for k, damping in enumerate(DAMPINGS):
+                    damped = normal * (1 + damping * np.eye(len(rows)))
+                    new[1 + k][:, rows] += np.linalg.solve(damped, JT @ r)[..., 0]
+            if self._choose(x, new) < SETTLED:
+                break
 
-    def _improve_states(self, x: Array) -> None:
-        """Make a step of Levenberg and Marquardt's for each limb of each window, where it is for the better."""
-        base, by_state, _ = self._simulate(x, figures=False)
-        new, nq = self.states.copy(), self.shots.model.nq
-        damping = np.repeat(1 / np.square(LARGEST_STEPS), (nq, self.shots.model.nv))
-        for c in self.limbs:
-            J, rows = by_state[c], self.state_rows[c]
-            r = ((self.measured - base) / self.noise)[..., self.channels[c]].reshape(len(base), -1, 1)
-            JT = np.swapaxes(J, 1, 2)
-            new[:, rows] += np.linalg.solve(JT @ J + np.diag(damping[rows]), JT @ r)[..., 0]
-        after = self.shots((x * self.scale)[None], new[None], self.windows.first, self.windows.length)[0]
-        for c in self.limbs:
-            costs = [
-                (((z - self.measured) / self.noise)[..., self.channels[c]] ** 2).sum((1, 2)) for z in (base, after)
-            ]
-            better = np.flatnonzero(costs[1] < costs[0])
-            self.states[np.ix_(better, self.state_rows[c])] = new[np.ix_(better, self.state_rows[c])]
+    def _choose(self, x: Array, states: Array) -> float:
+        """Take from several states (K, W, nq + nv) those that fit best, for each limb of each window.
+
+        Returns:
+            How much better than the first they fit, relative to that.
+        """
+        values = np.tile(self.values(x), (len(states), 1))
+        read = self.shots(values, states, self.windows.first, self.windows.length)
+        windows, before, after = np.arange(len(self.states)), 0.0, 0.0
+        for c in self.limbs.numbers:
+            costs = (((read - self.measured) / self.noise)[..., self.limbs.channels[c]] ** 2).sum((2, 3))
+            rows = self.limbs.states[c]
+            self.states[:, rows] = states[costs.argmin(axis=0), windows][:, rows]
+            before, after = before + costs[0].sum(), after + costs.min(axis=0).sum()
+        return (before - after) / before if before > 0 else 0.0
 
     def _evaluate(self, x: Array) -> tuple[Array, Array]:
-        base, by_state, by_figure = self._simulate(x, figures=True)
+        base, by_state, by_figure = self._differences.by_all(self.values(x), self.states, self.free)
         blocks, P = [], len(x)
-        for c in self.limbs:
-            chosen = self.channels[c]
-            r = ((base - self.measured) / self.noise)[..., chosen].reshape(len(base), -1, 1)
-            mine = np.concatenate([self.own[c], self.common])
-            both = np.concatenate([by_figure[c], r], axis=2)
-            Q = np.linalg.qr(by_state[c])[0]
+        common = self.limbs.own(-1, self.free)
+        for c in self.limbs.numbers:
+            noise = self._noise_of(c)
+            both = np.concatenate([by_figure[c] / noise, self._weighed(base - self.measured, c)], axis=2)
+            Q = np.linalg.qr(by_state[c] / noise)[0]
             both = both - Q @ (np.swapaxes(Q, 1, 2) @ both)
-            self.residual[..., chosen] = both[..., -1].reshape(*base.shape[:2], -1)
+            self.residual[..., self.limbs.channels[c]] = both[..., -1].reshape(*base.shape[:2], -1)
             R: Array = np.linalg.qr(both.reshape(-1, both.shape[2]), mode="r")  # type: ignore[assignment]
             block = np.zeros((len(R), P + 1))
+            mine = np.searchsorted(self.free, np.concatenate([self.limbs.own(c, self.free), common]))
             block[:, mine], block[:, P] = R[:, :-1], R[:, -1]
             blocks.append(block)
         stacked = np.vstack(blocks)
         return stacked[:, P], stacked[:, :P]
 
-    def _simulate(self, x: Array, figures: bool) -> tuple[Array, dict[int, Array], dict[int, Array]]:
-        """Return readings (W, L, n), and their weighted derivatives by states and figures of each limb (W, rows, k)."""
-        n_states = max(len(rows) for rows in self.state_rows.values())
-        n_own = max(len(rows) for rows in self.own.values()) if figures else 0
-        n_common = len(self.common) if figures else 0
-        values = np.tile(x * self.scale, (1 + n_states + n_own + n_common, 1))
-        states = np.tile(self.states, (len(values), 1, 1))
-        nq, steps = self.shots.model.nq, np.repeat(STATE_STEPS, (self.shots.model.nq, self.shots.model.nv))
-        for c in self.limbs:
-            for k, row in enumerate(self.state_rows[c]):
-                states[1 + k, :, row] += steps[row]
-            for k, row in enumerate(self.own[c][:n_own]):
-                values[1 + n_states + k, row] += STEP * self.scale[row]
-        for k in range(n_common):
-            values[1 + n_states + n_own + k, self.common[k]] += STEP * self.scale[self.common[k]]
-        assert nq == self.shots.model.nv
-        read = self.shots(values, states, self.windows.first, self.windows.length)
-        by_state, by_figure = {}, {}
-        for c in self.limbs:
-            change = ((read[1:] - read[0]) / self.noise)[..., self.channels[c]]
-            change = np.moveaxis(change.reshape(len(change), len(self.states), -1), 0, -1)
-            rows = self.state_rows[c]
-            by_state[c] = change[..., : len(rows)] / steps[rows]
-            own = change[..., n_states : n_states + (len(self.own[c]) if figures else 0)]
-            by_figure[c] = np.concatenate([own, change[..., n_states + n_own :]], axis=2) / STEP
-        return read[0], by_state, by_figure
+    def _weighed(self, difference: Array, c: int) -> Array:
+        """Return a limb's differences over their noise, shape (W, L n, 1)."""
+        return (difference / self.noise)[..., self.limbs.channels[c]].reshape(len(difference), -1, 1)
+
+    def _noise_of(self, c: int) -> Array:
+        """Return the noise of a limb's measurements row by row, shape (L n, 1)."""
+        return np.tile(self.noise[self.limbs.channels[c]], self.windows.length + 1)[:, None]
 
 
-def solve(problem: Problem, x: Array, low: Array, high: Array) -> Any:
-    """Return the result of SciPy's `least_squares`, from x and between bounds, all over the figures' scales."""
-    from scipy.optimize import least_squares
-
-    return least_squares(
-        problem.residuals,
-        x,
-        problem.jacobian,  # type: ignore[arg-type]
-        (low, high),
-        method="trf",
-        x_scale="jac",
-        ftol=1e-7,
-        xtol=1e-6,
-        gtol=1e-9,
-    )
-
-
-def noise_of(problem: Problem) -> Array:
-    """Return the standard deviation of what is left of each measured quantity, in its unit."""
-    share = problem.freedom / problem.measured.size
-    return problem.noise * np.sqrt((problem.residual**2).mean(axis=(0, 1)) / share)
-
-
-def correlation_time(residual: Array) -> float:
-    """Return by how much correlation in time makes the variance of a mean larger: 1 + 2 sum of autocorrelations.
-
-    Over lags up to the first that white noise would have (Sokal 1997), at least 1.
+def solve(problem: Problem, x: Array, tolerance: float) -> Array:
+    """Return free figures over their scales that fit best, by SciPy's `least_squares` from x and between bounds.
 
     Args:
-        residual: Shape (W, L, n).
+        problem: What is fitted.
+        x: Where to begin.
+        tolerance: It ends where the sum of squares, relative to itself, changes less.
     """
-    total, power = 1.0, float((residual**2).sum())
-    if power == 0:
-        return total
-    for lag in range(1, residual.shape[1] // 2):
-        rho = float((residual[:, :-lag] * residual[:, lag:]).sum()) / power
-        if rho < 3 / np.sqrt(residual.size):
-            break
-        total += 2 * rho
-    return total
+    from scipy.optimize import least_squares
+
+    low, high = (np.array([getattr(f, side) for f in problem.shots.figures]) for side in ("low", "high"))
+    bounds = tuple((bound / problem.scale)[problem.free] for bound in (low, high))
+    options = {"method": "trf", "x_scale": "jac", "ftol": tolerance, "xtol": 1e-6, "gtol": 1e-9}
+    return least_squares(problem.residuals, np.clip(x, *bounds), problem.jacobian, bounds, **options).x  # type: ignore[arg-type]

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ce_gym.identify.estimate import Identified
+from ce_gym.identify.found import Identified
+from ce_gym.model.errors import RobotError
+from ce_gym.model.formats.reading import read_yaml
 from ce_gym.model.table import table_text
 
 
 def report(found: Identified) -> str:
     """Return a table of the figures with 95 % intervals, errors, and what the data cannot tell."""
     rows = [
-        (figure.name, f"{value:.5g}", f"{low:.5g} .. {high:.5g}", figure.unit)
+        (figure.name, f"{value:.5g}", "held" if figure.name in found.held else f"{low:.5g} .. {high:.5g}", figure.unit)
         for figure, value, (low, high) in zip(found.figures, found.values, found.intervals, strict=True)
     ]
     error, before = (1e3 * np.sqrt((e**2).mean()) for e in (found.held_out, found.held_out_before))
@@ -28,6 +30,25 @@ def report(found: Identified) -> str:
         f"{found.processor_time:.1f} s of processor time",
     ]
     return "\n".join(lines)
+
+
+def check_base(robot: str) -> None:
+    """Refuse a robot that no file can be laid over.
+
+    Args:
+        robot: Name of a robot of the package, or a path.
+
+    Raises:
+        RobotError: It is not described by a YAML file, or that has identified figures of its own.
+    """
+    path = Path(robot)
+    if not path.suffix and ":" not in robot:
+        return
+    if path.suffix not in (".yaml", ".yml"):
+        expected = "a robot of the package or a YAML file, such as one with `urdf: FILE` alone"
+        raise RobotError(f"identify: ROBOT {robot}: expected {expected}: what is found is laid over it")
+    if path.is_file() and "identified" in read_yaml(path):
+        raise RobotError(f"{robot}: identified: expected a robot file without: what is found is laid over one")
 
 
 def overlay(found: Identified, robot: str) -> str:
@@ -46,11 +67,16 @@ def overlay(found: Identified, robot: str) -> str:
     notes += list(found.cannot_tell)
     if notes:
         lines += ["notes:", *(f'  - "{note}"' for note in notes)]
-    kinds = dict.fromkeys(figure.kind for figure in found.figures if figure.kind != "delay")
+    written = [
+        (figure, value, std)
+        for figure, value, std in zip(found.figures, found.values, found.std, strict=True)
+        if figure.kind != "delay" and figure.name not in found.held
+    ]
+    kinds = dict.fromkeys(figure.kind for figure, _, _ in written)
     lines.append("identified:" if kinds else "identified: {}")
     for kind in kinds:
         lines.append(f"  {kind}:")
-        for figure, value, std in zip(found.figures, found.values, found.std, strict=True):
+        for figure, value, std in written:
             if figure.kind == kind:
                 lines.append(f'    "{figure.of}": {value:.8g}  # +- {std:.2g} {figure.unit}')
     return "\n".join(lines) + "\n"

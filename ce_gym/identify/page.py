@@ -7,7 +7,7 @@ import html
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.identify.estimate import Identified
+from ce_gym.identify.found import Identified
 from ce_gym.identify.overlay import report
 
 Array = NDArray[np.float64]

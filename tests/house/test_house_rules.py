@@ -45,7 +45,7 @@ LAYERS = {
     "export": "joint_ties mjcf_text mjcf_equalities mjcf mujoco_model mujoco_coordinates mujoco_batch mujoco_twin"
     " guesses new_robot",
     "viewer": "errors console meshes rollouts page raytrace video server feed window renderers live watch cli",
-    "identify": "log held figures shots fit separable estimate excite overlay page command",
+    "identify": "log held figures shots windows differences fit separable found estimate excite overlay page command",
     "bench": "measure peers soak digests fuzz speed throughput paper accuracy stability gpu exactness page __main__",
 }
 """What a folder consists of, bottom first: a module imports from its own layer and from those below."""

@@ -11,8 +11,8 @@ import pytest
 from ce_gym import Model, Robot, RobotError, Simulator, load_robot
 from ce_gym.__main__ import main
 from ce_gym.identify import Identified, Log, LogError, identify, overlay, page, read_log, report, simulate_log
-from ce_gym.identify.fit import correlation_time
 from ce_gym.identify.held import held
+from ce_gym.identify.separable import correlation_time
 
 pytest.importorskip("scipy")
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -66,16 +66,6 @@ def test_friction_and_mass_of_joints_without_motors():
     for figure, value, std in zip(found.figures, found.values, found.std, strict=True):
         assert abs(value - planted.get(figure.name, 0.0)) < 4 * std + 1e-4 * figure.scale, figure.name
         assert std < 0.1 * planted.get(figure.name, np.inf), figure.name
-
-
-def test_a_first_rotor_and_its_link_cannot_be_separated(leg: Robot, log: Log):
-    names = [f"link_inertia:HR_{n}_link" for n in ("hip", "knee")]
-    names += [f"rotor_inertia:HR_{n}_rotor" for n in ("hip", "knee")]
-    found = identify(leg, log, kinds=("rotor_inertia", "link_inertia", "motor_friction", "delay"), fixed=names)
-    assert len(found.cannot_tell) == 1
-    assert found.cannot_tell[0].startswith(
-        "the data cannot separate rotor_inertia:HR_abad_rotor from link_inertia:HR_abad_link: correlation -1.0"
-    )
 
 
 def test_what_is_written_loads_and_is_the_same_robot(found: Identified, tmp_path: Path):
@@ -165,6 +155,22 @@ def test_nothing_that_is_read_is_replaced(log: Log, tmp_path: Path, capsys: pyte
         assert main(["identify", *words]) == 2
         assert "would replace what is read" in capsys.readouterr().err
     assert (tmp_path / "leg.yaml").read_text().startswith("robot: mini_cheetah")
+
+
+def test_what_nothing_can_be_laid_over_is_refused_before_the_search(
+    log: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "over.yaml").write_text("robot: mini_cheetah\nidentified: {}\n")
+    (tmp_path / "leg.urdf").write_text("<robot/>")
+    file = str(log.save(tmp_path / "leg.csv"))
+    for robot, message in (
+        (str(tmp_path / "over.yaml"), "over.yaml: identified: expected a robot file without"),
+        (str(tmp_path / "leg.urdf"), "leg.urdf: expected a robot of the package or a YAML file"),
+        ("menagerie:unitree_go2", "menagerie:unitree_go2: expected a robot of the package or a YAML file"),
+    ):
+        assert main(["identify", robot, file]) == 2
+        assert message in (said := capsys.readouterr().err)
+        assert said.count("\n") == 1
 
 
 def test_factors_are_those_of_the_parameters_in_any_order(tmp_path: Path):
