@@ -18,7 +18,8 @@ from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
     "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "adaptive",
-    "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness", "growth", "all", "stale",
+    "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness", "growth", "servo",
+    "all", "stale",
 )  # fmt: skip
 
 
