@@ -7,13 +7,14 @@ from ce_gym.compile.arrays import aligned_copy, aligned_zeros, lane_count
 from ce_gym.compile.critical import CriticalSection
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.loading import load_kernel
-from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While, calls_of
+from ce_gym.compile.program import Buffer, Call, Grid, Lookup, Program, Repeat, Step, While, calls_of
 from ce_gym.compile.sources import source_fingerprint
 
 __all__ = [
     "Buffer",
     "Call",
     "CriticalSection",
+    "Grid",
     "Kernel",
     "Lookup",
     "Program",

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 if TYPE_CHECKING:
     import casadi
 
+Grid: TypeAlias = tuple[tuple[float, float], ...]
+"""Places relative to one that is known only at run time: x and y of each."""
 BufferKind = Literal["tiles", "rows_in", "rows_out", "scratch", "random", "table"]
 
 
@@ -74,10 +76,12 @@ class Lookup:
     Attributes:
         table: a `table` buffer. Entry (i, j) belongs to the place `x = x0 + i cell`, `y = y0 + j cell`.
         frame: buffer of size 3 with each lane's `x0`, `y0` and `cell`.
-        points: buffer of size 2 n: x and y of point after point.
+        points: buffer of size 2 n: x and y of point after point; with a grid of m points, of size 2 + 2 n / m: cosine
+            and sine of the angle by which it is turned, then x and y of every place where it is put.
         output: buffer of size 3 n, another one: value and its slopes along x and y, point after point; of size n, the
             values, without slopes.
         slopes: whether they are asked for; values alone take half the time.
+        grid: points to look at around every place, which takes less than to be told of each; values only.
     """
 
     table: str
@@ -85,6 +89,7 @@ class Lookup:
     points: str
     output: str
     slopes: bool = True
+    grid: Grid = ()
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -263,8 +268,11 @@ def _check_lookup(place: str, lookup: Lookup, buffers: dict[str, Buffer]) -> Non
         _check_lanes(f"{place}: {side}", name, buffers)
     if lookup.output in lookup.inputs:
         raise ValueError(f"{place}: output {lookup.output!r} is an input too, expected another buffer")
-    n, each = buffers[lookup.points].size // 2, 3 if lookup.slopes else 1
-    sizes = (("frame", lookup.frame, 3), ("points", lookup.points, 2 * n), ("output", lookup.output, each * n))
+    if lookup.grid and lookup.slopes:
+        raise ValueError(f"{place}: slopes of a grid, expected values alone")
+    n, each = buffers[lookup.points].size // 2, len(lookup.grid) or (3 if lookup.slopes else 1)
+    n_found = each * (n - bool(lookup.grid))
+    sizes = (("frame", lookup.frame, 3), ("points", lookup.points, 2 * n), ("output", lookup.output, n_found))
     for side, name, size in sizes:
         if buffers[name].size != size:
             raise ValueError(f"{place}: {side} buffer {name!r} has size {buffers[name].size}, expected {size}")

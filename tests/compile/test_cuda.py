@@ -54,6 +54,23 @@ def test_look_up(dtype, slopes, needs_host_compiler):
     assert np.isfinite(cuda["found"][1:]).all()
 
 
+@DTYPES
+def test_look_up_of_a_grid(dtype, needs_host_compiler):
+    grid = ((-0.5, 0.25), (0.0, 0.0), (0.3, 0.7))
+    buffers = (Buffer("t", 0, "table"), Buffer("f", 3, "rows_in"), Buffer("p", 6, "rows_in"))
+    lookup = Lookup("t", "f", "p", "found", slopes=False, grid=grid)
+    program = Program("cuda grid", (*buffers, Buffer("found", 6, "rows_out")), (lookup,))
+    rng = np.random.default_rng(1)
+    pose = rng.uniform(-3, 9, (N, 6))
+    pose[:, 0], pose[:, 1] = np.cos(pose[:, 0]), np.sin(pose[:, 0])
+    pose[BLOCK:, 2:] = rng.uniform(3, 4, (N - BLOCK, 4))  # a tile of the CPU's of which nobody is near the border
+    pose[0, :4] = [np.nan, 1.0, np.inf, 2.0]
+    rows = {"t": rng.normal(size=(12, 14)), "f": np.tile([0.5, -0.5, 0.75], (N, 1)), "p": pose}
+    llvm, cuda = run_both(program, {name: row.astype(dtype) for name, row in rows.items()}, dtype)
+    np.testing.assert_array_equal(cuda["found"], llvm["found"])
+    assert np.isfinite(cuda["found"][1:]).all()
+
+
 def stepping():
     """Counts down where it has not reached zero, by calls that are made only there, as often as it is told."""
     x, more, noise = ca.SX.sym("x"), ca.SX.sym("more"), ca.SX.sym("noise", 2)

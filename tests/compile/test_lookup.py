@@ -163,6 +163,12 @@ WRONG = {
     "points buffer 'a' has size 3, expected 2": Program("p", (TABLE, A, B), (Lookup("t", "a", "a", "b"),)),
     "frame buffer 'b' has size 4, expected 3": Program("p", (TABLE, A, B, C), (Lookup("t", "b", "b", "c"),)),
     "output buffer 'd' has size 2, expected 6": Program("p", (TABLE, A, B, D), (Lookup("t", "a", "b", "d"),)),
+    "slopes of a grid, expected values alone": Program(
+        "p", (TABLE, A, B, C), (Lookup("t", "a", "b", "c", grid=((0.0, 0.0),)),)
+    ),
+    "output buffer 'c' has size 6, expected 2": Program(
+        "p", (TABLE, A, B, C), (Lookup("t", "a", "b", "c", slopes=False, grid=((0.0, 0.0), (1.0, 0.0))),)
+    ),
     "output 'a' is an input too": Program("p", (TABLE, A, B), (Lookup("t", "a", "b", "a"),)),
     "reads 'd', expected an earlier call": Program(
         "p", (TABLE, A, D, Buffer("e", 3, "tiles")), (Lookup("t", "a", "d", "e"),)
@@ -196,3 +202,59 @@ def test_values_alone_are_the_same(kernel):
     known = np.isfinite(expected)
     assert known.sum() == 3 * n - 2
     np.testing.assert_allclose(found.ravel()[known], expected[known], rtol=0, atol=TOLERANCE[kernel.dtype] * 1e3)
+
+
+GRID = tuple((float(x), float(y)) for x in (-0.75, 0.1, 0.5) for y in np.linspace(-0.5, 0.625, 7))
+
+
+def grid_program():
+    buffers = (Buffer("table", 0, "table"), Buffer("frame", 3, "rows_in"), Buffer("pose", 6, "rows_in"))
+    found = Buffer("found", 2 * len(GRID), "rows_out")
+    return Program("grid", (*buffers, found), (Lookup("table", "frame", "pose", "found", slopes=False, grid=GRID),))
+
+
+@pytest.fixture(scope="module")
+def grid_kernel(kernel):
+    return load_kernel("grid", grid_program, kernel.dtype)
+
+
+def look_around(kernel, table, pose, frame=(-1.3, 0.4, 0.25)):
+    """Values, shape (n, 2, points), of grids turned by an angle and put at two places, pose of shape (n, 5)."""
+    turned = np.column_stack([np.cos(pose[:, 0]), np.sin(pose[:, 0]), pose[:, 1:]])
+    found = np.full((len(pose), 2 * len(GRID)), np.nan, kernel.dtype)
+    arrays = {"table": np.ascontiguousarray(table, kernel.dtype), "pose": turned.astype(kernel.dtype), "found": found}
+    arrays["frame"] = np.ascontiguousarray(np.broadcast_to(frame, (len(pose), 3)), kernel.dtype)
+    kernel(arrays, len(pose))
+    return found.reshape(len(pose), 2, -1)
+
+
+def test_grids_are_turned_and_put_in_place(kernel, grid_kernel):
+    """In the middle of the table, across its border and beyond, point by point from the definition of the surface."""
+    table = np.random.default_rng(7).normal(0, 0.3, (14, 15))
+    pose = np.array([[0.7, 0.4, 2.1, 0.2, 2.0], [-2.0, -1.2, 3.6, 1.0, 0.5], [3.0, 5.0, 2.0, 0.4, -2.0]])
+    found = look_around(grid_kernel, table, pose)
+    for (angle, *places), heights in zip(pose, found, strict=True):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        for place, values in zip(np.reshape(places, (2, 2)), heights, strict=True):
+            at = (place + np.array(GRID) @ turn.T - [-1.3, 0.4]) / 0.25
+            expected = [surface(table, x, y) for x, y in at]
+            scale = 1 + np.abs(at).max() ** 2
+            np.testing.assert_allclose(values, expected, rtol=0, atol=scale * TOLERANCE[kernel.dtype])
+
+
+def test_grids_do_not_depend_on_who_is_near_the_border(grid_kernel):
+    """A tile looks the short way only if all its lanes are far from the border; no bit shows which way it was."""
+    table, n = np.random.default_rng(8).normal(0, 0.3, (40, 40)), 40
+    rng = np.random.default_rng(9)
+    middle = np.column_stack([rng.uniform(-3, 3, n), rng.uniform((2, 4, 2, 4), (5, 7, 5, 7), (n, 4))])
+    alone, mixed = look_around(grid_kernel, table, middle), middle.copy()
+    mixed[::5, 1:3], mixed[1, 0], mixed[11, 1], mixed[3, 4] = [-1.2, 9.0], np.nan, np.nan, np.inf
+    kept = (mixed == middle).all(axis=1)
+    assert 20 < kept.sum() < 35
+    np.testing.assert_array_equal(look_around(grid_kernel, table, mixed)[kept], alone[kept])
+
+
+def test_a_level_table_is_met_without_rounding(grid_kernel):
+    """Weights of a point add up to 1 in whatever precision."""
+    pose = np.random.default_rng(10).uniform(-5, 12, (20, 5))
+    assert (look_around(grid_kernel, np.full((30, 30), 0.1), pose) == np.array(0.1, grid_kernel.dtype)).all()

@@ -45,6 +45,12 @@ def points(q: np.ndarray, size=(0.8, 0.4), spacing=0.2, centre=(0.1, 0.0)) -> np
     return q[:, None, :2] + turned
 
 
+def looked_at(pose: np.ndarray, grid) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a grid as a `Lookup` turns it, shape (m, 2), and places where it puts it, shape (n, 2)."""
+    (c, s), places = pose[:2], pose[2:].reshape(-1, 2)
+    return np.array(grid) @ [[c, s], [-s, c]], places
+
+
 def test_readings_are_those_of_brute_force(envs):
     """The critic's exact; the policy's late, shifted, drifted and with gaps; through resets."""
     program = envs.batch.program
@@ -85,7 +91,8 @@ def test_around_feet_it_is_about_their_lowest_points():
     call = program.stages.places(begins=False)
     q = program.model.standing_q + 0.0
     q[:7] = [3.0, 4.0, 0.5, np.cos(0.4), 0.0, 0.0, np.sin(0.4)]
-    at = np.array(call.function(q)).reshape(-1, 3, 2)
+    turned, places = looked_at(np.array(call.function(q)).ravel(), program.probe.grids[key])
+    at = places[:, None] + turned
     spheres = [i for i, sphere in enumerate(robot.contacts) if sphere.group == "foot"]
     feet = program.model.contact_points(q, np.zeros(program.model.nv))[0][spheres]
     ahead = 0.1 * np.array([np.cos(0.8), np.sin(0.8)])

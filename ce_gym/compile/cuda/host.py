@@ -24,6 +24,7 @@ SHIM = """#include <cmath>
 #include <cstring>
 using namespace std;
 #define __device__
+#define __constant__ static
 #define __global__
 #define __forceinline__ inline
 #define __noinline__

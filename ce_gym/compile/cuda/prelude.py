@@ -108,26 +108,33 @@ __device__ __forceinline__ Along with_slopes(real u, int count)
     return a;
 }
 
-__device__ __forceinline__ Along with_weights(real u, int count)
+// The same of ce_gym/compile/lowering/lookup_values.py: the nearest entry, weights of its two neighbours.
+struct Near {
+    int entry;
+    real before, after;
+};
+
+__device__ __forceinline__ Near near(real u, int count)
 {
-    const real half = real(0.5);
-    real t, beyond;
-    Along a = along(u, count, t, beyond);
-    const real low = t - half, high = t + half;
-    a.weight[0] = low * fma(half, low, beyond);
-    a.weight[1] = fma(-t, fma(real(2.0), beyond, t), real(0.75));
-    a.weight[2] = high * fma(half, high, beyond);
-    return a;
+    const real number = real(count), half = real(0.5), one = real(1.0);
+    real inside = u > half ? u : half;
+    const real upper = number - real(1.5), last = number - real(2.0);
+    inside = inside < upper ? inside : upper;
+    real nearest = rint(inside);
+    nearest = nearest < last ? nearest : last;
+    nearest = nearest > one ? nearest : one;
+    const real t = inside - nearest, beyond = u - inside, low = t - half, high = t + half;
+    return {int(nearest), low * fma(half, low, beyond), high * fma(half, high, beyond)};
+}
+
+__device__ __forceinline__ real mean(Near n, real before, real middle, real after)
+{
+    return fma(n.after, after - middle, fma(n.before, before - middle, middle));
 }
 
 __device__ __forceinline__ real weighed(const real* w, const real* x)
 {
     return w[0] * x[0] + w[1] * x[1] + w[2] * x[2];
-}
-
-__device__ __forceinline__ real weighed_fused(const real* w, const real* x)
-{
-    return fma(w[2], x[2], fma(w[1], x[1], w[0] * x[0]));
 }
 
 template <int POINTS> __device__ void look_up(
@@ -151,21 +158,39 @@ template <int POINTS> __device__ void look_up(
     }
 }
 
+__device__ __forceinline__ real value_at(const real* table, int rows, int columns, real u, real w)
+{
+    const Near r = near(u, rows), c = near(w, columns);
+    const real* at = table + (long long)r.entry * columns + c.entry;
+    real found[3];
+    for (int j = 0; j < 3; ++j) found[j] = mean(r, at[j - 1 - columns], at[j - 1], at[j - 1 + columns]);
+    return mean(c, found[0], found[1], found[2]);
+}
+
 template <int POINTS> __device__ void look_up_values(
     const real* table, int rows, int columns, const real* frame, const real* points, real* found)
 {
     const real per_cell = real(1.0) / frame[2];
 #pragma unroll 1
     for (int p = 0; p < POINTS; ++p) {
-        const Along r = with_weights((points[2 * p] - frame[0]) * per_cell, rows);
-        const Along c = with_weights((points[2 * p + 1] - frame[1]) * per_cell, columns);
-        const real* start = table + (long long)r.first * columns + c.first;
-        real sum[3];
-        for (int j = 0; j < 3; ++j) {
-            const real entries[3] = {start[j], start[columns + j], start[2 * columns + j]};
-            sum[j] = weighed_fused(r.weight, entries);
+        const real u = (points[2 * p] - frame[0]) * per_cell, w = (points[2 * p + 1] - frame[1]) * per_cell;
+        found[p] = value_at(table, rows, columns, u, w);
+    }
+}
+
+// ce_gym/compile/lowering/lookup_grid.py; `pose` has the cosine and sine of the grid's angle, then where it is put.
+template <int PLACES, int POINTS> __device__ void look_up_grid(
+    const real* table, int rows, int columns, const real* grid, const real* frame, const real* pose, real* found)
+{
+    const real per_cell = real(1.0) / frame[2], c = pose[0] * per_cell, s = pose[1] * per_cell;
+    for (int i = 0; i < PLACES; ++i) {
+        const real* at = pose + 2 + 2 * i;
+        const real u = (at[0] - frame[0]) * per_cell, w = (at[1] - frame[1]) * per_cell;
+#pragma unroll 1
+        for (int p = 0; p < POINTS; ++p) {
+            const real x = grid[2 * p], y = grid[2 * p + 1];
+            found[POINTS * i + p] = value_at(table, rows, columns, fma(x, c, fma(y, -s, u)), fma(x, s, fma(y, c, w)));
         }
-        found[p] = weighed_fused(c.weight, sum);
     }
 }
 """

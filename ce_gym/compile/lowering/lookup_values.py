@@ -3,79 +3,132 @@
     place   where the nine entries of a point are, and their weights, in all lanes at once
     sum     lane by lane the three lines of entries, weighed and added, a line being one vector; then all lanes at once
 
-In between they are in memory, from which one instruction loads a lane's weight into all of a vector. Values may differ
-from those of `emit_lookup` in their last bits.
+In between they are in memory, from which one instruction loads a lane's weight into all of a vector. Weights add up to
+1, so that of three entries two weights are enough, those of the differences from the middle one. Values may differ from
+those of `emit_lookup` in their last bits. Where no point is near the border, what only that needs is left out: the same
+bits.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 from llvmlite import ir
 
 from ce_gym.compile.arrays import ALIGNMENT
-from ce_gym.compile.lowering.lookup import INT, Table, addresses, in_cells, nearest_entry
+from ce_gym.compile.lowering.lookup import INDEX, INT, Table, in_cells
 from ce_gym.compile.lowering.vector import Value, VectorBuilder, loop
 
 CHUNK = 16
 """Points at a time: few enough for what is kept of them to stay in the fastest memory."""
+Cells = Callable[[Value], list[Value]]
+"""Emits the x and y of a point by its number, in cells from the first entry."""
 
 
 def emit_value_lookup(
     v: VectorBuilder, table: Table, frame: Value, points: Value, output: Value, n_points: int
 ) -> None:
     """Emit the look-up of values, one vector for each point; arguments as of `emit_lookup`."""
-    b, cells = v.builder, in_cells(v, frame)
-    starts, weights = _room(v, ir.VectorType(INT, v.lanes), 1), _room(v, v.float_type, 6)
+    cells = in_cells(v, frame)
+    room = Room.of(v)
+    emit_values(v, table, room, lambda i: cells(v.builder.gep(points, [v.builder.mul(i, INT(2))])), output, n_points)
+
+
+@dataclass(frozen=True)
+class Room:
+    """Memory for the points of a chunk: the place of the middle one of the nine entries, and four weights."""
+
+    starts: Value
+    weights: Value
+
+    @classmethod
+    def of(cls, v: VectorBuilder) -> Room:
+        """Take it once in the whole function."""
+        with v.builder.goto_entry_block():
+            starts = v.builder.alloca(ir.VectorType(INDEX, v.lanes), INT(CHUNK))
+            weights = v.builder.alloca(v.float_type, INT(4 * CHUNK))
+        starts.align = weights.align = ALIGNMENT
+        return cls(starts, weights)
+
+
+def emit_values(
+    v: VectorBuilder, table: Table, room: Room, cells: Cells, output: Value, n_points: int, *, inside: bool = False
+) -> None:
+    """Emit both loops.
+
+    Args:
+        v: builder of the block to append to.
+        table: as of `emit_lookup`.
+        room: for a chunk.
+        cells: where the points are.
+        output: pointer to a vector for each point.
+        n_points: how many there are.
+        inside: whether all are farther from the border than half a cell.
+    """
+    b, place = v.builder, _inner if inside else _anywhere
     with loop(b, INT(-(-n_points // CHUNK)), "chunk") as chunk:
         first = b.mul(chunk, INT(CHUNK))
         left = b.sub(INT(n_points), first)
         count = b.select(b.icmp_signed("<", left, INT(CHUNK)), left, INT(CHUNK))
         with loop(b, count, "place") as i:
-            x, y = cells(b.gep(points, [b.mul(b.add(first, i), INT(2))]))
-            (row, across), (column, along) = _weights(v, x, table.rows), _weights(v, y, table.columns)
-            b.store(addresses(v, table, row, column), b.gep(starts, [i]), align=ALIGNMENT)
+            x, y = cells(b.add(first, i))
+            (row, across), (column, along) = place(v, x, table.rows), place(v, y, table.columns)
+            start = b.add(b.mul(row, v.splat(b.trunc(table.columns, INDEX))), column)
+            b.store(start, b.gep(room.starts, [i]), align=ALIGNMENT // (v.bits // 32))
             for k, weight in enumerate((*across, *along)):
-                v.store(weight, b.gep(weights, [b.mul(i, INT(6))]), k)
+                v.store(weight, b.gep(room.weights, [b.mul(i, INT(4))]), k)
         with loop(b, count, "sum") as i:
-            own = b.gep(weights, [b.mul(i, INT(6))])
-            columns = _columns(v, table, b.gep(starts, [i]), own)
-            along = [v.load(own, 3 + k) for k in range(3)]
-            v.store(_sum(v, along, columns), b.gep(output, [b.add(first, i)]), 0)
+            own = b.gep(room.weights, [b.mul(i, INT(4))])
+            columns = _columns(v, table, b.gep(room.starts, [i]), own)
+            v.store(_mean(v, columns, v.load(own, 2), v.load(own, 3)), b.gep(output, [b.add(first, i)]), 0)
 
 
-def _room(v: VectorBuilder, kind: ir.Type, count: int) -> Value:
-    """Memory for so many vectors of each point of a chunk, taken once in the whole function."""
-    with v.builder.goto_entry_block():
-        room = v.builder.alloca(kind, INT(count * CHUNK))
-    room.align = ALIGNMENT
-    return room
+def _inner(v: VectorBuilder, u: Value, count: Value) -> tuple[Value, tuple[Value, Value]]:
+    """Nearest entry to a coordinate, and the weights of the one before it and of the next one."""
+    nearest = v.intrinsic("rint", u)
+    t, half = v.sub(u, nearest), v.const(0.5)
+    low, high = v.sub(t, half), v.add(t, half)
+    return _index(v, nearest), (v.mul(low, v.mul(half, low)), v.mul(high, v.mul(half, high)))
 
 
-def _weights(v: VectorBuilder, u: Value, count: Value) -> tuple[Value, tuple[Value, ...]]:
-    """First of the three entries that take part at a coordinate in cells, and their weights."""
-    half = v.const(0.5)
-    first, t, beyond = nearest_entry(v, u, count)
-    low, high, twice = v.sub(t, half), v.add(t, half), v.fma(v.const(2.0), beyond, t)
-    outer = [v.mul(slope, v.fma(half, slope, beyond)) for slope in (low, high)]
-    return first, (outer[0], v.fma(v.neg(t), twice, v.const(0.75)), outer[1])
+def _anywhere(v: VectorBuilder, u: Value, count: Value) -> tuple[Value, tuple[Value, Value]]:
+    """The same for any coordinate, straight on beyond the border; what is no number has weights that are none."""
+    one, half = v.const(1.0), v.const(0.5)
+    number = v.splat(v.builder.sitofp(count, v.float_type.element))
+    # Both comparisons are false for a NaN, which so becomes a number before it becomes an index.
+    inside, upper = v.select(v.compare(">", u, half), u, half), v.sub(number, v.const(1.5))
+    inside = v.select(v.compare("<", inside, upper), inside, upper)
+    nearest, last = v.intrinsic("rint", inside), v.sub(number, v.const(2.0))
+    nearest = v.select(v.compare("<", nearest, last), nearest, last)
+    nearest = v.select(v.compare(">", nearest, one), nearest, one)
+    t, beyond = v.sub(inside, nearest), v.sub(u, inside)
+    low, high = v.sub(t, half), v.add(t, half)
+    before, after = (v.mul(slope, v.fma(half, slope, beyond)) for slope in (low, high))
+    return _index(v, nearest), (before, after)
+
+
+def _index(v: VectorBuilder, number: Value) -> Value:
+    return v.builder.fptosi(number, ir.VectorType(INDEX, v.lanes))
 
 
 def _columns(v: VectorBuilder, table: Table, starts: Value, weights: Value) -> list[Value]:
-    """Each lane's three columns of entries, the entries of a column weighed and added."""
+    """Means of each lane's three columns of entries."""
     b, scalar = v.builder, v.float_type.element
     pitch = b.mul(table.columns, INT(v.bits // 8))
-    starts, weights = (b.bitcast(at, kind.as_pointer()) for at, kind in ((starts, INT), (weights, scalar)))
-    sums = []
+    corner = b.sub(table.address, b.add(pitch, INT(v.bits // 8)))  # of the nine, if the middle one is the table's first
+    starts, weights = (b.bitcast(at, kind.as_pointer()) for at, kind in ((starts, INDEX), (weights, scalar)))
+    means = []
     for lane in range(v.lanes):
-        address = b.load(b.gep(starts, [INT(lane)]))
-        lines, shares = [], []
-        for k in range(3):
-            lines.append(v.load_three(address, more=k < 2))  # what follows the third line may not be the table's
-            shares.append(v.splat(b.load(b.gep(weights, [INT(k * v.lanes + lane)])), 4))
-            address = b.add(address, pitch)
-        sums.append(_sum(v, shares, lines))
-    return v.spread(sums)
+        offset = b.mul(b.sext(b.load(b.gep(starts, [INT(lane)])), INT), INT(v.bits // 8))
+        addresses = [b.add(b.add(corner, b.mul(pitch, INT(k))), offset) for k in range(3)]
+        lines = [v.load_three(addresses[k], more=k < 2) for k in range(3)]  # what follows the third may not be there
+        before, after = (v.splat(b.load(b.gep(weights, [INT(k * v.lanes + lane)])), 4) for k in range(2))
+        means.append(_mean(v, lines, before, after))
+    return v.spread(means)
 
 
-def _sum(v: VectorBuilder, weights: list[Value], values: list[Value]) -> Value:
-    """Weighted sum of three, each product but the first added without rounding it."""
-    return v.fma(weights[2], values[2], v.fma(weights[1], values[1], v.mul(weights[0], values[0])))
+def _mean(v: VectorBuilder, three: list[Value], before: Value, after: Value) -> Value:
+    """Weighted mean of three."""
+    first, middle, last = three
+    return v.fma(after, v.sub(last, middle), v.fma(before, v.sub(first, middle), middle))

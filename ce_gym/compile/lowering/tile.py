@@ -12,6 +12,7 @@ from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.layout import Layout
 from ce_gym.compile.lowering.function import lower_function
 from ce_gym.compile.lowering.lookup import Table, emit_lookup
+from ce_gym.compile.lowering.lookup_grid import emit_grid_lookup
 from ce_gym.compile.lowering.lookup_values import emit_value_lookup
 from ce_gym.compile.lowering.random import emit_uniform
 from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
@@ -19,8 +20,8 @@ from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, 
 
 INT = ir.IntType(64)
 FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
-MANY = 512
-"""Values per environment from which on rows are written block by block: so many exceed a level-1 cache."""
+MANY = 64
+"""Values per environment from which on rows are written block by block."""
 
 
 def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...], parts: int = 1) -> None:
@@ -204,6 +205,9 @@ class _TileWork:
         table = Table(self._array(buffers[lookup.table]), self._address(rows), self._address(rows + 1))
         frame, points, output = self.lanes[lookup.frame], self.lanes[lookup.points], self.lanes[lookup.output]
         n_points = buffers[lookup.points].size // 2
+        if lookup.grid:
+            emit_grid_lookup(self.vectors, table, frame, points, output, n_points - 1, lookup.grid)
+            return
         emit = emit_lookup if lookup.slopes else emit_value_lookup
         emit(self.vectors, table, frame, points, output, n_points)
 

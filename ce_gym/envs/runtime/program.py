@@ -263,9 +263,9 @@ class TaskProgram:
         if not (looked := self.probe.looked):
             return look, buffers
         places = self.stages.places(begins)
-        for name, at in zip(looked, places.outputs, strict=True):
-            look = (*look, Lookup(HEIGHTS, FRAME, at, name, slopes=False))
-            buffers += [Buffer(at, 2 * looked[name], "scratch"), Buffer(name, looked[name], "scratch")]
+        for i, (name, at) in enumerate(zip(looked, places.outputs, strict=True)):
+            look = (*look, Lookup(HEIGHTS, FRAME, at, name, slopes=False, grid=self.probe.grids[name]))
+            buffers += [Buffer(at, places.function.numel_out(i), "scratch"), Buffer(name, looked[name], "scratch")]
         return (places, *look), buffers
 
     def function(self, name: Literal["act", "assess", "begin"]) -> ca.Function:

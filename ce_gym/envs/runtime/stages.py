@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from ce_gym.compile import Call
+from ce_gym.compile import Call, Grid
 from ce_gym.dynamics.algebra.integration import turned_by
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
@@ -44,12 +44,14 @@ class Probe:
         sizes: Length of each observation block, by name; the policy's first.
         memories: Rows of what terms remember, and of errors of sensors that stay for an episode.
         looked: How many heights of the ground terms look up, by name of what is found.
+        grids: What they look at around every place, likewise.
         added: A text that changes with terms that users have added, for cache keys.
     """
 
     sizes: dict[str, int]
     memories: tuple[Row, ...]
     looked: Mapping[str, int]
+    grids: Mapping[str, Grid]
     added: str
 
 
@@ -88,9 +90,9 @@ class Stages:
         inputs = self.state | self.seen_ground | s.remembered | s.drifts | s.heights | {"draws": sampler.symbols}
         rows = tuple(Row(name, x.numel(), "term", s.resets[name]) for name, x in s.remembered.items())
         rows += tuple(Row(name, x.numel(), "drift") for name, x in s.drifts.items())
-        text = f"{traced('added', inputs, values).serialize()} {rows!r}" if added else ""
-        looked = {name: places.shape[1] for name, places in s.places.items()}
-        return Probe({name: block.numel() for name, block in blocks.items()}, rows, looked, text)
+        text = f"{traced('added', inputs, values).serialize()} {rows!r} {s.grids!r}" if added else ""
+        looked = {name: heights.numel() for name, heights in s.heights.items()}
+        return Probe({name: block.numel() for name, block in blocks.items()}, rows, looked, s.grids, text)
 
     def places(self, begins: bool) -> Call:
         """Trace where terms look at the ground, after the sub-steps or where a robot `begins`; return the call.
@@ -101,7 +103,7 @@ class Stages:
         state = self.state | {"clock": SX(0) if begins else self.state["clock"] + 1}
         s = self._context(state | self.seen_ground | {"previous_action": state["action"]})
         self._blocks(s, Sampler())
-        places = {f"{name}_places": ca.vec(at) for name, at in s.places.items()}
+        places = {f"{name}_places": at for name, at in s.places.items()}
         known = {x.name() for x in ca.symvar(ca.vertcat(*[ca.vec(x) for x in self.state.values()]))}
         for name, at in places.items():
             if unknown := {x.name() for x in ca.symvar(at)} - known:

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ce_gym.compile import Grid
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX, quaternion_product
 from ce_gym.dynamics.forces.ground import above as over_ground
@@ -47,7 +48,8 @@ class TermContext:
         remembered: What terms have recalled, by name of the state.
         resets: With what that begins, a number or shape (size,).
         kept: What terms have kept, likewise.
-        places: Where terms look at the ground of a field, x and y [m], shape (2, n), by name of what they find.
+        places: Where terms look at the ground of a field, as a `Lookup` has it, by name of what they find.
+        grids: Points that they look at around every place, if it is more than the place, likewise.
         heights: What they find there [m], shape (n,), likewise.
         unit: Draws a number in [0, 1) while sensors err; None where terms are exact, as rewards and critics have them.
         drifts: Errors that stay for an episode, by name of the state.
@@ -70,6 +72,7 @@ class TermContext:
         self.resets: dict[str, ArrayLike] = {}
         self.kept: dict[str, SX] = {}
         self.places: dict[str, SX] = {}
+        self.grids: dict[str, Grid] = {}
         self.heights: dict[str, SX] = {}
         self.unit: Callable[[], SX] | None = None
         self.drifts: dict[str, SX] = {}
@@ -133,11 +136,26 @@ class TermContext:
             name: Of what is found, a word.
             places: x and y of each [m], shape (2, n); of positions, and of what the term recalls and drifts by.
         """
+        return self._looked_up(name, ca.vec(places), places.shape[1])
+
+    def ground_around(self, name: str, heading: SX, places: SX, grid: ArrayLike) -> SX:
+        """Return heights of the ground around places [m], shape (n m,), place by place, for less than `ground_under`.
+
+        Args:
+            name: Of what is found, a word.
+            heading: Cosine and sine of the angle by which the grid is turned, shape (2,).
+            places: Where it is put, x and y of each [m], shape (2, n); both as for `ground_under`.
+            grid: x and y of its points [m], shape (2, m).
+        """
+        points = tuple((float(x), float(y)) for x, y in np.asarray(grid).T)
+        return self._looked_up(name, ca.vertcat(heading, ca.vec(places)), places.shape[1] * len(points), points)
+
+    def _looked_up(self, name: str, places: SX, size: int, grid: Grid = ()) -> SX:
         if not self._ground.numel():
-            return SX(ca.DM.zeros(places.shape[1]))
+            return SX(ca.DM.zeros(size))
         key = self._key(name)
-        self.places[key] = places
-        return self.heights.setdefault(key, self._values.get(key, SX.sym(key, places.shape[1])))
+        self.places[key], self.grids[key] = places, grid
+        return self.heights.setdefault(key, self._values.get(key, SX.sym(key, size)))
 
     def drift(self, name: str, size: int = 1) -> SX:
         """Return errors of a sensor that stay for an episode, in [-1, 1), shape (size,); 0 where terms are exact."""

@@ -55,10 +55,9 @@ def height_scan(
     check("delay", delay, isinstance(delay, int) and 0 <= delay <= 100, "a whole number from 0 to 100")
     seen = _late(s, _seen_from(s, around), delay)
     heading, centres = seen[:2], ca.reshape(seen[2:], 3, -1)
-    turned = ca.horzcat(heading, ca.vertcat(-heading[1], heading[0])) @ ca.DM(grid)
-    away = shift * s.drift("shift", 2) if shift else SX(2, 1)
-    at = [turned + ca.repmat(centres[:2, i] + away, 1, grid.shape[1]) for i in range(centres.shape[1])]
-    above = ca.vec(ca.repmat(centres[2, :], grid.shape[1], 1)) - s.ground_under("heights", ca.horzcat(*at))
+    away = ca.repmat(shift * s.drift("shift", 2) if shift else SX(2, 1), 1, centres.shape[1])
+    ground = s.ground_around("heights", heading, centres[:2, :] + away, grid)
+    above = ca.vec(ca.repmat(centres[2, :], grid.shape[1], 1)) - ground
     reading = ca.fmax(-clip, ca.fmin(clip, above + (drift * s.drift("offset") if drift else 0)))
     if dropout:
         reading = ca.if_else(s.chance(reading.numel()) < dropout, 0, reading)
