@@ -10,6 +10,7 @@ from ce_gym.dynamics import Model
 from ce_gym.envs.custom import missing
 from ce_gym.model import load_robot
 from ce_gym.model.constraints import RodConstraint
+from ce_gym.sim import Simulator
 
 SPRINGS = ("left_shin", "left_heel_spring", "right_shin", "right_heel_spring")
 
@@ -40,6 +41,20 @@ def test_springs_are_passive(robot):
     assert robot.passive == SPRINGS
     assert len(robot.driven) == len(robot.motors) == 10
     assert {robot.body(name).joint.stiffness for name in SPRINGS} == {1500.0, 1250.0}
+
+
+def test_it_stands_without_a_policy(robot):
+    """Ten seconds at the targets of its pose, from there and from up to 0.03 rad beside it, at every motor."""
+    model = Model(robot)
+    sim = Simulator(model, 8, outputs=())
+    target, rng = model.standing_q[7:], np.random.default_rng(0)
+    q = np.tile(model.standing_q, (8, 1))
+    q[1:, [7 + model.joint_links.index(name) for name in robot.driven]] += rng.uniform(-0.03, 0.03, (7, 10))
+    sim.set_state(q, np.zeros((8, model.nv)))
+    sim.step(target, 2000)
+    assert sim.q[:, 2].min() > 0.98 * model.standing_q[2] - 0.02
+    assert np.abs(sim.q[:, 4:6]).max() < np.radians(7) / 2  # upright: it leans 3 degrees forward
+    assert np.abs(sim.v).max() < 0.1
 
 
 @pytest.mark.parametrize("level", LEVELS)
