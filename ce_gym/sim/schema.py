@@ -70,7 +70,8 @@ def physics_rows(
     sizes = state_sizes(model.mechanism, options)
     rows = [Row(name, size, "physics", start.get(name, 0.0)) for name, size in sizes.items()]
     rows += [Row("diverged", 1, "physics"), Row("retries", 1, "physics")]
-    lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts, "motor_speed": motors}
+    lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts}
+    lengths |= {"motor_torque": motors, "motor_speed": motors}
     rows += [Row(name, size, "physics") for name in outputs if (size := lengths.get(name, 1))]
     if options.parameters:
         defaults = parameter_defaults(model.robot, options.material, options.parameters)

@@ -59,8 +59,8 @@ class Simulator:
             joint torques [N m]; "motor_position" and "motor_torque" for the same of the motors' rotors.
         contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
         material: Compliance and friction of the contacts; the robot's own if None.
-        outputs: Which of "torque", "motor_speed", "power", "contact_forces", "energy", "error", "loop_gap" and
-            "nearness" to compute; those left out cost nothing and read as errors.
+        outputs: Which of "torque", "motor_torque", "motor_speed", "power", "contact_forces", "energy", "error",
+            "loop_gap" and "nearness" to compute; those left out cost nothing and read as errors.
         method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
             scenes); or "adaptive": every robot advances by `dt` in extrapolated steps of its own, which are as long as
             `tolerance` allows.
@@ -307,6 +307,10 @@ class Simulator:
     q = _reading("q", "Positions, a copy, shape (num_envs, nq).")
     v = _reading("v", "Velocities, a copy, shape (num_envs, nv).")
     torque = _reading("torque", "Motor torques at the joints, mean of the last sub-step [N m], shape (num_envs, nj).")
+    motor_torque = _reading(
+        "motor_torque",
+        "Torque of motors' windings over a step, before losses [N m], shape (num_envs, n_motors).",
+    )
     motor_speed = _reading("motor_speed", "Speeds of motors' rotors after a step [rad/s], shape (num_envs, n_motors).")
     power = _reading("power", "Mechanical power of the motors at the joints after a step [W], shape (num_envs, nj).")
     error = _reading("error", "Estimated error of the last sub-step in `v` [rad/s or m/s], shape (num_envs,).", True)

@@ -1,13 +1,19 @@
-"""Gyros, accelerometers and foot switches by closed forms: at rest, in free fall, on a body that spins."""
+"""Gyros, accelerometers, foot switches, encoders and currents by closed forms."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from tripod import TRIPOD
 
+from ce_gym.dynamics import Model
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.setup import make_program
+from ce_gym.model import load_robot
 
 G = 9.81
 
@@ -102,9 +108,51 @@ def test_switches_close_above_a_threshold():
     np.testing.assert_array_equal(read(p, "foot_contact_switches", load=loads), [0, 0, 1, 1])
 
 
+def test_encoders_tell_joints_by_whole_counts_of_their_rotors():
+    """Behind gears: to half a count of the rotor over its ratio, in whole counts."""
+    p, counts, ratio = program(joint_encoders={"counts": 64}), 64, 6.0
+    q = np.array(p.model.standing_q)
+    q[-2:] += [0.123, -0.2871]
+    told = read(p, "joint_encoders", q=q) + p.model.standing_q[-2:]
+    count = 2 * np.pi / counts / ratio
+    np.testing.assert_allclose(told, count * np.round(q[-2:] / count), atol=1e-12)
+    assert 1e-3 < np.abs(told - q[-2:]).max() <= count / 2
+
+
+def test_encoders_tell_joints_through_belts_and_differentials():
+    """Where joints were as they are told, rotors of belts, and of Tello's ankles nearly, would be at whole counts."""
+    for robot, width in (("mit_humanoid", 0.1), ("tello", 0.1)):
+        p = make_program(robot, "velocity", observations={"joint_encoders": {"counts": 256}})
+        model, rng = p.model, np.random.default_rng(2)
+        n, count = len(model.joint_links), 2 * np.pi / 256
+        q = np.array(model.standing_q)
+        q[7 : 7 + n] += rng.uniform(-width, width, n)
+        told = np.array(q)
+        told[7 : 7 + n] = read(p, "joint_encoders", q=q) + model.standing_q[7 : 7 + n]
+        rows = [model.spanning_names.index(motor.rotor) for motor in model.robot.motors]
+        angles = model.spanning(told, np.zeros(model.nv))[0][-len(model.spanning_names) :][rows]
+        np.testing.assert_allclose(angles / count, np.round(angles / count), atol=0.02)
+        assert np.abs(told - q).max() > 1e-4
+
+
+def test_motor_torques_are_what_the_windings_give():
+    """Before friction, of limited motors; what joints ask through the transmission, of ideal ones."""
+    p = make_program(TRIPOD, "velocity", observations=["motor_torques"], motors="limited")
+    assert p.schema["motor_torque"].size == 2
+    np.testing.assert_allclose(read(p, "motor_torques", motor_torque=[1.0, -0.25]), [0.5, -0.25])
+    model = Model(replace(load_robot(TRIPOD), motors=tuple(replace(m, friction=0.2) for m in p.model.robot.motors)))
+    asked = {"target": np.array([3.0, 1.2]), "q": model.standing_q, "v": np.zeros(8), "diverged": 0, "dt": 0.005}
+    for motors in ("limited", "ideal"):
+        options = StepOptions(control="torque", motors=motors)
+        found = step_function(model.mechanism, options, ("motor_torque", "torque"))(**asked)
+        np.testing.assert_allclose(found["motor_torque"].full().ravel(), [0.5, -0.2], atol=1e-12)
+        assert np.allclose(found["torque"].full().ravel(), asked["target"]) == (motors == "ideal")
+
+
 @pytest.mark.parametrize(
     ("terms", "message"),
     [
+        ({"joint_encoders": {"counts": 0}}, "'joint_encoders': counts=0; expected 1 or more"),
         ({"gyro": {"link": "tail"}}, "'gyro': link='tail'; expected one of"),
         ({"accelerometer": {"position": [1, 2]}}, r"'accelerometer': position=\[1, 2\]; expected three lengths"),
     ],

@@ -16,7 +16,7 @@ from ce_gym.dynamics.algebra.spatial import SX, quaternion_to_rotation
 from ce_gym.dynamics.forces.scene import State
 from ce_gym.model.coordinates import Layout
 
-AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "contact_forces")
+AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "motor_torque", "contact_forces")
 """Outputs that belong to the start of a step, or are means over it; the others belong to its end."""
 MOVED = "moved"
 """Name of the output that says how far a step moves its fastest joint, at the speed of its end [rad or m]."""

@@ -10,7 +10,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
-from ce_gym.dynamics.forces.actuation import actuated_clusters, seen_joints
+from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, seen_joints
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import State, StepOptions, make_scene, symbolic_state, target_names
 from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
@@ -116,6 +116,7 @@ def _needed(given: dict[str, SX], results: dict[str, SX]) -> dict[str, SX]:
 
 OUTPUTS = {
     "torque": "motor torque at each joint, mean over the step [N m or N]",
+    "motor_torque": "torque of each motor's windings, before what it loses, mean over the step [N m]",
     "motor_speed": "speed of each motor's rotor at the end of the step [rad/s]",
     "power": "mechanical power of the motors at each joint, end of the step [W]",
     "contact_forces": "force on each contact, mean over the step, world axes [N]",
@@ -182,6 +183,8 @@ class Given:
             return furthest(stepped.state.v, layout.base_nv, self.dt)
         if name == "motor_speed":
             return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
+        if name == "motor_torque":
+            return winding_torques(self.mechanism, kinematics, stepped)
         if name == "power":
             return stepped.torque * (seen_joints(self.mechanism, kinematics) @ yd)
         if name == "energy":
@@ -189,6 +192,18 @@ class Given:
         if name == "loop_gap":
             return loop_gap(self.mechanism, kinematics)
         return loop_state(kinematics)[1] if name == "nearness" else getattr(stepped, name)
+
+
+def winding_torques(mechanism: Mechanism, kinematics: Kinematics, stepped: Stepped) -> SX:
+    """Return the torque of each motor [N m], shape (n_motors,); of ideal ones what gives the torque at the joints."""
+    motors, ydd = stepped.solved.motors, stepped.solved.motion.ydd
+    found = SX(len(mechanism.robot.motors), 1)
+    for cluster in actuated_clusters(mechanism, kinematics):
+        shares = effort_matrix(cluster.W[:, : len(cluster.joints)]) @ stepped.torque[cluster.joints]
+        for i, place in enumerate(cluster.places):
+            winding = motors.windings.get(place)
+            found[place] = shares[i] if winding is None else winding.tau - winding.slope @ ydd
+    return found
 
 
 def weighted(weights: Mapping[str, float], values: Mapping[str, SX]) -> SX:

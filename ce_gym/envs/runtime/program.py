@@ -109,7 +109,9 @@ class TaskProgram:
     @cached_property
     def _rows(self) -> dict[str, Row]:
         """The schema without what terms add to it."""
-        outputs = ("torque", "contact_forces") if self.contact_forces else ("torque",)
+        seen = {term for terms in (self.observation_terms, self.critic_terms) for term in terms}
+        outputs = ("torque", *(["motor_torque"] if "motor_torques" in seen else []))
+        outputs += ("contact_forces",) if self.contact_forces else ()
         feet = {contact.body for contact in self.model.robot.contacts if contact.group == "foot"}
         late = self.task.latency[1] > 0
         sizes = {
@@ -202,7 +204,7 @@ class TaskProgram:
         """
         assess, n_draws = self.stages.assess()
         act, size = self.actions.act("delay" in self.schema), self.observation_size + self.critic_size
-        outputs = tuple(name for name in ("torque", "contact_forces") if name in self.schema)
+        outputs = tuple(name for name in ("torque", "motor_torque", "contact_forces") if name in self.schema)
         _, scratch, physics = substeps(self.model.mechanism, self.options, outputs)
         buffers = [
             Buffer("action_in", self.n_actions, "rows_in", "float32"),

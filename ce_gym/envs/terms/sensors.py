@@ -1,4 +1,4 @@
-"""Sensors that a robot carries: rate gyros, accelerometers and foot switches, as observation terms.
+"""Sensors that a robot carries, as observation terms: rate gyros, accelerometers, foot switches, encoders, currents.
 
 Errors that stay for an episode are the terms' own; noise is the task's, `noise={"gyro": 0.05}`.
 """
@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, seen_joints
 from ce_gym.dynamics.recursion.kinematics import BodyState, constant
 from ce_gym.envs.terms.context import TermContext
 
@@ -59,6 +60,38 @@ def foot_contact_switches(s: TermContext, threshold: float = 5.0) -> SX:
     """Whether the ground pushes at each foot by more than `threshold`, 5 N, in the last sub-step, 0 or 1, (n_feet,)."""
     loads = s.foot_loads
     return ca.vertcat(SX(0, 1), *loads) > threshold
+
+
+def joint_encoders(s: TermContext, counts: float = 4096, bias: float = 0.0) -> SX:
+    """Joint positions as encoders at the rotors tell them, distance from the standing pose [rad], shape (n_joints,).
+
+    A rotor's angle is known to a count; joints follow from it through the transmission, where a count is the smaller
+    the larger the gear ratio is. What stretches in between is not seen. Joints without a motor have no encoder, and are
+    told as they are. Steps have no slope: for derivatives of environments it is 0.
+
+    Args:
+        s: The robot.
+        counts: Of a turn of a rotor.
+        bias: Largest error of each joint in an episode [rad], as of a calibration.
+    """
+    if not (isinstance(counts, int | float) and 1 <= counts < np.inf):
+        raise ValueError(f"observation term 'joint_encoders': counts={counts!r}; expected 1 or more of a turn")
+    robot, step = s.mechanism.robot, 2 * np.pi / counts
+    told = seen_joints(s.mechanism, s.kinematics) @ s.q[robot.layout.joints_q :]
+    for cluster in actuated_clusters(s.mechanism, s.kinematics):
+        off = step * ca.floor(cluster.angles / step + 0.5) - cluster.angles
+        told[cluster.joints] += effort_matrix(cluster.W[:, : len(cluster.joints)]).T @ off
+    drift = bias * s.drift("bias", told.numel()) if bias else 0.0
+    return told - s.standing_joints + drift
+
+
+def motor_torques(s: TermContext) -> SX:
+    """Torque of each motor's windings, which its current is in proportion to, over its largest [-], shape (n_motors,).
+
+    The mean over the last sub-step, before friction; what motors without a limit give is over 100 N m.
+    """
+    limits = [motor.torque for motor in s.mechanism.robot.motors]
+    return s.motor_torque / np.array([limit if 0 < limit < np.inf else 100.0 for limit in limits])
 
 
 def _link(s: TermContext, term: str, name: str) -> BodyState:
