@@ -188,7 +188,7 @@ def _chosen(
             none = ca.Function("zeros", [], [SX(ca.DM.zeros(function.numel_in("light_iterate")))])
             calls.append(Call(none, (), ("light_iterate",)))
         elif "iterate" in given:
-            calls.append(Call(zeros, (), ("iterate",)))
+            calls.append(Call(zeros, (), ("iterate",), only_if=only))  # of those apart nobody reads it
         most = min(repeats, iterations_needed(mechanism, light(options))) if only == "apart" else repeats
         calls += [Call(function, given, left, only_if=only)] + [Call(function, given, left, only_if=flag)] * most
     return calls
