@@ -92,7 +92,7 @@ def identify(
         values=values,
         std=std,
         covariance=covariance,
-        held=tuple(which.figure.name for which in held),
+        held=tuple(held),
         cannot_tell=(*(which.line(ends) for which in held), *known_badly(known, x, [figures[i] for i in free])),
         noise=problem.noise,
         correlation=correlation,

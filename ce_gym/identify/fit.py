@@ -78,18 +78,17 @@ class Problem:
 
     def _at(self, x: Array) -> tuple[Array, Array]:
         if self._known is None or self._known[0] != x.tobytes():
-            self._choose(x, np.stack([self.states, self.guess]))
             self.improve_states(x, 3 if self._settled else 8)
             self._settled = True
             self._known = (x.tobytes(), *self._evaluate(x))
         return self._known[1:]
 
     def improve_states(self, x: Array, steps: int) -> None:
-        """Make steps of Levenberg and Marquardt's while they help, those that fit best for each limb of each window."""
+        """Make steps of Levenberg and Marquardt's while they help, or go back to the guess, each limb and window."""
         least = np.repeat(1 / np.square(LARGEST_STEPS), (self.shots.model.nq, self.shots.model.nv))
         for _ in range(steps):
             base, by_state = self._differences.by_states(self.values(x), self.states)
-            new = np.tile(self.states, (1 + len(DAMPINGS), 1, 1))
+            new = np.stack([self.states, self.guess, *[self.states] * len(DAMPINGS)])
             for c in self.limbs.numbers:
                 rows, r = self.limbs.states[c], self._weighed(self.measured - base, c)
                 J = by_state[c] / self._noise_of(c)
@@ -97,7 +96,7 @@ class Problem:
                 normal = JT @ J + np.diag(least[rows])
                 for k, damping in enumerate(DAMPINGS):
                     damped = normal * (1 + damping * np.eye(len(rows)))
-                    new[1 + k][:, rows] += np.linalg.solve(damped, JT @ r)[..., 0]
+                    new[2 + k][:, rows] += np.linalg.solve(damped, JT @ r)[..., 0]
             if self._choose(x, new) < SETTLED:
                 break
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ce_gym.identify.figures import Figure
 from ce_gym.identify.log import Log
+from ce_gym.identify.separable import Held
 from ce_gym.model import Robot
 
 Array = NDArray[np.float64]
@@ -26,7 +27,7 @@ class Identified:
         values: Estimates, in the units of the figures, shape (P,).
         std: Their standard deviations, shape (P,); 0 for what is held.
         covariance: Of the estimates, shape (P, P); 0 for what is held.
-        held: Names of figures that stay what the robot's file has, since the data cannot tell them.
+        held: Figures that stay what the robot's file has, since the data cannot tell them, and what stands for them.
         cannot_tell: A line for each of these, and for what is known badly.
         noise: Standard deviation of what is left of each measurement, in its unit, shape (n_measured,).
         correlation: By how much correlation of it in time makes variances larger; they are.
@@ -42,7 +43,7 @@ class Identified:
     values: Array
     std: Array
     covariance: Array
-    held: tuple[str, ...]
+    held: tuple[Held, ...]
     cannot_tell: tuple[str, ...]
     noise: Array
     correlation: float
@@ -51,6 +52,12 @@ class Identified:
     curves: tuple[Array, Array, Array, Array]
     log: Log
     processor_time: float
+
+    @property
+    def sought(self) -> list[int]:
+        """Places of the figures that are not held."""
+        held = [which.figure.name for which in self.held]
+        return [i for i, figure in enumerate(self.figures) if figure.name not in held]
 
     @property
     def intervals(self) -> Array:

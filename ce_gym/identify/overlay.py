@@ -12,24 +12,35 @@ from ce_gym.model.errors import RobotError
 from ce_gym.model.formats.reading import read_yaml
 from ce_gym.model.table import table_text
 
+COLUMNS = "figure", "estimate", "95 % interval", "unit"
+
 
 def report(found: Identified) -> str:
     """Return a table of the figures with 95 % intervals, errors, and what the data cannot tell."""
-    rows = [
-        (figure.name, f"{value:.5g}", "held" if figure.name in found.held else f"{low:.5g} .. {high:.5g}", figure.unit)
-        for figure, value, (low, high) in zip(found.figures, found.values, found.intervals, strict=True)
+    return "\n".join([table_text(COLUMNS, rows_of(found)), "", *remarks(found)])
+
+
+def rows_of(found: Identified) -> list[tuple[str, str, str, str]]:
+    """Return a row of the table for each figure."""
+    intervals = ["held"] * len(found.figures)
+    for i in found.sought:
+        intervals[i] = "{:.5g} .. {:.5g}".format(*found.intervals[i])
+    return [
+        (figure.name, f"{value:.5g}", interval, figure.unit)
+        for figure, value, interval in zip(found.figures, found.values, intervals, strict=True)
     ]
+
+
+def remarks(found: Identified) -> list[str]:
+    """Return lines on errors and on what the data cannot tell."""
     error, before = (1e3 * np.sqrt((e**2).mean()) for e in (found.held_out, found.held_out_before))
-    lines = [
-        table_text(("figure", "estimate", "95 % interval", "unit"), rows),
-        "",
+    return [
         f"held-out error {error:.3g} (before: {before:.3g}), thousandths of the units of what was measured; "
         f"what is left of the fitted part is {1e3 * np.sqrt((found.noise**2).mean()):.3g}",
         f"correlation in time of what is left makes intervals {np.sqrt(found.correlation):.2f} times as long",
         *found.cannot_tell,
         f"{found.processor_time:.1f} s of processor time",
     ]
-    return "\n".join(lines)
 
 
 def check_base(robot: str) -> None:
@@ -67,11 +78,8 @@ def overlay(found: Identified, robot: str) -> str:
     notes += list(found.cannot_tell)
     if notes:
         lines += ["notes:", *(f'  - "{note}"' for note in notes)]
-    written = [
-        (figure, value, std)
-        for figure, value, std in zip(found.figures, found.values, found.std, strict=True)
-        if figure.kind != "delay" and figure.name not in found.held
-    ]
+    written = [(found.figures[i], found.values[i], found.std[i]) for i in found.sought]
+    written = [each for each in written if each[0].kind != "delay"]
     kinds = dict.fromkeys(figure.kind for figure, _, _ in written)
     lines.append("identified:" if kinds else "identified: {}")
     for kind in kinds:

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.identify.found import Identified
-from ce_gym.identify.overlay import report
+from ce_gym.identify.overlay import COLUMNS, remarks, rows_of
 
 Array = NDArray[np.float64]
-WIDTH, HEIGHT, LEFT = 900, 150, 70
-COLORS = {"measured": "#1f2d3d", "before": "#c9a227", "identified": "#1769aa"}
+WIDTH, HEIGHT = 900, 150
+MEASURED, BEFORE, AFTER = "#1f2d3d", "#c98a00", "#1769aa"
 STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#1f2d3d;max-width:960px;margin:2em auto;padding:0 1em}
-pre{background:#f3f5f7;padding:1em;overflow:auto;font-size:13px}svg{width:100%;height:auto}text{font-size:12px;fill:#555}
-polyline{fill:none;stroke-width:1.4}b{font-weight:600}"""
+h1{font-size:1.5em;overflow-wrap:anywhere}h2{font-size:1.1em;margin:2em 0 0}p{margin:.6em 0;overflow-wrap:anywhere}
+table{border-collapse:collapse;font-size:13px;font-variant-numeric:tabular-nums}
+td,th{text-align:left;padding:.15em .8em .15em 0}
+td:first-child{overflow-wrap:anywhere}tr{border-bottom:1px solid #e3e7eb}
+@media(max-width:600px){table{font-size:11px}}
+svg{width:100%;height:120px;background:#f6f8f9;display:block}small{color:#555}
+polyline{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}"""
 
 
 def page(found: Identified, shown: int = 4) -> str:
@@ -25,35 +31,50 @@ def page(found: Identified, shown: int = 4) -> str:
         found: What was identified.
         shown: How many windows of each measurement are drawn.
     """
-    times, *curves = found.curves
-    keys = "".join(f' <b style="color:{color}">{name}</b>' for name, color in COLORS.items())
-    plots = []
-    for k, (kind, name) in enumerate(found.log.measured):
-        rms = f"error {1e3 * found.held_out[k]:.3g}, before {1e3 * found.held_out_before[k]:.3g} thousandths"
-        plots.append(f"<h3>{html.escape(f'{kind} of {name}')}: {rms}</h3>")
-        plots.append(_plot(times[:shown], [curve[:shown, :, k] for curve in curves]))
+    plots = [_measurement(found, k, shown) for k in range(len(found.log.measured))]
     title = html.escape(f"{found.robot.name}: identified from {found.log.source}")
+    table = "".join(_row("td", row) for row in rows_of(found))
+    lines = "".join(f"<p>{html.escape(line)}</p>" for line in remarks(found))
+    keys = ", ".join(
+        f'<b style="color:{color}">{name}</b>'
+        for color, name in ((MEASURED, "measured"), (BEFORE, "errors before"), (AFTER, "errors as identified"))
+    )
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>{title}</title><style>{STYLE}</style>"
-        f"<h1>{title}</h1><pre>{html.escape(report(found))}</pre><p>Windows that were not fitted:{keys}</p>"
+        f"<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+        f"<table>{_row('th', COLUMNS)}{table}</table>{lines}"
+        f"<p>Windows that were not fitted, each from an initial state of its own: {keys}, simulated less measured.</p>"
         + "".join(plots)
         + "</html>\n"
     )
 
 
-def _plot(times: Array, curves: list[Array]) -> str:
-    """Return curves over time, shapes (W, L), windows apart from each other."""
-    low, high = float(min(c.min() for c in curves)), float(max(c.max() for c in curves))
+def _row(cell: str, texts: Sequence[str]) -> str:
+    return "<tr>" + "".join(f"<{cell}>{html.escape(text)}</{cell}>" for text in texts) + "</tr>"
+
+
+def _measurement(found: Identified, k: int, shown: int) -> str:
+    """Return what was measured, and below it the errors, which the same axis would not show."""
+    times, measured, before, after = (curve[:shown] for curve in found.curves)
+    kind, name = found.log.measured[k]
+    rms = f"error {1e3 * found.held_out[k]:.3g}, before {1e3 * found.held_out_before[k]:.3g} thousandths"
+    errors = {BEFORE: (before - measured)[..., k], AFTER: (after - measured)[..., k]}
+    return (
+        f"<h2>{html.escape(f'{kind} of {name}')}: {rms}</h2>"
+        + _plot(times, {MEASURED: measured[..., k]})
+        + _plot(times, errors)
+    )
+
+
+def _plot(times: Array, curves: dict[str, Array]) -> str:
+    """Return curves over time by their colours, shapes (W, L), windows apart from each other, and a line of ranges."""
+    low, high = float(min(c.min() for c in curves.values())), float(max(c.max() for c in curves.values()))
     span, first, last = max(high - low, 1e-9), float(times.min()), float(times.max())
     lines = []
-    for color, curve in zip(COLORS.values(), curves, strict=True):
+    for color, curve in curves.items():
         for t, y in zip(times, curve, strict=True):
-            xs = LEFT + (WIDTH - LEFT - 5) * (t - first) / (last - first)
-            ys = 5 + (HEIGHT - 25) * (high - y) / span
+            xs, ys = WIDTH * (t - first) / (last - first), 5 + (HEIGHT - 10) * (high - y) / span
             points = " ".join(f"{x:.1f},{v:.1f}" for x, v in zip(xs, ys, strict=True))
             lines.append(f'<polyline points="{points}" stroke="{color}"/>')
-    texts = [(0, 15, f"{high:.3f}"), (0, HEIGHT - 22, f"{low:.3f}"), (LEFT, HEIGHT - 4, f"{first:.2f} s")]
-    texts.append((WIDTH - 60, HEIGHT - 4, f"{last:.2f} s"))
-    words = "".join(f'<text x="{x}" y="{y}">{text}</text>' for x, y, text in texts)
-    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}">{words}{"".join(lines)}</svg>'
+    drawing = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" preserveAspectRatio="none">{"".join(lines)}</svg>'
+    return f"{drawing}<small>{low:.4g} to {high:.4g}, from {first:.2f} to {last:.2f} s</small>"

@@ -59,7 +59,9 @@ def covariance_of(J: Array, correlation: float) -> Array:
     return correlation * (V.T / s**2) @ V
 
 
-def hold(J: Array, x: Array, figures: Sequence[Figure], correlation: float) -> tuple[list[Held], Array, Array]:
+def hold(
+    J: Array, x: Array, figures: Sequence[Figure], correlation: float
+) -> tuple[list[Held], NDArray[np.int64], Array]:
     """Choose figures to hold: of those that are not known, again and again the one that data feel least.
 
     Args:
@@ -71,7 +73,8 @@ def hold(J: Array, x: Array, figures: Sequence[Figure], correlation: float) -> t
     Returns:
         What is held; places of the others; their estimates given what is held.
     """
-    held, left, x = [], np.arange(len(x)), x.copy()
+    held: list[Held] = []
+    left, x = np.arange(len(x)), x.copy()
     felt = np.linalg.norm(J, axis=0)
     while len(left) > 1:
         covariance = covariance_of(J[:, left], correlation)
@@ -79,14 +82,14 @@ def hold(J: Array, x: Array, figures: Sequence[Figure], correlation: float) -> t
         unknown = np.flatnonzero(share > UNKNOWN)
         if not len(unknown):
             break
-        worst = unknown[felt[left[unknown]].argmin()]
-        figure = figures[left[worst]]
+        worst = int(unknown[felt[left[unknown]].argmin()])
+        figure = figures[int(left[worst])]
         slopes = covariance[:, worst] / covariance[worst, worst]
         together = np.abs(_correlations(covariance)[worst]) > CORRELATED
         taken = tuple(
-            (figures[i], float(-slope * figures[i].scale / figure.scale))
+            (figures[int(i)], float(-slope * figures[int(i)].scale / figure.scale))
             for i, slope, tied in zip(left, slopes, together, strict=True)
-            if tied and figures[i] is not figure
+            if tied and i != left[worst]
         )
         held.append(Held(figure, float(share[worst]), taken))
         x[left] += slopes * (figure.nominal / figure.scale - x[left[worst]])

@@ -26,7 +26,8 @@ MAY_IMPORT = {
     "viewer": {"model", "dynamics", "sim", "envs", "policies"},
     "identify": {"model", "dynamics", "compile", "sim", "viewer"},
     "bench": {
-        "model", "dynamics", "compile", "export", "sim", "envs", "diagnostics", "adapters", "policies", "viewer"
+        "model", "dynamics", "compile", "export", "sim", "envs", "diagnostics", "adapters", "policies", "viewer",
+        "identify",
     },
 }  # fmt: skip
 """What the modules of a folder may import from other folders."""

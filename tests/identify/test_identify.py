@@ -92,7 +92,7 @@ def test_report_and_page_name_every_figure(found: Identified):
     for name in PLANTED:
         assert name in text
         assert name in shown
-    assert shown.count("<svg") == 3
+    assert shown.count("<svg") == 6  # of each angle what was measured, and errors
 
 
 def test_a_log_is_read_as_it_was_saved(log: Log, tmp_path: Path):
