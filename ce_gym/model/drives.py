@@ -70,6 +70,7 @@ class Motor:
         damping: Viscous friction of the rotor [N m s/rad].
         friction: Dry friction of the rotor [N m].
         drive_friction: What depends on speed and load besides; None for nothing.
+        bandwidth: Of the loop that follows the torque it is asked for, a lag of first order [Hz].
     """
 
     rotor: str
@@ -79,6 +80,7 @@ class Motor:
     damping: float = 0.0
     friction: float = 0.0
     drive_friction: DriveFriction | None = None
+    bandwidth: float = float("inf")
 
 
 def stretch_of(rotor: str) -> str:

@@ -18,6 +18,7 @@ from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.control import control_sizes
 from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.stepping.plan import Rates
 from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.devices import Array
 from ce_gym.sim.substeps import DT, FRAME
@@ -68,6 +69,8 @@ def physics_rows(
     joints, contacts, motors = len(model.joint_links), len(options.contacts), len(model.robot.motors)
     start = {"q": model.standing_q, "dependent": model.guess}
     sizes = state_sizes(model.mechanism, options)
+    explicit = isinstance(METHODS[options.method].end, Rates)
+    check("method", options.method, not (explicit and "winding" in sizes), "an implicit one, for torques of motors lag")
     rows = [Row(name, size, "physics", start.get(name, 0.0)) for name, size in sizes.items()]
     rows += [Row("diverged", 1, "physics"), Row("retries", 1, "physics")]
     lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts}

@@ -197,7 +197,7 @@ class Simulator:
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
         rows |= {
             name: np.zeros(self._arrays[name].shape[1])
-            for name in ("anchor", "pressed", "carried", "diverged", "step_error", "step_change")
+            for name in ("anchor", "pressed", "carried", "winding", "diverged", "step_error", "step_change")
             if name in self._arrays
         }
         if "step_length" in self._arrays:

@@ -1,4 +1,4 @@
-"""Dry friction of motors in robot files: what is read, and what is refused in one line."""
+"""Dry friction and bandwidth of motors in robot files: what is read, and what is refused in one line."""
 
 from __future__ import annotations
 
@@ -30,6 +30,10 @@ def read(tmp_path: Path):
     return load
 
 
+def test_a_bandwidth(read):
+    assert read("0, bandwidth: 50") == Motor("knee_rotor", bandwidth=50.0)
+
+
 def test_a_number_or_a_mapping(read):
     assert read("0.02") == Motor("knee_rotor", friction=0.02)
     assert read("{coulomb: 0.02}") == Motor("knee_rotor", friction=0.02)
@@ -53,6 +57,7 @@ def test_a_number_or_a_mapping(read):
         ("{stribeck: 0.1, stribeck_speed: 0}", "stribeck_speed is 0.0: expected more than 0"),
         ("{efficiency: 0}", "motors.knee_rotor.friction.efficiency is 0.0"),
         ("{backdriving_efficiency: 1.5}", "motors.knee_rotor.friction.backdriving_efficiency is 1.5"),
+        ("0, bandwidth: 0", "motors.knee_rotor.bandwidth is 0.0: expected more than 0 [Hz]"),
         ("[0.1]", "motors.knee_rotor.friction is [0.1]"),
     ],
 )

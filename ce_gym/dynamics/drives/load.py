@@ -19,7 +19,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.actuation import Actuated, actuated_clusters, effort_matrix
 from ce_gym.dynamics.forces.law import Motion
-from ce_gym.dynamics.forces.motors import loaded_motors
+from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors
 from ce_gym.dynamics.forces.saturation import SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.recursion.kinematics import Kinematics
@@ -52,6 +52,12 @@ def carried_after(
                 own[places.index(place)] = winding.tau - winding.slope @ motion.ydd
                 other[places.index(place)] = external[i]
     return ca.vertcat(own, other, 1) if places else SX(0, 1)
+
+
+def windings_after(scene: Scene, motors: SaturatedForce, motion: Motion) -> SX:
+    """Return torques of motors at the end of a step whose acceleration is known, as `State.winding` is."""
+    lagging = [motors.windings[i] for i in lagging_motors(scene.mechanism.robot, scene.options.motors)]
+    return ca.vertcat(SX(0, 1), *[winding.tau - winding.slope @ motion.ydd for winding in lagging])
 
 
 def _external(cluster: Actuated, motors: SaturatedForce, inertia: SX, motion: Motion) -> SX:

@@ -24,7 +24,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction, rubs
 from ce_gym.dynamics.forces.law import JointForce, is_moment
-from ce_gym.dynamics.forces.motors import MOTORS, MotorModel, loaded_motors, most_friction
+from ce_gym.dynamics.forces.motors import MOTORS, MotorModel, caught_up, lagging_motors, loaded_motors, most_friction
 from ce_gym.dynamics.forces.parameters import rubbing_as_declared
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
@@ -84,10 +84,25 @@ Carried: TypeAlias = Mapping[int, tuple[SX, SX, SX]]
 friction goes by them."""
 
 
-def carried_by(mechanism: Mechanism, options: StepOptions, torques: SX) -> Carried:
-    """Return torques that motors carry, by their places, of a column as `State.carried` is."""
-    places = loaded_motors(mechanism.robot, options.motors)
-    return {place: (torques[i], torques[len(places) + i], torques[-1]) for i, place in enumerate(places)}
+@dataclass
+class Before:
+    """What motors go by of the step before, by their places.
+
+    Attributes:
+        carried: What friction under load goes by.
+        windings: Torques at its end [N m], of those that lag.
+    """
+
+    carried: Carried
+    windings: Mapping[int, SX]
+
+    @staticmethod
+    def of(mechanism: Mechanism, options: StepOptions, carried: SX, windings: SX) -> Before:
+        """Return it, given columns as `State.carried` and `State.winding` are."""
+        robot, model = mechanism.robot, options.motors
+        loaded, lagging = loaded_motors(robot, model), lagging_motors(robot, model)
+        torques = {place: (carried[i], carried[len(loaded) + i], carried[-1]) for i, place in enumerate(loaded)}
+        return Before(torques, {place: windings[i] for i, place in enumerate(lagging)})
 
 
 def motor_forces(
@@ -98,7 +113,7 @@ def motor_forces(
     dt: float,
     iterate: SX,
     seen: SX,
-    carried: Carried,
+    before: Before,
 ) -> SaturatedForce:
     """Return what the motors deliver of what they are asked for at the joints, which they see as `seen` has it."""
     strength = scene.figures.strength
@@ -111,7 +126,7 @@ def motor_forces(
     for cluster in actuated:
         rows, to_motors = cluster.joints, effort_matrix(cluster.W[:, : len(cluster.joints)])
         shares = JointForce(to_motors @ at_joints.tau[rows], to_motors @ at_joints.slope[rows, rows] @ to_motors.T)
-        deliver(model, force, shares, cluster, yd, strength, dt, iterate, carried)
+        deliver(model, force, shares, cluster, yd, strength, dt, iterate, before)
     driven = {row for cluster in actuated for row in cluster.joints}
     left = [row for row in joints if row not in driven]
     return within_joint_limits(scene, force, left, iterate, SX.eye(yd.numel()))
@@ -187,7 +202,7 @@ def deliver(
     strength: SX,
     dt: float,
     iterate: SX,
-    carried: Carried,
+    before: Before,
 ) -> None:
     """Limit the torques that motors of a cluster are asked for, take friction off each, and carry the sum to `force`.
 
@@ -200,9 +215,10 @@ def deliver(
         strength: Of all motors, as a multiple of what they should have.
         dt: Length of the step [s].
         iterate: From the iteration before, shape (limit_count,).
-        carried: What friction under load goes by.
+        before: What motors go by of the step before.
     """
     W, motors, rows = cluster.W, cluster.motors, cluster.rows
+    asked = lagged(model, asked, cluster, dt, before)
     speed, tau, slope = W @ yd[rows], SX(asked.tau), asked.slope
     turning = SX(len(motors), yd.numel())
     turning[:, rows] = W
@@ -220,9 +236,9 @@ def deliver(
         tau[i] -= damping * speed[i]
         own[i, i] += dt * damping
         drive = model.drive_friction(motor)
-        friction = most_friction(model.friction(motor), drive, speed[i], carried.get(place, ())[:2])
-        if place in carried and not is_moment(dt):
-            known = ca.logic_or(carried[place][2], ca.fabs(speed[i]) > STICK_SPEED)
+        friction = most_friction(model.friction(motor), drive, speed[i], before.carried.get(place, ())[:2])
+        if place in before.carried and not is_moment(dt):
+            known = ca.logic_or(before.carried[place][2], ca.fabs(speed[i]) > STICK_SPEED)
             friction = ca.if_else(known, friction, HOLD)
         if rubs(friction):
             last = iterate.numel() - 1  # before it, the frictions of all motors, as many as there are before those
@@ -238,6 +254,23 @@ def deliver(
     for i, (place, given, at_limit) in enumerate(windings):
         force.windings[place] = JointForce(given, answer[i, :] @ turning + at_limit * turning[i, :])
     force.tau[rows], force.slope[rows, rows] = W.T @ tau, W.T @ (answer + own) @ W
+
+
+def lagged(model: MotorModel, asked: JointForce, cluster: Actuated, dt: float, before: Before) -> JointForce:
+    """Return what motors of a cluster are asked for [N m], of which torques that lag reach a part within the step.
+
+    Where motors answer to each other's speeds the slope between two goes by the geometric mean of their parts, so that
+    it stays symmetric; of a cluster's motors with one bandwidth that is what it is.
+    """
+    parts, tau = SX.ones(len(cluster.motors)), SX(asked.tau)
+    for i, (motor, place) in enumerate(zip(cluster.motors, cluster.places, strict=True)):
+        if place in before.windings:
+            parts[i] = caught_up(model.bandwidth(motor), dt)
+            tau[i] = before.windings[place] + parts[i] * (tau[i] - before.windings[place])
+    if not before.windings:
+        return asked
+    root = ca.diag(ca.sqrt(parts))
+    return JointForce(tau, root @ asked.slope @ root)
 
 
 def effort_matrix(W: SX) -> SX:

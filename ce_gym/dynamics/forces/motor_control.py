@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.actuation import (
     Actuated,
-    Carried,
+    Before,
     actuated_clusters,
     controller,
     deliver,
@@ -54,7 +54,7 @@ class Motors:
         yd: Their velocities, shape (nj,).
         target: See `target_names`, shape (n_targets,).
         dt: Length of the step [s].
-        carried: What friction under load goes by.
+        before: What motors go by of the step before.
     """
 
     scene: Scene
@@ -63,7 +63,7 @@ class Motors:
     yd: SX
     target: SX
     dt: float
-    carried: Carried
+    before: Before
 
     @property
     def size(self) -> int:
@@ -76,14 +76,14 @@ class Motors:
         if scene.options.control in ("position", "torque"):
             seen = seen_joints(scene.mechanism, self.kinematics)
             asked = controller(scene, seen @ y, seen @ yd, self.target, dt)
-            return motor_forces(scene, self.kinematics, asked, yd, dt, iterate, seen, self.carried)
+            return motor_forces(scene, self.kinematics, asked, yd, dt, iterate, seen, self.before)
         names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.commanded
         undriven = [row for row, name in enumerate(joints) if name in names]
         force = self._at_joints(names, undriven, iterate.numel())
         for cluster in actuated_clusters(scene.mechanism, self.kinematics):
             own = self.target[[names.index(motor.rotor) for motor in cluster.motors]]
             asked, model = self._at_motors(cluster, own), MOTORS[scene.options.motors]
-            deliver(model, force, asked, cluster, yd, scene.figures.strength, dt, iterate, self.carried)
+            deliver(model, force, asked, cluster, yd, scene.figures.strength, dt, iterate, self.before)
         return within_joint_limits(scene, force, undriven, iterate, SX.eye(y.numel()))
 
     def _at_motors(self, cluster: Actuated, own: SX) -> JointForce:

@@ -44,6 +44,10 @@ class MotorModel(Protocol):
         """Return what it has more of it at rest and under load; None if it has none."""
         ...
 
+    def bandwidth(self, motor: Motor) -> float:
+        """Return the bandwidth of its torque loop [Hz]; infinite if it gives at once what it is asked for."""
+        ...
+
 
 class Ideal:
     """Motors that deliver what joints are asked for up to the joints' limits, at any speed and without loss."""
@@ -66,6 +70,10 @@ class Ideal:
     def drive_friction(self, motor: Motor) -> None:
         """Return none."""
         return None
+
+    def bandwidth(self, motor: Motor) -> float:
+        """Return that it gives torque at once."""
+        return math.inf
 
 
 class Limited:
@@ -105,6 +113,10 @@ class Limited:
         """Return the motor's own."""
         return motor.drive_friction
 
+    def bandwidth(self, motor: Motor) -> float:
+        """Return the motor's own."""
+        return motor.bandwidth
+
 
 MOTORS: dict[str, MotorModel] = {"ideal": Ideal(), "limited": Limited()}
 """All models, by the name that `Simulator(motors=...)` takes."""
@@ -114,6 +126,16 @@ def loaded_motors(robot: Robot, model: str) -> list[int]:
     """Return the places of the motors whose friction depends on torques, by the name of the model of the motors."""
     frictions = [MOTORS[model].drive_friction(motor) for motor in robot.motors]
     return [i for i, friction in enumerate(frictions) if friction is not None and friction.loaded]
+
+
+def lagging_motors(robot: Robot, model: str) -> list[int]:
+    """Return the places of the motors whose torque lags, by the name of the model of the motors."""
+    return [i for i, motor in enumerate(robot.motors) if math.isfinite(MOTORS[model].bandwidth(motor))]
+
+
+def caught_up(bandwidth: float, dt: float) -> SX:
+    """Return which share of the distance to what it is asked for a torque goes in a step, taken one step ahead."""
+    return SX(dt / (1 / (2 * math.pi * bandwidth) + dt))
 
 
 def most_friction(constant: float | SX, drive: DriveFriction | None, speed: SX, carried: tuple[SX, ...]) -> float | SX:

@@ -19,9 +19,9 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.drives.load import carried_after, carried_now
+from ce_gym.dynamics.drives.load import carried_after, carried_now, windings_after
 from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretching
-from ce_gym.dynamics.forces.actuation import carried_by, limit_count
+from ce_gym.dynamics.forces.actuation import Before, limit_count
 from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground
 from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
 from ce_gym.dynamics.forces.friction import FRICTION
@@ -151,7 +151,8 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
 
     laws, unloaded = touching(scene, kinematics, state, dt), iterate.numel() - state.carried.numel()
     carried = carried_now(state, iterate[unloaded:])
-    driven = Motors(scene, kinematics, y, yd, target, dt, carried_by(mechanism, scene.options, carried))
+    before = Before.of(mechanism, scene.options, carried, state.winding)
+    driven = Motors(scene, kinematics, y, yd, target, dt, before)
     meeting = meeting_pairs(scene, kinematics, state, dt)
     rubbing = JointFriction(mechanism, kinematics, yd, dt)
     sizes = [law.size for law in (*laws, *meeting, driven, rubbing)]
@@ -219,6 +220,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
         pressed=stacked([ca.fmax(pair.normal_after(pair.gain(motion)), 0) for pair in solved.pairs]),
         carried=carried_after(scene, kinematics, motors, solved.inertia, motion) if solved.inertia else solved.carried,
+        winding=windings_after(scene, motors, motion),
     )
     touches = [*solved.contacts, *solved.pairs]
     unconverged = ca.sum1(stacked([c.check(motion) for c in touches])) > 0

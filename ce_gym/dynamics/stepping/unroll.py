@@ -59,6 +59,7 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
             load=first.state.load,
             pressed=first.state.pressed,
             carried=first.state.carried,
+            winding=first.state.winding,
         )
     else:
         after = combined(plan, {name: part.state for name, part in parts.items()}, layout)

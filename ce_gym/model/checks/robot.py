@@ -213,6 +213,8 @@ def _check_motors(robot: Robot, file: str) -> None:
                 raise bad(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
         if motor.velocity == 0.0:
             raise bad(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
+        if not motor.bandwidth > 0.0:
+            raise bad(file, f"motors.{motor.rotor}.bandwidth", motor.bandwidth, "more than 0 [Hz]")
         if motor.drive_friction is not None:
             _check_drive_friction(motor.drive_friction, file, f"motors.{motor.rotor}.friction")
 
