@@ -231,7 +231,7 @@ def env_kwargs_of(args: argparse.Namespace) -> dict[str, Any]:
 def parser() -> argparse.ArgumentParser:
     """The command line of every learner."""
     result = Parser(
-        description="Train a policy with PPO. Ctrl-C and SIGTERM stop in good order and save; --resume goes on.",
+        description="Train a policy. Ctrl-C and SIGTERM stop in good order and save; --resume goes on.",
         epilog="Settings not named here are in the settings file; --set KEY=VALUE changes any of them.",
     )
     what = result.add_argument_group("what to train")
