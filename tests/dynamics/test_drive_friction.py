@@ -252,6 +252,23 @@ def test_all_levels_and_a_stretching_transmission_carry_the_same_load():
         np.testing.assert_allclose(state["carried"].full().ravel()[:2], expected, rtol=1e-6, err_msg=level)
 
 
+def test_a_factor_on_it_is_a_parameter():
+    """At 0 it is the Coulomb part alone, at 2 what twice the figures are."""
+    motor = at_rotor(SHARP, RATIO)
+    assert motor.drive_friction is not None
+    twice = replace(motor, drive_friction=replace(motor.drive_friction, factor=2.0))
+    names = StepOptions(control="torque", motors="limited", parameters=("drive_friction",))
+    given = {"q": 0.4, "v": 1.5, "diverged": 0, "target": 1.0, "dt": 1e-3}
+    loaded = given | {"carried": [0.05, -0.03, 1.0]}
+    function = step_function(Model(pendulum(motor, 0.02)).mechanism, names)
+    for factor, other in ((0.0, replace(motor, drive_friction=None)), (2.0, twice)):
+        stepper = Stepper(pendulum(other, 0.02)).function
+        expected = stepper(**(loaded if "carried" in stepper.name_in() else given))["v_next"]
+        found = function(**loaded, parameters=factor)["v_next"]
+        assert float(found) == pytest.approx(float(expected), rel=1e-12)
+    assert float(function(**loaded, parameters=1.0)["v_next"]) != pytest.approx(float(found), rel=1e-6)
+
+
 def test_torques_go_to_the_rotors_of_a_differential():
     """Two rotors that turn two joints together: what the load does to each is its torque through the inverse."""
     robot = differential()

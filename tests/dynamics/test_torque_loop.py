@@ -21,10 +21,10 @@ KP, KD = 30.0, 1.0
 INERTIA = LINK + RATIO**2 * ROTOR
 
 
-def table(**motor: float) -> Robot:
+def table(torque: float = np.inf) -> Robot:
     """A geared joint without gravity whose motor's torque lags."""
     gains = Gains((("table", KP),), (("table", KD),))
-    return replace(turntable(1.0), elastic=(), motors=(Motor("rotor", bandwidth=BANDWIDTH, **motor),), gains=gains)
+    return replace(turntable(1.0), elastic=(), motors=(Motor("rotor", torque, bandwidth=BANDWIDTH),), gains=gains)
 
 
 def run(robot: Robot, target: list[float], dt: float, steps: int, control: str) -> dict[str, np.ndarray]:

@@ -237,7 +237,6 @@ def fit(logs: Logs, model: str) -> dict[str, float]:
 
     start = np.array([FIGURES[name] if name == "q_offset" else np.log(FIGURES[name]) for name in names])
     low, high = start - np.log(1e4), start + np.log(30.0)
-    found = least_squares(
-        lambda x: residuals([x])[0], start, jacobian, bounds=(low, high), loss="soft_l1", f_scale=0.03, max_nfev=60
-    )
+    options: dict[str, Any] = {"jac": jacobian, "loss": "soft_l1", "f_scale": 0.03, "max_nfev": 60}
+    found = least_squares(lambda x: residuals([x])[0], start, bounds=(low, high), **options)
     return figures(found.x)
