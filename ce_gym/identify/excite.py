@@ -87,7 +87,7 @@ def simulate_log(
     figures = _planted(model.robot, planted or {})
     shots = Shots(model, log, figures, Settings(control, substep))
     values, state = np.array([[f.start for f in figures]]), np.r_[model.standing_q, np.zeros(model.nv)][None, None]
-    exact = shots(values, state, np.array([0]), len(commands) - 1)[0, 0]
+    exact = shots(values, state, np.array([0]), len(commands))[0, 0]
     read = exact + np.random.default_rng(seed).normal(0.0, noise, exact.shape)
     read = np.round(read / resolution) * resolution if resolution else read
     return Log(dt, names, commands, measured, read, "simulated log")

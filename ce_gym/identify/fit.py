@@ -36,7 +36,7 @@ class Problem:
 
     Attributes:
         free: Places of the figures that are fitted; the others are what the robot's file has.
-        residual: What is left at the last figures, over the noise, projected, shape (W, length + 1, n_measured).
+        residual: What is left at the last figures, over the noise, projected, shape (W, length, n_measured).
     """
 
     def __init__(self, shots: Shots, windows: Windows, states: Array, noise: Array) -> None:
@@ -140,7 +140,7 @@ class Problem:
 
     def _noise_of(self, c: int) -> Array:
         """Return the noise of a limb's measurements row by row, shape (L n, 1)."""
-        return np.tile(self.noise[self.limbs.channels[c]], self.windows.length + 1)[:, None]
+        return np.tile(self.noise[self.limbs.channels[c]], self.windows.length)[:, None]
 
 
 def solve(problem: Problem, x: Array, tolerance: float) -> Array:

@@ -138,7 +138,7 @@ class Shots:
             length: Of windows [rows].
 
         Returns:
-            Shape (C, W, length + 1, n_measured).
+            Shape (C, W, length, n_measured).
         """
         most = max(1, LARGEST_BATCH // len(values))
         pieces = range(0, len(first), most)
@@ -161,13 +161,13 @@ class Shots:
         delay = np.repeat(values[:, late[0]] if late else np.zeros(C), W) / self.log.dt
         at = np.tile(first, C) - delay
         read, before = [self.encoders(flat[:, :nq], flat[:, nq:])], self._integral(at)
-        for k in range(length * steps):
+        for k in range((length - 1) * steps):
             after = self._integral(at + (k + 1) / steps)
             sim.step((after - before) * steps)
             before = after
             if (k + 1) % steps == 0:
                 read.append(self.encoders(sim.q, sim.v))
-        return np.stack(read, axis=1).reshape(C, W, length + 1, -1)
+        return np.stack(read, axis=1).reshape(C, W, length, -1)
 
     def _default(self, name: str) -> Array:
         return parameter_defaults(self.model.robot, self.model.robot.material, (name,))[name]

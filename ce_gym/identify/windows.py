@@ -21,7 +21,7 @@ class Windows:
 
     Attributes:
         first: Rows where they start, shape (W,).
-        length: [rows], a multiple of `PARTS`.
+        length: [rows], a multiple of `PARTS`; no row is in two windows, or its noise would count twice.
     """
 
     first: NDArray[np.int64]
@@ -34,8 +34,8 @@ class Windows:
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """Rows of each window and of the one after it, shape (W, length + 1)."""
-        return self.first[:, None] + np.arange(self.length + 1)
+        """Rows of each window, shape (W, length)."""
+        return self.first[:, None] + np.arange(self.length)
 
 
 def cut(log: Log, window: float, longest_delay: float, held_out: float) -> tuple[Windows, Windows]:

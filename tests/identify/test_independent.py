@@ -132,7 +132,7 @@ def test_standard_errors_are_those_of_dense_least_squares(found: Identified, run
         late, rest = divmod(4 * figures["delay"] / DT, 1)  # in sub-steps; each has the mean of what is due in it
         sim.set_state(start[:, :2], start[:, 2:])
         read = [sim.q.copy()]
-        for k in range(4 * length):
+        for k in range(4 * (length - 1)):
             due, earlier = (log.commands[first + (k - int(late) - i) // 4] for i in (0, 1))
             sim.step((1 - rest) * due + rest * earlier)
             read.append(sim.q.copy())
