@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from published import feet_above_ground
 
 from ce_gym import LEVELS
 from ce_gym.dynamics import Model
@@ -24,11 +25,10 @@ def test_it_stands_flat_on_its_feet_and_has_what_tasks_need(robot):
     assert not missing(robot)
     assert robot.total_mass == pytest.approx(33.312, abs=1e-9), "of the published file, rods counted"
     model = Model(robot)
+    lowest, highest = feet_above_ground(model)
+    assert lowest == pytest.approx(0.0, abs=1e-6)
+    assert highest < 1e-6
     points = model.contact_points(model.standing_q, np.zeros(model.nv))[0]
-    under = {c.name: z - c.radius for c, z in zip(robot.contacts, points[:, 2], strict=True)}
-    feet = [under[contact.name] for contact in robot.contacts if contact.group == "foot"]
-    assert min(feet) == pytest.approx(0.0, abs=1e-6)
-    assert max(feet) < 1e-6
     forward = {c.name: x for c, x in zip(robot.contacts, points[:, 0], strict=True)}
     assert forward["left_toe"] - forward["left_heel"] == pytest.approx(0.16, abs=1e-3)
     p, R = model.body_poses(model.standing_q)

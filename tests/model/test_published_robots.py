@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from published import above_ground, feet_above_ground
 
 from ce_gym.dynamics import Model
 from ce_gym.envs.custom import missing
@@ -84,11 +85,10 @@ def test_it_stands_on_its_feet_and_has_what_tasks_need(name):
     assert len(robot.motors) == len(list(robot.rotors())) == len(robot.independent) == len(ROBOTS[name][1])
     assert all(np.isfinite(motor.torque) and np.isfinite(motor.velocity) for motor in robot.motors)
     model = Model(robot)
-    points = model.contact_points(model.standing_q, np.zeros(model.nv))[0]
-    under = {c.name: z - c.radius for c, z in zip(robot.contacts, points[:, 2], strict=True)}
-    feet = [under[contact.name] for contact in robot.contacts if contact.group == "foot"]
-    assert min(feet) == pytest.approx(0.0, abs=1e-6)
-    assert max(feet) < 3e-4
+    lowest, highest = feet_above_ground(model)
+    assert lowest == pytest.approx(0.0, abs=1e-6)
+    assert highest < 3e-4
+    under = above_ground(model)
     assert min(under[contact.name] for contact in robot.contacts if contact.group != "foot") > 0.05
 
 

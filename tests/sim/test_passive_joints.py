@@ -80,3 +80,20 @@ def test_mjcf_has_no_actuator_of_it():
     root = ET.fromstring(to_mjcf(pair(), "none"))
     assert [actuator.get("joint") for actuator in root.iter("position")] == ["arm"]
     assert [len(key.attrib["ctrl"].split()) for key in root.iter("key")] == [1]
+
+
+def test_it_is_passive_again_when_mjcf_is_read_back(tmp_path):
+    """So is every joint with a spring that no actuator of a file drives; without any actuator, joints await torques."""
+    pytest.importorskip("mujoco")
+    path = tmp_path / "pair.xml"
+    path.write_text(to_mjcf(pair(), "none"))
+    again = ce_gym.load_robot(path)
+    assert (again.passive, again.driven) == (("blade",), ("arm",))
+    assert [name for name, _ in (*again.gains.kp, *again.gains.kd)] == ["arm", "arm"]
+    blade = again.body("blade").joint
+    assert (blade.stiffness, blade.springref) == (STIFFNESS, 0.3)
+    root = ET.fromstring(path.read_text())
+    for parent, tag in ((root, "actuator"), (root, "keyframe")):
+        parent.remove(next(parent.iter(tag)))
+    path.write_text(ET.tostring(root, encoding="unicode"))
+    assert ce_gym.load_robot(path).passive == ()

@@ -1,7 +1,8 @@
 """The actuators of a compiled MJCF file -> torque limits and gains of joints.
 
 An actuator on a joint gives `gear * (gain * control + bias)`. With an affine bias it is a position controller, whose
-gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up.
+gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up. Where a file has actuators, a
+joint that has a spring and none of them is passive: its torque limit is 0, and it has no gains.
 """
 
 from __future__ import annotations
@@ -33,6 +34,10 @@ def read_actuators(source: MjcfSource, tree: MjcfTree, independent: tuple[str, .
     for j, body in tree.moved_by.items():
         if model.jnt_actfrclimited[j]:
             limits[body] = min(limits.get(body, np.inf), float(np.abs(model.jnt_actfrcrange[j]).max()))
+    springs = {body.name for body in tree.bodies if body.joint.stiffness}
+    for name in [joint for joint in independent if model.nu and joint in springs and joint not in limits]:
+        limits[name] = 0.0
+        del kp[name], kd[name]
     tree.bodies[:] = [
         replace(body, joint=replace(body.joint, torque=limits[body.name])) if body.name in limits else body
         for body in tree.bodies
