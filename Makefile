@@ -13,7 +13,7 @@ help:
 	@echo "make lint    ruff: style and format"
 	@echo "make types   pyright: types, as on Linux, macOS and Windows"
 	@echo "make docs    this documentation as HTML in docs/_build/html; a warning is an error"
-	@echo "make gallery make the moving pictures of the documentation anew from the policies that come along"
+	@echo "make gallery make the pictures of robots in the documentation anew, moving ones from the policies that come along"
 	@echo "make links   follow the links of README and docs that lead out into the web"
 	@echo "make wheel   build sdist and wheel into dist/"
 	@echo "make venv    create .venv with everything the others need"
@@ -51,6 +51,7 @@ docs: .venv/installed
 	@echo docs/_build/html/index.html
 
 gallery: .venv/installed
+	$(BIN)/python docs/robots_picture.py
 	for robot in g1 jvrc1 mini_cheetah mit_humanoid spot t1 tello; do $(BIN)/python -m ce_gym play $${robot}_velocity --size 320 240 \
 		--command 1.5 0.5 0 0 --command 1.5 0.5 0 0.8 --video docs/images/$${robot}.gif || exit 1; done
 	$(BIN)/python -m ce_gym play mini_cheetah_stairs --seed 26 --command 7 0.6 0 0 --size 256 192 \

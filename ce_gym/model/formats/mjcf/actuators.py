@@ -1,8 +1,8 @@
 """The actuators of a compiled MJCF file -> torque limits and gains of joints.
 
 An actuator on a joint gives `gear * (gain * control + bias)`. With an affine bias it is a position controller, whose
-gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up. Where a file has actuators, a
-joint that has a spring and none of them is passive: its torque limit is 0, and it has no gains.
+gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up. Where a file has actuators,
+a joint that has a spring and none of them is passive: its torque limit is 0, and it has no gains.
 """
 
 from __future__ import annotations
