@@ -30,6 +30,7 @@ def folder(tmp_path):
     (tmp_path / "two.xml").write_text(
         MJCF.replace("</worldbody>", f'<body name="b"><freejoint/>{LINK}</body></worldbody>')
     )
+    (tmp_path / "dragged.xml").write_text(MJCF.replace("<freejoint/>", '<joint type="free" armature="0.1"/>'))
     (tmp_path / "scene.xml").write_text('<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
     shutil.copy(ROOT / "tests" / "data" / "own_robot" / "pup.urdf", tmp_path)
     return tmp_path
@@ -38,8 +39,10 @@ def folder(tmp_path):
 @pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
 def test_the_table(folder, monkeypatch):
     rows = {path.name: files.row(path, folder) for path in files.files(folder)}
-    assert set(rows) == {"hopper.xml", "balls.xml", "two.xml", "pup.urdf"}, "a scene without a robot is no robot"
-    for name, joints in (("hopper.xml", 3), ("balls.xml", 2), ("pup.urdf", 8)):
+    assert set(rows) == {"hopper.xml", "balls.xml", "dragged.xml", "two.xml", "pup.urdf"}, (
+        "a scene without a robot is no robot"
+    )
+    for name, joints in (("hopper.xml", 3), ("balls.xml", 2), ("dragged.xml", 3), ("pup.urdf", 8)):
         assert rows[name][1:3] == ("same", joints)
         assert all(isinstance(x, float) and x <= files.BAR for x in rows[name][4:7])
     assert (

@@ -228,3 +228,11 @@ def test_rotations_are_proper_and_right_angles_exact(rpy):
     if all(angle * 2 / math.pi == round(angle * 2 / math.pi) for angle in rpy):
         assert set(rotation.ravel()) <= {-1.0, 0.0, 1.0}
         assert not np.signbit(rotation[rotation == 0.0]).any()
+
+
+def test_a_shape_without_extent_is_a_point_of_a_virtual_link(load_urdf):
+    """Upkie's base is drawn as a box of size 0; a box that is flat is still a mistake."""
+    visual = '<visual><geometry><box size="{}"/></geometry></visual>'
+    assert load_urdf(link("b", block() + visual.format("0 0 0"))).bodies[0].shapes == ()
+    with pytest.raises(RobotError, match="lengths above 0"):
+        load_urdf(link("b", block() + visual.format("0 1 1")))

@@ -100,6 +100,7 @@ def _mujoco(path: Path, robot: Robot, q: Array, v: Array, tau: Array) -> Dynamic
     import mujoco
 
     mj = mujoco.MjModel.from_xml_path(str(path))
+    mj.dof_armature[: robot.layout.base_nv] = 0.0  # of the base, by a default meant for joints: listed as left out
     data, free, rotation = mujoco.MjData(mj), robot.layout.base_nv, np.zeros(9)
     mujoco.mju_quat2Mat(rotation, q[3:7] if free else np.array([1.0, 0.0, 0.0, 0.0]))
     to_theirs = np.zeros((mj.nv, mj.nv))  # their velocity of ours: [linear in the world, angular in the body, joints]

@@ -125,13 +125,15 @@ def axis(file: str, where: str, parent: Element) -> Vec3:
 
 
 def shape(file: str, where: str, visual: Element, colors: dict[str, Color]) -> Shape | None:
-    """Return a <visual> or <collision> as a primitive; None if it is a mesh."""
+    """Return a <visual> or <collision> as a primitive; None if it is a mesh, or a point (of a virtual link)."""
     geometry = required(file, where, visual, "geometry")
     pose = placement(file, where, visual)
     color = _color(file, where, visual.find("material"), colors)
     for kind in geometry:
         if kind.tag in _SIZES:
             size = tuple(value for name, count in _SIZES[kind.tag] for value in numbers(file, where, kind, name, count))
+            if not any(size):
+                return None
             if min(size) <= 0.0:
                 raise bad(file, f"{where} <{kind.tag}> size", size, "lengths above 0 [m]")
             return Shape(kind.tag, size, pose, color)  # type: ignore[arg-type]
