@@ -17,9 +17,9 @@ from types import ModuleType
 from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
-    "speed", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy", "adaptive",
-    "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness", "growth", "servo",
-    "identification", "all", "stale",
+    "speed", "beside", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy",
+    "adaptive", "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness", "growth",
+    "servo", "identification", "all", "stale",
 )  # fmt: skip
 
 

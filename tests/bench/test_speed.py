@@ -169,3 +169,13 @@ def test_compiled_derivatives_are_those_of_the_model():
     ours = [array for name, array in arrays.items() if name not in states]
     for found, theirs in zip(ours, expected, strict=True):
         np.testing.assert_allclose(found[0].T, theirs[:, 0], rtol=1e-9, atol=1e-9)
+
+
+def test_mujoco_holds_a_robot_with_passive_joints_by_the_others():
+    pytest.importorskip("mujoco")
+    from ce_gym.bench.speed import stepping
+
+    robot = load_robot("cassie")
+    batch = stepping.mujoco_batch(robot, "coupled", 2, 1, 0.005)
+    assert batch.model.nu == len(robot.driven) == len(robot.independent) - 4
+    stepping.theirs(batch, robot).run()

@@ -81,7 +81,8 @@ def mujoco_batch(robot: Robot, level: str, num_envs: int, num_threads: int, dt: 
 def theirs(batch: Batch, robot: Robot) -> Competitor:
     """Return a rollout; one unit of work is one robot's step."""
     calls = max(1, 32 // batch.num_envs)
-    control = np.repeat(stand.targets(robot, batch.num_envs, 1, seed=2), SUBSTEPS, axis=1)
+    moved = [robot.independent.index(name) for name in robot.driven]  # passive joints have no actuator
+    control = np.repeat(stand.targets(robot, batch.num_envs, 1, seed=2)[..., moved], SUBSTEPS, axis=1)
     out = np.empty((batch.num_envs, SUBSTEPS, batch.states.shape[1]))
 
     def run() -> None:

@@ -1,0 +1,65 @@
+"""Every robot's sub-step beside MuJoCo's, same contacts and targets, one core; of MuJoCo also at its cheapest level.
+
+Ours is exact, in double precision. MuJoCo, with Newton 4/4 as for robots that it is not tuned for, is timed at `exact`,
+where rotors are bodies and gears equalities, and at the simplest level that MJCF has for it: what most people run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+
+from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
+from ce_gym.bench.measure.timing import Competitor, interleaved, ratio
+from ce_gym.bench.speed import stepping
+from ce_gym.dynamics.model import Model
+from ce_gym.envs.custom import missing
+from ce_gym.model import Robot, RobotError, load_robot, robots
+
+REQUIRED = 40.0
+"""How many times as long as ours MuJoCo's sub-step has to take, exact."""
+SIMPLEST = ("armature", "coupled")
+NUM_ENVS, MUJOCO_ENVS = 1024, 32
+COLUMNS = ("robot", "contacts", "ours [us]", "MuJoCo exact [us]", "ratio", "MuJoCo simplest [us]", "level", "ratio ")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--robots", nargs="+", default=[], help="names or paths; without, all that tasks can have")
+    parser.add_argument("--rounds", type=int, default=15, help="how often each side is timed")
+    parser.add_argument("--dt", type=float, default=0.005, help="sub-step [s]")
+
+
+def run(arguments: argparse.Namespace) -> Report:
+    """Run the benchmark."""
+    stepping.quiet()
+    report, rows = Report("beside"), []
+    for name in arguments.robots or [name for name in robots() if not missing(load_robot(name))]:
+        rows.append(_row(load_robot(name), arguments, report))
+    report.tables.append(Table("A sub-step of one robot, one core, double precision", COLUMNS, tuple(rows)))
+    load = ", ".join(f"{x:.1f}" for x in os.getloadavg())
+    report.remarks.append(f"CPU time of one thread, sides in turn, best of {arguments.rounds} rounds. Load: {load}.")
+    return report
+
+
+def _row(robot: Robot, arguments: argparse.Namespace, report: Report) -> tuple[Cell, ...]:
+    sides: dict[str, Competitor] = {
+        "ours": stepping.ours(Model(robot), "float64", NUM_ENVS, 1, arguments.dt),
+    }
+    for level in ("exact", *SIMPLEST):
+        if level == SIMPLEST[1] and SIMPLEST[0] in sides:
+            continue
+        try:
+            sides[level] = stepping.theirs(stepping.mujoco_batch(robot, level, MUJOCO_ENVS, 1, arguments.dt), robot)
+        except (RobotError, ValueError) as error:
+            report.remarks.append(f"MuJoCo, {robot.name} {level}: {error}")
+    timings = interleaved(sides, arguments.rounds, time.thread_time)
+    best = {name: 1e6 * timing.best for name, timing in timings.items()}
+    times = {name: ratio(timing, timings["ours"]).cautious for name, timing in timings.items()}
+    simplest = next((level for level in SIMPLEST if level in best), None)
+    if "exact" in times:
+        claim = f"{robot.name}: MuJoCo / ours, exact, at least {REQUIRED:.0f}"
+        report.requirements.append(Requirement(claim, f"{times['exact']:.1f}", times["exact"] >= REQUIRED))
+    last = (best[simplest], simplest, times[simplest]) if simplest else (None, None, None)
+    return (robot.name, len(robot.contacts), best["ours"], best.get("exact"), times.get("exact"), *last)
