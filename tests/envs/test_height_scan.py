@@ -88,7 +88,7 @@ def test_around_feet_it_is_about_their_lowest_points():
     scan = {"size": (0.2, 0.0), "around": "feet", "clip": 9.0}
     program = make_program("mini_cheetah", "velocity", terrain="rough", observations={"height_scan": scan})
     (key,), robot = program.probe.looked, program.model.robot
-    call = program.stages.places(begins=False)
+    (call,) = program.stages.places(begins=False)
     q = program.model.standing_q + 0.0
     q[:7] = [3.0, 4.0, 0.5, np.cos(0.4), 0.0, 0.0, np.sin(0.4)]
     turned, places = looked_at(np.array(call.function(q)).ravel(), program.probe.grids[key])

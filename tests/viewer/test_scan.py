@@ -24,7 +24,7 @@ def test_points_are_where_the_sensor_looks(seen: str) -> None:
     program = make_program(TRIPOD, "velocity", terrain="rough", **{seen: scan})
     q = program.model.standing_q + 0.0
     q[:7] = [3.0, 4.0, 0.5, np.cos(0.4), 0.0, 0.0, np.sin(0.4)]
-    (grid,), pose = program.probe.grids.values(), np.array(program.stages.places(begins=False).function(q)).ravel()
+    (grid,), pose = program.probe.grids.values(), np.array(program.stages.places(begins=False)[0].function(q)).ravel()
     np.testing.assert_allclose(pose, [np.cos(0.8), np.sin(0.8), 3.0, 4.0], atol=1e-12)
     turn = np.array([[np.cos(0.8), np.sin(0.8)], [-np.sin(0.8), np.cos(0.8)]])
     np.testing.assert_allclose(np.array(scan_points(program)) @ turn, np.array(grid) @ turn, atol=1e-12)

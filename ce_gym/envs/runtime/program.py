@@ -264,11 +264,13 @@ class TaskProgram:
         buffers = [Buffer(HEIGHTS, 0, "table"), *buffers]
         if not (looked := self.probe.looked):
             return look, buffers
-        places = self.stages.places(begins)
-        for i, (name, at) in enumerate(zip(looked, places.outputs, strict=True)):
-            look = (*look, Lookup(HEIGHTS, FRAME, at, name, slopes=False, grid=self.probe.grids[name]))
-            buffers += [Buffer(at, places.function.numel_out(i), "scratch"), Buffer(name, looked[name], "scratch")]
-        return (places, *look), buffers
+        for places in self.stages.places(begins):
+            look = (*look, places)
+            for i, at in enumerate(places.outputs):
+                name = at.removesuffix("_places")
+                look = (*look, Lookup(HEIGHTS, FRAME, at, name, slopes=False, grid=self.probe.grids[name]))
+                buffers += [Buffer(at, places.function.numel_out(i), "scratch"), Buffer(name, looked[name], "scratch")]
+        return look, buffers
 
     def function(self, name: Literal["act", "assess", "begin"]) -> ca.Function:
         """Trace what is done once in an environment step, before and after its sub-steps, or in a reset."""

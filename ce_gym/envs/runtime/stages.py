@@ -94,8 +94,11 @@ class Stages:
         looked = {name: heights.numel() for name, heights in s.heights.items()}
         return Probe({name: block.numel() for name, block in blocks.items()}, rows, looked, s.grids, text)
 
-    def places(self, begins: bool) -> Call:
-        """Trace where terms look at the ground, after the sub-steps or where a robot `begins`; return the call.
+    def places(self, begins: bool) -> list[Call]:
+        """Trace where terms look at the ground, after the sub-steps or where a robot `begins`.
+
+        Returns:
+            Calls, each of which may depend on what is found at the places of those before.
 
         Raises:
             ValueError: If that depends on what is not known before observations are made.
@@ -104,12 +107,19 @@ class Stages:
         s = self._context(state | self.seen_ground | {"previous_action": state["action"]})
         self._blocks(s, Sampler())
         places = {f"{name}_places": at for name, at in s.places.items()}
-        known = {x.name() for x in ca.symvar(ca.vertcat(*[ca.vec(x) for x in self.state.values()]))}
-        for name, at in places.items():
-            if unknown := {x.name() for x in ca.symvar(at)} - known:
+        given, calls = dict(self.state), []
+        while places:
+            known = {x.name() for x in ca.symvar(ca.vertcat(*[ca.vec(x) for x in given.values()]))}
+            unknown = {name: {x.name() for x in ca.symvar(at)} - known for name, at in places.items()}
+            if all(unknown.values()):
+                name, first = next(iter(unknown.items()))
                 expected = "expected positions and memory alone"
-                raise ValueError(f"{name}: depends on {', '.join(sorted(unknown))}; {expected}")
-        return _call("seen_by_terms", self.state, places)
+                raise ValueError(f"{name}: depends on {', '.join(sorted(first))}; {expected}")
+            ready = [name for name in places if not unknown[name]]
+            calls.append(_call("seen_by_terms", given, {name: places.pop(name) for name in ready}))
+            found = [name.removesuffix("_places") for name in ready]
+            given |= {name: self.seen_ground[name] for name in found}
+        return calls
 
     def look(self) -> ca.Function:
         """Trace one observation of the policy, neither noisy nor clipped, and `failed`; of what they look at."""

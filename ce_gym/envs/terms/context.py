@@ -135,7 +135,8 @@ class TermContext:
 
         Args:
             name: Of what is found, a word.
-            places: x and y of each [m], shape (2, n); of positions, and of what the term recalls and drifts by.
+            places: x and y of each [m], shape (2, n); of positions, what the term recalls and drifts by, and heights
+                that it has found so.
         """
         return self._looked_up(name, ca.vec(places), places.shape[1])
 
@@ -151,8 +152,13 @@ class TermContext:
         points = tuple((float(x), float(y)) for x, y in np.asarray(grid).T)
         return self._looked_up(name, ca.vertcat(heading, ca.vec(places)), places.shape[1] * len(points), points)
 
+    @property
+    def on_field(self) -> bool:
+        """Whether the ground is a field, which is looked up, and not the plane z = 0."""
+        return self._ground.numel() > 0
+
     def _looked_up(self, name: str, places: SX, size: int, grid: Grid = ()) -> SX:
-        if not self._ground.numel():
+        if not self.on_field:
             return SX(ca.DM.zeros(size))
         key = self._key(name)
         self.places[key], self.grids[key] = places, grid

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
 from typing import Any
 
@@ -29,10 +29,17 @@ def grid_points(size: Sequence[float], spacing: float, centre: Sequence[float]) 
     return np.stack([along.ravel() for along in np.meshgrid(x, y, indexing="ij")])
 
 
-def check(name: str, value: Any, valid: bool, expected: str) -> None:
-    """Refuse a parameter of the scan that is not valid, in one line."""
-    if not valid:
-        raise ValueError(f"observation term 'height_scan': {name}={value!r}; expected {expected}")
+def check_of(term: str) -> Callable[[str, Any, bool, str], None]:
+    """Return what refuses a parameter of a term that is not valid, in one line."""
+
+    def refuse_unless(name: str, value: Any, valid: bool, expected: str) -> None:
+        if not valid:
+            raise ValueError(f"observation term {term!r}: {name}={value!r}; expected {expected}")
+
+    return refuse_unless
+
+
+check = check_of("height_scan")
 
 
 def _number(value: Any) -> bool:

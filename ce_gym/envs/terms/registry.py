@@ -17,7 +17,17 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.envs.terms import height_scan, metrics, observations, outcomes, rewards, sensors, skills, terminations
+from ce_gym.envs.terms import (
+    height_scan,
+    metrics,
+    observations,
+    outcomes,
+    range_scan,
+    rewards,
+    sensors,
+    skills,
+    terminations,
+)
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.sim.arguments import is_number
 
@@ -35,7 +45,10 @@ def _functions_of(module: ModuleType) -> dict[str, Function]:
 
 OWN: dict[str, dict[str, Function]] = {
     "reward": _functions_of(rewards) | _functions_of(skills),
-    "observation": _functions_of(observations) | _functions_of(height_scan) | _functions_of(sensors),
+    "observation": _functions_of(observations)
+    | _functions_of(height_scan)
+    | _functions_of(range_scan)
+    | _functions_of(sensors),
     "termination": _functions_of(terminations),
     "metric": _functions_of(metrics) | _functions_of(outcomes),
 }
