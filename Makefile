@@ -52,7 +52,7 @@ docs: .venv/installed
 
 gallery: .venv/installed
 	$(BIN)/python docs/robots_picture.py
-	for robot in g1 jvrc1 mini_cheetah mit_humanoid spot t1 tello; do $(BIN)/python -m ce_gym play $${robot}_velocity --size 320 240 \
+	for robot in cassie g1 jvrc1 mini_cheetah mit_humanoid spot t1 tello; do $(BIN)/python -m ce_gym play $${robot}_velocity --size 320 240 \
 		--command 1.5 0.5 0 0 --command 1.5 0.5 0 0.8 --video docs/images/$${robot}.gif || exit 1; done
 	$(BIN)/python -m ce_gym play mini_cheetah_stairs --seed 26 --command 7 0.6 0 0 --size 256 192 \
 		--env-arg 'terrain={"kind": "stairs", "rise": 0.1, "curriculum": false}' --video docs/images/mini_cheetah_stairs.gif
