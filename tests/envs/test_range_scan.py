@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ SENSOR = {"position": [0.1, 0.02, 0.05], "rotation": [0.1, 0.6, -0.2], "rays": [
 SENSOR |= {"reach": REACH, "steps": 12}
 
 
-def cast(height, start, direction, reach=REACH) -> float:
+def cast(height: Any, start: Any, direction: Any, reach: float = REACH) -> float:
     """First place in the ground along a ray, by steps of half a millimetre and bisection."""
     distances = np.arange(0, reach, 5e-4)
 
@@ -32,7 +34,7 @@ def cast(height, start, direction, reach=REACH) -> float:
     for _ in range(30):
         middle = (low + high) / 2
         low, high = (low, middle) if above(middle)[0] <= 0 else (middle, high)
-    return (low + high) / 2
+    return float(low + high) / 2
 
 
 def turned(w, x, y, z):
@@ -73,7 +75,7 @@ def rays(pattern: str) -> np.ndarray:
 def test_readings_are_those_of_a_ray_caster(kind, pattern):
     """The critic's within a millimetre; the policy's drift and are lost."""
     terrain = {"kind": "rough", "amplitude": 0.15, "curriculum": False} if kind == "rough" else "flat"
-    envs = gymnasium.make_vec(
+    envs: Any = gymnasium.make_vec(
         "ce_gym/MiniCheetahVelocity-v0",
         robot=TRIPOD,
         num_envs=N,

@@ -78,7 +78,7 @@ def _offsets(v: VectorBuilder, grid: Grid) -> Value:
     numbers = [float(np.dtype(v.dtype).type(x)) for point in grid for x in point]
     kind = ir.ArrayType(v.float_type.element, len(numbers))
     name = v.builder.module.get_unique_name("grid")
-    held = ir.GlobalVariable(v.builder.module, kind, name)
+    held: Value = ir.GlobalVariable(v.builder.module, kind, name)
     held.global_constant, held.linkage, held.align = True, "internal", ALIGNMENT
     held.initializer = ir.Constant(kind, numbers)
     return v.builder.bitcast(held, v.float_type.element.as_pointer())
