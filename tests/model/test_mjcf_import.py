@@ -224,3 +224,18 @@ def test_joints_that_follow_from_others_keep_their_stops(tmp_path):
     robot = load_robot(tmp_path / "tied.xml")
     assert robot.independent == ("a",)
     assert robot.body("b").joint.position == pytest.approx(np.radians((-80.0, 80.0)))
+
+
+def test_a_sprung_joint_that_a_tendon_moves_is_not_passive(tmp_path):
+    """Its actuator is left out, with a line; the joint keeps what a joint has."""
+    file = tmp_path / "tendon.xml"
+    file.write_text(
+        """<mujoco model="tendon"><worldbody>
+        <body name="arm"><joint name="hinge" axis="0 1 0" stiffness="3"/><geom size="0.02"/>
+        <body name="hand" pos="0 0 -0.2"><joint name="wrist" axis="0 1 0"/><geom size="0.02"/></body></body></worldbody>
+        <tendon><fixed name="cable"><joint joint="hinge" coef="1"/></fixed></tendon>
+        <actuator><position tendon="cable" kp="20"/><position joint="wrist" kp="5"/></actuator></mujoco>"""
+    )
+    with pytest.warns(LossyImportWarning, match="tendon"):
+        robot = load_robot(file)
+    assert robot.body("arm").joint.torque != 0.0

@@ -1,4 +1,4 @@
-"""Every benchmark that README and docs take figures from, one after the other, as one page with their CSV and JSON.
+"""The benchmarks of speed, accuracy and stability, one after the other, as one page with their CSV and JSON.
 
 Each runs in a process of its own, so that none finds memory or kernels of another; what a machine lacks is named as
 skipped. `--quick` takes about ten minutes, everything up to two hours.

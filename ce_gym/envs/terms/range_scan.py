@@ -21,6 +21,8 @@ MOST_PLACES = 4000
 """Where one sensor looks at the ground: rays times steps."""
 REFINEMENTS = 1
 """Look-ups of each ray after the march; for each all that was before is computed again."""
+SMALLEST = 1e-12
+"""Difference of heights that is still divided by [m]: a sensor in level ground has none."""
 
 
 def range_scan(
@@ -75,7 +77,8 @@ def range_scan(
     body = bodies[link]
     start = body.point_position(constant(np.array(position, dtype=float)))
     along = body.R @ ca.DM(_turned(rotation) @ directions)
-    reading = ca.fmin(reach, _hit(s, start, along, reach, steps)) + (drift * s.drift("offset") if drift else 0)
+    hit = _hit(s, start, along, reach, steps)
+    reading = ca.if_else(hit < reach, hit + (drift * s.drift("offset") if drift else 0), reach)
     if dropout:
         reading = ca.if_else(s.chance(reading.numel()) < dropout, reach, reading)
     return scale * ca.fmax(0, ca.fmin(reach, reading))
@@ -124,7 +127,7 @@ def _hit(s: TermContext, start: SX, along: SX, reach: float, steps: int) -> SX:
         over, under = ca.if_else(into, above[k - 1], over), ca.if_else(into, above[k], under)
     low = high - step
     for i in range(REFINEMENTS):
-        middle = low + (high - low) * over / (over - under)
+        middle = low + (high - low) * over / ca.fmax(over - under, SMALLEST)
         here = start[2] + ca.vec(along[2, :]) * middle - s.ground_under(f"refined_{i}", places(middle))
         into = here <= 0
         low, over, high, under = (
@@ -133,7 +136,7 @@ def _hit(s: TermContext, start: SX, along: SX, reach: float, steps: int) -> SX:
             ca.if_else(into, middle, high),
             ca.if_else(into, here, under),
         )
-    return ca.if_else(above[0] <= 0, 0, low + (high - low) * over / ca.fmax(over - under, 1e-12))
+    return ca.if_else(above[0] <= 0, 0, low + (high - low) * over / ca.fmax(over - under, SMALLEST))
 
 
 def _turned(rotation: Sequence[float]) -> NDArray:

@@ -35,7 +35,8 @@ def read_actuators(source: MjcfSource, tree: MjcfTree, independent: tuple[str, .
         if model.jnt_actfrclimited[j]:
             limits[body] = min(limits.get(body, np.inf), float(np.abs(model.jnt_actfrcrange[j]).max()))
     springs = {body.name for body in tree.bodies if body.joint.stiffness}
-    for name in [joint for joint in independent if model.nu and joint in springs and joint not in limits]:
+    passive = springs.intersection(independent) - _moved(source, tree) if model.nu else ()
+    for name in passive:
         limits[name] = 0.0
         del kp[name], kd[name]
     tree.bodies[:] = [
@@ -43,6 +44,19 @@ def read_actuators(source: MjcfSource, tree: MjcfTree, independent: tuple[str, .
         for body in tree.bodies
     ]
     return _gains(source, kp, kd)
+
+
+def _moved(source: MjcfSource, tree: MjcfTree) -> set[str]:
+    """Return the joints that an actuator of the file moves, those included whose actuator is left out."""
+    model, trn, joint = source.model, source.mujoco.mjtTrn, source.mujoco.mjtWrap.mjWRAP_JOINT
+    moved: set[int] = set()
+    for kind, (first, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
+        if kind in (trn.mjTRN_JOINT, trn.mjTRN_JOINTINPARENT):
+            moved.add(int(first))
+        elif kind == trn.mjTRN_TENDON:
+            along = range(model.tendon_adr[first], model.tendon_adr[first] + model.tendon_num[first])
+            moved |= {int(model.wrap_objid[w]) for w in along if model.wrap_type[w] == joint}
+    return {tree.moved_by[j] for j in moved if j in tree.moved_by}
 
 
 def _gains(source: MjcfSource, kp: dict[str, float], kd: dict[str, float]) -> Gains:

@@ -27,7 +27,7 @@ from ce_gym.model.frames import Placement, Vec3
 _KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
 _ELASTIC_KEYS = ("stiffness", "damping", "backlash", "preload")
 _MOTOR_KEYS = ("torque", "velocity", "stall", "damping", "friction", "bandwidth")
-_FRICTION_KEYS = tuple(field.name for field in fields(DriveFriction))
+_FRICTION_KEYS = tuple(field.name for field in fields(DriveFriction) if field.name != "factor")
 _BOTH_KEYS = ("load", "stribeck_load")
 """Stand for the share of the motor's torque and that of all else, equal."""
 
