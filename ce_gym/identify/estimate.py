@@ -19,7 +19,7 @@ from ce_gym.identify.fit import Problem, solve
 from ce_gym.identify.found import NORMAL_95, Identified
 from ce_gym.identify.held import held_model
 from ce_gym.identify.log import Log, LogError
-from ce_gym.identify.separable import Held, correlation_time, covariance_of, hold, known_badly
+from ce_gym.identify.separable import correlation_time, covariance_of, held_of, hold, known_badly, lines_of
 from ce_gym.identify.shots import Settings, Shots
 from ce_gym.identify.windows import PARTS, Windows, cut, first_states, noise_of_encoders
 from ce_gym.model import Robot, RobotError, load_robot
@@ -76,13 +76,15 @@ def identify(
     log = _ordered(model, log, control)
     shots = Shots(model, log, figures, Settings(control, substep, method, usable_cores()))
     fitted, kept = cut(log, window, longest_delay, held_out)
-    problem, x, held = _search(shots, fitted)
+    problem, x = _search(shots, fitted)
     free, scale = problem.free, problem.scale[problem.free]
     correlation = correlation_time(problem.residual)
-    known = covariance_of(problem.jacobian(x), correlation)
+    J = problem.jacobian_of_all(x)
+    known = covariance_of(J[:, free], correlation)
     covariance = np.zeros((len(figures), len(figures)))
     covariance[np.ix_(free, free)] = known * np.outer(scale, scale)
     values, std = problem.values(x), np.sqrt(np.diag(covariance))
+    held = held_of(J, values / problem.scale, free, figures, correlation)
     ends = {f.name: (v - NORMAL_95 * s, v + NORMAL_95 * s) for f, v, s in zip(figures, values, std, strict=True)}
     before = np.array([figure.start for figure in figures])
     curves, errors = _held_out(shots, kept, problem.noise, (before, values))
@@ -93,7 +95,7 @@ def identify(
         std=std,
         covariance=covariance,
         held=tuple(held),
-        cannot_tell=(*(which.line(ends) for which in held), *known_badly(known, x, [figures[i] for i in free])),
+        cannot_tell=(*lines_of(held, ends), *known_badly(known, x, [figures[i] for i in free])),
         noise=problem.noise,
         correlation=correlation,
         held_out=errors[1],
@@ -104,8 +106,8 @@ def identify(
     )
 
 
-def _search(shots: Shots, windows: Windows) -> tuple[Problem, Array, list[Held]]:
-    """Return a problem, the free figures that fit best, over their scales, and what is held.
+def _search(shots: Shots, windows: Windows) -> tuple[Problem, Array]:
+    """Return a problem, whose free figures are those that are not held, and these over their scales as they fit best.
 
     In short windows errors stay small and so does what friction makes of them, stick or slip: there the search goes
     first, for figures, states and noise to begin with.
@@ -115,15 +117,13 @@ def _search(shots: Shots, windows: Windows) -> tuple[Problem, Array, list[Held]]
     x = solve(short, x, 1e-3)
     short.weigh(x)
     problem = Problem(shots, windows, short.states[::PARTS], short.noise)
-    held: list[Held] = []
     while True:
         x = solve(problem, x, 1e-6)
         problem.weigh(x)
         figures, correlation = [shots.figures[i] for i in problem.free], correlation_time(problem.residual)
-        more, left, x = hold(problem.jacobian(x), x, figures, correlation)
-        if not more:
-            return problem, x, held
-        held += more
+        left, x = hold(problem.jacobian(x), x, figures, correlation)
+        if len(left) == len(figures):
+            return problem, x
         problem.free = problem.free[left]
         problem.forget()
 

@@ -76,6 +76,15 @@ class Problem:
         """Return their derivatives, shape (m, len(x))."""
         return self._at(x)[1]
 
+    def jacobian_of_all(self, x: Array) -> Array:
+        """Return derivatives by all figures, those that are not free too, at free figures x, shape (m, P)."""
+        self.residuals(x)
+        free, values = self.free, self.values(x)
+        self.free = np.arange(len(values))
+        J = self._evaluate(values / self.scale)[1]
+        self.free = free
+        return J
+
     def _at(self, x: Array) -> tuple[Array, Array]:
         if self._known is None or self._known[0] != x.tobytes():
             self.improve_states(x, 3 if self._settled else 8)

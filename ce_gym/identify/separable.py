@@ -16,6 +16,8 @@ UNKNOWN = 0.3
 LOOSE = 0.03
 """Of two figures that are correlated, one that is known worse than this is worth a line."""
 CORRELATED = 0.95
+SHIFTED = 0.3
+"""What is held goes into an estimate that it shifts by more than this share of the estimate's standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -25,26 +27,42 @@ class Held:
     Attributes:
         figure: The figure.
         share: Its standard deviation where nothing is held, over it or its scale.
-        taken: Figures that data cannot tell it from, and how much of each stands for one of it, in their units.
+        taken: Figures that are found and whose estimates it shifts, and how much of each stands for one of it, in
+            their units.
     """
 
     figure: Figure
     share: float
     taken: tuple[tuple[Figure, float], ...]
 
-    def line(self, intervals: Mapping[str, Sequence[float]]) -> str:
-        """Return which is held and why, and what combination the others' estimates and intervals are of."""
-        nominal = f"{self.figure.nominal:g}"
-        line = f"{self.figure.name} is held at {nominal}, as in the robot's file: the data "
-        if not self.taken:
-            return line + f"know it to {100 * self.share:.3g} % only"
-        own = self.figure.name if nominal == "0" else f"({self.figure.name} - {nominal})"
-        sums = []
-        for figure, much in self.taken:
-            low, high = intervals[figure.name]
-            is_that = f"{figure.name} {'-' if much < 0 else '+'} {abs(much):.4g} {own}"
-            sums.append(f"{is_that} is {(low + high) / 2:.5g}, {low:.5g} to {high:.5g}")
-        return line + f"cannot separate it from {' and '.join(f.name for f, _ in self.taken)}; {'; '.join(sums)}"
+
+def lines_of(held: Sequence[Held], intervals: Mapping[str, Sequence[float]]) -> list[str]:
+    """Return which figures are held and why, and what combinations the others' estimates and intervals are of.
+
+    Args:
+        held: All that is held: what is found may stand for several at once.
+        intervals: Of what is found, by name.
+    """
+    sums: dict[str, str] = {}
+    for which in held:
+        nominal = f"{which.figure.nominal:g}"
+        own = which.figure.name if nominal == "0" else f"({which.figure.name} - {nominal})"
+        for figure, much in which.taken:
+            so_far = sums.get(figure.name, figure.name)
+            sums[figure.name] = f"{so_far} {'-' if much < 0 else '+'} {abs(much):.4g} {own}"
+    lines = []
+    for which in held:
+        why, names = f"know it to {100 * which.share:.3g} % only", [figure.name for figure, _ in which.taken]
+        if names:
+            said = [f"{sums[name]} is {_interval_text(*intervals[name])}" for name in names]
+            why = f"cannot separate it from {' and '.join(names)}; {'; '.join(said)}"
+        nominal = f"{which.figure.nominal:g}"
+        lines.append(f"{which.figure.name} is held at {nominal}, as in the robot's file: the data {why}")
+    return lines
+
+
+def _interval_text(low: float, high: float) -> str:
+    return f"{(low + high) / 2:.5g}, {low:.5g} to {high:.5g}"
 
 
 def covariance_of(J: Array, correlation: float) -> Array:
@@ -59,9 +77,7 @@ def covariance_of(J: Array, correlation: float) -> Array:
     return correlation * (V.T / s**2) @ V
 
 
-def hold(
-    J: Array, x: Array, figures: Sequence[Figure], correlation: float
-) -> tuple[list[Held], NDArray[np.int64], Array]:
+def hold(J: Array, x: Array, figures: Sequence[Figure], correlation: float) -> tuple[NDArray[np.int64], Array]:
     """Choose figures to hold: of those that are not known, again and again the one that data feel least.
 
     Args:
@@ -71,9 +87,8 @@ def hold(
         correlation: Of residuals in time.
 
     Returns:
-        What is held; places of the others; their estimates given what is held.
+        Places of those that are not held; their estimates given what is.
     """
-    held: list[Held] = []
     left, x = np.arange(len(x)), x.copy()
     felt = np.linalg.norm(J, axis=0)
     while len(left) > 1:
@@ -85,16 +100,35 @@ def hold(
         worst = int(unknown[felt[left[unknown]].argmin()])
         figure = figures[int(left[worst])]
         slopes = covariance[:, worst] / covariance[worst, worst]
-        together = np.abs(_correlations(covariance)[worst]) > CORRELATED
-        taken = tuple(
-            (figures[int(i)], float(-slope * figures[int(i)].scale / figure.scale))
-            for i, slope, tied in zip(left, slopes, together, strict=True)
-            if tied and i != left[worst]
-        )
-        held.append(Held(figure, float(share[worst]), taken))
         x[left] += slopes * (figure.nominal / figure.scale - x[left[worst]])
         left = np.delete(left, worst)
-    return held, left, x[left]
+    return left, x[left]
+
+
+def held_of(J: Array, x: Array, left: NDArray[np.int64], figures: Sequence[Figure], correlation: float) -> list[Held]:
+    """Return what is held, and which estimates it shifts, all that is held at once.
+
+    Estimates are, to first order, the figures plus the least-squares solution of J_left Y = J_held times what is held
+    wrongly. How wrong that may be is what data leave open, but its own size or scale at most.
+
+    Args:
+        J: Derivatives of residuals of unit variance by all figures, held ones too, shape (m, P).
+        x: All figures over their scales, shape (P,).
+        left: Places of those that are not held.
+        figures: What they are.
+        correlation: Of residuals in time.
+    """
+    places, size = np.setdiff1d(np.arange(len(x)), left), np.maximum(np.abs(x), 1.0)
+    unsure, std = (np.sqrt(np.diag(covariance_of(J[:, these], correlation))) for these in (np.arange(len(x)), left))
+    Y = np.linalg.lstsq(J[:, left], J[:, places], rcond=None)[0]
+    shifts = np.abs(Y) * np.minimum(unsure, size)[places] > SHIFTED * std[:, None]
+    held = []
+    for k, place in enumerate(places):
+        figure = figures[int(place)]
+        others = [(figures[int(left[i])], float(Y[i, k])) for i in np.flatnonzero(shifts[:, k])]
+        taken = tuple((other, much * other.scale / figure.scale) for other, much in others)
+        held.append(Held(figure, float(unsure[place] / size[place]), taken))
+    return held
 
 
 def known_badly(covariance: Array, x: Array, figures: Sequence[Figure]) -> list[str]:

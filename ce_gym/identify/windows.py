@@ -60,11 +60,15 @@ def cut(log: Log, window: float, longest_delay: float, held_out: float) -> tuple
 
 
 def first_states(shots: Shots, windows: Windows) -> Array:
-    """Return a first guess of states, shape (W, nq + nv): cubics through the angles about the start of each window."""
-    n = min(int(windows.first[0]), max(3, round(0.02 / shots.log.dt)))
-    rows = np.arange(-n, n + 1)
-    powers = np.vander(rows * shots.log.dt, 4, increasing=True)
-    fit = np.einsum("pt,wtn->wpn", np.linalg.pinv(powers), shots.log.values[windows.first[:, None] + rows])
+    """Return a first guess of states, shape (W, nq + nv): cubics through the angles about the start of each window.
+
+    Near an end of the log they go through what there is on the other side.
+    """
+    log, last = shots.log, len(shots.log.values) - 1
+    n = min(max(3, round(0.02 / log.dt)), last // 2)
+    rows = np.clip(windows.first, n, last - n)[:, None] + np.arange(-n, n + 1)
+    powers = ((rows - windows.first[:, None]) * log.dt)[..., None] ** np.arange(4)
+    fit = np.linalg.pinv(powers) @ log.values[rows]
     q = shots.encoders.positions(fit[:, 0])
     ahead = shots.encoders.positions(fit[:, 0] + 1e-3 * fit[:, 1])
     return np.hstack([q, (ahead - q) / 1e-3])

@@ -82,7 +82,10 @@ def _drawn(figure: Figure, rng: np.random.Generator) -> float:
 
 
 def combined(found: Identified, planted: dict[str, float]) -> Array:
-    """Return what estimates should be, given that some figures are held at what they are not."""
+    """Return what estimates should be, given that some figures are held at what they are not.
+
+    What is held shifts only what is found (`ce_gym.identify.separable.held_of`), so that no shift goes into another.
+    """
     truth = dict(planted)
     for which in found.held:
         for figure, much in which.taken:
