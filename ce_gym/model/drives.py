@@ -11,9 +11,8 @@ class DriveFriction:
 
     With `tau_m` the torque of the motor, `tau_e` what all else does to the rotor, of opposite signs where it has to
     carry something, and `s = exp(-|speed / stribeck_speed|^stribeck_exponent)`, its dry friction is at most
-
-        friction + factor (|load_motor tau_m - load_external tau_e| + E
-            + s (stribeck + |stribeck_load_motor tau_m - stribeck_load_external tau_e| + Q)).
+    `friction + factor (|load_motor tau_m - load_external tau_e| + E + s (stribeck + S + Q))`, where
+    `S = |stribeck_load_motor tau_m - stribeck_load_external tau_e|`.
 
     If they are of opposite signs and the motor drives, `|tau_m| > |tau_e|`, it is `Q = stribeck_square_external
     tau_e^2` and `E = (1 / efficiency - 1) |tau_e|`; if it is driven back, `Q = stribeck_square_motor tau_m^2` and `E =
@@ -24,9 +23,12 @@ class DriveFriction:
         stribeck: What is added at rest [N m].
         stribeck_speed: Speed at which that has fallen to 37 % [rad/s].
         stribeck_exponent: How abruptly it falls; 2 for a Gaussian.
-        load_motor, load_external: Shares of torques [-].
-        stribeck_load_motor, stribeck_load_external: The same of what is added at rest [-].
-        stribeck_square_motor, stribeck_square_external: Shares of their squares in it [1/(N m)].
+        load_motor: Share of the motor's torque [-].
+        load_external: Share of what all else does [-].
+        stribeck_load_motor: The same of what is added at rest [-].
+        stribeck_load_external: The same [-].
+        stribeck_square_motor: Share of the square in what is added at rest [1/(N m)].
+        stribeck_square_external: The same [1/(N m)].
         efficiency: Share of the motor's torque that moves a load at a steady speed, without all the above [-].
         backdriving_efficiency: Share of a load that reaches the motor as it is driven back; 0 for self-locking [-].
         factor: On all of this [-].

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -96,6 +98,13 @@ class Windage:
     def friction(self, motor: Motor) -> float:
         """Return none."""
         return 0.0
+
+    def drive_friction(self, motor: Motor) -> None:
+        """Return none."""
+
+    def bandwidth(self, motor: Motor) -> float:
+        """Return that it gives torque at once."""
+        return math.inf
 
 
 def wheel() -> Model:

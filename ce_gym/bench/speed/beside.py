@@ -38,8 +38,9 @@ def run(arguments: argparse.Namespace) -> Report:
     for name in arguments.robots or [name for name in robots() if not missing(load_robot(name))]:
         rows.append(_row(load_robot(name), arguments, report))
     report.tables.append(Table("A sub-step of one robot, one core, double precision", COLUMNS, tuple(rows)))
-    load = ", ".join(f"{x:.1f}" for x in os.getloadavg())
-    report.remarks.append(f"CPU time of one thread, sides in turn, best of {arguments.rounds} rounds. Load: {load}.")
+    average = getattr(os, "getloadavg", None)  # Windows does not count
+    load = f" Load: {average()[0]:.1f}." if average else ""
+    report.remarks.append(f"CPU time of one thread, sides in turn, best of {arguments.rounds} rounds.{load}")
     return report
 
 

@@ -18,11 +18,11 @@ from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.grid import check_of
 
 MOST_PLACES = 4000
-"""Where one sensor looks at the ground: rays times steps."""
+"""How many places one sensor looks at, rays times steps."""
 REFINEMENTS = 1
 """Look-ups of each ray after the march; for each all that was before is computed again."""
 SMALLEST = 1e-12
-"""Difference of heights that is still divided by [m]: a sensor in level ground has none."""
+"""Least difference of heights that is divided by [m], for a sensor in level ground has none."""
 
 
 def range_scan(

@@ -91,6 +91,8 @@ def motor_torques(s: TermContext) -> SX:
     The mean over the last sub-step, before friction; what motors without a limit give is over 100 N m.
     """
     limits = [motor.torque for motor in s.mechanism.robot.motors]
+    if not limits:
+        return SX(0, 1)
     return s.motor_torque / np.array([limit if 0 < limit < np.inf else 100.0 for limit in limits])
 
 
