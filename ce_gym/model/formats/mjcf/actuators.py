@@ -48,14 +48,14 @@ def read_actuators(source: MjcfSource, tree: MjcfTree, independent: tuple[str, .
 
 def _moved(source: MjcfSource, tree: MjcfTree) -> set[str]:
     """Return the joints that an actuator of the file moves, those included whose actuator is left out."""
-    model, trn, joint = source.model, source.mujoco.mjtTrn, source.mujoco.mjtWrap.mjWRAP_JOINT
+    model, mujoco = source.model, source.mujoco
     moved: set[int] = set()
-    for kind, (first, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
-        if kind in (trn.mjTRN_JOINT, trn.mjTRN_JOINTINPARENT):
+    for a, (first, _) in enumerate(model.actuator_trnid):
+        if drives_joint(source, a):
             moved.add(int(first))
-        elif kind == trn.mjTRN_TENDON:
+        elif model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
             along = range(model.tendon_adr[first], model.tendon_adr[first] + model.tendon_num[first])
-            moved |= {int(model.wrap_objid[w]) for w in along if model.wrap_type[w] == joint}
+            moved |= {int(model.wrap_objid[w]) for w in along if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT}
     return {tree.moved_by[j] for j in moved if j in tree.moved_by}
 
 
