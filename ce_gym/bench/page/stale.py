@@ -1,7 +1,7 @@
 """Figures of README and docs that name a commit, and what has changed since in the code that they were measured on.
 
 A figure names its command and its commit, "`python -m ce_gym.bench speed` at 1a2b3c4". It is stale when files have
-changed since that the benchmark runs: physics and compiler, environments where it steps them, its own.
+changed since that the benchmark runs: model, physics and compiler, and environments where it steps them.
 """
 
 from __future__ import annotations
