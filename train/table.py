@@ -26,8 +26,11 @@ from transfer import interval, shown
 
 from ce_gym.policies import load_policy
 
-LEARNERS = ("fast_ppo", "ppo", "shac")
-"""Files that have `train(job)`; their own `Settings` if they have others than PPO."""
+LEARNERS = {
+    **{name: name for name in ("fast_ppo", "ppo", "shac")},
+    **{name: f"others.{name}" for name in ("plain_sb3", "plain_sbx", "plain_rsl_rl", "clean_ppo")},
+}
+"""Modules that have `train(job)`; their own `Settings` if they have others than PPO. What others need is in them."""
 
 TARGETS = (0.1, 0.06)
 """Forward errors whose times are wanted [m/s]."""
@@ -53,7 +56,7 @@ def row_of(key: Mapping[str, Any], folder: Path, overrides: Sequence[str] = (), 
         Times [s], of the wall and of all threads together; the policy's forward error [m/s] and falls; shares of the
         time; times until a checkpoint came within each of `TARGETS`, empty if none did; the machine's load at the end.
     """
-    module = importlib.import_module(key["learner"])
+    module = importlib.import_module(LEARNERS[key["learner"]])
     kind = getattr(module, "Settings", Settings)
     path = config_file(key["env"], kind.folder)
     settings, kwargs = load_settings(path, overrides, kind), load_env_args(path)
