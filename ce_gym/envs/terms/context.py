@@ -19,6 +19,7 @@ from ce_gym.dynamics.algebra.spatial import SX, quaternion_product
 from ce_gym.dynamics.forces.ground import above as over_ground
 from ce_gym.dynamics.recursion.derived import spanning_coordinates
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
+from ce_gym.dynamics.standing import standing_pose
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -306,6 +307,16 @@ class TermContext:
             ca.vertcat(sum(p[:2] for p in points) / len(points), ca.mmin(ca.horzcat(*[p[2] for p in points])))
             for points in spheres.values()
         ]
+
+    @cached_property
+    def foot_sides(self) -> list[float]:
+        """How far to the left of the base's middle the spheres of each foot are in the standing pose, means [m]."""
+        standing, sides = standing_pose(self.mechanism), dict[str, list[float]]()
+        for sphere in self.mechanism.robot.contacts:
+            if sphere.group == "foot":
+                place = standing.p[sphere.body] + standing.R[sphere.body] @ np.array(sphere.position)
+                sides.setdefault(sphere.body, []).append(place[1])
+        return [float(np.mean(places)) for places in sides.values()]
 
     def touching(self, group: str) -> SX:
         """Whether each contact sphere of a group is on the ground, 0 or 1, shape (n,)."""

@@ -6,6 +6,7 @@ is a rate: a task multiplies it by its weight and by the control step.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import casadi as ca
@@ -142,6 +143,20 @@ def swing_height(s: TermContext, height: float = 0.06, offsets: Sequence[float] 
     for i in range(s.foot_heights.numel()):
         lift = ca.fmax(0, ca.sin(s.phase + 2 * np.pi * offsets[i % len(offsets)]))
         total += (s.foot_heights[i] - ca.if_else(moving, height * lift, 0)) ** 2
+    return total
+
+
+def feet_distance(s: TermContext, least: float = 0.2) -> SX:
+    """How much less than `least` [m] left feet are to the left of right ones, along the base's y-axis, squared [m^2].
+
+    Left and right are those of the standing pose, where they are further apart than half of it. Keeps legs from
+    crossing: links pass through each other unless a scene has self-collisions.
+    """
+    total, y_axis = SX(0), s.kinematics.bodies[s.mechanism.robot.bodies[0].name].R[:, 1]
+    feet = list(zip(s.foot_places, s.foot_sides, strict=True))
+    for (left, y_left), (right, y_right) in itertools.permutations(feet, 2):
+        if y_left - y_right > least / 2:
+            total += ca.fmax(0, least - ca.dot(y_axis, left - right)) ** 2
     return total
 
 
