@@ -128,6 +128,8 @@ class FastPPO:
         figures = self.learn(linear(s.entropy, s.final_entropy, done))
         if s.target_kl:
             self.rate = adapted_rate(self.rate, figures["train/approx_kl"], s.target_kl)
+        else:
+            self.rate = linear(s.learning_rate, 0.0, min(self.steps / s.steps, 1.0))
         return figures
 
     def collect(self, cost: float) -> None:

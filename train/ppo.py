@@ -45,7 +45,7 @@ from progress import StopInOrder, read_curve
 from run_folder import going_on, make_folder, save_somewhere, write_whole
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from training_page import Present
 
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
@@ -125,7 +125,7 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
         "ortho_init": True,
     }
     options: dict[str, Any] = {
-        "learning_rate": s.learning_rate,
+        "learning_rate": s.learning_rate if s.target_kl else LinearSchedule(s.learning_rate, 0.0, 1.0),
         "n_steps": s.rollout,
         "batch_size": -(-s.num_envs * s.rollout // s.minibatches),
         "n_epochs": s.epochs,

@@ -40,7 +40,7 @@ def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: i
 
     Args:
         env_id: Registered environment id.
-        s: What shapes learning. The divergence is kept near `target_kl` by a penalty, not by the learning rate.
+        s: What shapes learning. The divergence is kept near `target_kl` by a penalty; without it the rate falls linearly.
         runners: Processes that step environments; 0 steps them here.
         learners: Processes that learn; 0 learns here.
         seed: Of everything.
@@ -66,7 +66,7 @@ def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: i
             train_batch_size_per_learner=samples // max(learners, 1),
             minibatch_size=samples // s.minibatches // max(learners, 1),
             num_epochs=s.epochs,
-            lr=s.learning_rate,
+            lr=s.learning_rate if s.target_kl else [[0, s.learning_rate], [s.steps, 0.0]],
             gamma=s.gamma,
             lambda_=s.gae_lambda,
             clip_param=s.clip,

@@ -32,12 +32,15 @@ from settings import Settings, config_file, load_env_args, load_settings
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
 from ce_gym.policies import Actor, add_env_arg, keep_map, load_policy
 
+DIVERGENCE = 0.01
+"""What the learning rate is adapted to where settings ask for one that falls linearly; usual with rsl_rl."""
+
 
 def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str, Any]:
     """Return our settings in the form that rsl_rl's runner takes; `groups` are those of the observations.
 
     The weight of the entropy bonus stays as it is at the start, the noise is learned, and falls cost nothing: rsl_rl
-    has no schedules for them.
+    has no schedules for them. Nor has it one for the learning rate but that which a divergence sets.
     """
     network = {"class_name": "MLPModel", "hidden_dims": list(s.hidden), "activation": s.activation.lower()}
     spread = {"class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log"}
@@ -60,8 +63,8 @@ def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str
             "entropy_coef": s.entropy,
             "learning_rate": s.learning_rate,
             "max_grad_norm": s.max_grad_norm,
-            "schedule": "adaptive" if s.target_kl else "fixed",
-            "desired_kl": s.target_kl or None,
+            "schedule": "adaptive",
+            "desired_kl": s.target_kl or DIVERGENCE,
         },
     }
 

@@ -1,5 +1,6 @@
 """The fast learner: it learns, repeats itself, goes on where it stopped, and shares the reference's ways."""
 
+import csv
 import json
 import os
 import shlex
@@ -53,6 +54,17 @@ def test_it_learns_as_the_reference_does(trained, tmp_path):
     assert ours["forward_error"] < 0.1
     assert ours["reward"] == pytest.approx(theirs["reward"], abs=1.0)  # of 50
     assert ours["falls"] == 0.0
+
+
+@pytest.mark.parametrize("learn", [train, reference_train])
+def test_without_a_target_the_rate_falls_linearly(learn, tmp_path):
+    learn(job(tmp_path, 10 * 1024, tensorboard=False))
+    with (tmp_path / "progress.csv").open(newline="") as lines:
+        found = [row["train/learning_rate"] for row in csv.DictReader(lines)]
+    rates = [float(rate) for rate in found if rate]  # the reference logs an update with the next rollout
+    assert len(rates) >= 9
+    np.testing.assert_allclose(np.diff(rates), -1e-3, rtol=1e-4)
+    assert 0 <= rates[-1] <= 1e-3 * (1 + 1e-6)
 
 
 def test_the_policy_file_is_the_trained_policy(trained):

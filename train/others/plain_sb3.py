@@ -8,6 +8,7 @@ import torch
 from job import Job, Trained
 from others.keeping import Keeper
 from stable_baselines3 import PPO
+from stable_baselines3.common.utils import LinearSchedule
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.policies import Actor
@@ -37,7 +38,7 @@ def train(job: Job) -> Trained:
 def arguments(s: Any) -> dict[str, Any]:
     """Return our settings in the form that PPO of Stable-Baselines3, and of SBX, takes."""
     return {
-        "learning_rate": lambda remaining: s.learning_rate * remaining,
+        "learning_rate": LinearSchedule(s.learning_rate, 0.0, 1.0),
         "n_steps": s.rollout,
         "batch_size": -(-s.num_envs * s.rollout // s.minibatches),
         "n_epochs": s.epochs,
