@@ -40,7 +40,7 @@ def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: i
 
     Args:
         env_id: Registered environment id.
-        s: What shapes learning. The divergence is kept near `target_kl` by a penalty; without it the rate falls linearly.
+        s: What shapes learning. The divergence is kept near `target_kl` by a penalty; without one the rate falls.
         runners: Processes that step environments; 0 steps them here.
         learners: Processes that learn; 0 learns here.
         seed: Of everything.

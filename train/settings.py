@@ -94,7 +94,7 @@ class Settings(CommonSettings):
     Attributes:
         final_std: 0 lets the learner choose it during training. Of use where robots fall by the mean action, by which
             policies are judged, that stood with the noise of training.
-        target_kl: KL divergence of one update that the learning rate is adapted to; with 0 the rate falls linearly to 0.
+        target_kl: KL divergence of an update that the learning rate is adapted to; with 0 it falls linearly to 0.
         clip: Clipping range of PPO's probability ratio.
         entropy: Weight of the entropy bonus at the start.
         final_entropy: At the end, linear in between.
