@@ -70,11 +70,14 @@ def physics_rows(
     start = {"q": model.standing_q, "dependent": model.guess}
     sizes = state_sizes(model.mechanism, options)
     explicit = isinstance(METHODS[options.method].end, Rates)
-    check("method", options.method, not (explicit and "winding" in sizes), "an implicit one, for torques of motors lag")
+    for part, why in (("winding", "torques of motors lag"), ("supply", "motors grow warm or a battery sags")):
+        check("method", options.method, not (explicit and part in sizes), f"an implicit one, for {why}")
     rows = [Row(name, size, "physics", start.get(name, 0.0)) for name, size in sizes.items()]
     rows += [Row("diverged", 1, "physics"), Row("retries", 1, "physics")]
     lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts}
     lengths |= {"motor_torque": motors, "motor_speed": motors}
+    fed = sizes.get("supply", 0) % 2
+    lengths |= {"winding_temperature": (sizes.get("supply", 0) - fed) // 2, "battery_voltage": fed}
     rows += [Row(name, size, "physics") for name in outputs if (size := lengths.get(name, 1))]
     if options.parameters:
         defaults = parameter_defaults(model.robot, options.material, options.parameters)

@@ -60,7 +60,8 @@ class Simulator:
         contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
         material: Compliance and friction of the contacts; the robot's own if None.
         outputs: Which of "torque", "motor_torque", "motor_speed", "power", "contact_forces", "energy", "error",
-            "loop_gap" and "nearness" to compute; those left out cost nothing and read as errors.
+            "loop_gap", "nearness", "winding_temperature" and "battery_voltage" to compute; those left out cost nothing
+            and read as errors.
         method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
             scenes); or "adaptive": every robot advances by `dt` in extrapolated steps of its own, which are as long as
             `tolerance` allows.
@@ -197,7 +198,7 @@ class Simulator:
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
         rows |= {
             name: np.zeros(self._arrays[name].shape[1])
-            for name in ("anchor", "pressed", "carried", "winding", "diverged", "step_error", "step_change")
+            for name in ("anchor", "pressed", "carried", "winding", "supply", "diverged", "step_error", "step_change")
             if name in self._arrays
         }
         if "step_length" in self._arrays:
@@ -312,6 +313,11 @@ class Simulator:
         "Torque of motors' windings over a step, before losses [N m], shape (num_envs, n_motors).",
     )
     motor_speed = _reading("motor_speed", "Speeds of motors' rotors after a step [rad/s], shape (num_envs, n_motors).")
+    winding_temperature = _reading(
+        "winding_temperature",
+        "Temperatures of the windings of motors that grow warm, after a step [deg C], shape (num_envs, n_warm).",
+    )
+    battery_voltage = _reading("battery_voltage", "Voltage of the battery after a step [V], shape (num_envs,).", True)
     power = _reading("power", "Mechanical power of the motors at the joints after a step [W], shape (num_envs, nj).")
     error = _reading("error", "Estimated error of the last sub-step in `v` [rad/s or m/s], shape (num_envs,).", True)
     energy = _reading("energy", "Kinetic, potential and elastic energy after a step [J], shape (num_envs,).", True)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import reference_guess
-from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors
+from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors, supply_size
 from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactMaterial
@@ -94,6 +94,8 @@ class State:
         carried: Over the last step the torque of each motor whose friction depends on it, then what all else did to
             each of their rotors [N m], and 1; zeros where there was no step before, shape (2 n_loaded + 1,).
         winding: Torque at the end of the last step of each motor whose torque lags [N m], shape (n_lagging,).
+        supply: How much the winding of each motor that grows warm is warmer than the air, then each of their housings
+            [K], and how far the battery's voltage is below that without load [V], if there is one.
     """
 
     q: SX
@@ -104,6 +106,7 @@ class State:
     pressed: SX
     carried: SX
     winding: SX
+    supply: SX
 
     def items(self) -> list[tuple[str, SX]]:
         """Return the parts that are there, by name."""
@@ -135,6 +138,7 @@ def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
     loaded = loaded_motors(mechanism.robot, options.motors)
     sizes["carried"] = 2 * len(loaded) + 1 if loaded else 0
     sizes["winding"] = len(lagging_motors(mechanism.robot, options.motors))
+    sizes["supply"] = supply_size(mechanism.robot, options.motors)
     return {name: size for name, size in sizes.items() if size}
 
 

@@ -116,6 +116,10 @@ RANDOMISED = {
     "motor_damping": "factor on the viscous friction of each motor, limited ones [-]",
     "motor_friction": "factor on the dry friction of each motor, limited ones [-]",
     "drive_friction": "factor on what that is more at rest and under load [-]",
+    "cogging": "factor on the cogging of motors, limited ones [-]",
+    "ambient": "temperature of the air around motors that grow warm, limited ones [deg C]",
+    "battery_voltage": "factor on the voltage of the battery without load, limited motors [-]",
+    "battery_resistance": "factor on its resistance, likewise [-]",
     "added_mass": "mass added to the base [kg]; added_mass:BODY for another body",
     "com_shift": "shift of the base's centre of mass, each axis [m]; com_shift:BODY for another body",
 }
