@@ -21,8 +21,8 @@ def check_supply(robot: Robot, file: str) -> None:
         key = f"motors.{motor.rotor}"
         if motor.motor_constant is not None and not motor.motor_constant > 0.0:
             raise bad(file, f"{key}.motor_constant", motor.motor_constant, "more than 0 [N m/sqrt(W)]")
-        for order, torque, _ in motor.cogging:
-            check_not_negative(file, f"{key}.cogging.{order}", torque, " [N m]")
+        for i, (_, torque, _) in enumerate(motor.cogging):
+            check_not_negative(file, f"{key}.cogging[{i}][1]", torque, " [N m]")
         if motor.heat is not None:
             _check_heat(motor.heat, file, f"{key}.heat")
             _check_known(motor, file, key, "heat")

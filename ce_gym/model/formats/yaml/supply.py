@@ -34,16 +34,14 @@ def read_heat(motor: Section, used: MotorType | None) -> dict[str, Any]:
 
 
 def read_cogging(motor: Section) -> dict[str, Any]:
-    """Return harmonics of cogging by their order in a turn: a torque, or a torque and a phase."""
-    if "cogging" not in motor:
-        return {}
-    section, found = motor.section("cogging"), []
-    for key, value in section.data.items():
-        name = section.key(key)
-        if not (isinstance(key, int) and key > 0):
-            raise bad(motor.file, name, key, "a whole number of periods in a turn of the rotor")
-        given = value if isinstance(value, list) else [value, 0.0]
-        if len(given) != 2:
-            raise bad(motor.file, name, value, "a torque [N m], or a torque and a phase [rad]")
-        found.append((key, *(finite(motor.file, name, number) for number in given)))
-    return {"cogging": tuple(sorted(found))}
+    """Return harmonics of cogging, each a list of its order in a turn, torque and phase, which may be left out."""
+    found = []
+    for i, item in enumerate(motor.list("cogging")):
+        key = f"{motor.key('cogging')}[{i}]"
+        if not isinstance(item, list) or len(item) not in (2, 3):
+            raise bad(motor.file, key, item, "order in a turn of the rotor, torque [N m] and perhaps phase [rad]")
+        order, torque, phase = (finite(motor.file, f"{key}[{j}]", x) for j, x in enumerate([*item, 0.0][:3]))
+        if not (order > 0 and order == int(order)):
+            raise bad(motor.file, f"{key}[0]", order, "a whole number of periods in a turn of the rotor")
+        found.append((int(order), torque, phase))
+    return {"cogging": tuple(found)} if found else {}
