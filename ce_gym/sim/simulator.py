@@ -79,6 +79,8 @@ class Simulator:
             they are not near, that saves their time.
         retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move too far, see
             `ce_gym.dynamics.stepping.parts.LARGEST_MOVE`; it alone then makes the sub-step in parts.
+        control_period: Of the controllers of positions: they look at joints or motors every so often, a multiple of
+            `dt`, and hold their torques in between [s]; 0 for controllers so fast that they never stop looking.
         device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
 
     Attributes:
@@ -120,6 +122,7 @@ class Simulator:
         self_collisions: str | Sequence[Sequence[str]] = (),
         seldom: str | Sequence[str] = (),
         retry: int = 6,
+        control_period: float = 0.0,
         device: str | Device = "cpu",
     ) -> None:
         self._made_with = {name: value for name, value in locals().items() if name != "self"}
@@ -154,6 +157,7 @@ class Simulator:
             self_collisions=select_pairs(model.mechanism, self_collisions),
             seldom=tuple(name for name in select_contacts(model.robot, seldom) if name in self.contact_names),
             retry=retry,
+            control_period=control_period,
         )
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
@@ -198,7 +202,17 @@ class Simulator:
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
         rows |= {
             name: np.zeros(self._arrays[name].shape[1])
-            for name in ("anchor", "pressed", "carried", "winding", "supply", "diverged", "step_error", "step_change")
+            for name in (
+                "anchor",
+                "pressed",
+                "carried",
+                "winding",
+                "supply",
+                "held",
+                "diverged",
+                "step_error",
+                "step_change",
+            )
             if name in self._arrays
         }
         if "step_length" in self._arrays:

@@ -37,7 +37,7 @@ from ce_gym.dynamics.forces.motors import (
 )
 from ce_gym.dynamics.forces.parameters import rubbing_as_declared
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
-from ce_gym.dynamics.forces.scene import Scene, StepOptions
+from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.drives import Motor
 from ce_gym.model.mechanism import Mechanism
@@ -102,19 +102,22 @@ class Before:
         carried: What friction under load goes by.
         windings: Torques at its end [N m], of those that lag.
         supply: Temperatures and voltage at its end.
+        held: What a sampled controller holds, as `State.held` is.
     """
 
     carried: Carried
     windings: Mapping[int, SX]
     supply: Supply
+    held: SX
 
     @staticmethod
-    def of(mechanism: Mechanism, options: StepOptions, carried: SX, windings: SX, supply: SX) -> Before:
-        """Return it, given columns as `State.carried`, `State.winding` and `State.supply` are."""
+    def of(mechanism: Mechanism, options: StepOptions, carried: SX, state: State) -> Before:
+        """Return it, given the state before and a column as `State.carried` is."""
         robot, model = mechanism.robot, options.motors
         loaded, lagging = loaded_motors(robot, model), lagging_motors(robot, model)
         torques = {place: (carried[i], carried[len(loaded) + i], carried[-1]) for i, place in enumerate(loaded)}
-        return Before(torques, {place: windings[i] for i, place in enumerate(lagging)}, supply_of(robot, model, supply))
+        windings = {place: state.winding[i] for i, place in enumerate(lagging)}
+        return Before(torques, windings, supply_of(robot, model, state.supply), state.held)
 
 
 def motor_forces(

@@ -151,7 +151,7 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
 
     laws, unloaded = touching(scene, kinematics, state, dt), iterate.numel() - state.carried.numel()
     carried = carried_now(state, iterate[unloaded:])
-    before = Before.of(mechanism, scene.options, carried, state.winding, state.supply)
+    before = Before.of(mechanism, scene.options, carried, state)
     driven = Motors(scene, kinematics, y, yd, target, dt, before)
     meeting = meeting_pairs(scene, kinematics, state, dt)
     rubbing = JointFriction(mechanism, kinematics, yd, dt)
@@ -223,6 +223,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         carried=carried_after(scene, kinematics, motors, solved.inertia, motion) if solved.inertia else solved.carried,
         winding=windings_after(scene, motors, motion),
         supply=supply_after(scene, kinematics, motors, motion, state.supply, yd, dt),
+        held=motors.sampled,
     )
     touches = [*solved.contacts, *solved.pairs]
     unconverged = ca.sum1(stacked([c.check(motion) for c in touches])) > 0

@@ -59,6 +59,7 @@ class Task:
         self_collisions: Which links push each other apart: "listed", "all" or pairs, see `ce_gym.Simulator`.
         friction: "tangent" or "secant", see `ce_gym.Simulator`.
         motors: "ideal" or "limited", see `ce_gym.Simulator`.
+        control_period: Of the motors' controllers [s], a multiple of `dt`; 0 for none, see `ce_gym.Simulator`.
         method: How sub-steps are made, "euler" or another, see `ce_gym.Simulator`.
         tolerance: Of method "adaptive" [rad or m]; every robot then makes steps of its own within each sub-step.
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
@@ -96,6 +97,7 @@ class Task:
     self_collisions: str | tuple[tuple[str, ...], ...] = ()
     friction: Literal["tangent", "secant"] = "tangent"
     motors: Literal["ideal", "limited"] = "ideal"
+    control_period: float = 0.0
     method: str = "euler"
     tolerance: float | None = None
     only_positive: bool = True
