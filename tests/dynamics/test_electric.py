@@ -210,6 +210,17 @@ def test_cogging_holds_a_rotor_and_vanishes_at_speed():
     assert np.abs(fast["motor_speed"][:, 0] / 95.0 - 1).max() < 2e-3
 
 
+def test_stiff_teeth_do_not_throw_a_rotor_in_long_steps():
+    """A hundred times the stiffness at which explicit steps would: implicit where teeth hold, so it comes to rest."""
+    teeth = ((84, 20.0, 0.0),)
+    held = run(table(cogging=teeth), [0.0], 0.005, 400, ("energy",), q=[0.005 / RATIO])
+    stiffness = 84 * 20.0 * 0.005**2 * RATIO**2 / Model(table()).mass_matrix(np.zeros(1))[0, 0]
+    assert stiffness > 100
+    assert np.abs(RATIO * held["q"]).max() < 0.0051
+    assert (held["energy"] < -20 / 84 * np.cos(84 * 0.005)).all()  # what it had at first
+    assert np.abs(RATIO * held["q"][-1]).max() < 1e-4
+
+
 @pytest.mark.parametrize(
     ("name", "value", "change"),
     [

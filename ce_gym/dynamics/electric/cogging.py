@@ -2,8 +2,9 @@
 
 It is that of a potential, a sum of harmonics `-(A / n) cos(n theta + phase)`, so it gives nothing over a turn. A step
 takes its mean over the way that the rotor goes in it, which is what the potential falls by over that way: where a step
-is longer than a tooth the mean vanishes, as cogging at speed does, instead of being any value of it. It is implicit
-where it holds the rotor back.
+is longer than a tooth the mean vanishes, as cogging at speed does, instead of being any value of it. Where teeth hold
+the rotor back they count by where they will be at the end of the step, twice the slope of the mean: then they never
+throw it over the place where they hold it, however stiff they are.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def cogging(harmonics: Iterable[Harmonic], angle: SX, speed: SX, dt: SX | float)
         half, middle = order * way / 2, order * (angle + way / 2) + phase
         share, slope = _mean(half)
         torque -= size * ca.sin(middle) * share
-        stiffness += size * order / 2 * (ca.cos(middle) * share + ca.sin(middle) * slope)
+        stiffness += size * order * (ca.cos(middle) * share + ca.sin(middle) * slope)
     return torque, dt * dt * ca.fmax(stiffness, 0)
 
 

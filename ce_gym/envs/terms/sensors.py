@@ -102,11 +102,9 @@ def winding_temperatures(s: TermContext) -> SX:
 
 
 def battery_sag(s: TermContext) -> SX:
-    """How far the battery's voltage is below that without load, over the nominal one [-], shape (1,)."""
+    """How far the battery's voltage is below that without load, over the nominal one [-], shape (1,); () without."""
     battery = s.mechanism.robot.battery
-    if battery is None or not s.supply.numel():
-        raise ValueError("observation term 'battery_sag': expected limited motors of a robot with a `battery`")
-    return s.supply[-1] / battery.nominal
+    return SX(0, 1) if battery is None or not s.supply.numel() else s.supply[-1] / battery.nominal
 
 
 def _link(s: TermContext, term: str, name: str) -> BodyState:
