@@ -19,7 +19,7 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.drives.load import carried_after, carried_now, windings_after
+from ce_gym.dynamics.drives.load import carried_after, carried_now, supply_after, windings_after
 from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretching
 from ce_gym.dynamics.forces.actuation import Before, limit_count
 from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground
@@ -151,7 +151,7 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
 
     laws, unloaded = touching(scene, kinematics, state, dt), iterate.numel() - state.carried.numel()
     carried = carried_now(state, iterate[unloaded:])
-    before = Before.of(mechanism, scene.options, carried, state.winding)
+    before = Before.of(mechanism, scene.options, carried, state)
     driven = Motors(scene, kinematics, y, yd, target, dt, before)
     meeting = meeting_pairs(scene, kinematics, state, dt)
     rubbing = JointFriction(mechanism, kinematics, yd, dt)
@@ -205,6 +205,7 @@ def iteration(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
 def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) -> Stepped:
     """Return what a step leaves behind whose acceleration is known; arguments as for `solve`."""
     kinematics, motion, motors = solved.kinematics, solved.motion, solved.motors
+    yd = state.v[scene.mechanism.robot.layout.joints_v :]
     q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.layout)
     saturated = [motors, *solved.friction]
     for row, held in [pair for force in saturated for pair in force.held.items()]:  # such a joint does not move at all
@@ -221,6 +222,8 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         pressed=stacked([ca.fmax(pair.normal_after(pair.gain(motion)), 0) for pair in solved.pairs]),
         carried=carried_after(scene, kinematics, motors, solved.inertia, motion) if solved.inertia else solved.carried,
         winding=windings_after(scene, motors, motion),
+        supply=supply_after(scene, kinematics, motors, motion, state.supply, yd, dt),
+        held=motors.sampled,
     )
     touches = [*solved.contacts, *solved.pairs]
     unconverged = ca.sum1(stacked([c.check(motion) for c in touches])) > 0

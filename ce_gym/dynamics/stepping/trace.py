@@ -11,6 +11,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, seen_joints
+from ce_gym.dynamics.forces.motors import supply_of
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import State, StepOptions, make_scene, symbolic_state, target_names
 from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
@@ -119,6 +120,8 @@ OUTPUTS = {
     "motor_torque": "torque of each motor's windings, before what it loses, mean over the step [N m]",
     "motor_speed": "speed of each motor's rotor at the end of the step [rad/s]",
     "power": "mechanical power of the motors at each joint, end of the step [W]",
+    "winding_temperature": "temperature of the winding of each motor that grows warm, end of the step [deg C]",
+    "battery_voltage": "voltage of the battery that feeds the motors, if there is one, end of the step [V]",
     "contact_forces": "force on each contact, mean over the step, world axes [N]",
     "energy": "kinetic, potential and elastic energy at the end of the step, see `mechanical_energy` [J]",
     "error": "estimated error of the step in the velocities, of methods that have one [rad/s or m/s]",
@@ -177,7 +180,7 @@ class Given:
 
     def _of(self, stepped: Stepped, name: str) -> SX:
         layout = self.mechanism.robot.layout
-        yd = stepped.state.v[layout.joints_v :]
+        robot, yd = self.scene.mechanism.robot, stepped.state.v[layout.joints_v :]
         kinematics = stepped.solved.kinematics
         if name == MOVED:
             return furthest(stepped.state.v, layout.base_nv, self.dt)
@@ -185,6 +188,9 @@ class Given:
             return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
         if name == "motor_torque":
             return winding_torques(self.mechanism, kinematics, stepped)
+        if name in ("winding_temperature", "battery_voltage"):
+            supply = supply_of(robot, self.scene.options.motors, stepped.state.supply)
+            return supply.voltage if name == "battery_voltage" else stacked(supply.temperatures(robot.motors))
         if name == "power":
             return stepped.torque * (seen_joints(self.mechanism, kinematics) @ yd)
         if name == "energy":
