@@ -13,13 +13,19 @@ from collections.abc import Callable, Sequence
 import casadi
 
 from ce_gym.compile.lowering import math as vector_math
-from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, SELECT, graph_of
+from ce_gym.compile.lowering.decided import decided
+from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, SELECT, Graph, graph_of
 from ce_gym.compile.lowering.ordering import ordered
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 
 def lower_function(
-    v: VectorBuilder, function: casadi.Function, inputs: Sequence[Value], outputs: Sequence[Value], apart: bool = False
+    v: VectorBuilder,
+    function: casadi.Function,
+    inputs: Sequence[Value],
+    outputs: Sequence[Value],
+    apart: bool = False,
+    zero: int | None = None,
 ) -> None:
     """Emit `function` at the builder's position.
 
@@ -29,11 +35,12 @@ def lower_function(
         inputs: pointer to the first vector of each function input.
         outputs: pointer to the first vector of each function output; structural zeros are written as 0.
         apart: whether no output shares memory with an input.
+        zero: an input that is zero, if one is: what is left out where it is leaves the bits of the rest as they are.
 
     Raises:
         NotImplementedError: for an operation that has no vector form.
     """
-    graph = graph_of(function)
+    graph = graph_of(function) if zero is None else short_graph(function, zero)
     lowering = _Lowering(v, function.name())
     loads = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
     places = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
@@ -72,6 +79,13 @@ def lower_function(
         for position, result in enumerate(results[which]):
             if (which, position) not in stored:
                 v.store(result, pointer, position)
+
+
+def short_graph(function: casadi.Function, zero: int) -> Graph:
+    """Return the graph of a function where an input is zero."""
+    graph = graph_of(function)
+    sources = [k for k, op in enumerate(graph.ops) if op == casadi.OP_INPUT]
+    return decided(graph, {k for k in sources if function.instruction_input(k)[0] == zero})
 
 
 def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:

@@ -57,19 +57,32 @@ def step_function(
 
 
 def iteration_function(
-    mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = (), follows: bool = False
+    mechanism: Mechanism,
+    options: StepOptions,
+    outputs: tuple[str, ...] = (),
+    follows: bool = False,
+    chooses: bool = False,
 ) -> ca.Function:
     """Trace one iteration of an Euler step: repeated on its own iterate until it has converged, it makes the step.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+        outputs: See `step_function`.
+        follows: See `step_function`.
+        chooses: Whether what is seldom near is left out where it is not; `near` is one more of what is given then.
 
     Returns:
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
         `step_function`; the iterate is zero at first, shape (iterate_size,).
     """
     given, iterate = Given(mechanism, options, follows), SX.sym("iterate", iterate_size(mechanism, options))
+    choice = {"near": SX.sym("near")} if chooses else {}
+    given.scene = replace(given.scene, **choice)
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
     told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
     left = {"iterate_next": stepped.iterate, "unconverged": stepped.unconverged}
-    return traced("iteration", given.inputs() | {"iterate": iterate}, given.guarded(stepped) | left | told)
+    return traced("iteration", given.inputs() | {"iterate": iterate} | choice, given.guarded(stepped) | left | told)
 
 
 def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
