@@ -55,7 +55,7 @@ def substeps(
     kept = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
     if len(kept) < len(outputs):
         return substeps(mechanism, options, tuple(kept))
-    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in ("iterate", "ground", NEAR)}
+    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground", NEAR)}
     sizes |= {"retries": 1, **kept} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= control_sizes(mechanism.robot.layout) if plan.controlled else {}
     fractions = {TRIED: 1.0} | ({_own(plan, stage): stage.length for stage in plan.stages} if staged else {})
@@ -69,6 +69,8 @@ def substeps(
     return sizes, buffers, (Repeat(TIMES, (begins, While("unfinished", (*try_part, *take)))),)
 
 
+ITERATES = {"near_iterate": NEAR, "iterate": ""}
+"""Buffers of iterates, and where they are needed."""
 TRIED = "tried"
 """What names of buffers begin with that have the state after a part of a step that is tried, and what it reports."""
 Parts: TypeAlias = tuple[list[Buffer], tuple[Call | Lookup, ...]]
@@ -122,11 +124,12 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
     """
     plan, most = METHODS[options.method], iterations_needed(mechanism, options)
     asked = tuple(name for name in outputs if name in iteration.name_out())
-    state = [name for name in iteration.name_in() if f"{name}_next" in iteration.name_out() and name != "iterate"]
-    zeros = ca.Function("zeros", [], [SX(ca.DM.zeros(iteration.numel_in("iterate")))])
+    state = [name for name in iteration.name_in() if f"{name}_next" in iteration.name_out() and name not in ITERATES]
+    iterates = {name: iteration.numel_in(name) for name in ITERATES if name in iteration.name_in()}
+    zeros = {name: ca.Function("zeros", [], [SX(ca.DM.zeros(size))]) for name, size in iterates.items()}
     sizes = {name: iteration.numel_in(name) for name in state} | {name: iteration.numel_out(name) for name in asked}
     scratch = {f"{_own(plan, stage)}_{name}": size for stage in plan.stages for name, size in sizes.items()}
-    scratch |= {"iterate": iteration.numel_in("iterate"), "unconverged": 1}
+    scratch |= iterates | {"unconverged": 1}
     near = near_function(mechanism, options) if chooses(options) else None
     scratch |= {NEAR: 1} if near else {}
     buffers = look_up(mechanism, options)[0] if "ground" in iteration.name_in() else []
@@ -140,13 +143,14 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
             ground_at = stage.start
         here = {name: f"{start}{name}" for name in state} | {DT: f"{own}_dt"}
         given = tuple(here.get(name, name) for name in iteration.name_in())
-        left = (*(f"{own}_{name}" for name in state), "iterate", "unconverged", *(f"{own}_{name}" for name in asked))
+        left = (*(f"{own}_{name}" for name in state), *iterates, "unconverged", *(f"{own}_{name}" for name in asked))
         repeats = min(stage.iterations, most)
         short = ""
         if near:
             each.append(Call(near, tuple(here.get(name, name) for name in near.name_in()), (NEAR,)))
             short = NEAR
-        each += [Call(zeros, (), ("iterate",)), Call(iteration, given, left, short_if_zero=short)]
+        each += [Call(zeros[name], (), (name,), only_if=ITERATES[name]) for name in iterates]
+        each.append(Call(iteration, given, left, short_if_zero=short))
         each += [Call(iteration, given, left, only_if="unconverged", short_if_zero=short)] * repeats
     if not plan.single:
         combine = combination_function(mechanism, options, outputs)

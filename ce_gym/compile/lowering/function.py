@@ -26,6 +26,7 @@ def lower_function(
     outputs: Sequence[Value],
     apart: bool = False,
     zero: int | None = None,
+    same: frozenset[tuple[int, int]] = frozenset(),
 ) -> None:
     """Emit `function` at the builder's position.
 
@@ -35,6 +36,7 @@ def lower_function(
         inputs: pointer to the first vector of each function input.
         outputs: pointer to the first vector of each function output; structural zeros are written as 0.
         apart: whether no output shares memory with an input.
+        same: inputs and outputs that share their memory; what is only handed on is not stored again.
         zero: an input that is zero, if one is: what is left out where it is leaves the bits of the rest as they are.
 
     Raises:
@@ -61,6 +63,11 @@ def lower_function(
                 values[k] = loaded[place]
         return values[k]
 
+    def handed_on(which: int, position: int) -> bool:
+        """Whether an output is what was loaded from where it would be stored."""
+        found = [loaded.get((source, position)) for source, to in same if to == which]
+        return any(place is results[which][position] for place in found)
+
     leave: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for k, op in enumerate(graph.ops):
         if op == casadi.OP_OUTPUT:
@@ -77,7 +84,7 @@ def lower_function(
             results[which][position] = value(k)
     for which, pointer in enumerate(outputs):
         for position, result in enumerate(results[which]):
-            if (which, position) not in stored:
+            if (which, position) not in stored and not handed_on(which, position):
                 v.store(result, pointer, position)
 
 

@@ -236,7 +236,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
     parts = split(iterate, [c.law.size for c in touches])
     of_contacts = stacked(
         [
-            where(c.law.near, ca.if_else(unconverged, c.next_iterate(motion), part))
+            where(c.law.near, ca.if_else(unconverged, c.next_iterate(motion), part), part)
             for c, part in zip(touches, parts, strict=False)
         ]
     )
@@ -277,6 +277,13 @@ def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
     touches = len(options.contacts) + len(colliding(mechanism.robot, options.self_collisions))
     of_joints = limit_count(mechanism, options) + friction_count(mechanism, options.parameters) + mesh_count(mechanism)
     return Contact.size * touches + of_joints + state_sizes(mechanism, options).get("carried", 0)
+
+
+def rows_of_near(mechanism: Mechanism, options: StepOptions) -> list[int]:
+    """Return which rows of an iterate belong to what acts only where it is near."""
+    acts = [name in options.seldom for name in options.contacts]
+    acts += [True] * len(colliding(mechanism.robot, options.self_collisions))
+    return [Contact.size * i + j for i, seldom in enumerate(acts) if seldom for j in range(Contact.size)]
 
 
 def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:

@@ -19,7 +19,7 @@ from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pa
 from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.plan import AFTER, MOVED, OFF, combined, error_estimate, position_errors
-from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, stacked
+from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, rows_of_near, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
 from ce_gym.model.mechanism import Mechanism
 
@@ -70,19 +70,25 @@ def iteration_function(
         options: The scene.
         outputs: See `step_function`.
         follows: See `step_function`.
-        chooses: Whether what is seldom near is left out where it is not; `near` is one more of what is given then.
+        chooses: Whether what is seldom near is left out where it is not; `near` is one more of what is given then, and
+            `near_iterate` what of the iterate nobody looks at elsewhere.
 
     Returns:
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
         `step_function`; the iterate is zero at first, shape (iterate_size,).
     """
-    given, iterate = Given(mechanism, options, follows), SX.sym("iterate", iterate_size(mechanism, options))
+    given, size = Given(mechanism, options, follows), iterate_size(mechanism, options)
+    rows = {"near_iterate": rows_of_near(mechanism, options)} if chooses else {}
+    rows["iterate"] = [i for i in range(size) if i not in rows.get("near_iterate", ())]
+    parts, iterate = {name: SX.sym(name, len(of)) for name, of in rows.items()}, SX(size, 1)
+    for name, part in parts.items():
+        iterate[rows[name]] = part
     choice = {"near": SX.sym("near")} if chooses else {}
     given.scene = replace(given.scene, **choice)
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
     told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
-    left = {"iterate_next": stepped.iterate, "unconverged": stepped.unconverged}
-    return traced("iteration", given.inputs() | {"iterate": iterate} | choice, given.guarded(stepped) | left | told)
+    left = {f"{name}_next": stepped.iterate[of] for name, of in rows.items()} | {"unconverged": stepped.unconverged}
+    return traced("iteration", given.inputs() | parts | choice, given.guarded(stepped) | left | told)
 
 
 def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
