@@ -205,6 +205,17 @@ def test_a_robot_does_what_it_would_do_alone(folded: Simulator):
     assert folded.pairs == PAIR
 
 
+def test_pairs_are_all_that_a_scene_may_have():
+    """Without contacts and limited motors: balls that meet part again, and momentum is kept."""
+    bodies = (slider("a", 1.0), slider("b", 3.0))
+    robot = Robot("balls", bodies, independent=("a", "b"), material=ContactMaterial(5e4, 0.0, 0.8))
+    sim = Simulator(Model(robot), 3, 1e-3, control="torque", self_collisions=[("a", "b")])
+    sim.set_state(np.array([-0.11, 0.1]), np.array([1.0, 0.0]))
+    sim.step(np.zeros(2), 60)
+    assert (sim.v[:, 1] > 0.3).all()
+    np.testing.assert_allclose(sim.v @ [1.0, 3.0], 1.0, atol=1e-12)
+
+
 def test_gradients_go_through_pairs(folded: Simulator):
     """Against central differences, where links press on each other."""
     derivatives, n = ce_gym.StepDerivatives(folded), 24

@@ -79,7 +79,8 @@ def iteration_function(
     """
     given, size = Given(mechanism, options, follows), iterate_size(mechanism, options)
     rows = {"near_iterate": rows_of_near(mechanism, options)} if chooses else {}
-    rows["iterate"] = [i for i in range(size) if i not in rows.get("near_iterate", ())]
+    always = [i for i in range(size) if i not in rows.get("near_iterate", ())]
+    rows |= {"iterate": always} if always or not chooses else {}
     parts, iterate = {name: SX.sym(name, len(of)) for name, of in rows.items()}, SX(size, 1)
     for name, part in parts.items():
         iterate[rows[name]] = part
