@@ -29,15 +29,6 @@ def test_folded_legs_press_on_each_other(model: Model):
     assert (sim.pair_forces > 1.0).all()
 
 
-def test_the_same_motion_every_time(model: Model):
-    sim = Simulator(model, 4, contacts="foot")
-    competitor = surroundings.stepping(sim, model.standing_q[7:] + 0.05)
-    competitor.run()
-    first = sim.q
-    competitor.run()
-    np.testing.assert_array_equal(sim.q, first)
-
-
 def test_report():
     parser = argparse.ArgumentParser()
     surroundings.add_arguments(parser)

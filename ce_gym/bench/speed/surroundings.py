@@ -1,6 +1,6 @@
 """What scenes cost: spheres that are seldom near, links that push each other apart, height and range scans, in turn.
 
-Sub-steps are compared with those on the feet alone, in the same motion; links stand apart, move about, or are pressed
+Sub-steps are compared with those on the feet alone, by the same targets; links stand apart, move about, or are pressed
 on each other in most robots. Environment steps are compared with those of the same task that does not look.
 """
 
@@ -25,9 +25,11 @@ from ce_gym.model.checks.collisions import capsules_of
 from ce_gym.sim import Simulator
 
 DTYPES = ("float64", "float32")
-SUBSTEPS = 40
+SUBSTEPS = 10
+"""For which a target is held."""
+TARGETS = 4
 SETTLED = 100
-"""Sub-steps before what is timed, which is the same motion in every round."""
+"""Sub-steps before what is timed."""
 FOLDED_SHARE = 0.7
 """Share of the robots whose links are pressed on each other."""
 FURTHER = 2.0
@@ -84,7 +86,7 @@ def spheres(model: Model, num_envs: int, dtype: str) -> dict[str, Case]:
     sims = _beside(model, num_envs, dtype, contacts="all", seldom=groups)
     targets = np.tile(model.standing_q[model.robot.layout.joints_q :], (num_envs, 1))
     name = f"{len(model.robot.contacts)} spheres, seldom near but the feet"
-    return {name: ("spheres", {side: stepping(sim, targets) for side, sim in sims.items()})}
+    return {name: ("spheres", {side: stepping(sim, [targets] * TARGETS) for side, sim in sims.items()})}
 
 
 def pairs(model: Model, num_envs: int, dtype: str) -> dict[str, Case]:
@@ -92,10 +94,11 @@ def pairs(model: Model, num_envs: int, dtype: str) -> dict[str, Case]:
     beside = neighbours(model)
     standing = np.tile(model.standing_q[model.robot.layout.joints_q :], (num_envs, 1))
     rng, folded = np.random.default_rng(0), [folded_targets(model, pair) for pair in beside]
+    standing = np.tile(standing, (TARGETS, 1, 1))
     moving = standing + rng.uniform(-JITTER, JITTER, standing.shape)
     pressed = standing + rng.uniform(-0.02, 0.02, standing.shape)
     for i in np.flatnonzero(rng.uniform(size=num_envs) < FOLDED_SHARE):
-        pressed[i] += folded[i % len(folded)] - standing[i]
+        pressed[:, i] += folded[i % len(folded)] - standing[:, i]
     cases: dict[str, Case] = {}
     for name, targets in (("apart", standing), ("apart, in motion", moving), ("70 % folded", pressed)):
         sims = _beside(model, num_envs, dtype, contacts="foot", self_collisions=beside)
@@ -117,17 +120,16 @@ def looking(env: str, scan: str, num_envs: int, dtype: str) -> dict[str, Competi
     return sides
 
 
-def stepping(sim: Simulator, targets: NDArray) -> Competitor:
-    """Sub-steps from where robots have settled, the same ones every time."""
+def stepping(sim: Simulator, targets: Sequence[NDArray]) -> Competitor:
+    """Sub-steps of robots that have settled, with one target after the other."""
     sim.set_state(np.tile(sim.model.standing_q, (sim.num_envs, 1)), np.zeros(sim.model.nv))
-    sim.step(targets, n_substeps=SETTLED)
-    settled = sim.snapshot()
+    sim.step(targets[0], n_substeps=SETTLED)
 
     def run() -> None:
-        sim.restore(settled)
-        sim.step(targets, n_substeps=SUBSTEPS)
+        for each in targets:
+            sim.step(each, n_substeps=SUBSTEPS)
 
-    return Competitor(run, sim.num_envs * SUBSTEPS)
+    return Competitor(run, sim.num_envs * SUBSTEPS * len(targets))
 
 
 def neighbours(model: Model) -> list[tuple[str, str]]:
