@@ -28,8 +28,8 @@ from evaluate import WEIGHTS_SEED, env_kwargs, load
 from numpy.typing import NDArray
 from suites import weights_seed
 
+from ce_gym import RobotError
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
-from ce_gym.model import RobotError
 from ce_gym.policies import WHERE, Policy, PolicyError, add_env_arguments
 
 STEADY = {"push_period": 0.0, "randomise": {}, "latency": (0, 0), "heading": False, "command_period": 1e6}
