@@ -163,7 +163,7 @@ def report_scene(env_id: str, **arguments: Any) -> SceneReport:
     program = make_program(**{name: value for name, value in given.items() if name not in WITHOUT_COST})
     outputs = ("torque", "contact_forces") if program.contact_forces else ("torque",)
     whole = SubStep(program.model, program.options, outputs)
-    again = dict.fromkeys(call.function for call in whole.calls if call.only_if)
+    again = dict.fromkeys(call.function for call in whole.calls if call.only_if and call.inputs)
     sometimes = [(AGAIN[f.name()], f) for f in again] + [("reset", program.function("begin"))]
     return SceneReport(
         name=env_id,
@@ -186,7 +186,10 @@ def layers(whole: SubStep) -> Iterator[tuple[str, int, SubStep | ca.Function]]:
     """
     options, robot = whole.options, whole.model.robot
     loose = _with_joints(robot, position=(-math.inf, math.inf))
-    bare = replace(options, control="torque", contacts=(), motors="ideal", ground="flat", method="euler", parameters=())
+    nothing: dict[str, Any] = {"contacts": (), "seldom": (), "self_collisions": (), "parameters": ()}
+    bare = replace(
+        options, control="torque", control_period=0.0, motors="ideal", ground="flat", method="euler", **nothing
+    )
     step = SubStep(Model(_with_joints(loose, torque=math.inf, damping=0.0, friction=0.0), "none"), bare, ())
     kinematics, acceleration = _parts_of_dynamics(step)
     # the results of the first are not results of the whole, so that writing them does not count
@@ -201,10 +204,13 @@ def layers(whole: SubStep) -> Iterator[tuple[str, int, SubStep | ca.Function]]:
     steps += [("rotors", present, whole.model.transmission != "none")]
     for name, field in (
         ("contact", "contacts"),
+        ("contacts seldom near, where they are", "seldom"),
+        ("pairs of links, where they are near", "self_collisions"),
         ("ground field", "ground"),
         ("limited motors", "motors"),
         ("method", "method"),
         ("parameters", "parameters"),
+        ("control at a rate of its own", "control_period"),
     ):
         chosen = getattr(options, field)
         before, present = present, replace(present, options=replace(present.options, **{field: chosen}))

@@ -72,6 +72,21 @@ def test_lines_add_up_whatever_a_task_asks_for():
     assert not {"motors='limited'", "parameter 'friction'", "output 'contact_forces'", "pushes"} & missing
 
 
+CHANGES = {
+    "pairs of links, where they are near": {"self_collisions": [["HR_knee_link", "HL_knee_link"]]},
+    "contacts seldom near, where they are": {"seldom": "knee"},
+    "control at a rate of its own": {"control_period": 0.01},
+}
+
+
+@pytest.mark.parametrize(("name", "change"), CHANGES.items())
+def test_what_a_scene_is_asked_for_has_a_line_and_sums_add_up(name: str, change: dict):
+    report = report_scene("ce_gym/MiniCheetahVelocity-v0", **change)
+    whole = SubStep(report.program.model, report.program.options, ("torque",))
+    assert report.sub_step == whole.instructions
+    assert name in {item.name for item in report.layers}
+
+
 def test_every_term_of_the_task_has_a_line(report: SceneReport):
     task = report.program.task
     terms = [item.name for item in report.once[2:]]
