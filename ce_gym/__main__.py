@@ -99,7 +99,9 @@ def _parser() -> argparse.ArgumentParser:
     add_env_arg(inspect)
     inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")
     inspect.add_argument("--levels", action="store_true", help="robot: only what simplified levels get wrong of it")
-    inspect.add_argument("--no-timing", action="store_true", help="environment: count instructions, compile nothing")
+    inspect.add_argument(
+        "--no-timing", action="store_true", help="compile nothing: do not time an environment, nor let a robot stand"
+    )
     inspect.set_defaults(run=_inspect)
     new = commands.add_parser(
         "new",
@@ -157,6 +159,7 @@ def _new(args: argparse.Namespace) -> int:
 
 def _inspect(args: argparse.Namespace) -> int:
     from ce_gym.diagnostics.levels_text import levels_report
+    from ce_gym.diagnostics.standing_text import standing_report
     from ce_gym.diagnostics.transmission_text import transmission_report
     from ce_gym.dynamics import Model
     from ce_gym.envs.custom import missing
@@ -171,6 +174,8 @@ def _inspect(args: argparse.Namespace) -> int:
     problems = missing(model.robot)
     print("Environments: it has what every task needs\n" if not problems else "Environments lack:")
     print("".join(f"  {problem}\n" for problem in problems), flush=True)
+    if not (problems or args.no_timing):
+        print(f"{standing_report(model)}\n", flush=True)
     print(transmission_report(model, states=0) if args.no_errors else transmission_report(model))
     return 0
 

@@ -81,15 +81,23 @@ class Drives:
         Args:
             model: The robot.
             q: Positions, shape (n, nq).
-            yd: Joint velocities [rad/s], shape (n, n_joints).
+            yd: Velocities of joints, then of what stretches [rad/s], shape (n, n_joints + n_stretches).
             tau: What the motors do to the joints [N m], shape (n, n_joints).
         """
+        (joints, stretched), own = np.split(yd, [tau.shape[1]], axis=1), self.own_speeds(model)
         if self.constant is not None:
-            return tau @ np.linalg.pinv(self.constant), yd @ self.constant.T
+            return tau @ np.linalg.pinv(self.constant), joints @ self.constant.T + stretched @ own
         guess = [model.dependent_guess(q).T] if self.speeds.n_in() == 2 else []
-        columns = ca.DM(self.speeds(q.T, *guess)).full()
-        W = columns.reshape(yd.shape[1], len(self.names), len(q)).transpose(2, 1, 0)
-        return np.einsum("nj,njm->nm", tau, np.linalg.pinv(W)), np.einsum("nmj,nj->nm", W, yd)
+        columns = ca.DM(self.speeds(q[:, : self.speeds.size1_in(0)].T, *guess)).full()
+        W = columns.reshape(joints.shape[1], len(self.names), len(q)).transpose(2, 1, 0)
+        speed = np.einsum("nmj,nj->nm", W, joints) + stretched @ own
+        return np.einsum("nj,njm->nm", tau, np.linalg.pinv(W)), speed
+
+    def own_speeds(self, model: ce_gym.Model) -> NDArray[np.bool_]:
+        """Return speeds of motors for unit velocities of what stretches, each its own, (n_stretches, n_motors)."""
+        rotors = {elastic.stretch: elastic.rotor for elastic in model.robot.elastic}
+        turned = [rotors[name] for name in model.robot.independent if name in rotors]
+        return np.array(turned, object)[:, None] == np.array(self.names, object)
 
     def beyond(self, tau: Array, speed: Array, before: Array) -> NDArray[np.bool_]:
         """Return which motors give more than current and voltage allow at any speed of a sub-step, shape (n, n_motors).

@@ -17,6 +17,7 @@ import single_blas  # noqa: F401
 # isort: split
 
 import argparse
+import sys
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -27,6 +28,7 @@ from evaluate import WEIGHTS_SEED, env_kwargs, load
 from numpy.typing import NDArray
 from suites import weights_seed
 
+from ce_gym import RobotError
 from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
 from ce_gym.policies import WHERE, Policy, PolicyError, add_env_arguments
 
@@ -207,8 +209,14 @@ def compare(
         envs.close()
     for level, (name, _) in TWINS.items():
         envs, obs, given = _environment(record, record["transmission"], episodes, seconds, every, seed)
-        results[name] = play(policy, MujocoWorld(envs.envs.unwrapped, obs, level), obs, given)
-        envs.close()
+        try:
+            results[name] = play(policy, MujocoWorld(envs.envs.unwrapped, obs, level), obs, given)
+        except RobotError as error:  # of loops MJCF can say `exact`, but no armature that varies with the pose
+            if level == "exact":
+                raise
+            print(f"{name}: not judged: {error}", file=sys.stderr)
+        finally:
+            envs.close()
     found = verdicts(results)
     return {"simulations": results, "verdict": found, "passed": all(verdict["passed"] for verdict in found.values())}
 
@@ -222,10 +230,13 @@ def verdicts(results: dict[str, dict[str, float]]) -> dict[str, dict[str, Any]]:
 
     Returns:
         By the name of the simulation: on_feet, share without a fall; error_ratio and yaw_ratio, velocity and yaw rate
-        error over ours; passed, whether these are within `ON_FEET` and `WORSE`.
+        error over ours; passed, whether these are within `ON_FEET` and `WORSE`. A level that MJCF cannot say is left
+        out.
     """
     found = {}
     for name, level in TWINS.values():
+        if name not in results:
+            continue
         theirs, ours = results[name], results[_ours(level)]
         on_feet = 1.0 - theirs["falls"]
         ratios = [theirs[key] / max(ours[key], 1e-9) for key in ("velocity_error", "yaw_rate_error")]

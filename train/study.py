@@ -46,10 +46,11 @@ DIGITS = 6
 
 @dataclass(frozen=True)
 class Trial:
-    """A task of a study: the environment, how long to train, and what is reported of the policy and of its motors."""
+    """A task of a study: the environment, how long to train, what decides, of which more is better, and is reported."""
 
     env: str
     steps: float
+    decides: str
     metrics: list[str]
     motors: list[str]
     seconds: float
@@ -57,7 +58,7 @@ class Trial:
     @property
     def figures(self) -> list[str]:
         """Names of all that is reported, the one that decides first."""
-        return [*self.metrics, "falls", "reward", *self.motors]
+        return list(dict.fromkeys([self.decides, *self.metrics, "falls", "reward", *self.motors]))
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,15 @@ class Arm:
 
 @dataclass(frozen=True)
 class Judged:
-    """A way to judge: arguments of the environment that replace those of training, episodes, robots for motors."""
+    """A way to judge: arguments of the environment that replace those of training, episodes, robots for motors.
+
+    What `decides` is what arms lose against the first one in the ways of judging that say so.
+    """
 
     env_args: dict[str, Any]
     episodes: int
     robots: int
+    decides: bool
 
 
 @dataclass(frozen=True)

@@ -63,20 +63,22 @@ def means(study: Study, rows: list[Row], task: str) -> Table:
 def losses(study: Study, rows: list[Row]) -> Table:
     """One line for each task and arm: what it loses against the first arm, and what its own policies lose."""
     first, (judged, own, *others) = next(iter(study.arms)), study.judged
-    deciding = [judged, *others]
-    titles = [f"lost against {first}, on {where}" for where in deciding]
+    across = [judged, *others]
+    deciding = [i for i, where in enumerate(across) if study.judged[where].decides]
+    titles = [f"lost against {first}, on {where}" for where in across]
     table: Table = [["task", "trained on", "figure", *titles, f"lost from {own} to {judged}", "a gap"]]
     for task, trial in study.tasks.items():
         name = trial.figures[0]
         for arm in study.arms:
-            found = [[samples(rows, task, one, f"{where}: {name}") for where in deciding] for one in (first, arm)]
+            found = [[samples(rows, task, one, f"{where}: {name}") for where in across] for one in (first, arm)]
             if arm == first or not min(len(x) for x in (*found[0], *found[1])):
                 continue
             lost = [loss(*pair) for pair in zip(*found, strict=True)]
             change = interval(of_one, [samples(rows, task, arm, f"{own}: {name}") - found[1][0]])
             seeds = min(len(found[0][0]), len(found[1][0]))
             said = [shown(one, ".2%") for one in lost]
-            table.append([task, arm, name.replace("_", " "), *said, shown(change), answer(lost, seeds)])
+            verdict = answer([lost[i] for i in deciding], seeds)
+            table.append([task, arm, name.replace("_", " "), *said, shown(change), verdict])
     return table
 
 

@@ -19,7 +19,7 @@ from ce_gym.viewer.console import Parser, print_anything
 BENCHMARKS = (
     "speed", "beside", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy",
     "adaptive", "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness", "growth",
-    "servo", "identification", "all", "stale",
+    "surroundings", "servo", "identification", "all", "stale",
 )  # fmt: skip
 
 

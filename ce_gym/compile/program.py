@@ -60,6 +60,8 @@ class Call:
             independent of their neighbours it must change nothing in a lane where the buffer is zero.
         times: how often the function is applied, to the next part each time of those buffers that are so many times as
             large as what it takes or returns.
+        short_if_zero: an input of size 1; a tile where it is zero in all lanes computes what is left of the function
+            then, to the same bits.
     """
 
     function: casadi.Function
@@ -67,6 +69,7 @@ class Call:
     outputs: tuple[str, ...]
     only_if: str = ""
     times: int = 1
+    short_if_zero: str = ""
 
 
 @dataclass(frozen=True)
@@ -199,6 +202,10 @@ def check_program(program: Program) -> None:
             if call.only_if:
                 _check_flag(f"{place}: only_if", buffers.get(call.only_if))
                 read = (*read, call.only_if)
+            if call.short_if_zero:
+                _check_flag(f"{place}: short_if_zero", buffers.get(call.short_if_zero))
+                if call.short_if_zero not in call.inputs:
+                    raise ValueError(f"{place}: short_if_zero {call.short_if_zero!r}, expected one of its inputs")
         if unset := [name for name in read if name not in written]:
             raise ValueError(f"{place}: reads {unset[0]!r}, expected an earlier call to write it first")
         written.update(call.outputs)

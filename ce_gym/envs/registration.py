@@ -13,7 +13,7 @@ from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 ROBOTS = (
     *("mini_cheetah", "mit_humanoid", "tello", "jvrc1"),
-    *("go1", "go2", "anymal_c", "spot", "g1", "h1", "t1", "berkeley_humanoid", "cassie"),
+    *("go1", "go2", "anymal_c", "spot", "g1", "h1", "t1", "berkeley_humanoid", "cassie", "dr_legs"),
 )
 """Robots that ship with the package and have what the tasks ask for."""
 STRETCHING = ("mini_cheetah",)

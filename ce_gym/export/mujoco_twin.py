@@ -9,9 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.dynamics.model import Model
 from ce_gym.export.mujoco_batch import Batch
 from ce_gym.export.mujoco_coordinates import Coordinates
 from ce_gym.export.mujoco_model import STIFF, Settings, compiled
+from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Robot
 from ce_gym.model.frames import rotation_matrix
 
@@ -25,7 +27,7 @@ class MujocoTwin:
     """Copies of a robot in MuJoCo.
 
     Args:
-        robot: With a floating base and no closed loops.
+        robot: With a floating base.
         level: "armature", reflected inertia as MuJoCo users know it, or "exact", every rotor a body on the stiffest
             equality that is stable.
         num_envs: Copies.
@@ -37,7 +39,8 @@ class MujocoTwin:
 
     Raises:
         ValueError: If the level is another one.
-        RobotError: If the robot has closed loops, or MJCF cannot express it.
+        RobotError: If MJCF cannot express the robot at that level, as `armature` of loops whose rotors turn with joints
+            that follow.
     """
 
     def __init__(self, robot: Robot, level: str, num_envs: int) -> None:
@@ -46,7 +49,9 @@ class MujocoTwin:
         self.robot, self.level = robot, level
         impedance = STIFF if level == "exact" else None
         self.model = compiled(robot, level, Settings(TIMESTEPS[level], solimp=impedance))
-        self._coordinates = Coordinates.of(self.model, robot)
+        loops = not all(isinstance(tie, LinearConstraint) for tie in robot.constraints)
+        self._coordinates = None if loops else Coordinates.of(self.model, robot)
+        self._tree = Model(robot, level) if loops else None
         self._batch = Batch(self.model, num_envs)
         names = [*robot.balls, *robot.independent]
         at = [(int(self.model.joint(name).qposadr[0]), int(self.model.joint(name).dofadr[0])) for name in names]
@@ -54,6 +59,7 @@ class MujocoTwin:
         placed = list(zip(at, sizes, strict=True))
         self._positions = [*range(7), *(p + i for (p, _), (n, _) in placed for i in range(n))]
         self._velocities = [d + i for (_, d), (_, n) in placed for i in range(n)]
+        self._driven = [robot.commanded.index(name) for name in robot.driven]
         self.diverged = np.zeros(num_envs, bool)
 
     def start(self, q: Array, v: Array) -> None:
@@ -67,13 +73,25 @@ class MujocoTwin:
         self.diverged[:] = False
         nq, nv = self.model.nq, self.model.nv
         for state, q_i, v_i in zip(self._batch.states, q, v, strict=True):
-            state[1 : 1 + nq] = self._coordinates.positions(q_i)
-            state[1 + nq : 1 + nq + nv] = self._coordinates.velocity_map(q_i) @ v_i
+            state[1 : 1 + nq], state[1 + nq : 1 + nq + nv] = self._theirs(q_i, v_i)
+
+    def _theirs(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return MuJoCo's positions and velocities for ours."""
+        if self._coordinates is not None:
+            return self._coordinates.positions(q), self._coordinates.velocity_map(q) @ v
+        assert self._tree is not None
+        qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
+        qpos[:7], qvel[:3], qvel[3:6] = q[:7], rotation_matrix(q[3:7]) @ v[3:6], v[:3]
+        span = self._tree.spanning(q, v)
+        for name, position, speed in zip(self._tree.spanning_names, span[0][7:], span[1][6:], strict=True):
+            joint = self.model.joint(name)
+            qpos[joint.qposadr], qvel[joint.dofadr] = position, speed
+        return qpos, qvel
 
     def step(self, target: Array, duration: float) -> None:
         """Hold joint targets [rad], shape (num_envs, n_joints), for a time [s]."""
         n = round(duration / self.model.opt.timestep)
-        control = np.repeat(target[:, None, :], n, axis=1)
+        control = np.repeat(target[:, None, self._driven], n, axis=1)  # passive joints have no actuator
         before = self._batch.states[:, 0]
         after = self._batch.trajectory(control)[:, -1]
         # MuJoCo puts a robot whose state is bad back to the start, where its clock is zero.

@@ -25,7 +25,7 @@ from ce_gym.model.description import (
     Robot,
     Shape,
 )
-from ce_gym.model.drives import DriveFriction, Elasticity, Motor
+from ce_gym.model.drives import Battery, DriveFriction, Elasticity, Heat, Motor
 from ce_gym.model.errors import InertiaWarning, LossyImportWarning, RobotError
 from ce_gym.model.formats.hinges import coincident_hinges
 from ce_gym.model.frames import IDENTITY, ZERO, Mat3, Placement, Vec3
@@ -34,6 +34,7 @@ from ce_gym.model.load import load_robot
 __all__ = [
     "IDENTITY",
     "ZERO",
+    "Battery",
     "Body",
     "Capsule",
     "Cluster",
@@ -45,6 +46,7 @@ __all__ = [
     "Elasticity",
     "FunctionConstraint",
     "Gains",
+    "Heat",
     "InertiaWarning",
     "Inertial",
     "Joint",

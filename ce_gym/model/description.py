@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from ce_gym.model.constraints import Constraint
 from ce_gym.model.coordinates import Layout, placed, sizes
-from ce_gym.model.drives import Elasticity, Motor
+from ce_gym.model.drives import Battery, Elasticity, Motor
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
 
 
@@ -229,6 +229,7 @@ class Robot:
         self_collisions: Pairs of links that push each other apart, in a scene that asks for it.
         motors: One for each driven rotor.
         elastic: How transmissions give way at the elastic level; those that are not named are rigid there, too.
+        battery: What feeds the motors; None for a voltage that never sags.
         pose: The standing pose.
         gains: PD gains for position control of the independent joints.
         assembly: Pairs (body, angle) for dependent joints: where they are, roughly, in the standing pose. Chooses among
@@ -250,6 +251,7 @@ class Robot:
     self_collisions: tuple[tuple[str, str], ...] = ()
     motors: tuple[Motor, ...] = ()
     elastic: tuple[Elasticity, ...] = ()
+    battery: Battery | None = None
     pose: Pose = Pose()
     gains: Gains = Gains()
     assembly: tuple[tuple[str, float], ...] = ()

@@ -1,4 +1,4 @@
-"""What drives joints: motors, what rubs in them, and transmissions that give way; all figures are the rotor's."""
+"""What drives joints: motors, what they lose, what feeds them, transmissions that give way; figures are the rotor's."""
 
 from __future__ import annotations
 
@@ -61,6 +61,48 @@ class DriveFriction:
 
 
 @dataclass(frozen=True)
+class Heat:
+    """How a motor grows warm: its losses heat the winding, the winding the housing, and the housing the air.
+
+    From `warm` on the largest torque falls with the winding's temperature, to none at `hot`, as drives protect motors.
+
+    Attributes:
+        winding_capacity: Heat capacity of the winding [J/K].
+        housing_capacity: Of the housing [J/K].
+        winding_to_housing: Thermal resistance [K/W].
+        housing_to_ambient: The same [K/W].
+        warm: Temperature of the winding from which torque is held back [deg C].
+        hot: Where none is left [deg C].
+        ambient: Temperature of the air, and of a motor that has rested [deg C].
+    """
+
+    winding_capacity: float
+    housing_capacity: float
+    winding_to_housing: float
+    housing_to_ambient: float
+    warm: float = 100.0
+    hot: float = 125.0
+    ambient: float = 25.0
+
+
+@dataclass(frozen=True)
+class Battery:
+    """What feeds all motors: a voltage behind a resistance. What flows back charges it.
+
+    Attributes:
+        voltage: Without load [V].
+        resistance: Of cells and wires [ohm].
+        nominal: At which the motors' torque-speed lines are what their figures say [V].
+        idle: What everything but the motors takes [W].
+    """
+
+    voltage: float
+    resistance: float
+    nominal: float
+    idle: float = 0.0
+
+
+@dataclass(frozen=True)
 class Motor:
     """An electric motor that turns a rotor.
 
@@ -73,6 +115,10 @@ class Motor:
         friction: Dry friction of the rotor [N m].
         drive_friction: What depends on speed and load besides; None for nothing.
         bandwidth: Of the loop that follows the torque it is asked for, a lag of first order [Hz].
+        motor_constant: Torque over the root of what the winding then loses, at 20 deg C [N m/sqrt(W)]; None if unknown.
+        heat: How it grows warm; None if it never does.
+        cogging: Harmonics of the torque of its magnets on its teeth, `-torque sin(order angle + phase)`: triples of
+            order in a turn of the rotor, torque [N m] and phase [rad].
     """
 
     rotor: str
@@ -83,6 +129,14 @@ class Motor:
     friction: float = 0.0
     drive_friction: DriveFriction | None = None
     bandwidth: float = float("inf")
+    motor_constant: float | None = None
+    heat: Heat | None = None
+    cogging: tuple[tuple[int, float, float], ...] = ()
+
+    @property
+    def line(self) -> float:
+        """Torque at standstill, as the voltage allows [N m]."""
+        return self.torque if self.stall is None else self.stall
 
 
 def stretch_of(rotor: str) -> str:

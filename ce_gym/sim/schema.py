@@ -70,11 +70,19 @@ def physics_rows(
     start = {"q": model.standing_q, "dependent": model.guess}
     sizes = state_sizes(model.mechanism, options)
     explicit = isinstance(METHODS[options.method].end, Rates)
-    check("method", options.method, not (explicit and "winding" in sizes), "an implicit one, for torques of motors lag")
+    for part, why in (
+        ("winding", "torques of motors lag"),
+        ("supply", "motors grow warm or a battery sags"),
+        ("held", "controllers hold"),
+    ):
+        check("method", options.method, not (explicit and part in sizes), f"an implicit one, for {why}")
+    check_control_period(options, dt)
     rows = [Row(name, size, "physics", start.get(name, 0.0)) for name, size in sizes.items()]
     rows += [Row("diverged", 1, "physics"), Row("retries", 1, "physics")]
     lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts}
     lengths |= {"motor_torque": motors, "motor_speed": motors}
+    fed = sizes.get("supply", 0) % 2
+    lengths |= {"winding_temperature": (sizes.get("supply", 0) - fed) // 2, "battery_voltage": fed}
     rows += [Row(name, size, "physics") for name in outputs if (size := lengths.get(name, 1))]
     if options.parameters:
         defaults = parameter_defaults(model.robot, options.material, options.parameters)
@@ -87,6 +95,20 @@ def physics_rows(
         rows.append(Row(TOLERATED, 1, "scene", tolerance))
     rows.append(Row(DT, 1, "scene", dt))
     return rows + ([Row(FRAME, 3, "host")] if options.ground == "field" else [])
+
+
+def check_control_period(options: StepOptions, dt: float) -> None:
+    """Refuse a period of controllers that steps of a length [s] do not come to, or of controllers that there are not.
+
+    Raises:
+        ValueError: It is not 0 and not a multiple of the step, or control is of torques, or steps have other lengths.
+    """
+    period = options.control_period
+    steps = period / dt if is_number(period) else -1.0
+    fits = 0 <= steps < np.inf and abs(steps - round(steps)) < 1e-6 * max(steps, 1.0)
+    check("control_period", period, fits, f"0, or a multiple of dt={dt:g} s: faster controllers are as those of 0")
+    follows = options.control.endswith("position") and not METHODS[options.method].controlled
+    check("control_period", period, period == 0 or follows, "0, but for control of positions in steps of one length")
 
 
 def state_buffers(rows: Iterable[Row]) -> list[Buffer]:

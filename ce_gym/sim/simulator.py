@@ -60,7 +60,7 @@ class Simulator:
         contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
         material: Compliance and friction of the contacts; the robot's own if None.
         outputs: Which of "torque", "motor_torque", "motor_speed", "power", "contact_forces", "energy", "error",
-            "loop_gap" and "nearness" to compute; those left out cost nothing and read as errors.
+            "loop_gap", "nearness", "winding_temperature", "battery_voltage" to compute; others read as errors.
         method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
             scenes); or "adaptive": every robot advances by `dt` in extrapolated steps of its own, which are as long as
             `tolerance` allows.
@@ -78,6 +78,8 @@ class Simulator:
             they are not near, that saves their time.
         retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move too far, see
             `ce_gym.dynamics.stepping.parts.LARGEST_MOVE`; it alone then makes the sub-step in parts.
+        control_period: Controllers of positions look every so often, a multiple of `dt`, and hold their torques in
+            between [s]; 0 for controllers so fast that they never stop looking.
         device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
 
     Attributes:
@@ -119,6 +121,7 @@ class Simulator:
         self_collisions: str | Sequence[Sequence[str]] = (),
         seldom: str | Sequence[str] = (),
         retry: int = 6,
+        control_period: float = 0.0,
         device: str | Device = "cpu",
     ) -> None:
         self._made_with = {name: value for name, value in locals().items() if name != "self"}
@@ -153,6 +156,7 @@ class Simulator:
             self_collisions=select_pairs(model.mechanism, self_collisions),
             seldom=tuple(name for name in select_contacts(model.robot, seldom) if name in self.contact_names),
             retry=retry,
+            control_period=control_period,
         )
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
@@ -195,11 +199,8 @@ class Simulator:
             check_shape(name, value, (size,), (self.num_envs, size))
             if not (np.abs(value) <= np.finfo(self.dtype).max).all():
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
-        rows |= {
-            name: np.zeros(self._arrays[name].shape[1])
-            for name in ("anchor", "pressed", "carried", "winding", "diverged", "step_error", "step_change")
-            if name in self._arrays
-        }
+        begun = ("anchor", "pressed", "carried", "winding", "supply", "held", "diverged", "step_error", "step_change")
+        rows |= {name: np.zeros(self._arrays[name].shape[1]) for name in begun if name in self._arrays}
         if "step_length" in self._arrays:
             rows["step_length"] = np.atleast_1d(self._batch.schema["step_length"].reset)
         if self.contact_names:
@@ -307,11 +308,10 @@ class Simulator:
     q = _reading("q", "Positions, a copy, shape (num_envs, nq).")
     v = _reading("v", "Velocities, a copy, shape (num_envs, nv).")
     torque = _reading("torque", "Motor torques at the joints, mean of the last sub-step [N m], shape (num_envs, nj).")
-    motor_torque = _reading(
-        "motor_torque",
-        "Torque of motors' windings over a step, before losses [N m], shape (num_envs, n_motors).",
-    )
+    motor_torque = _reading("motor_torque", "Of motors' windings, before losses [N m], shape (num_envs, n_motors).")
     motor_speed = _reading("motor_speed", "Speeds of motors' rotors after a step [rad/s], shape (num_envs, n_motors).")
+    winding_temperature = _reading("winding_temperature", "Of motors that grow warm [deg C], shape (num_envs, n_warm).")
+    battery_voltage = _reading("battery_voltage", "Voltage of the battery after a step [V], shape (num_envs,).", True)
     power = _reading("power", "Mechanical power of the motors at the joints after a step [W], shape (num_envs, nj).")
     error = _reading("error", "Estimated error of the last sub-step in `v` [rad/s or m/s], shape (num_envs,).", True)
     energy = _reading("energy", "Kinetic, potential and elastic energy after a step [J], shape (num_envs,).", True)

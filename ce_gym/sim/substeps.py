@@ -11,14 +11,14 @@ import casadi as ca
 from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step, While
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.stepping.choice import full_function, light, light_function, near_function
+from ce_gym.dynamics.stepping.choice import NEAR, chooses, near_function
 from ce_gym.dynamics.stepping.control import beginning_function as beginning_of_interval
 from ce_gym.dynamics.stepping.control import control_function, control_sizes
 from ce_gym.dynamics.stepping.ground_lookup import places_function, planes_function, touching_function
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import beginning_function, judging_function, mending_function
 from ce_gym.dynamics.stepping.plan import MOVED, OFF, Plan, Rates, Stage
-from ce_gym.dynamics.stepping.step import iterate_size, iterations_needed
+from ce_gym.dynamics.stepping.step import iterations_needed
 from ce_gym.dynamics.stepping.trace import combination_function, iteration_function, step_function
 from ce_gym.model.mechanism import Mechanism
 
@@ -47,11 +47,15 @@ def substeps(
     staged = any(min(stage.iterations, most) for stage in plan.stages)
     measured = {MOVED: 1} | ({OFF: mechanism.robot.layout.nv} if plan.controlled else {})
     asked = (*outputs, *measured) if plan.single or not staged else tuple(name for name in outputs if name != "error")
-    function = (iteration_function if staged else step_function)(mechanism, options, asked)
+    function = (
+        iteration_function(mechanism, options, asked, chooses=chooses(options))
+        if staged
+        else step_function(mechanism, options, asked)
+    )
     kept = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
     if len(kept) < len(outputs):
         return substeps(mechanism, options, tuple(kept))
-    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in ("iterate", "ground")}
+    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground", NEAR)}
     sizes |= {"retries": 1, **kept} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= control_sizes(mechanism.robot.layout) if plan.controlled else {}
     fractions = {TRIED: 1.0} | ({_own(plan, stage): stage.length for stage in plan.stages} if staged else {})
@@ -65,6 +69,8 @@ def substeps(
     return sizes, buffers, (Repeat(TIMES, (begins, While("unfinished", (*try_part, *take)))),)
 
 
+ITERATES = {"near_iterate": NEAR, "iterate": ""}
+"""Buffers of iterates, and where they are needed."""
 TRIED = "tried"
 """What names of buffers begin with that have the state after a part of a step that is tried, and what it reports."""
 Parts: TypeAlias = tuple[list[Buffer], tuple[Call | Lookup, ...]]
@@ -118,12 +124,14 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
     """
     plan, most = METHODS[options.method], iterations_needed(mechanism, options)
     asked = tuple(name for name in outputs if name in iteration.name_out())
-    state = [name for name in iteration.name_in() if f"{name}_next" in iteration.name_out() and name != "iterate"]
-    zeros = ca.Function("zeros", [], [SX(ca.DM.zeros(iteration.numel_in("iterate")))])
+    state = [name for name in iteration.name_in() if f"{name}_next" in iteration.name_out() and name not in ITERATES]
+    iterates = {name: iteration.numel_in(name) for name in ITERATES if name in iteration.name_in()}
+    zeros = {name: ca.Function("zeros", [], [SX(ca.DM.zeros(size))]) for name, size in iterates.items()}
     sizes = {name: iteration.numel_in(name) for name in state} | {name: iteration.numel_out(name) for name in asked}
     scratch = {f"{_own(plan, stage)}_{name}": size for stage in plan.stages for name, size in sizes.items()}
-    scratch |= {"iterate": iteration.numel_in("iterate"), "unconverged": 1}
-    scratch |= _chosen_buffers(mechanism, options)
+    scratch |= iterates | {"unconverged": 1}
+    near = near_function(mechanism, options) if chooses(options) else None
+    scratch |= {NEAR: 1} if near else {}
     buffers = look_up(mechanism, options)[0] if "ground" in iteration.name_in() else []
     each: list[Call | Lookup] = []
     ground_at: str | None = None
@@ -135,13 +143,15 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
             ground_at = stage.start
         here = {name: f"{start}{name}" for name in state} | {DT: f"{own}_dt"}
         given = tuple(here.get(name, name) for name in iteration.name_in())
-        left = (*(f"{own}_{name}" for name in state), "iterate", "unconverged", *(f"{own}_{name}" for name in asked))
+        left = (*(f"{own}_{name}" for name in state), *iterates, "unconverged", *(f"{own}_{name}" for name in asked))
         repeats = min(stage.iterations, most)
-        if options.seldom or options.self_collisions:
-            each += _chosen(mechanism, options, asked, zeros, here, own, repeats)
-            continue
-        each += [Call(zeros, (), ("iterate",)), Call(iteration, given, left)]
-        each += [Call(iteration, given, left, only_if="unconverged")] * repeats
+        short = ""
+        if near:
+            each.append(Call(near, tuple(here.get(name, name) for name in near.name_in()), (NEAR,)))
+            short = NEAR
+        each += [Call(zeros[name], (), (name,), only_if=ITERATES[name]) for name in iterates]
+        each.append(Call(iteration, given, left, short_if_zero=short))
+        each += [Call(iteration, given, left, only_if="unconverged", short_if_zero=short)] * repeats
     if not plan.single:
         combine = combination_function(mechanism, options, outputs)
         tried = {f"{TRIED}_{name.removesuffix('_next')}": combine.numel_out(name) for name in combine.name_out()}
@@ -149,49 +159,6 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
         each.append(Call(combine, given, tuple(tried)))
         scratch |= tried
     return buffers + [Buffer(name, size, "scratch") for name, size in scratch.items()], tuple(each)
-
-
-def _chosen_buffers(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
-    """Return sizes of what it takes further to choose between two scenes."""
-    if not (options.seldom or options.self_collisions):
-        return {}
-    size = iterate_size(mechanism, light(options))
-    return {"near": 1, "apart": 1, "unsettled": 1} | ({"light_iterate": size} if size else {})
-
-
-def _chosen(
-    mechanism: Mechanism,
-    options: StepOptions,
-    outputs: tuple[str, ...],
-    zeros: ca.Function,
-    here: Mapping[str, str],
-    own: str,
-    repeats: int,
-) -> list[Call]:
-    """Make a stage in the light scene where nothing else is near, and in the full one elsewhere.
-
-    `here` are buffers of what the stage is given, `own` is what names of those begin with that it writes.
-    """
-    near = near_function(mechanism, options)
-    little, full = light_function(mechanism, options, outputs), full_function(mechanism, options, outputs)
-
-    def buffer(name: str, flag: str) -> str:
-        """Return the buffer of an output, or of an input that is one as it was."""
-        name = name.removeprefix("old_").removesuffix("_next")
-        return flag if name == "unconverged" else name if name.endswith("iterate") else f"{own}_{name}"
-
-    calls = [Call(near, tuple(here.get(name, name) for name in near.name_in()), ("near", "apart"))]
-    for function, flag, only in ((little, "unconverged", "apart"), (full, "unsettled", "near")):
-        given = tuple(buffer(x, flag) if x.startswith("old_") else here.get(x, x) for x in function.name_in())
-        left = tuple(buffer(name, flag) for name in function.name_out())
-        if "light_iterate" in given:
-            none = ca.Function("zeros", [], [SX(ca.DM.zeros(function.numel_in("light_iterate")))])
-            calls.append(Call(none, (), ("light_iterate",)))
-        elif "iterate" in given:
-            calls.append(Call(zeros, (), ("iterate",), only_if=only))  # of those apart nobody reads it
-        most = min(repeats, iterations_needed(mechanism, light(options))) if only == "apart" else repeats
-        calls += [Call(function, given, left, only_if=only)] + [Call(function, given, left, only_if=flag)] * most
-    return calls
 
 
 def look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> Parts:

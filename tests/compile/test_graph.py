@@ -1,9 +1,13 @@
 """What is done to a trace before compilers see it: every rewriting by its operations and by its values."""
 
+from functools import partial
+
 import casadi as ca
 import numpy as np
 import pytest
 
+from ce_gym.compile import Buffer, Call, Program, aligned_zeros, load_kernel
+from ce_gym.compile.lowering.function import short_graph
 from ce_gym.compile.lowering.graph import (
     FMA,
     FMS,
@@ -13,6 +17,7 @@ from ce_gym.compile.lowering.graph import (
     SELECT,
     graph_of,
 )
+from ce_gym.compile.program import check_program
 from ce_gym.dynamics.model import Model
 
 X, Y, Z = (ca.SX.sym(name) for name in "xyz")
@@ -112,3 +117,66 @@ def test_a_step_takes_far_fewer_operations():
     before = sum(function.instruction_id(k) not in NO_OPERATION for k in range(function.n_instructions()))
     assert sum(op not in NO_OPERATION for op in graph.ops) < 0.75 * before
     assert REMOVED in graph.ops
+
+
+def choosing():
+    """A function of x, y, z that reckons more where z is not zero, from a product that is used elsewhere, too."""
+    product = X * Y
+    more = ca.if_else(Z, product * product + ca.sin(Y), 0)
+    chosen = ca.if_else(ca.logic_and(Z, X > 0), product + more, product + X)
+    return ca.Function("choosing", [X, Y, Z], [chosen, ca.logic_or(Z, X < 0)])
+
+
+def test_what_is_left_where_an_input_is_zero():
+    """Choices are made, what was not chosen is gone, and what was not fused in the whole is not fused now."""
+    whole, left = graph_of(choosing()), short_graph(choosing(), 2)
+    assert ca.OP_SIN in operations(whole)
+    assert sorted(operations(left)) == sorted([ca.OP_MUL, ca.OP_ADD, ca.OP_LT, ca.OP_OR])
+    alone = graph_of(ca.Function("alone", [X, Y], [X * Y + X, X < 0]))
+    assert FMA in operations(alone)
+
+
+def operations(graph):
+    return [op for op in graph.ops if op not in NO_OPERATION]
+
+
+def test_a_tile_takes_the_short_way_to_the_same_bits():
+    """Robots with zero among zeros alone, and beside others: the same bits, those of the whole function."""
+    function, results = choosing(), []
+
+    def program(short):
+        buffers = [Buffer(name, 1, "tiles") for name in ("x", "y", "z", "value", "truth")]
+        return Program("choosing", tuple(buffers), (Call(function, *NAMES, short_if_zero=short),))
+
+    for short in ("", "z"):
+        kernel = load_kernel(f"choosing {short}", partial(program, short), "float64")
+        n = 3 * kernel.lanes
+        rows = np.random.default_rng(2).uniform(-1, 1, (3, n))
+        rows[2, kernel.lanes :] = 0.0
+        rows[2, -1] = 1.0  # the second tile has zeros alone, the third one robot that is none
+        arrays = {name: row.reshape(3, 1, kernel.lanes).copy() for name, row in zip("xyz", rows, strict=True)}
+        arrays |= {name: np.zeros_like(arrays["x"]) for name in ("value", "truth")}
+        arrays = {name: aligned(value) for name, value in arrays.items()}
+        kernel(arrays, n)
+        results.append((arrays["value"].copy(), arrays["truth"].copy()))
+    np.testing.assert_array_equal(results[0], results[1])
+    expected = np.array([[float(v) for v in function(*row)] for row in rows.T]).T
+    np.testing.assert_allclose(results[1][0].ravel(), expected[0], rtol=1e-15, atol=1e-15)
+    np.testing.assert_array_equal(results[1][1].ravel(), expected[1])
+
+
+NAMES = (("x", "y", "z"), ("value", "truth"))
+
+
+def aligned(values):
+    """A copy of an array as kernels want it."""
+    result = aligned_zeros(values.shape, values.dtype)
+    result[...] = values
+    return result
+
+
+def test_the_short_way_goes_by_an_input():
+    buffers = tuple(Buffer(name, 1, "tiles") for name in ("x", "y", "z", "value", "truth", "other"))
+    program = Program("choosing", buffers, (Call(choosing(), *NAMES, short_if_zero="other"),))
+    with pytest.raises(ValueError, match="short_if_zero 'other', expected one of its inputs"):
+        check_program(program)

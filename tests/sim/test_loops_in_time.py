@@ -30,7 +30,7 @@ def turning(torque: float = 20.0) -> Robot:
     return replace(robot, bodies=(crank, *rest))
 
 
-LOOPS = ("four_bar", "six_bar", "planar_leg_linkage", "tello", "tello_with_arms", "g1", "spot", "cassie")
+LOOPS = ("four_bar", "six_bar", "planar_leg_linkage", "tello", "tello_with_arms", "g1", "spot", "cassie", "dr_legs")
 ROBOTS = {name: lambda name=name: load_robot(name) for name in LOOPS}
 ROBOTS["spatial four-bar"] = turning
 

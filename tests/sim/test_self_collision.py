@@ -133,6 +133,42 @@ def test_forces_of_several_pairs_against_a_dense_solve():
     np.testing.assert_allclose((M @ after)[:6], 0, atol=1e-12)
 
 
+def arms() -> Robot:
+    """Two chains of three balls side by side on the ground, in gravity."""
+    away, ball = Placement((0.0, 0.0, 0.3)), Placement((0.01, 0.02, 0.3))
+    bodies = []
+    for side, x in (("left", 0.0), ("right", 0.09)):
+        for i, axis in enumerate(((0.0, 1.0, 0.0), (0.6, 0.8, 0.0), (0.0, 0.8, 0.6))):
+            start = away if i else Placement((x, 0.0, 0.0))
+            inertial = Inertial(1.3, (0.02, 0.0, 0.25), STILL)
+            shape, parent = (Shape("sphere", (0.06,), ball),), f"{side}_{i - 1}" if i else None
+            bodies.append(Body(f"{side}_{i}", "link", parent, start, Joint("revolute", axis=axis), inertial, shape))
+    material = ContactMaterial(5e4, 300.0, 0.8)
+    return Robot("arms", tuple(bodies), independent=tuple(body.name for body in bodies), material=material)
+
+
+def test_forces_in_motion_and_gravity_against_a_dense_solve():
+    """As above, on a fixed base: M v+ = M v + dt (tau - h + J^T lam), with what links do to each other in turning."""
+    dt, rng = 0.002, np.random.default_rng(6)
+    model, listed = Model(arms()), tuple((f"left_{i}", f"right_{i}") for i in (1, 2))
+    options = StepOptions(dt, control="torque", material=model.robot.material, self_collisions=listed)
+    step, pairs, seen = step_function(model.mechanism, options), colliding(model.robot, listed), 0
+    k, c = model.robot.material.stiffness, model.robot.material.damping
+    for _ in range(20):
+        q, v = rng.normal(0, 0.2, 6), rng.normal(0, 1.0, 6)
+        J = np.array([(gaps(model, q + e, pairs) - gaps(model, q - e, pairs)) / 2e-6 for e in 1e-6 * np.eye(6)]).T
+        found = step(q=q, v=v, pressed=np.zeros(2), diverged=0, target=np.zeros(6))
+        after, lam = (found[name].full().ravel() for name in ("v_next", "pressed_next"))
+        acts, seen = lam > 0, seen + (lam > 0).sum()
+        law = -k * gaps(model, q, pairs) - (c + dt * k) * (J @ after)
+        np.testing.assert_allclose(lam[acts], law[acts], rtol=1e-4, atol=1e-2)
+        free = v + dt * model.forward_dynamics(q, v, np.zeros(6))
+        np.testing.assert_allclose(
+            model.mass_matrix(q) @ (after - free), dt * J.T @ lam, atol=1e-9 + 1e-4 * dt * lam.max()
+        )
+    assert seen > 10
+
+
 @pytest.fixture(scope="module")
 def folded() -> Simulator:
     """Tripods on their feet with a rod that may hit the plate: the arm moves freely."""
@@ -167,6 +203,17 @@ def test_a_robot_does_what_it_would_do_alone(folded: Simulator):
         folded.step(np.zeros(2), 60)
         np.testing.assert_array_equal(folded.q[7], together[i])
     assert folded.pairs == PAIR
+
+
+def test_pairs_are_all_that_a_scene_may_have():
+    """Without contacts and limited motors: balls that meet part again, and momentum is kept."""
+    bodies = (slider("a", 1.0), slider("b", 3.0))
+    robot = Robot("balls", bodies, independent=("a", "b"), material=ContactMaterial(5e4, 0.0, 0.8))
+    sim = Simulator(Model(robot), 3, 1e-3, control="torque", self_collisions=[("a", "b")])
+    sim.set_state(np.array([-0.11, 0.1]), np.array([1.0, 0.0]))
+    sim.step(np.zeros(2), 60)
+    assert (sim.v[:, 1] > 0.3).all()
+    np.testing.assert_allclose(sim.v @ [1.0, 3.0], 1.0, atol=1e-12)
 
 
 def test_gradients_go_through_pairs(folded: Simulator):

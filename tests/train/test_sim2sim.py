@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mujoco")
+import mujoco
 from job import Job
 from ppo import train
 from settings import config_file, load_settings
@@ -41,6 +42,32 @@ def test_robots_start_in_the_same_state(level):
     assert not failed.any()
     rotors = [body for body in made.native.model.robot.bodies if body.kind == "rotor"] if level == "exact" else []
     assert made.twin.model.njnt == 1 + 12 + len(rotors)
+
+
+@pytest.mark.parametrize("name", ["cassie", "dr_legs"])
+def test_robots_with_loops_start_closed_and_stand_as_ours_do(name):
+    """Dependent joints and rotors are where loops put them; springs without actuators get no targets."""
+    model, rng = ce_gym.Model(name), np.random.default_rng(0)
+    q, v = np.tile(model.standing_q, (2, 1)), np.zeros((2, model.nv))
+    q[1, 7:] += rng.uniform(-0.02, 0.02, model.nq - 7)
+    v[1] = rng.normal(size=model.nv)
+    twin = MujocoTwin(model.robot, "exact", 2)
+    twin.start(q, v)
+    np.testing.assert_allclose(np.hstack(twin.state()), np.hstack([q, v]), atol=1e-12)
+    nq, data = twin.model.nq, mujoco.MjData(twin.model)
+    for state in twin._batch.states:
+        data.qpos[:], data.qvel[:] = state[1 : 1 + nq], state[1 + nq : 1 + nq + twin.model.nv]
+        mujoco.mj_forward(twin.model, data)
+        held = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        assert held.sum() > 10
+        np.testing.assert_allclose(data.efc_pos[held], 0.0, atol=1e-9)
+        np.testing.assert_allclose(data.efc_vel[held], 0.0, atol=1e-7)
+    twin.start(q[:1].repeat(2, 0), 0 * v)
+    sim = ce_gym.Simulator(model, 1)
+    for _ in range(20):
+        twin.step(np.tile(model.standing_q[7:], (2, 1)), 0.02)
+    sim.step(model.standing_q[7:], 80)
+    np.testing.assert_allclose(twin.state()[0][0], sim.q[0], atol=0.02)
 
 
 @pytest.mark.parametrize("level", ["armature", "exact"])

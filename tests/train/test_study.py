@@ -16,7 +16,8 @@ from ce_gym.policies import parse_yaml
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = ROOT / "train" / "studies" / "policies.yaml"
-TRIAL = {"env": ID, "steps": 20_000, "metrics": ["velocity_error"], "motors": [], "seconds": 1.0}
+FIGURES = {"decides": "velocity_error", "metrics": ["velocity_error"], "motors": []}
+TRIAL = {"env": ID, "steps": 20_000, **FIGURES, "seconds": 1.0}
 TOY = {
     "seeds": [1, 2],
     "tasks": {"push": TRIAL},
@@ -26,8 +27,8 @@ TOY = {
         "none": {"env_args": {"transmission": "none"}, "training": {}, "turn": 0},
     },
     "judged": {
-        "exact": {"env_args": {"transmission": "exact"}, "episodes": 8, "robots": 2},
-        "own": {"env_args": {}, "episodes": 4, "robots": 2},
+        "exact": {"env_args": {"transmission": "exact"}, "episodes": 8, "robots": 2, "decides": True},
+        "own": {"env_args": {}, "episodes": 4, "robots": 2, "decides": True},
     },
 }
 

@@ -98,8 +98,8 @@ class _KernelText:
     def __init__(self, program: Program, layout: Layout):
         self.program, self.layout = program, layout
         self.sizes = {b.name: b.size for b in program.buffers}
-        self.names: dict[casadi.Function, str] = {}
-        self.places: Counter[casadi.Function] = Counter()
+        self.names: dict[tuple[casadi.Function, int | None], str] = {}
+        self.places: Counter[tuple[casadi.Function, int | None]] = Counter()
         self.grids: dict[Grid, str] = {}
 
     def signature(self) -> str:
@@ -187,7 +187,7 @@ class _KernelText:
     def _calls(self, calls: Sequence[Call]) -> Iterator[str]:
         """Calls of one function with the same buffers, one after the other."""
         first, flag = calls[0], calls[-1].only_if
-        call = f"{self._function(first.function)}({', '.join(f'{name}_' for name in (*first.inputs, *first.outputs))});"
+        call = self._version(first)
         if len(calls) == 1:
             yield f"if ({flag}_[0] != 0) {call}" if flag else call
             return
@@ -200,6 +200,15 @@ class _KernelText:
         yield f"for (int iteration = 0; iteration < {len(calls)} && ({asked}{flag}_[0] != 0); ++iteration)"
         yield f"    {call}"
 
+    def _version(self, call: Call) -> str:
+        """The call of a whole function, or of what is left of it."""
+        values, short = ", ".join(f"{name}_" for name in (*call.inputs, *call.outputs)), call.short_if_zero
+        whole = f"{self._function(call.function)}({values});"
+        if not short:
+            return whole
+        left = f"{self._function(call.function, call.inputs.index(short))}({values});"
+        return f"{{ if ({short}_[0] != 0) {whole} else {left} }}"
+
     def _look_up(self, lookup: Lookup) -> str:
         n, table = self.sizes[lookup.points] // 2, lookup.table
         lanes = f"{lookup.frame}_, {lookup.points}_, {lookup.output}_"
@@ -209,10 +218,10 @@ class _KernelText:
         name = "look_up" if lookup.slopes else "look_up_values"
         return f"{name}<{n}>(all_{table}, rows_{table}, columns_{table}, {lanes});"
 
-    def _function(self, function: casadi.Function) -> str:
-        """Name of a traced function's own C function, for one more place."""
-        self.places[function] += 1
-        return self.names.setdefault(function, f"{function.name()}_{len(self.names)}")
+    def _function(self, function: casadi.Function, zero: int | None = None) -> str:
+        """Name of a traced function's own C function, for one more place; of what is left where an input is zero."""
+        self.places[function, zero] += 1
+        return self.names.setdefault((function, zero), f"{function.name()}_{len(self.names)}")
 
     def constants(self) -> list[str]:
         """The grids that have been named."""
@@ -225,19 +234,19 @@ class _KernelText:
     def functions(self) -> list[str]:
         """The C functions that have been named: inlined, but for a long one that is called from several places."""
         texts = []
-        for function, name in self.names.items():
-            called = self.places[function] > 1 and function.n_instructions() > LONG
+        for (function, zero), name in self.names.items():
+            called = self.places[function, zero] > 1 and function.n_instructions() > LONG
             inline = "__noinline__" if called else "__forceinline__"
-            texts.append(_function_text(name, function, self.layout.dtype, inline))
+            texts.append(_function_text(name, function, self.layout.dtype, inline, zero))
         return texts
 
 
-def _function_text(name: str, function: casadi.Function, dtype: str, inline: str) -> str:
+def _function_text(name: str, function: casadi.Function, dtype: str, inline: str, zero: int | None) -> str:
     """A traced function. Loads come before stores in the text, so that an output may be an input's array."""
     inputs = [f"in{i}" for i in range(function.n_in())]
     outputs = [f"out{i}" for i in range(function.n_out())]
     writer: Any = Writer(dtype)  # stands in for the vector builder
-    lower_function(writer, function, inputs, outputs)
+    lower_function(writer, function, inputs, outputs, zero=zero)
     arguments = [f"const real* {name}" for name in inputs] + [f"real* {name}" for name in outputs]
     head = f"static __device__ {inline} void {name}({', '.join(arguments)})"
     return "\n".join([head, "{", *_indented(writer.lines), "}", ""])

@@ -13,13 +13,20 @@ from collections.abc import Callable, Sequence
 import casadi
 
 from ce_gym.compile.lowering import math as vector_math
-from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, SELECT, graph_of
+from ce_gym.compile.lowering.decided import decided
+from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, SELECT, Graph, graph_of
 from ce_gym.compile.lowering.ordering import ordered
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 
 def lower_function(
-    v: VectorBuilder, function: casadi.Function, inputs: Sequence[Value], outputs: Sequence[Value], apart: bool = False
+    v: VectorBuilder,
+    function: casadi.Function,
+    inputs: Sequence[Value],
+    outputs: Sequence[Value],
+    apart: bool = False,
+    zero: int | None = None,
+    same: frozenset[tuple[int, int]] = frozenset(),
 ) -> None:
     """Emit `function` at the builder's position.
 
@@ -29,11 +36,13 @@ def lower_function(
         inputs: pointer to the first vector of each function input.
         outputs: pointer to the first vector of each function output; structural zeros are written as 0.
         apart: whether no output shares memory with an input.
+        same: inputs and outputs that share their memory; what is only handed on is not stored again.
+        zero: an input that is zero, if one is: what is left out where it is leaves the bits of the rest as they are.
 
     Raises:
         NotImplementedError: for an operation that has no vector form.
     """
-    graph = graph_of(function)
+    graph = graph_of(function) if zero is None else short_graph(function, zero)
     lowering = _Lowering(v, function.name())
     loads = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
     places = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
@@ -54,6 +63,11 @@ def lower_function(
                 values[k] = loaded[place]
         return values[k]
 
+    def handed_on(which: int, position: int) -> bool:
+        """Whether an output is what was loaded from where it would be stored."""
+        found = [loaded.get((source, position)) for source, to in same if to == which]
+        return any(place is results[which][position] for place in found)
+
     leave: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for k, op in enumerate(graph.ops):
         if op == casadi.OP_OUTPUT:
@@ -70,8 +84,15 @@ def lower_function(
             results[which][position] = value(k)
     for which, pointer in enumerate(outputs):
         for position, result in enumerate(results[which]):
-            if (which, position) not in stored:
+            if (which, position) not in stored and not handed_on(which, position):
                 v.store(result, pointer, position)
+
+
+def short_graph(function: casadi.Function, zero: int) -> Graph:
+    """Return the graph of a function where an input is zero."""
+    graph = graph_of(function)
+    sources = [k for k, op in enumerate(graph.ops) if op == casadi.OP_INPUT]
+    return decided(graph, {k for k in sources if function.instruction_input(k)[0] == zero})
 
 
 def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TypeAlias
 
 import casadi
 from llvmlite import ir
@@ -20,6 +21,7 @@ from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, 
 
 INT = ir.IntType(64)
 FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
+Same: TypeAlias = frozenset[tuple[int, int]]
 MANY = 64
 """Values per environment from which on rows are written block by block."""
 
@@ -60,7 +62,7 @@ class _TileWork:
         remaining = builder.sub(num_envs, self.first_env)
         self.valid_lanes = self._smaller(remaining, INT(self.vectors.lanes))
         self.lanes = {b.name: self._lanes_of(b, scratch, tile) for b in program.buffers if b.kind != "table"}
-        self.bodies: dict[casadi.Function, ir.Function] = {}
+        self.bodies: dict[tuple[casadi.Function, int | None, Same], ir.Function] = {}
 
     def any_lane(self, name: str) -> Value:
         """Whether a buffer of size 1 is not zero in some lane."""
@@ -213,13 +215,22 @@ class _TileWork:
 
     def _call(self, call: Call) -> None:
         """Call one lowered function, if it is needed."""
-        body = self.bodies.get(call.function) or self._body(call.function)
-        self.bodies[call.function] = body
         if not call.only_if:
-            self._call_body(call, body)
+            self._call_version(call)
             return
         with self.builder.if_then(self.any_lane(call.only_if)):
-            self._call_body(call, body)
+            self._call_version(call)
+
+    def _call_version(self, call: Call) -> None:
+        """Call the whole function, or what is left of it."""
+        if not call.short_if_zero:
+            self._call_body(call, self._body(call))
+            return
+        with self.builder.if_else(self.any_lane(call.short_if_zero)) as (whole, short):
+            with whole:
+                self._call_body(call, self._body(call))
+            with short:
+                self._call_body(call, self._body(call, call.inputs.index(call.short_if_zero)))
 
     def _call_body(self, call: Call, body: ir.Function) -> None:
         """Call it as often as it takes: for every part of the lanes, and of the buffers."""
@@ -236,8 +247,15 @@ class _TileWork:
             first = [b.mul(time, INT(n * parts)) if goes else INT(0) for n, goes in zip(numel, goes_on, strict=True)]
             b.call(body, [b.gep(pointer, [b.add(at, part)]) for pointer, at in zip(narrow, first, strict=True)])
 
-    def _body(self, function: casadi.Function) -> ir.Function:
-        """A function's own LLVM function: one long block that the optimiser sees alone."""
+    def _body(self, call: Call, zero: int | None = None) -> ir.Function:
+        """A function's own LLVM function, the first time it is asked for; what is left of it if an input is zero."""
+        key = call.function, zero, _same(call) if zero is not None else frozenset()
+        if key not in self.bodies:
+            self.bodies[key] = self._emitted(*key)
+        return self.bodies[key]
+
+    def _emitted(self, function: casadi.Function, zero: int | None, same: Same) -> ir.Function:
+        """A function as one long block that the optimiser sees alone."""
         pointer = VectorBuilder(None, self.layout.dtype, self.parts).float_type.as_pointer()
         signature = ir.FunctionType(ir.VoidType(), [pointer] * (function.n_in() + function.n_out()))
         body = ir.Function(self.builder.module, signature, f"call_{len(self.bodies)}")
@@ -246,7 +264,8 @@ class _TileWork:
         body.attributes.alignstack = ALIGNMENT  # else spilled vectors straddle two cache lines each
         vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype, self.parts)
         inputs, outputs = body.args[: function.n_in()], body.args[function.n_in() :]
-        lower_function(vectors, function, inputs, outputs, apart=self.program.compact and self._is_apart(function))
+        apart = self.program.compact and self._is_apart(function)
+        lower_function(vectors, function, inputs, outputs, apart, zero, same)
         vectors.builder.ret_void()
         return body
 
@@ -258,6 +277,12 @@ class _TileWork:
 
     def _smaller(self, a: Value, b: Value) -> Value:
         return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
+
+
+def _same(call: Call) -> Same:
+    """Inputs and outputs of a call that are one buffer."""
+    pairs = ((i, j) for i, name in enumerate(call.inputs) for j, to in enumerate(call.outputs) if name == to)
+    return frozenset(pairs)
 
 
 def _convert(builder: Builder, value: Value, to: ir.Type) -> Value:

@@ -17,9 +17,10 @@ from __future__ import annotations
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.electric.supply import Work
 from ce_gym.dynamics.forces.actuation import Actuated, actuated_clusters, effort_matrix
 from ce_gym.dynamics.forces.law import Motion
-from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors
+from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors, supply_of
 from ce_gym.dynamics.forces.saturation import SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.recursion.kinematics import Kinematics
@@ -58,6 +59,34 @@ def windings_after(scene: Scene, motors: SaturatedForce, motion: Motion) -> SX:
     """Return torques of motors at the end of a step whose acceleration is known, as `State.winding` is."""
     lagging = [motors.windings[i] for i in lagging_motors(scene.mechanism.robot, scene.options.motors)]
     return ca.vertcat(SX(0, 1), *[winding.tau - winding.slope @ motion.ydd for winding in lagging])
+
+
+def supply_after(
+    scene: Scene, kinematics: Kinematics, motors: SaturatedForce, motion: Motion, before: SX, yd: SX, dt: float
+) -> SX:
+    """Return temperatures and voltage after a step whose acceleration is known, as `State.supply` is.
+
+    Args:
+        scene: The robot and what surrounds it.
+        kinematics: At the start of the step.
+        motors: What the motors deliver.
+        motion: The acceleration.
+        before: As `State.supply` was.
+        yd: Velocities of the independent joints at the start, shape (n,).
+        dt: Length of the step [s].
+    """
+    robot, model = scene.mechanism.robot, scene.options.motors
+    supply = supply_of(robot, model, before)
+    clusters = actuated_clusters(scene.mechanism, kinematics) if before.numel() else ()
+    work = {}
+    for cluster in clusters:
+        speed = cluster.W @ (yd + dt * motion.ydd)[cluster.rows]
+        for i, (place, motor) in enumerate(zip(cluster.places, cluster.motors, strict=True)):
+            torque = motors.windings[place].tau - motors.windings[place].slope @ motion.ydd
+            full = scene.figures.strength * supply.line(place, motor)
+            answer = ca.if_else(motors.on_line.get(place, SX(0)), ca.sign(torque) * full, 0)
+            work[place] = Work(torque, speed[i], answer)
+    return ca.vertcat(SX(0, 1), *supply.after(robot.motors, work, dt))
 
 
 def _external(cluster: Actuated, motors: SaturatedForce, inertia: SX, motion: Motion) -> SX:

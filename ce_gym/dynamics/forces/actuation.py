@@ -22,12 +22,22 @@ from typing import TypeAlias
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.electric.cogging import cogging
+from ce_gym.dynamics.electric.supply import Supply
 from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction, rubs
 from ce_gym.dynamics.forces.law import JointForce, is_moment
-from ce_gym.dynamics.forces.motors import MOTORS, MotorModel, caught_up, lagging_motors, loaded_motors, most_friction
+from ce_gym.dynamics.forces.motors import (
+    MOTORS,
+    MotorModel,
+    caught_up,
+    lagging_motors,
+    loaded_motors,
+    most_friction,
+    supply_of,
+)
 from ce_gym.dynamics.forces.parameters import rubbing_as_declared
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
-from ce_gym.dynamics.forces.scene import Scene, StepOptions
+from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.drives import Motor
 from ce_gym.model.mechanism import Mechanism
@@ -91,18 +101,23 @@ class Before:
     Attributes:
         carried: What friction under load goes by.
         windings: Torques at its end [N m], of those that lag.
+        supply: Temperatures and voltage at its end.
+        held: What a sampled controller holds, as `State.held` is.
     """
 
     carried: Carried
     windings: Mapping[int, SX]
+    supply: Supply
+    held: SX
 
     @staticmethod
-    def of(mechanism: Mechanism, options: StepOptions, carried: SX, windings: SX) -> Before:
-        """Return it, given columns as `State.carried` and `State.winding` are."""
+    def of(mechanism: Mechanism, options: StepOptions, carried: SX, state: State) -> Before:
+        """Return it, given the state before and a column as `State.carried` is."""
         robot, model = mechanism.robot, options.motors
         loaded, lagging = loaded_motors(robot, model), lagging_motors(robot, model)
         torques = {place: (carried[i], carried[len(loaded) + i], carried[-1]) for i, place in enumerate(loaded)}
-        return Before(torques, {place: windings[i] for i, place in enumerate(lagging)})
+        windings = {place: state.winding[i] for i, place in enumerate(lagging)}
+        return Before(torques, windings, supply_of(robot, model, state.supply), state.held)
 
 
 def motor_forces(
@@ -224,14 +239,19 @@ def deliver(
     turning[:, rows] = W
     free, own, sticks, windings = SX.eye(len(motors)), SX(len(motors), len(motors)), [], []
     for i, (motor, place) in enumerate(zip(motors, cluster.places, strict=True)):
-        if (limits := model.limits(motor, speed[i], strength, dt)) is not None:
+        if (limits := model.limits(before.supply.now(place, motor), speed[i], strength, dt)) is not None:
             (high, forwards), (low, backwards) = limits
             ends = (JointForce(high, forwards * turning[i, :]), JointForce(low, backwards * turning[i, :]))
             one = Saturation.about(iterate, yd.numel() + place, JointForce(tau[i], slope[i, :] @ turning), *ends)
             force.limited[yd.numel() + place] = one
             tau[i], free[i, i] = one.given, one.free
             own[i, i] = ca.if_else(one.at_high, forwards, ca.if_else(one.at_low, backwards, 0))
+            force.on_line[place] = own[i, i] > 0
         windings.append((place, tau[i], own[i, i]))
+        if motor.cogging and model.at_motors:
+            teeth, stiffness = cogging(motor.cogging, cluster.angles[i], speed[i], dt)
+            tau[i] += teeth
+            own[i, i] += stiffness
         damping = model.damping(motor, speed[i])
         tau[i] -= damping * speed[i]
         own[i, i] += dt * damping

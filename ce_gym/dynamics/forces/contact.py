@@ -25,7 +25,7 @@ steps for ever. So a contact that pushed at the end of the last step stays activ
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import casadi as ca
@@ -190,6 +190,7 @@ class Contact:
         normal: Law of its normal force.
         friction: Law of its friction.
         dt: Step length [s].
+        near: 1 where it may act, 0 where it does not; None if it always may.
     """
 
     body: str
@@ -198,6 +199,7 @@ class Contact:
     normal: NormalLaw
     friction: FrictionLaw
     dt: float
+    near: SX | None = field(default=None, kw_only=True)
 
     size = Iterate.SIZE
 
@@ -301,7 +303,7 @@ class LinearContact:
         arrived = self.law.touch.depth - self.law.dt * self._closing(gain) > 0
         pulled = ca.logic_and(self._above, self.normal_after(gain) < -FORCE_FLOOR)
         changed = ca.logic_or(slid, ca.if_else(self.active, pulled, arrived))
-        return ca.logic_and(changed, ca.logic_not(self.iterate.last))
+        return where(self.law.near, ca.logic_and(changed, ca.logic_not(self.iterate.last)))
 
     def next_iterate(self, motion: Motion) -> SX:
         """Return the iterate for another iteration, shape (Iterate.SIZE,)."""
@@ -320,6 +322,11 @@ class LinearContact:
         touch = self.law.touch
         s = touch.anchor + self.law.dt * self._tangential(touch.velocity + gain)
         return s * ca.fmin(1, self._cone() / (self.law.compliance.bristle * _length(s)))
+
+
+def where(near: SX | None, x: SX, otherwise: SX | float = 0.0) -> SX:
+    """Return `x` where something may act, see `Contact.near`, else what there is without it."""
+    return x if near is None else ca.if_else(near, x, otherwise)
 
 
 def _length(x: SX) -> SX:

@@ -11,7 +11,10 @@ its joints as it feels them alone, the other motors of the cluster at rest, in t
 
     kp_m,i = e_i^T W^-T diag(kp) W^-1 e_i        kp / N^2 behind a gear of ratio N, where both controls are the same
 
-As in actuation.py forces are taken one step ahead.
+As in actuation.py forces are taken one step ahead: what a controller that is much faster than the steps does. One that
+is slower looks at positions and speeds at the start of the step in which its time has come, and holds what it asks for
+until it looks again; nothing of that is implicit, and gains that are too large for its period are unstable, as they are
+in hardware.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ from ce_gym.dynamics.forces.actuation import (
     seen_joints,
     within_joint_limits,
 )
-from ce_gym.dynamics.forces.law import JointForce
+from ce_gym.dynamics.forces.law import JointForce, is_moment
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.saturation import SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, target_names
@@ -72,10 +75,41 @@ class Motors:
 
     def linearise(self, iterate: SX) -> SaturatedForce:
         """Linearise about an iterate, shape (size,)."""
+        force = self._delivered(iterate)
+        if self.scene.options.sampled:
+            period, left = self.scene.options.control_period, self.before.held[-1]
+            force.sampled = ca.vertcat(self._sampled, ca.if_else(self._due, period, left) - self.dt)
+        return force
+
+    @property
+    def _due(self) -> SX:
+        """1 if a sampled controller looks now; steps and samples need not be the same numbers to rounding."""
+        return SX(1) if is_moment(self.dt) else self.before.held[-1] < self.dt / 2
+
+    @property
+    def _sampled(self) -> SX:
+        """What a sampled controller asks for over the step [N m or N], shape (n_targets,)."""
+        scene = self.scene
+        if scene.options.control == "position":
+            seen = seen_joints(scene.mechanism, self.kinematics)
+            now = controller(scene, seen @ self.y, seen @ self.yd, self.target, 0.0).tau
+        else:
+            names, now = target_names(scene.mechanism, scene.options.control), SX.zeros(self.target.numel())
+            for row, name in enumerate(scene.mechanism.robot.commanded):
+                if name in names:
+                    now[names.index(name)] = self._joints_ask(names, [row], 0.0).tau[row]
+            for cluster in actuated_clusters(scene.mechanism, self.kinematics):
+                places = [names.index(motor.rotor) for motor in cluster.motors]
+                now[places] = self._motors_ask(cluster, self.target[places], 0.0).tau
+        return ca.densify(ca.if_else(self._due, now, self.before.held[:-1]))
+
+    def _delivered(self, iterate: SX) -> SaturatedForce:
         scene, y, yd, dt = self.scene, self.y, self.yd, self.dt
         if scene.options.control in ("position", "torque"):
             seen = seen_joints(scene.mechanism, self.kinematics)
             asked = controller(scene, seen @ y, seen @ yd, self.target, dt)
+            if scene.options.sampled:
+                asked = unanswering(self._sampled)
             return motor_forces(scene, self.kinematics, asked, yd, dt, iterate, seen, self.before)
         names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.commanded
         undriven = [row for row, name in enumerate(joints) if name in names]
@@ -91,27 +125,49 @@ class Motors:
         strength = self.scene.figures.strength
         if self.scene.options.control == "motor_torque":
             asked = JointForce(own, SX(own.numel(), 1))
+        elif self.scene.options.sampled:
+            names = target_names(self.scene.mechanism, self.scene.options.control)
+            places = [names.index(motor.rotor) for motor in cluster.motors]
+            asked = JointForce(self._sampled[places], SX(own.numel(), 1))
         else:
-            kp, kd = _gains(self.scene, cluster)
-            damping = kd + self.dt * kp
-            tau = kp * (own - cluster.angles) - damping * (cluster.W @ self.yd[cluster.rows])
-            asked = JointForce(tau, self.dt * damping)
+            asked = self._motors_ask(cluster, own, self.dt)
         return JointForce(strength * asked.tau, ca.diag(strength * asked.slope))
+
+    def _motors_ask(self, cluster: Actuated, own: SX, dt: float) -> JointForce:
+        """Return what position control asks the motors of a cluster for, slopes as a column."""
+        kp, kd = _gains(self.scene, cluster)
+        damping = kd + dt * kp
+        tau = kp * (own - cluster.angles) - damping * (cluster.W @ self.yd[cluster.rows])
+        return JointForce(tau, dt * damping)
 
     def _at_joints(self, names: tuple[str, ...], rows: list[int], size: int) -> SaturatedForce:
         """Return what is asked of the joints that no motor drives, and nothing of the others."""
-        scene, n, strength = self.scene, self.y.numel(), self.scene.figures.strength
+        n, strength, joints = self.y.numel(), self.scene.figures.strength, self.scene.mechanism.robot.commanded
         force = SaturatedForce(SX(n, 1), SX(n, n), size)
-        joints = scene.mechanism.robot.commanded
+        asked = self._joints_ask(names, rows, self.dt)
+        if self.scene.options.sampled:
+            held, full = self._sampled, SX.zeros(len(joints))
+            for row in rows:
+                full[row] = held[names.index(joints[row])]
+            asked = unanswering(full)
+        for row in rows:
+            force.tau[row], force.slope[row, row] = strength * asked.tau[row], strength * asked.slope[row, row]
+        return force
+
+    def _joints_ask(self, names: tuple[str, ...], rows: list[int], dt: float) -> JointForce:
+        """Return what control asks for at the joints that no motor drives, their own targets being followed."""
+        scene, joints = self.scene, self.scene.mechanism.robot.commanded
         control = "position" if scene.options.control == "motor_position" else "torque"
         full = SX.zeros(len(joints))
         for row in rows:
             full[row] = self.target[names.index(joints[row])]
         scene = replace(scene, options=replace(scene.options, control=control))
-        asked = controller(scene, self.y[: len(joints)], self.yd[: len(joints)], full, self.dt)
-        for row in rows:
-            force.tau[row], force.slope[row, row] = strength * asked.tau[row], strength * asked.slope[row, row]
-        return force
+        return controller(scene, self.y[: len(joints)], self.yd[: len(joints)], full, dt)
+
+
+def unanswering(tau: SX) -> JointForce:
+    """Return torques that do not depend on accelerations."""
+    return JointForce(tau, SX(tau.numel(), tau.numel()))
 
 
 def motor_springs(scene: Scene, kinematics: Kinematics, y: SX, target: SX) -> tuple[SX, SX]:

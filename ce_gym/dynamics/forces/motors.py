@@ -11,6 +11,7 @@ from typing import Protocol, TypeAlias
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.electric.supply import Supply
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import DriveFriction, Motor
 
@@ -88,11 +89,11 @@ class Limited:
 
     def limits(self, motor: Motor, speed: SX, strength: SX, dt: float) -> tuple[Line, Line] | None:
         """Return the torques that current and voltage allow."""
-        if math.isinf(motor.torque) and math.isinf(motor.velocity):
+        if _endless(motor.torque) and _endless(motor.velocity):
             return None
-        limit = strength * motor.torque if math.isfinite(motor.torque) else SX(math.inf)
-        stall = strength * (motor.torque if motor.stall is None else motor.stall)
-        if math.isinf(motor.velocity) or math.isinf(motor.torque if motor.stall is None else motor.stall):
+        limit = SX(math.inf) if _endless(motor.torque) else strength * motor.torque
+        stall = strength * motor.line
+        if _endless(motor.velocity) or _endless(motor.line):
             return (limit, SX(0)), (-limit, SX(0))
         ends = []
         for side in (1, -1):
@@ -120,6 +121,28 @@ class Limited:
 
 MOTORS: dict[str, MotorModel] = {"ideal": Ideal(), "limited": Limited()}
 """All models, by the name that `Simulator(motors=...)` takes."""
+
+
+def _endless(figure: float | SX) -> bool:
+    return not isinstance(figure, SX) and math.isinf(figure)
+
+
+def supply_size(robot: Robot, model: str) -> int:
+    """Return how many temperatures and voltages there are, by the name of the model of the motors."""
+    return 2 * len(_heated(robot, model)) + (robot.battery is not None and MOTORS[model].at_motors)
+
+
+def supply_of(robot: Robot, model: str, column: SX) -> Supply:
+    """Return temperatures and voltage, given a column as `State.supply` is and the name of the model of the motors."""
+    heated = _heated(robot, model)
+    windings = {place: column[i] for i, place in enumerate(heated)}
+    housings = {place: column[len(heated) + i] for i, place in enumerate(heated)}
+    battery = robot.battery if MOTORS[model].at_motors else None
+    return Supply(windings, housings, battery, SX(0) if battery is None else column[-1])
+
+
+def _heated(robot: Robot, model: str) -> list[int]:
+    return [i for i, motor in enumerate(robot.motors) if motor.heat is not None and MOTORS[model].at_motors]
 
 
 def loaded_motors(robot: Robot, model: str) -> list[int]:

@@ -14,7 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX, skew
 from ce_gym.dynamics.forces.contact import Compliance
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
-from ce_gym.model.drives import Motor
+from ce_gym.model.drives import Battery, Motor
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 PARAMETERS = {
@@ -36,6 +36,10 @@ PARAMETERS = {
     "motor_damping": "viscous friction of the rotors of limited motors [N m s/rad], n_motors",
     "motor_friction": "dry friction of the rotors of limited motors [N m], n_motors",
     "drive_friction": "factor on what friction of limited motors has more of at rest and under load [-], 1",
+    "cogging": "factor on the cogging of limited motors [-], 1",
+    "ambient": "temperature of the air around limited motors that grow warm [deg C], 1",
+    "battery_voltage": "of the battery of limited motors, without load [V], 1",
+    "battery_resistance": "of it and of its wires [ohm], 1",
     "joint_damping": "viscous friction of the joints [N m s/rad or N s/m], n_joints",
     "joint_friction": "dry friction of the joints [N m or N], n_joints",
     "link_inertia:BODY": "factor on the moments of inertia of a body about its centre of mass [-], 1",
@@ -92,9 +96,14 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
         "motor_damping": np.array([motor.damping for motor in robot.motors]),
         "motor_friction": np.array([motor.friction for motor in robot.motors]),
         "drive_friction": np.ones(1),
+        "cogging": np.ones(1),
         "joint_damping": np.array([robot.body(name).joint.damping for name in robot.commanded]),
         "joint_friction": np.array([robot.body(name).joint.friction for name in robot.commanded]),
     }
+    airs = [motor.heat.ambient for motor in robot.motors if motor.heat is not None]
+    plain["ambient"] = np.array(airs[:1] or [25.0])
+    battery = robot.battery or Battery(1.0, 0.0, 1.0)
+    plain |= {f"battery_{name}": np.array([getattr(battery, name)]) for name in ("voltage", "resistance")}
     links = [body.name for body in robot.bodies if body.kind == "link"]
     plain |= {f"added_mass:{link}": np.zeros(1) for link in links}
     plain |= {f"com_shift:{link}": np.zeros(3) for link in links}
@@ -123,9 +132,9 @@ def check_parameter(robot: Robot, name: str, values: ArrayLike) -> None:
     """
     numbers, kind = np.asarray(values, dtype=float), name.split(":")[0]
     good, expected = numbers >= 0, "0 or more"
-    if kind in ("gravity", "com_shift"):
+    if kind in ("gravity", "com_shift", "ambient"):
         good, expected = np.isfinite(numbers), "finite numbers"
-    elif kind in ("ratio", "slip_speed", "drive_stiffness"):
+    elif kind in ("ratio", "slip_speed", "drive_stiffness", "battery_voltage"):
         good, expected = numbers > 0, "more than 0"
     elif kind == "added_mass":
         mass = robot.body(name.split(":")[1]).inertial.mass
@@ -177,6 +186,11 @@ def with_drives(robot: Robot, given: Mapping[str, SX]) -> Robot:
         changed["motors"] = motors
     if "drive_friction" in given:
         changed["motors"] = tuple(_with_rubbing(motor, given["drive_friction"]) for motor in motors or robot.motors)
+    if "ambient" in given or "cogging" in given:
+        changed["motors"] = tuple(_with_air(motor, given) for motor in changed.get("motors", robot.motors))
+    feeding = {name: given[f"battery_{name}"] for name in ("voltage", "resistance") if f"battery_{name}" in given}
+    if feeding and robot.battery is not None:
+        changed["battery"] = replace(robot.battery, **feeding)  # type: ignore[arg-type]
     joints = [robot.body(name).joint for name in robot.commanded]
     if rubbing := _each(joints, given, {"joint_damping": "damping", "joint_friction": "friction"}):
         moved = dict(zip(robot.commanded, rubbing, strict=True))
@@ -226,6 +240,14 @@ def _each(things: Sequence[Any], given: Mapping[str, SX], fields: Mapping[str, s
 def _with_rubbing(motor: Motor, factor: SX) -> Motor:
     drive = motor.drive_friction
     return motor if drive is None else replace(motor, drive_friction=replace(drive, factor=drive.factor * factor))
+
+
+def _with_air(motor: Motor, given: Mapping[str, SX]) -> Motor:
+    if "ambient" in given and motor.heat is not None:
+        motor = replace(motor, heat=replace(motor.heat, ambient=given["ambient"]))  # type: ignore[arg-type]
+    if "cogging" in given and motor.cogging:
+        motor = replace(motor, cogging=tuple((n, given["cogging"] * size, at) for n, size, at in motor.cogging))  # type: ignore[misc]
+    return motor
 
 
 def _with_factor(spin: Spin, given: Mapping[str, SX]) -> Spin:

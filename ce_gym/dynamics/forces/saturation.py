@@ -90,6 +90,8 @@ class SaturatedForce(JointForce):
         limited: The torques that are kept within limits, at their places in the iterate.
         held: Rows of `y` that dry friction holds, each with 1 if it does, else 0.
         windings: Torques of motors, by their places, before what they lose.
+        on_line: Whether the voltage limits them, likewise.
+        sampled: What a sampled controller holds after the step, as `State.held` is.
         count: Above 0, which says that there is an iterate.
     """
 
@@ -97,6 +99,8 @@ class SaturatedForce(JointForce):
     limited: dict[int, Saturation] = field(default_factory=dict)
     held: dict[int, SX] = field(default_factory=dict)
     windings: dict[int, JointForce] = field(default_factory=dict)
+    on_line: dict[int, SX] = field(default_factory=dict)
+    sampled: SX = field(default_factory=lambda: SX(0, 1))
     count: SX | int = 1
 
     def check(self, motion: Motion) -> SX:

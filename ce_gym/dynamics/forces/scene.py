@@ -7,7 +7,7 @@ from typing import Literal
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import reference_guess
-from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors
+from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors, supply_size
 from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactMaterial
@@ -35,6 +35,8 @@ class StepOptions:
         parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
         self_collisions: Pairs of links that push each other apart.
         seldom: Contacts that are looked at only where they are near, see `stepping/choice.py`.
+        control_period: Of position control: it looks at joints or motors every so often and holds its torques in
+            between [s]; 0 for controllers that never stop, see `forces/motor_control.py`.
         retry: How often a kernel may halve a step for a robot that fails in it, see `stepping/parts.py`.
     """
 
@@ -50,7 +52,13 @@ class StepOptions:
     parameters: tuple[str, ...] = ()
     self_collisions: tuple[tuple[str, str], ...] = ()
     seldom: tuple[str, ...] = ()
+    control_period: float = 0.0
     retry: int = 6
+
+    @property
+    def sampled(self) -> bool:
+        """Whether torques that are asked for are held between the samples of a controller."""
+        return self.control_period > 0 and self.control.endswith("position")
 
 
 @dataclass
@@ -65,6 +73,7 @@ class Scene:
             flat ground.
         looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_contacts);
             empty if that is where they are.
+        near: 1 where what is seldom near acts, 0 where it is left out; None if all acts always.
     """
 
     mechanism: Mechanism
@@ -72,6 +81,7 @@ class Scene:
     figures: Figures
     ground: SX
     looked_up: SX = field(default_factory=SX)
+    near: SX | None = None
 
 
 def make_scene(mechanism: Mechanism, options: StepOptions, parameters: SX, ground: SX) -> Scene:
@@ -94,6 +104,10 @@ class State:
         carried: Over the last step the torque of each motor whose friction depends on it, then what all else did to
             each of their rotors [N m], and 1; zeros where there was no step before, shape (2 n_loaded + 1,).
         winding: Torque at the end of the last step of each motor whose torque lags [N m], shape (n_lagging,).
+        supply: How much the winding of each motor that grows warm is warmer than the air, then each of their housings
+            [K], and how far the battery's voltage is below that without load [V], if there is one.
+        held: What a sampled controller asks for until it looks again [N m or N], one for each target, and how long that
+            still is [s].
     """
 
     q: SX
@@ -104,6 +118,8 @@ class State:
     pressed: SX
     carried: SX
     winding: SX
+    supply: SX
+    held: SX
 
     def items(self) -> list[tuple[str, SX]]:
         """Return the parts that are there, by name."""
@@ -135,6 +151,8 @@ def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
     loaded = loaded_motors(mechanism.robot, options.motors)
     sizes["carried"] = 2 * len(loaded) + 1 if loaded else 0
     sizes["winding"] = len(lagging_motors(mechanism.robot, options.motors))
+    sizes["supply"] = supply_size(mechanism.robot, options.motors)
+    sizes["held"] = len(target_names(mechanism, options.control)) + 1 if options.sampled else 0
     return {name: size for name, size in sizes.items() if size}
 
 

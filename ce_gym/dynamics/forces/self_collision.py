@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from ce_gym.dynamics.algebra.spatial import SX, cross, mirrored, solve_positive_definite
+from ce_gym.dynamics.algebra.spatial import SX, cross, solve_positive_definite
 from ce_gym.dynamics.forces.contact import (
     Compliance,
     Contact,
@@ -28,13 +28,14 @@ from ce_gym.dynamics.forces.contact import (
     NormalLaw,
     TangentialForce,
     Touch,
+    where,
 )
 from ce_gym.dynamics.forces.law import Motion
 from ce_gym.dynamics.recursion.ce_aba import (
     Articulation,
     BodyTerms,
+    gravity_acceleration,
     outward_acceleration_pass,
-    outward_response_pass,
 )
 from ce_gym.dynamics.recursion.gyroscopic import solve_turning
 from ce_gym.dynamics.recursion.kinematics import BodyState, Kinematics, constant
@@ -122,6 +123,7 @@ def meeting(
     compliance: Compliance,
     normal: NormalLaw,
     dt: float,
+    near: SX | None = None,
 ) -> Pair:
     """Place two capsules against each other.
 
@@ -132,6 +134,7 @@ def meeting(
         compliance: What they are made of; friction is left out.
         normal: Law of the force.
         dt: Step length [s].
+        near: 1 where it may act, 0 where it does not; None if it always may.
     """
     axes = [[constant(np.array(end)) for end in (one.start, one.end)] for one in capsules]
     placed = [[body.point_position(end) for end in axis] for axis, body in zip(axes, bodies, strict=True)]
@@ -148,7 +151,8 @@ def meeting(
     depth = capsules[0].radius + capsules[1].radius - distance
     still = SX(3, 1)
     touch = Touch(_normal(SX(1)), still, depth, _normal(closing), still, load, still)
-    return Pair(f"{first.name} {second.name}", touch, compliance, normal, Frictionless(), dt, (first, second))
+    names, ends = f"{first.name} {second.name}", (first, second)
+    return Pair(names, touch, compliance, normal, Frictionless(), dt, ends, near=near)
 
 
 def nearest(a: SX, b: SX, c: SX, d: SX, long: tuple[bool, ...] = (True, True)) -> tuple[SX, SX]:
@@ -193,10 +197,12 @@ def settled(
     pairs: Sequence[LinearPair],
     forces: SX,
 ) -> tuple[SX, dict[str, SX]]:
-    """Find the forces of pairs, and the accelerations that come of them, as `outward_acceleration_pass` returns them.
+    """Find the accelerations with the forces of pairs, as `outward_acceleration_pass` returns them.
 
-    With `Y` what a unit force of each pair leaves at a cluster or the base on its way inwards, and `J` the Jacobian of
-    the pairs' distances, `J A^-1 J^T = sum Y^T D^-1 Y`: the factorisation that the recursion is.
+    With `Y` what a unit force of each pair leaves at a cluster or the base on its way inwards, `u` what is left there
+    of all other forces, `d` the acceleration of what carries a cluster while all of vdot is zero, and `J` the Jacobian
+    of the pairs' distances, `J A^-1 J^T = sum Y^T D^-1 Y` and `J vdot = sum Y^T D^-1 (u - U^T d)`: the factorisation
+    that the recursion is.
 
     Args:
         mechanism: The mechanism.
@@ -206,26 +212,43 @@ def settled(
         pairs: About an iterate.
         forces: Symbols of their forces, shape (n_pairs,).
     """
-    n, none = len(pairs), SX(ca.DM.zeros(len(pairs)))
-    left = {k: ca.sparsify(ca.jacobian(u, forces)) for k, u in articulation.u.items()}
-    W = sum((Y.T @ solve_positive_definite(articulation.D[k], Y) for k, Y in left.items() if Y.nnz()), SX(n, n))
-    W = mirrored(W)
-    free = replace(articulation, u={k: ca.substitute(u, forces, none) for k, u in articulation.u.items()})
-    of_base = SX(6, n)
+    n, near = len(pairs), pairs[0].law.near
+    left = {k: _apart(u, forces) for k, u in articulation.u.items()}
+    found, acting = SX(n, n + 1), replace(articulation, u={})
+    for k, (Y, u) in left.items():
+        if Y.nnz():
+            own = u - articulation.U[k].T @ _carried(mechanism, kinematics, articulation, k)
+            found += Y.T @ solve_positive_definite(articulation.D[k], ca.horzcat(Y, own))
     if articulation.base is not None:
-        inertia, wrench = articulation.base
-        Y = ca.jacobian(wrench, forces)
-        of_base = solve_positive_definite(inertia, Y) if momentum is None else solve_turning(inertia, momentum, Y)
-        W += Y.T @ of_base
-        free.base = inertia, ca.substitute(wrench, forces, none)
-    vdot, a = outward_acceleration_pass(mechanism, kinematics, free, momentum)
-    motion = Motion(vdot, a, {})
-    start = [pair.normal_after(pair.gain(motion)) for pair in pairs]
+        inertia, (Y, wrench) = articulation.base[0], _apart(articulation.base[1], forces)
+        wrenches = ca.horzcat(Y, wrench)
+        at_once = momentum is None
+        of_base = solve_positive_definite(inertia, wrenches) if at_once else solve_turning(inertia, momentum, wrenches)
+        found += Y.T @ of_base
+    W, gains = found[:, :n], found[:, n]
+    start = [pair.normal_after(_normal(pair.law.dt * gains[i])) for i, pair in enumerate(pairs)]
     slopes = ca.vertcat(*[pair.law.dt * pair.normal_slope for pair in pairs])
-    found = eliminated(SX.eye(n) + ca.diag(slopes) @ W, ca.vertcat(*start))
-    change = {k: Y @ found for k, Y in left.items()}
-    more, bodies = outward_response_pass(mechanism, kinematics, articulation, change, of_base @ found)
-    return vdot + more, {name: value + bodies[name] for name, value in a.items()}
+    pressed = eliminated(SX.eye(n) + ca.diag(slopes) @ W, ca.vertcat(*start))
+    acting.u = {k: where(near, u + Y @ pressed, u) for k, (Y, u) in left.items()}
+    if articulation.base is not None:
+        acting.base = inertia, where(near, wrench + Y @ pressed, wrench)
+    return outward_acceleration_pass(mechanism, kinematics, acting, momentum)
+
+
+def _apart(u: SX, forces: SX) -> tuple[SX, SX]:
+    """Return what is linear in forces of pairs as their factor, and the rest."""
+    return ca.sparsify(ca.jacobian(u, forces)), ca.substitute(u, forces, SX(ca.DM.zeros(forces.numel())))
+
+
+def _carried(mechanism: Mechanism, kinematics: Kinematics, articulation: Articulation, k: int) -> SX:
+    """Return how a handle accelerates while all of `vdot` is zero, shape (6,); on a fixed base minus gravity."""
+    output, handle = mechanism.tree.clusters[k].output_body, articulation.handle_body[k]
+    drift, R = SX(6, 1), SX.eye(3)
+    if output is not None:
+        drift, R = kinematics.bodies[output].drift, kinematics.bodies[output].R
+    if handle:
+        drift, R = kinematics.bodies[handle].X.motion(drift), kinematics.bodies[handle].R
+    return drift if articulation.base else drift - ca.vertcat(SX(3, 1), R.T @ gravity_acceleration(mechanism))
 
 
 def eliminated(A: SX, b: SX) -> SX:

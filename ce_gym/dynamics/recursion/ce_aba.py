@@ -201,41 +201,6 @@ def outward_acceleration_pass(
     return vdot, a
 
 
-def outward_response_pass(
-    mechanism: Mechanism, kinematics: Kinematics, articulation: Articulation, u: dict[int, SX], base: SX
-) -> tuple[SX, dict[str, SX]]:
-    """Compute what accelerations change by if forces do, base to tip; arguments as for `outward_acceleration_pass`.
-
-    Args:
-        mechanism: The mechanism.
-        kinematics: From the outward velocity pass.
-        articulation: From the inward pass.
-        u: What the generalised forces that are left change by, shape (d,) each.
-        base: What the acceleration of a floating base changes by, shape (6,).
-
-    Returns:
-        Changes of vdot, shape (nv,), and of the acceleration of every body, body coordinates, shape (6,) each.
-    """
-    vdot, a = SX(sum(len(rows) for rows in kinematics.rows), 1), dict[str | None, SX]({None: SX(6, 1)})
-    for k in mechanism.tree.base_to_tip():
-        cluster, rows, handle = mechanism.tree.clusters[k], kinematics.rows[k], articulation.handle_body.get(k)
-        if is_free(mechanism, cluster):
-            a[cluster.bodies[0]] = vdot[rows] = base
-            continue
-        a_handle = a[cluster.output_body]
-        if handle:
-            a_handle = kinematics.bodies[handle].X.motion(a_handle)
-        ydd = solve_positive_definite(articulation.D[k], u[k] - articulation.U[k].T @ a_handle)
-        vdot[rows] = ydd
-        coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
-        qdd = coordinates.G @ ydd
-        for body in mechanism.moving(cluster):
-            state = kinematics.bodies[body.name]
-            carried = a_handle if body.name == handle else state.X.motion(a[body.parent])
-            a[body.name] = carried + state.S @ qdd[coordinates.index[body.name]]
-    return vdot, {name: change for name, change in a.items() if name is not None}
-
-
 def gravity_acceleration(mechanism: Mechanism) -> SX:
     """Return the acceleration of free fall in the world, shape (3,)."""
     return constant(mechanism.gravity)

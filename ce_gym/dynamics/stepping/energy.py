@@ -12,8 +12,10 @@ import casadi as ca
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.drives.mesh import mesh_energy
-from ce_gym.dynamics.forces.actuation import seen_joints
+from ce_gym.dynamics.electric.cogging import cogging_energy
+from ce_gym.dynamics.forces.actuation import actuated_clusters, seen_joints
 from ce_gym.dynamics.forces.motor_control import motor_springs
+from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.passive import limit_stiffness, yielding_joints
 from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.recursion.derived import kinetic_and_potential
@@ -23,7 +25,7 @@ from ce_gym.model.description import Robot
 
 
 def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
-    """Return kinetic, potential and elastic energy [J].
+    """Return kinetic, potential and elastic energy, and that of cogging [J].
 
     Elastic are the springs and bristles of contacts, stops and springs of joints, transmissions, and position control,
     the last as if motors had no limits.
@@ -35,7 +37,19 @@ def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
     """
     kinetic, potential = kinetic_and_potential(scene.mechanism, state.q, state.v, state.dependent)
     total = kinetic + potential + contact_energy(scene, state) + joint_energy(scene, state, target)
-    return total + spring_energy(scene, state) + mesh_energy(scene, state.q[scene.mechanism.robot.layout.joints_q :])
+    total += spring_energy(scene, state) + mesh_energy(scene, state.q[scene.mechanism.robot.layout.joints_q :])
+    return total + teeth_energy(scene, state)
+
+
+def teeth_energy(scene: Scene, state: State) -> SX:
+    """Return the potential of the motors' cogging [J]."""
+    robot, total = scene.mechanism.robot, SX(0)
+    if MOTORS[scene.options.motors].at_motors and any(motor.cogging for motor in robot.motors):
+        kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
+        for cluster in actuated_clusters(scene.mechanism, kinematics):
+            for i, motor in enumerate(cluster.motors):
+                total += cogging_energy(motor.cogging, cluster.angles[i])
+    return total
 
 
 def contact_energy(scene: Scene, state: State) -> SX:

@@ -7,7 +7,7 @@ leave the arithmetic of combining stages to this file.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
@@ -130,7 +130,7 @@ def combined(plan: Plan, ends: Mapping[str, State], layout: Layout) -> State:
     if layout.floating:
         world = [w * (quaternion_to_rotation(ends[s].q[3:7]) @ ends[s].v[3:6]) for s, w in weights.items()]
         v[3:6] = quaternion_to_rotation(q[3:7]).T @ sum(world, SX(0))
-    return State(q, v, last.load, last.anchor, last.dependent, last.pressed, last.carried, last.winding)
+    return replace(last, q=q, v=v)
 
 
 def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:

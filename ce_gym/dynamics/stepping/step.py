@@ -19,10 +19,10 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.drives.load import carried_after, carried_now, windings_after
+from ce_gym.dynamics.drives.load import carried_after, carried_now, supply_after, windings_after
 from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretching
 from ce_gym.dynamics.forces.actuation import Before, limit_count
-from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground
+from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground, where
 from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.law import JointForce, Motion, is_moment
@@ -151,7 +151,7 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
 
     laws, unloaded = touching(scene, kinematics, state, dt), iterate.numel() - state.carried.numel()
     carried = carried_now(state, iterate[unloaded:])
-    before = Before.of(mechanism, scene.options, carried, state.winding)
+    before = Before.of(mechanism, scene.options, carried, state)
     driven = Motors(scene, kinematics, y, yd, target, dt, before)
     meeting = meeting_pairs(scene, kinematics, state, dt)
     rubbing = JointFriction(mechanism, kinematics, yd, dt)
@@ -205,22 +205,25 @@ def iteration(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
 def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) -> Stepped:
     """Return what a step leaves behind whose acceleration is known; arguments as for `solve`."""
     kinematics, motion, motors = solved.kinematics, solved.motion, solved.motors
+    yd = state.v[scene.mechanism.robot.layout.joints_v :]
     q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.layout)
     saturated = [motors, *solved.friction]
     for row, held in [pair for force in saturated for pair in force.held.items()]:  # such a joint does not move at all
         place = q.numel() - motors.tau.numel() + row
         q[place] = ca.if_else(held, state.q[place], q[place])
     contacts = [(kinematics.bodies[c.body].R, c, c.gain(motion)) for c in solved.contacts]
-    anchors = [(R @ c.anchor_after(gain))[:2] for R, c, gain in contacts]
+    anchors = [where(c.law.near, (R @ c.anchor_after(gain))[:2]) for R, c, gain in contacts]
     after = State(
         q=q,
         v=v,
-        load=stacked([ca.fmax(c.normal_after(gain), 0) for _, c, gain in contacts]),
+        load=stacked([where(c.law.near, ca.fmax(c.normal_after(gain), 0)) for _, c, gain in contacts]),
         anchor=stacked(anchors) if state.anchor.numel() else state.anchor,
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
-        pressed=stacked([ca.fmax(pair.normal_after(pair.gain(motion)), 0) for pair in solved.pairs]),
+        pressed=stacked([where(p.law.near, ca.fmax(p.normal_after(p.gain(motion)), 0)) for p in solved.pairs]),
         carried=carried_after(scene, kinematics, motors, solved.inertia, motion) if solved.inertia else solved.carried,
         winding=windings_after(scene, motors, motion),
+        supply=supply_after(scene, kinematics, motors, motion, state.supply, yd, dt),
+        held=motors.sampled,
     )
     touches = [*solved.contacts, *solved.pairs]
     unconverged = ca.sum1(stacked([c.check(motion) for c in touches])) > 0
@@ -228,10 +231,15 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         unconverged = ca.logic_or(force.check(motion), unconverged)
     if solved.carried.numel():
         unconverged = ca.logic_or(unconverged, solved.carried[-1] < 0.5)
-    of_contacts = stacked([c.next_iterate(motion) for c in touches])
     # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of motors are fixed
     # points by themselves.
-    of_contacts = ca.if_else(unconverged, of_contacts, iterate[: of_contacts.numel()])
+    parts = split(iterate, [c.law.size for c in touches])
+    of_contacts = stacked(
+        [
+            where(c.law.near, ca.if_else(unconverged, c.next_iterate(motion), part), part)
+            for c, part in zip(touches, parts, strict=False)
+        ]
+    )
     of_friction = stacked([force.next_iterate(motion) for force in solved.friction])
     of_meshes = stacked([force.next_iterate(motion) for force in solved.meshes])
     of_carried = ca.if_else(unconverged, after.carried, solved.carried)
@@ -242,7 +250,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         before=state,
         solved=solved,
         torque=(motors.tau - motors.slope @ motion.ydd)[: len(scene.mechanism.robot.commanded)],
-        contact_forces=ca.horzcat(SX(3, 0), *[R @ c.force_after(gain) for R, c, gain in contacts]),
+        contact_forces=ca.horzcat(SX(3, 0), *[where(c.law.near, R @ c.force_after(gain)) for R, c, gain in contacts]),
         unconverged=unconverged,
         iterate=ca.vertcat(of_contacts, motors.next_iterate(motion), of_friction, of_meshes, of_carried),
         error=SX(0),
@@ -271,6 +279,13 @@ def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
     return Contact.size * touches + of_joints + state_sizes(mechanism, options).get("carried", 0)
 
 
+def rows_of_near(mechanism: Mechanism, options: StepOptions) -> list[int]:
+    """Return which rows of an iterate belong to what acts only where it is near."""
+    acts = [name in options.seldom for name in options.contacts]
+    acts += [True] * len(colliding(mechanism.robot, options.self_collisions))
+    return [Contact.size * i + j for i, seldom in enumerate(acts) if seldom for j in range(Contact.size)]
+
+
 def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> list[Contact]:
     """Place every contact sphere of the scene against the ground."""
     contacts, options = [], scene.options
@@ -285,7 +300,8 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> l
             up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
         touch = touch_ground(body, position, sphere.radius, height, up, state.load[i], anchor)
-        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt))
+        near = scene.near if sphere.name in options.seldom else None
+        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt, near=near))
     return contacts
 
 
@@ -295,7 +311,7 @@ def meeting_pairs(scene: Scene, kinematics: Kinematics, state: State, dt: float)
     law, pairs = normal_law(options.normal_law, options.material), []
     for i, pair in enumerate(colliding(robot, options.self_collisions)):
         bodies = kinematics.bodies[pair[0].body], kinematics.bodies[pair[1].body]
-        pairs.append(meeting(pair, bodies, state.pressed[i], compliance, law, dt))
+        pairs.append(meeting(pair, bodies, state.pressed[i], compliance, law, dt, scene.near))
     return pairs
 
 
@@ -331,7 +347,9 @@ def on_bodies(contacts: list[LinearContact], gravity: dict[str, SX], couples: di
     terms = {name: BodyTerms(SX(6, 6), ca.vertcat(couple, SX(3, 1))) for name, couple in couples.items()}
     for contact in contacts:
         new, old = contact.body_terms(gravity[contact.body]), terms.get(contact.body)
-        terms[contact.body] = BodyTerms(old.inertia + new.inertia, old.force + new.force) if old else new
+        total, near = BodyTerms(old.inertia + new.inertia, old.force + new.force) if old else new, contact.law.near
+        none = old or BodyTerms(SX(6, 6), SX(6, 1))
+        terms[contact.body] = BodyTerms(where(near, total.inertia, none.inertia), where(near, total.force, none.force))
     return terms
 
 

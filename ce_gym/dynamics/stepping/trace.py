@@ -11,6 +11,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, seen_joints
+from ce_gym.dynamics.forces.motors import supply_of
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import State, StepOptions, make_scene, symbolic_state, target_names
 from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
@@ -18,7 +19,7 @@ from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pa
 from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.plan import AFTER, MOVED, OFF, combined, error_estimate, position_errors
-from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, stacked
+from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, rows_of_near, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
 from ce_gym.model.mechanism import Mechanism
 
@@ -56,19 +57,39 @@ def step_function(
 
 
 def iteration_function(
-    mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = (), follows: bool = False
+    mechanism: Mechanism,
+    options: StepOptions,
+    outputs: tuple[str, ...] = (),
+    follows: bool = False,
+    chooses: bool = False,
 ) -> ca.Function:
     """Trace one iteration of an Euler step: repeated on its own iterate until it has converged, it makes the step.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+        outputs: See `step_function`.
+        follows: See `step_function`.
+        chooses: Whether what is seldom near is left out where it is not; `near` is one more of what is given then, and
+            `near_iterate` what of the iterate nobody looks at elsewhere.
 
     Returns:
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
         `step_function`; the iterate is zero at first, shape (iterate_size,).
     """
-    given, iterate = Given(mechanism, options, follows), SX.sym("iterate", iterate_size(mechanism, options))
+    given, size = Given(mechanism, options, follows), iterate_size(mechanism, options)
+    rows = {"near_iterate": rows_of_near(mechanism, options)} if chooses else {}
+    always = [i for i in range(size) if i not in rows.get("near_iterate", ())]
+    rows |= {"iterate": always} if always or not chooses else {}
+    parts, iterate = {name: SX.sym(name, len(of)) for name, of in rows.items()}, SX(size, 1)
+    for name, part in parts.items():
+        iterate[rows[name]] = part
+    choice = {"near": SX.sym("near")} if chooses else {}
+    given.scene = replace(given.scene, **choice)
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
     told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
-    left = {"iterate_next": stepped.iterate, "unconverged": stepped.unconverged}
-    return traced("iteration", given.inputs() | {"iterate": iterate}, given.guarded(stepped) | left | told)
+    left = {f"{name}_next": stepped.iterate[of] for name, of in rows.items()} | {"unconverged": stepped.unconverged}
+    return traced("iteration", given.inputs() | parts | choice, given.guarded(stepped) | left | told)
 
 
 def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
@@ -119,6 +140,8 @@ OUTPUTS = {
     "motor_torque": "torque of each motor's windings, before what it loses, mean over the step [N m]",
     "motor_speed": "speed of each motor's rotor at the end of the step [rad/s]",
     "power": "mechanical power of the motors at each joint, end of the step [W]",
+    "winding_temperature": "temperature of the winding of each motor that grows warm, end of the step [deg C]",
+    "battery_voltage": "voltage of the battery that feeds the motors, if there is one, end of the step [V]",
     "contact_forces": "force on each contact, mean over the step, world axes [N]",
     "energy": "kinetic, potential and elastic energy at the end of the step, see `mechanical_energy` [J]",
     "error": "estimated error of the step in the velocities, of methods that have one [rad/s or m/s]",
@@ -177,7 +200,7 @@ class Given:
 
     def _of(self, stepped: Stepped, name: str) -> SX:
         layout = self.mechanism.robot.layout
-        yd = stepped.state.v[layout.joints_v :]
+        robot, yd = self.scene.mechanism.robot, stepped.state.v[layout.joints_v :]
         kinematics = stepped.solved.kinematics
         if name == MOVED:
             return furthest(stepped.state.v, layout.base_nv, self.dt)
@@ -185,6 +208,9 @@ class Given:
             return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
         if name == "motor_torque":
             return winding_torques(self.mechanism, kinematics, stepped)
+        if name in ("winding_temperature", "battery_voltage"):
+            supply = supply_of(robot, self.scene.options.motors, stepped.state.supply)
+            return supply.voltage if name == "battery_voltage" else stacked(supply.temperatures(robot.motors))
         if name == "power":
             return stepped.torque * (seen_joints(self.mechanism, kinematics) @ yd)
         if name == "energy":

@@ -60,6 +60,8 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
             pressed=first.state.pressed,
             carried=first.state.carried,
             winding=first.state.winding,
+            supply=first.state.supply,
+            held=first.state.held,
         )
     else:
         after = combined(plan, {name: part.state for name, part in parts.items()}, layout)

@@ -90,6 +90,7 @@ class TaskProgram:
             friction=task.friction,
             method=task.method,
             motors=task.motors,
+            control_period=task.control_period,
             ground="field" if self.ground and self.contacts else "flat",
             parameters=self.randomised.parameters,
             self_collisions=select_pairs(self.model.mechanism, task.self_collisions),

@@ -15,7 +15,7 @@ from ce_gym.sim.arguments import check
 
 FACTORS = (
     *("stiffness", "kp", "kd", "motor_strength", "rotor_inertia", "ratio"),
-    *("motor_damping", "motor_friction", "drive_friction"),
+    *("motor_damping", "motor_friction", "drive_friction", "cogging", "battery_voltage", "battery_resistance"),
 )
 """Figures whose ranges are factors on what the robot has."""
 

@@ -59,6 +59,7 @@ class Task:
         self_collisions: Which links push each other apart: "listed", "all" or pairs, see `ce_gym.Simulator`.
         friction: "tangent" or "secant", see `ce_gym.Simulator`.
         motors: "ideal" or "limited", see `ce_gym.Simulator`.
+        control_period: Of the motors' controllers [s], a multiple of `dt`; 0 for none, see `ce_gym.Simulator`.
         method: How sub-steps are made, "euler" or another, see `ce_gym.Simulator`.
         tolerance: Of method "adaptive" [rad or m]; every robot then makes steps of its own within each sub-step.
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
@@ -96,6 +97,7 @@ class Task:
     self_collisions: str | tuple[tuple[str, ...], ...] = ()
     friction: Literal["tangent", "secant"] = "tangent"
     motors: Literal["ideal", "limited"] = "ideal"
+    control_period: float = 0.0
     method: str = "euler"
     tolerance: float | None = None
     only_positive: bool = True
@@ -116,6 +118,10 @@ RANDOMISED = {
     "motor_damping": "factor on the viscous friction of each motor, limited ones [-]",
     "motor_friction": "factor on the dry friction of each motor, limited ones [-]",
     "drive_friction": "factor on what that is more at rest and under load [-]",
+    "cogging": "factor on the cogging of motors, limited ones [-]",
+    "ambient": "temperature of the air around motors that grow warm, limited ones [deg C]",
+    "battery_voltage": "factor on the voltage of the battery without load, limited motors [-]",
+    "battery_resistance": "factor on its resistance, likewise [-]",
     "added_mass": "mass added to the base [kg]; added_mass:BODY for another body",
     "com_shift": "shift of the base's centre of mass, each axis [m]; com_shift:BODY for another body",
 }

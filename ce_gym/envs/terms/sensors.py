@@ -96,6 +96,17 @@ def motor_torques(s: TermContext) -> SX:
     return s.motor_torque / np.array([limit if 0 < limit < np.inf else 100.0 for limit in limits])
 
 
+def winding_temperatures(s: TermContext) -> SX:
+    """How much windings of motors that grow warm are warmer than the air [100 K], shape (n_warm,)."""
+    return s.supply[: s.supply.numel() // 2] / 100  # then their housings, and perhaps a voltage
+
+
+def battery_sag(s: TermContext) -> SX:
+    """How far the battery's voltage is below that without load, over the nominal one [-], shape (1,); () without."""
+    battery = s.mechanism.robot.battery
+    return SX(0, 1) if battery is None or not s.supply.numel() else s.supply[-1] / battery.nominal
+
+
 def _link(s: TermContext, term: str, name: str) -> BodyState:
     bodies = s.kinematics.bodies
     name = name or s.mechanism.robot.bodies[0].name

@@ -24,6 +24,7 @@ from ce_gym.model.checks.body import (
 )
 from ce_gym.model.checks.collisions import adjacent, capsules_of
 from ce_gym.model.checks.constraint import check_constraint
+from ce_gym.model.checks.supply import check_supply
 from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Robot
@@ -59,6 +60,7 @@ def check_robot(robot: Robot) -> None:
     _check_something_moves(robot, file)
     _check_contacts(robot, file)
     _check_motors(robot, file)
+    check_supply(robot, file)
     _check_elastic(robot, file)
     _check_pose_and_gains(robot, file)
     _check_inertia(robot, file)

@@ -5,17 +5,18 @@ The file is `motors.yaml` beside the robots that come with the package; each ent
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from functools import cache
 from pathlib import Path
 
 from ce_gym.model.assets import assets_folder
+from ce_gym.model.drives import Heat
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.reading import Section, read_yaml
 from ce_gym.model.table import table_text
 
-_NUMBERS = ("ratio", "inertia", "torque", "velocity", "resistance")
-_OPTIONAL = ("velocity", "resistance")
+_NUMBERS = ("ratio", "inertia", "torque", "velocity", "resistance", "motor_constant")
+_OPTIONAL = ("velocity", "resistance", "motor_constant")
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class MotorType:
         torque: Largest, at the rotor [N m].
         velocity: No-load speed of the rotor [rad/s]; None if it is not published.
         resistance: Of a phase [ohm]; None if it is not published.
+        motor_constant: Torque over the root of what the winding then loses, at 20 deg C [N m/sqrt(W)]; None likewise.
+        heat: How it grows warm; None likewise.
         source: Where the figures are from, and which of them are estimates.
     """
 
@@ -38,11 +41,14 @@ class MotorType:
     torque: float
     velocity: float | None
     resistance: float | None
+    motor_constant: float | None
+    heat: Heat | None
     source: str
 
     def limits(self) -> dict[str, float]:
-        """Return what a `Motor` has of it: torque [N m] and velocity [rad/s] of the rotor."""
-        return {"torque": self.torque} | ({} if self.velocity is None else {"velocity": self.velocity})
+        """Return what a `Motor` has of it: torque [N m], velocity [rad/s] and motor constant of the rotor."""
+        more = {"velocity": self.velocity, "motor_constant": self.motor_constant}
+        return {"torque": self.torque} | {key: value for key, value in more.items() if value is not None}
 
 
 def motor_types(folder: Path | None = None) -> dict[str, MotorType]:
@@ -85,15 +91,23 @@ def motor_table() -> str:
     return table_text(columns, rows)
 
 
+def heat_of(section: Section) -> Heat:
+    """Return the figures of how a motor grows warm."""
+    section.allow(*(field.name for field in fields(Heat)))
+    asked = {field.name for field in fields(Heat) if field.default is MISSING} | set(section)
+    return Heat(**{name: section.number(name) for name in asked})
+
+
 @cache
 def _library(folder: Path) -> tuple[tuple[str, MotorType], ...]:
     return tuple((name, _motor(name, section)) for name, section in read_yaml(folder / "motors.yaml").sections())
 
 
 def _motor(name: str, section: Section) -> MotorType:
-    section.allow(*_NUMBERS, "source")
+    section.allow(*_NUMBERS, "heat", "source")
     figures = {key: section.number(key, None) if key in _OPTIONAL else section.number(key) for key in _NUMBERS}
     for key, value in figures.items():
         if value is not None and not value > 0.0:
             raise bad(section.file, section.key(key), value, "more than 0")
-    return MotorType(name, **figures, source=section.text("source"))  # type: ignore[arg-type]
+    heat = heat_of(section.section("heat")) if "heat" in section else None
+    return MotorType(name, **figures, heat=heat, source=section.text("source"))  # type: ignore[arg-type]

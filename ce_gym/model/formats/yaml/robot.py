@@ -24,12 +24,13 @@ from ce_gym.model.formats.yaml.constraints import read_constraints
 from ce_gym.model.formats.yaml.contacts import read_capsules, read_contacts, read_pairs
 from ce_gym.model.formats.yaml.links import read_links
 from ce_gym.model.formats.yaml.rotors import add_rotors, read_elastic, read_motors
+from ce_gym.model.formats.yaml.supply import read_battery
 
 _JOINT_FIGURES = {"joint_friction": "friction", "joint_stiffness": "stiffness", "joint_springref": "springref"}
 _KEYS = (
     *("name", "urdf", "mjcf", "base", "sources", "notes", "kept_inertia", "gravity", "gears"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
-    *("capsules", "self_collisions", "elastic"),
+    *("capsules", "self_collisions", "elastic", "battery"),
     *_JOINT_FIGURES,
 )
 
@@ -55,6 +56,7 @@ def robot_from_yaml(path: Path) -> Robot:
         constraints=(*below.constraints, *ties),
         independent=independent,
         motors=motors,
+        battery=read_battery(file),
         elastic=read_elastic(file.section("elastic"), bodies) if "elastic" in file else below.elastic,
         assembly=file.section("assembly").numbers()
         if "assembly" in file

@@ -22,11 +22,13 @@ from ce_gym.model.formats.rotor_links import FixedLink, disc, without_rotors
 from ce_gym.model.formats.urdf.elements import unit_axis
 from ce_gym.model.formats.yaml.constraints import coefficients, frame_named
 from ce_gym.model.formats.yaml.links import Links, names_in
+from ce_gym.model.formats.yaml.supply import read_cogging, read_heat
 from ce_gym.model.frames import Placement, Vec3
 
 _KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
 _ELASTIC_KEYS = ("stiffness", "damping", "backlash", "preload")
-_MOTOR_KEYS = ("torque", "velocity", "stall", "damping", "friction", "bandwidth")
+_MOTOR_KEYS = ("torque", "velocity", "stall", "damping", "bandwidth", "motor_constant")
+_MOTOR_PARTS = ("use", "friction", "heat", "cogging")
 _FRICTION_KEYS = tuple(field.name for field in fields(DriveFriction) if field.name != "factor")
 _BOTH_KEYS = ("load", "stribeck_load")
 """Stand for the share of the motor's torque and that of all else, equal."""
@@ -37,13 +39,14 @@ def read_motors(section: Section) -> tuple[dict[str, MotorType], tuple[Motor, ..
     used: dict[str, MotorType] = {}
     motors = []
     for rotor, motor in section.sections():
-        motor.allow("use", *_MOTOR_KEYS)
+        motor.allow(*_MOTOR_PARTS, *_MOTOR_KEYS)
         figures: dict[str, float] = {}
         if "use" in motor:
             used[rotor] = motor_type(motor.text("use"), motor.file, motor.key("use"))
             figures = used[rotor].limits()
-        figures |= {key: motor.number(key) for key in motor if key not in ("use", "friction")}
-        motors.append(Motor(rotor, **figures, **_friction(motor)))
+        figures |= {key: motor.number(key) for key in motor if key in _MOTOR_KEYS}
+        more = _friction(motor) | read_heat(motor, used.get(rotor)) | read_cogging(motor)
+        motors.append(Motor(rotor, **figures, **more))
     return used, tuple(motors)
 
 

@@ -1,0 +1,90 @@
+"""What temperature and voltage leave of motors over a step, and what the step makes of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.electric.battery import sagged
+from ce_gym.dynamics.electric.heat import allowed, copper_loss, resistance, warmed
+from ce_gym.model.drives import Battery, Motor
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a motor did over a step.
+
+    Attributes:
+        torque: Of its winding, at the end of the step [N m].
+        speed: Of its rotor, likewise [rad/s].
+        answer: How its torque rises with its share of the nominal voltage, 0 where the voltage does not limit it [N m].
+    """
+
+    torque: SX
+    speed: SX
+    answer: SX
+
+
+@dataclass(frozen=True)
+class Supply:
+    """Temperatures of motors and the voltage that feeds them.
+
+    Attributes:
+        windings: How much windings are warmer than the air, by the places of the motors that grow warm [K].
+        housings: The same of housings.
+        battery: What feeds them all; None for a steady voltage.
+        sag: How far its voltage is below that without load [V]; not used without a battery.
+    """
+
+    windings: Mapping[int, SX]
+    housings: Mapping[int, SX]
+    battery: Battery | None
+    sag: SX
+
+    @property
+    def voltage(self) -> SX:
+        """Of the battery [V]; of none without one."""
+        return SX(0, 1) if self.battery is None else SX(self.battery.voltage - self.sag)
+
+    def temperatures(self, motors: tuple[Motor, ...]) -> list[SX]:
+        """Return temperatures of the windings of those motors that grow warm [deg C]."""
+        return [motors[i].heat.ambient + rise for i, rise in self.windings.items()]  # type: ignore[union-attr]
+
+    def now(self, place: int, motor: Motor) -> Motor:
+        """Return a motor with the limits that current and voltage leave it."""
+        figures = {}
+        if self.battery is not None:
+            share = self.voltage / self.battery.nominal
+            figures = {"stall": share * self.line(place, motor), "velocity": share * motor.velocity}
+        if place in self.windings:
+            assert motor.heat is not None
+            figures.setdefault("stall", self.line(place, motor))
+            figures["torque"] = allowed(motor.heat, self.windings[place]) * motor.torque
+        return replace(motor, **figures) if figures else motor
+
+    def line(self, place: int, motor: Motor) -> SX | float:
+        """Return what the nominal voltage allows a motor at standstill [N m]: less, as its winding is warm."""
+        warm = place in self.windings and motor.heat is not None
+        return motor.line / resistance(motor.heat, self.windings[place]) if warm else motor.line
+
+    def after(self, motors: tuple[Motor, ...], work: Mapping[int, Work], dt: SX | float) -> list[SX]:
+        """Return temperatures and sag after a step of the mechanics, as `State.supply` has them."""
+        warmth = [
+            warmed(motors[i], motors[i].heat, self.windings[i], self.housings[i], work[i].torque, dt)  # type: ignore[arg-type]
+            for i in self.windings
+        ]
+        column = [winding for winding, _ in warmth] + [housing for _, housing in warmth]
+        return column if self.battery is None else [*column, self._sag_after(self.battery, motors, work)]
+
+    def _sag_after(self, battery: Battery, motors: tuple[Motor, ...], work: Mapping[int, Work]) -> SX:
+        power, answer = SX(0), SX(0)
+        for place, done in work.items():
+            motor, warmth = motors[place], SX(1)
+            if place in self.windings:
+                warmth = resistance(motor.heat, self.windings[place])  # type: ignore[arg-type]
+            loss = copper_loss(motor, done.torque) * warmth
+            power += done.torque * done.speed + loss
+            per_torque = done.speed + 2 * warmth * done.torque / motor.motor_constant**2  # type: ignore[operator]
+            answer += per_torque * done.answer / battery.nominal
+        return sagged(battery, self.sag, power, answer)
