@@ -174,7 +174,7 @@ def _inspect(args: argparse.Namespace) -> int:
     problems = missing(model.robot)
     print("Environments: it has what every task needs\n" if not problems else "Environments lack:")
     print("".join(f"  {problem}\n" for problem in problems), flush=True)
-    if not (problems or args.no_timing):
+    if model.robot.gains.kp and not (problems or args.no_timing):
         print(f"{standing_report(model)}\n", flush=True)
     print(transmission_report(model, states=0) if args.no_errors else transmission_report(model))
     return 0

@@ -122,14 +122,14 @@ class FastPPO:
         s, done = self.settings, min(self.steps / self.settings.steps, 1.0)
         if s.final_std:
             self.parts(self.theta)[1][:] = np.log(geometric(s.initial_std, s.final_std, done))
+        if not s.target_kl:
+            self.rate = linear(s.learning_rate, 0.0, done)
         start = time.perf_counter()
         self.collect(fall_cost(s.fall_cost, done))
         self.collect_seconds += time.perf_counter() - start
         figures = self.learn(linear(s.entropy, s.final_entropy, done))
         if s.target_kl:
             self.rate = adapted_rate(self.rate, figures["train/approx_kl"], s.target_kl)
-        else:
-            self.rate = linear(s.learning_rate, 0.0, min(self.steps / s.steps, 1.0))
         return figures
 
     def collect(self, cost: float) -> None:

@@ -81,9 +81,10 @@ def fallen_after(model: Model, scales: Array) -> Array:
     v = np.zeros((sim.num_envs, model.nv))
     v[:, 3:5] = PUSH * np.tile(PUSHES, (len(scales), 1))
     sim.set_state(np.broadcast_to(model.standing_q, (sim.num_envs, model.nq)), v)
+    standing = model.standing_q[model.robot.layout.joints_q :][: len(sim.target_names)]  # what stretches comes after
     after, every = np.full(sim.num_envs, np.inf), round(0.1 / DT)
     for i in range(round(SECONDS / (every * DT))):
-        sim.step(model.standing_q[model.robot.layout.joints_q :], every)
+        sim.step(standing, every)
         now = has_fallen(model.robot, np.asarray(sim.q)) | np.asarray(sim.diverged, bool)
         after[now & np.isinf(after)] = (i + 1) * every * DT
     return after.reshape(len(scales), len(PUSHES)).min(1)

@@ -19,16 +19,17 @@ def as_text(report: StandingReport) -> str:
     """Return a report as plain text."""
     if report.after is None:
         return f"Without a policy: stands {SECONDS:g} s by its gains, targets held at the standing pose"
-    ankles = ", ".join(report.ankles)
-    return "\n".join(
-        [
-            f"Without a policy: falls within {report.after:.1f} s, targets held at the standing pose.",
-            f"  All position gains times {_times(report.factor)} would carry it; those of {ankles}",
-            f"  alone times {_times(report.ankle_factor)}. Weight times height above these joints is "
-            f"{report.toppling:.3g} N m/rad, and what their",
-            f"  gains hold against that {report.stiffness:.3g}.",
+    lines = [
+        f"Without a policy: falls within {report.after:.1f} s, targets held at the standing pose.",
+        f"  All position gains times {_times(report.factor)} would carry it.",
+    ]
+    if report.ankles:
+        lines += [
+            f"  Those of {', '.join(report.ankles)} alone times {_times(report.ankle_factor)}.",
+            f"  Weight times height above these joints is {report.toppling:.3g} N m/rad; their gains hold "
+            f"{report.stiffness:.3g} against it.",
         ]
-    )
+    return "\n".join(lines)
 
 
 def _times(factor: float | None) -> str:

@@ -65,11 +65,12 @@ class CleanPPO:
             action = spread.sample()
             self.seen, rewards, failed, late, infos = self.envs.step(action.clamp(-1, 1).numpy())
             reward = torch.as_tensor(np.float32(rewards))
+            done, late = failed | late, late & ~failed
             if late.any():  # time is up: what would have come is worth what the critic says
                 final = torch.as_tensor(np.stack(infos["final_obs"][late]), dtype=torch.float32)
                 reward[torch.as_tensor(late)] += self.s.gamma * self.agent.value(final).flatten()
             log_prob, value = spread.log_prob(action).sum(1), self.agent.value(seen).flatten()
-            rows.append((seen, action, log_prob, value, reward, torch.as_tensor(np.float32(failed | late))))
+            rows.append((seen, action, log_prob, value, reward, torch.as_tensor(np.float32(done))))
         seen, actions, log_probs, values, rewards, done = (torch.stack(column) for column in zip(*rows, strict=True))
         following = self.agent.value(torch.as_tensor(self.seen, dtype=torch.float32)).flatten()
         advantages, carried = torch.zeros_like(values), torch.zeros_like(following)

@@ -21,6 +21,6 @@ def train(job: Job) -> Trained:
     envs = make_rsl_rl_vec_env(job.env_id, s.num_envs, job.seed, "cpu", **{**options, **s.training})
     runner = OnPolicyRunner(envs, runner_settings(s, ("policy",), job.seed), None, device="cpu")
     keeper = Keeper(job, envs.envs.unwrapped, lambda: actor_of(runner, s.activation), ("rsl-rl-lib", "torch"))
-    keeper.watch(envs, "step", runner.alg, "update")
+    keeper.watch(envs.envs, "step", runner.alg, "update")
     runner.learn(math.ceil(s.steps / keeper.batch), init_at_random_ep_len=True)
     return keeper.end()

@@ -24,9 +24,7 @@ def train(job: Job) -> Trained:
         "activation_fn": getattr(torch.nn, s.activation),
         "log_std_init": float(torch.tensor(s.initial_std).log()),
     }
-    model = PPO(
-        "MlpPolicy", envs, policy_kwargs=network, seed=job.seed, device="cpu", **arguments(s)
-    )  # fmt: skip
+    model = PPO("MlpPolicy", envs, policy_kwargs=network, seed=job.seed, device="cpu", **arguments(s))
     native: Any = envs.envs
     keeper = Keeper(job, native.unwrapped, lambda: actor(model.policy, s.activation), ("stable_baselines3", "torch"))
     keeper.watch(native, "step", model, "train")

@@ -43,7 +43,6 @@ SCANS: Mapping[str, dict[str, Any]] = {
     "range_scan": {"position": [0.2, 0.0, 0.05], "rays": [3, 7], "reach": 1.0, "steps": 16},
 }
 
-PARTS = ("spheres", "pairs", *SCANS)
 Case: TypeAlias = tuple[str, dict[str, Competitor]]
 
 

@@ -22,7 +22,8 @@ def decided(graph: Graph, zeros: set[int]) -> Graph:
         k = same.get(k, k)
         if k in known and k not in left.constants:
             constant = left.add(casadi.OP_CONST)
-            left.constants[constant], same[k] = known[k], constant
+            left.constants[constant] = known[constant] = known[k]
+            same[k] = constant
             return constant
         return k
 

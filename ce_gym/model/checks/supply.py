@@ -26,6 +26,7 @@ def check_supply(robot: Robot, file: str) -> None:
         if motor.heat is not None:
             _check_heat(motor.heat, file, f"{key}.heat")
             _check_known(motor, file, key, "heat")
+    _check_ambient([motor.heat.ambient for motor in robot.motors if motor.heat is not None], file)
     if robot.battery is not None:
         for name in ("voltage", "nominal"):
             if not getattr(robot.battery, name) > 0.0:
@@ -48,6 +49,11 @@ def _check_heat(heat: Heat, file: str, key: str) -> None:
             raise bad(file, f"{key}.{field.name}", value, "more than 0")
     if not heat.ambient < heat.warm < heat.hot:
         raise bad(file, f"{key}.hot", heat.hot, f"more than {key}.warm, and that more than {key}.ambient")
+
+
+def _check_ambient(found: list[float], file: str) -> None:
+    if len(set(found)) > 1:
+        raise bad(file, "motors.*.heat.ambient", sorted(set(found)), "one temperature [deg C], that of the air")
 
 
 def _check_known(motor: Motor, file: str, key: str, what: str) -> None:
