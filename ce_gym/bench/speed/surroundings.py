@@ -101,7 +101,7 @@ def pairs(model: Model, num_envs: int, dtype: str) -> dict[str, Case]:
     cases: dict[str, Case] = {}
     for name, targets in (("apart", standing), ("apart, in motion", moving), ("70 % folded", pressed)):
         sims = _beside(model, num_envs, dtype, contacts="foot", self_collisions=beside)
-        sides = {side: stepping(sim, targets) for side, sim in sims.items()}
+        sides = {side: stepping(sim, list(targets)) for side, sim in sims.items()}
         cases[f"feet, {len(beside)} pairs of links, {name}"] = ("pairs", sides)
     return cases
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.electric.battery import sagged
@@ -53,7 +54,7 @@ class Supply:
 
     def now(self, place: int, motor: Motor) -> Motor:
         """Return a motor with the limits that current and voltage leave it."""
-        figures = {}
+        figures: dict[str, Any] = {}
         if self.battery is not None:
             share = self.voltage / self.battery.nominal
             figures = {"stall": share * self.line(place, motor), "velocity": share * motor.velocity}
@@ -65,8 +66,9 @@ class Supply:
 
     def line(self, place: int, motor: Motor) -> SX | float:
         """Return what the nominal voltage allows a motor at standstill [N m]: less, as its winding is warm."""
-        warm = place in self.windings and motor.heat is not None
-        return motor.line / resistance(motor.heat, self.windings[place]) if warm else motor.line
+        if place not in self.windings or motor.heat is None:
+            return motor.line
+        return motor.line / resistance(motor.heat, self.windings[place])
 
     def after(self, motors: tuple[Motor, ...], work: Mapping[int, Work], dt: SX | float) -> list[SX]:
         """Return temperatures and sag after a step of the mechanics, as `State.supply` has them."""
