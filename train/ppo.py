@@ -43,6 +43,7 @@ from job import main as run_jobs
 from learner import ThreadedPPO
 from progress import StopInOrder, read_curve
 from run_folder import going_on, make_folder, save_somewhere, write_whole
+from settings import Settings
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
@@ -124,8 +125,21 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
         "log_std_init": float(torch.tensor(s.initial_std).log()),
         "ortho_init": True,
     }
-    options: dict[str, Any] = {
-        "learning_rate": s.learning_rate if s.target_kl else LinearSchedule(s.learning_rate, 0.0, 1.0),
+    options: dict[str, Any] = ppo_arguments(s) | {"stats_window_size": s.num_envs, "device": "cpu"}
+    if s.target_kl:  # it begins there and is adapted
+        options["learning_rate"] = s.learning_rate
+    policy = AsymmetricPolicy if isinstance(envs.observation_space, gymnasium.spaces.Dict) else "MlpPolicy"
+    model = ThreadedPPO(policy, envs, policy_kwargs=network, seed=job.seed, **options)
+    model.threads = job.threads
+    if job.resume:
+        restore(model, job)
+    return model
+
+
+def ppo_arguments(s: Settings) -> dict[str, Any]:
+    """Return our settings in the form that PPO of Stable-Baselines3, and of SBX, takes; the rate falls linearly."""
+    return {
+        "learning_rate": LinearSchedule(s.learning_rate, 0.0, 1.0),
         "n_steps": s.rollout,
         "batch_size": -(-s.num_envs * s.rollout // s.minibatches),
         "n_epochs": s.epochs,
@@ -135,15 +149,7 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
         "ent_coef": s.entropy,
         "vf_coef": s.value,
         "max_grad_norm": s.max_grad_norm,
-        "stats_window_size": s.num_envs,
-        "device": "cpu",
     }
-    policy = AsymmetricPolicy if isinstance(envs.observation_space, gymnasium.spaces.Dict) else "MlpPolicy"
-    model = ThreadedPPO(policy, envs, policy_kwargs=network, seed=job.seed, **options)
-    model.threads = job.threads
-    if job.resume:
-        restore(model, job)
-    return model
 
 
 def restore(model: PPO, job: Job) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from job import Job, Trained
 from others.keeping import Keeper
+from ppo import ppo_arguments
 from stable_baselines3 import PPO
-from stable_baselines3.common.utils import LinearSchedule
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.policies import Actor
@@ -24,29 +24,13 @@ def train(job: Job) -> Trained:
         "activation_fn": getattr(torch.nn, s.activation),
         "log_std_init": float(torch.tensor(s.initial_std).log()),
     }
-    model = PPO("MlpPolicy", envs, policy_kwargs=network, seed=job.seed, device="cpu", **arguments(s))
+    model = PPO("MlpPolicy", envs, policy_kwargs=network, seed=job.seed, device="cpu", **ppo_arguments(s))
     native: Any = envs.envs
     keeper = Keeper(job, native.unwrapped, lambda: actor(model.policy, s.activation), ("stable_baselines3", "torch"))
     keeper.watch(native, "step", model, "train")
     model.learn(s.steps)
     envs.close()
     return keeper.end()
-
-
-def arguments(s: Any) -> dict[str, Any]:
-    """Return our settings in the form that PPO of Stable-Baselines3, and of SBX, takes."""
-    return {
-        "learning_rate": LinearSchedule(s.learning_rate, 0.0, 1.0),
-        "n_steps": s.rollout,
-        "batch_size": -(-s.num_envs * s.rollout // s.minibatches),
-        "n_epochs": s.epochs,
-        "gamma": s.gamma,
-        "gae_lambda": s.gae_lambda,
-        "clip_range": s.clip,
-        "ent_coef": s.entropy,
-        "vf_coef": s.value,
-        "max_grad_norm": s.max_grad_norm,
-    }
 
 
 def actor(policy: Any, activation: str) -> Actor:

@@ -10,7 +10,7 @@ import flax.linen
 import numpy as np
 from job import Job, Trained
 from others.keeping import Keeper
-from others.plain_sb3 import arguments
+from ppo import ppo_arguments
 from sbx import PPO
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
@@ -28,7 +28,7 @@ def train(job: Job) -> Trained:
         "ortho_init": True,
     }
     adapted = {"target_kl": s.target_kl, "learning_rate": s.learning_rate} if s.target_kl else {}
-    model = PPO("MlpPolicy", envs, policy_kwargs=network, seed=job.seed, **{**arguments(s), **adapted})
+    model = PPO("MlpPolicy", envs, policy_kwargs=network, seed=job.seed, **{**ppo_arguments(s), **adapted})
     native: Any = envs.envs
     keeper = Keeper(job, native.unwrapped, lambda: actor(model, s.activation), ("sbx-rl", "jax"))
     keeper.watch(native, "step", model, "train")
