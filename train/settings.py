@@ -234,6 +234,11 @@ def _convert(source: str, key: str, value: Any, kind: str) -> Any:
         if kind.startswith("Mapping"):
             wanted = "arguments of the environment by name, as plain data"
             return checked_arguments(value)
+        if kind == "str":
+            wanted = "a name or a path"
+            if not isinstance(value, str) or not value:
+                raise ValueError
+            return value
         if kind == "Activation" and value in ACTIVATIONS:
             return value
         if kind == "Activation" or not isinstance(value, list | tuple) or len(value) > 100:

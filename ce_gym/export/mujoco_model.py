@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -54,8 +54,12 @@ def load(
     integrator: str = "implicitfast",
     solref: Sequence[float] | None = None,
     solimp: Sequence[float] | None = None,
+    also: Callable[[mujoco.MjSpec], None] | None = None,
 ) -> mujoco.MjModel:
-    """Compile a robot's MJCF and put back inertias that MuJoCo's compiler refuses; arguments as in `to_mjcf`."""
+    """Compile a robot's MJCF and put back inertias that MuJoCo's compiler refuses; arguments as in `to_mjcf`.
+
+    What `also` adds to the description is compiled with it.
+    """
     text = to_mjcf(
         robot,
         transmission,
@@ -65,7 +69,10 @@ def load(
         solref=solref,
         solimp=solimp,
     )
-    model = mujoco.MjModel.from_xml_string(text)
+    spec = mujoco.MjSpec.from_string(text)
+    if also:
+        also(spec)
+    model = spec.compile()
     for moving in build_mechanism(robot, transmission, eliminate=False).bodies.values():
         _, _, inertia = mass_properties(moving.inertia)
         moments, axes = np.linalg.eigh(inertia)
@@ -76,11 +83,19 @@ def load(
     return model
 
 
-def compiled(robot: Robot, level: str, settings: Settings) -> mujoco.MjModel:
-    """Compile a robot with settings, and without whatever the scene does not need."""
+def compiled(
+    robot: Robot, level: str, settings: Settings, also: Callable[[mujoco.MjSpec], None] | None = None
+) -> mujoco.MjModel:
+    """Compile a robot with settings, with what is added to it, and without whatever the scene does not need."""
     solref = None if settings.solimp is None else (2.0 * settings.timestep, 1.0)
     model = load(
-        robot, level, timestep=settings.timestep, integrator=settings.integrator, solref=solref, solimp=settings.solimp
+        robot,
+        level,
+        timestep=settings.timestep,
+        integrator=settings.integrator,
+        solref=solref,
+        solimp=settings.solimp,
+        also=also,
     )
     model.opt.solver = getattr(mujoco.mjtSolver, f"mjSOL_{settings.solver.upper()}")
     model.opt.iterations, model.opt.ls_iterations = settings.iterations, settings.line_search

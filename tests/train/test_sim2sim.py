@@ -18,6 +18,7 @@ from tripod import TRIPOD
 import ce_gym
 from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.export.mujoco_twin import MujocoTwin
+from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.policies import Policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
@@ -68,6 +69,25 @@ def test_robots_with_loops_start_closed_and_stand_as_ours_do(name):
         twin.step(np.tile(model.standing_q[7:], (2, 1)), 0.02)
     sim.step(model.standing_q[7:], 80)
     np.testing.assert_allclose(twin.state()[0][0], sim.q[0], atol=0.02)
+
+
+@pytest.mark.parametrize(("stiffness", "damping"), [(2e4, 200.0), (5e4, 500.0)])
+def test_the_ground_gives_way_as_ours_does(stiffness, damping):
+    """A ball of 2 kg that lands at 0.5 m/s: how deep it goes, by the closed form of a spring and a damper."""
+    inertia = Inertial(2.0, (0.0, 0.0, 0.0), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)))
+    body = Body("ball", "link", None, Placement(), Joint("free"), inertia)
+    material = ContactMaterial(stiffness, damping)
+    robot = Robot("ball", (body,), contacts=(ContactSphere("ball", "ball", (0.0, 0.0, 0.0), 0.1),), material=material)
+    twin = MujocoTwin(robot, "exact", 1)
+    twin.start(np.array([[0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -0.5]]))
+    depths = []
+    for _ in range(20):
+        twin.step(np.zeros((1, 0)), 0.001)
+        depths.append(0.1 - twin.state()[0][0, 2])
+    decay, speed = damping / 4.0, np.sqrt(stiffness / 2.0 - (damping / 4.0) ** 2)
+    deepest = np.arctan2(speed, decay) / speed
+    expected = 0.5 / speed * np.exp(-decay * deepest) * np.sin(speed * deepest)
+    assert max(depths) == pytest.approx(expected, rel=0.15)  # its impedance alone is 5 to 10 %, its step 1 ms
 
 
 @pytest.mark.parametrize("level", ["armature", "exact"])
