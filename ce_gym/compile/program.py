@@ -6,7 +6,7 @@ Data and its checks only.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 if TYPE_CHECKING:
@@ -62,6 +62,8 @@ class Call:
             large as what it takes or returns.
         short_if_zero: an input of size 1; a tile where it is zero in all lanes computes what is left of the function
             then, to the same bits.
+        again: inputs; no others have changed since the call before, which is of the same function, and what does not
+            follow from them may be taken from there.
     """
 
     function: casadi.Function
@@ -70,6 +72,7 @@ class Call:
     only_if: str = ""
     times: int = 1
     short_if_zero: str = ""
+    again: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,7 @@ def check_program(program: Program) -> None:
         if buffer.within:
             _check_part(program.name, buffer, buffers)
     written = {b.name for b in program.buffers if b.kind in ("tiles", "rows_in", "random")}
+    before: Call | Lookup | None = None
     for number, call in enumerate(program.calls):
         read = call.inputs
         if isinstance(call, Lookup):
@@ -199,6 +203,7 @@ def check_program(program: Program) -> None:
         else:
             place = f"program {program.name!r}: call {number} ({call.function.name()})"
             _check_call(place, call, buffers)
+            _check_again(place, call, before)
             if call.only_if:
                 _check_flag(f"{place}: only_if", buffers.get(call.only_if))
                 read = (*read, call.only_if)
@@ -210,6 +215,7 @@ def check_program(program: Program) -> None:
             raise ValueError(f"{place}: reads {unset[0]!r}, expected an earlier call to write it first")
         written.update(call.outputs)
         written.update(buffers[name].within for name in call.outputs)
+        before = call
     if unset := [b.name for b in program.buffers if b.name not in written and b.kind == "rows_out"]:
         raise ValueError(f"program {program.name!r}: no call writes the rows_out buffer {unset[0]!r}")
     for flag in program.flags:
@@ -265,6 +271,19 @@ def _check_call(place: str, call: Call, buffers: dict[str, Buffer]) -> None:
             if buffers[name].size not in (numel(position), call.times * numel(position)):
                 expected = f"{numel(position)} as {side} {position} of the function"
                 raise ValueError(f"{place}: buffer {name!r} has size {buffers[name].size}, expected {expected}")
+
+
+def _check_again(place: str, call: Call, before: Call | Lookup | None) -> None:
+    if not call.again:
+        return
+    if not set(call.again) <= set(call.inputs):
+        raise ValueError(f"{place}: again {call.again}, expected some of its inputs")
+    if not isinstance(before, Call) or replace(before, only_if="", again=()) != replace(call, only_if="", again=()):
+        raise ValueError(f"{place}: again, expected it right after a call of the same function with the same buffers")
+    if not (before.again or not before.only_if) or call.times > 1:
+        raise ValueError(f"{place}: again, expected the first such call without only_if, and none with times")
+    if changed := set(call.outputs) & set(call.inputs) - set(call.again):
+        raise ValueError(f"{place}: again {call.again}, but it changes {min(changed)!r}, too")
 
 
 def _check_lookup(place: str, lookup: Lookup, buffers: dict[str, Buffer]) -> None:

@@ -151,7 +151,8 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
             short = NEAR
         each += [Call(zeros[name], (), (name,), only_if=ITERATES[name]) for name in iterates]
         each.append(Call(iteration, given, left, short_if_zero=short))
-        each += [Call(iteration, given, left, only_if="unconverged", short_if_zero=short)] * repeats
+        further = Call(iteration, given, left, only_if="unconverged", short_if_zero=short, again=tuple(iterates))
+        each += [further] * repeats
     if not plan.single:
         combine = combination_function(mechanism, options, outputs)
         tried = {f"{TRIED}_{name.removesuffix('_next')}": combine.numel_out(name) for name in combine.name_out()}

@@ -7,7 +7,7 @@ import argparse
 import numpy as np
 import pytest
 
-from ce_gym.bench.speed import surroundings
+from ce_gym.bench.speed import pressed, surroundings
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
 
@@ -39,3 +39,29 @@ def test_report():
     assert len(table.rows) == 8
     assert len(report.requirements) == 8
     assert all(row[2] > 0 and row[3] > 0 for row in table.rows)
+
+
+def test_links_pressed_on_each_other_are_less_than_a_millimetre_in_each_other():
+    """As deep as their force over the stiffness, by the poses; two pairs of a robot whose gains press hardest."""
+    parser = argparse.ArgumentParser()
+    surroundings.add_arguments(parser)
+    report = surroundings.run(parser.parse_args(["--robot", "mit_humanoid", "--parts", "depth"]))
+    (table,), stiffness = report.tables, Model("mit_humanoid").robot.material.stiffness
+    shanks = [row for row in table.rows if "knee" in str(row[0])]
+    assert len(shanks) == len(pressed.OVERLAPS)
+    for _, asked, depth, deepest, force in shanks:
+        assert 0.02 < float(depth) <= float(deepest) <= 1.0  # [mm]; asked for five times as much and more
+        assert float(depth) < 0.1 * 10 * float(asked)
+        assert 1e-3 * float(depth) * stiffness == pytest.approx(float(force), rel=1e-6)
+    assert report.requirements
+    assert all(requirement.met for requirement in report.requirements)
+
+
+def test_targets_are_as_deep_as_asked(model: Model):
+    pair = surroundings.neighbours(model)[0]
+    q = model.standing_q.copy()
+    assert pressed.depth(model, q, pair) < 0
+    q[model.robot.layout.joints_q :] = pressed.folded(model, pair, 0.01)
+    assert 0.01 <= pressed.depth(model, q, pair) < 0.013
+    with pytest.raises(ValueError, match="do not meet"):
+        pressed.folded(model, pair, 1.0)

@@ -1,5 +1,6 @@
 """What is done to a trace before compilers see it: every rewriting by its operations and by its values."""
 
+from dataclasses import replace
 from functools import partial
 
 import casadi as ca
@@ -7,18 +8,23 @@ import numpy as np
 import pytest
 
 from ce_gym.compile import Buffer, Call, Program, aligned_zeros, load_kernel
-from ce_gym.compile.lowering.function import short_graph
+from ce_gym.compile.lowering.function import left_graph
 from ce_gym.compile.lowering.graph import (
     FMA,
     FMS,
     FNMA,
+    KEPT,
     NO_OPERATION,
     REMOVED,
     SELECT,
     graph_of,
+    sources,
 )
+from ce_gym.compile.lowering.parted import parted
 from ce_gym.compile.program import check_program
+from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.stepping.trace import iteration_function
 
 X, Y, Z = (ca.SX.sym(name) for name in "xyz")
 
@@ -129,7 +135,7 @@ def choosing():
 
 def test_what_is_left_where_an_input_is_zero():
     """Choices are made, what was not chosen is gone, and what was not fused in the whole is not fused now."""
-    whole, left = graph_of(choosing()), short_graph(choosing(), 2)
+    whole, left = graph_of(choosing()), left_graph(choosing(), 2)
     assert ca.OP_SIN in operations(whole)
     assert sorted(operations(left)) == sorted([ca.OP_MUL, ca.OP_ADD, ca.OP_LT, ca.OP_OR])
     alone = graph_of(ca.Function("alone", [X, Y], [X * Y + X, X < 0]))
@@ -173,6 +179,86 @@ def aligned(values):
     result = aligned_zeros(values.shape, values.dtype)
     result[...] = values
     return result
+
+
+def growing():
+    """A function of x, y and an iterate z, of which a sine and a choice by y do not follow from z: (value, z, flag)."""
+    shared = ca.sin(X) + X * Y
+    chosen = ca.if_else(Y, shared * Z, Z)
+    following = chosen + ca.if_else(Y, ca.sqrt(shared * shared + 1), X) * Z + X
+    return ca.Function("growing", [X, Y, Z], [following - X * Y, following, ca.logic_and(following < 20, X > 0)])
+
+
+GIVEN, LEFT = ("x", "y", "z"), ("value", "z", "flag")
+
+
+def growing_program(again, short=""):
+    function, first = growing(), ca.Function("first", [X], [0.5 + ca.if_else(X > 2, X, 0)])
+    calls = [Call(first, ("x",), ("z",)), Call(function, GIVEN, LEFT, short_if_zero=short)]
+    calls += [Call(function, GIVEN, LEFT, only_if="flag", short_if_zero=short, again=again)] * 3
+    buffers = [Buffer(name, 1, "tiles") for name in ("x", "y", "value")]
+    return Program("growing", (*buffers, Buffer("z", 1, "scratch"), Buffer("flag", 1, "scratch")), tuple(calls))
+
+
+def test_what_does_not_follow_from_an_iterate_is_in_the_first_part():
+    graph = graph_of(growing())
+    first, second, places = parted(graph, sources(growing(), graph, {2}))
+    assert ca.OP_SIN in operations(first)
+    assert ca.OP_SQRT in operations(first)
+    assert not {ca.OP_SIN, ca.OP_SQRT} & set(operations(second))
+    assert sorted(operations(first) + operations(second)) == sorted(operations(graph))
+    assert set(places) == {k for k, op in enumerate(second.ops) if op == KEPT} != set()
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("short", ["", "y"])
+def test_a_call_again_goes_by_what_the_first_one_left_to_the_same_bits(short, dtype):
+    """Where the loop ends at once, late or never, and for what is left of the function where an input is zero."""
+    results = []
+    for again in ((), ("z",)):
+        kernel = load_kernel(f"growing {again} {short}", partial(growing_program, again, short), dtype)
+        n = 4 * kernel.lanes
+        rows = np.random.default_rng(2).uniform(-1, 3, (2, n)).astype(dtype)
+        rows[1, kernel.lanes : 3 * kernel.lanes] = 0.0  # the second tile and the third take the short way
+        rows[0, 2 * kernel.lanes : 3 * kernel.lanes] = -1.0  # which makes one call, the fourth makes several again
+        arrays = {name: row.reshape(4, 1, kernel.lanes) for name, row in zip("xy", rows, strict=True)}
+        arrays |= {"value": np.zeros_like(arrays["x"])}
+        arrays = {name: aligned(value) for name, value in arrays.items()}
+        kernel(arrays, n)
+        results.append(arrays["value"].copy())
+    np.testing.assert_array_equal(results[0], results[1])
+    assert np.isfinite(results[1]).all()
+
+
+def test_a_second_iteration_of_a_step_takes_kinematics_from_the_first():
+    """No joint's sine is in what is iterated, only that of the step's turn, and a fifth of the instructions less."""
+    model = Model("mini_cheetah")
+    options = StepOptions(contacts=tuple(c.name for c in model.robot.contacts if c.group == "foot"))
+    function = iteration_function(model.mechanism, options)
+    graph = graph_of(function)
+    first, second, _ = parted(graph, sources(function, graph, {function.name_in().index("iterate")}))
+    assert operations(first).count(ca.OP_SIN) == 12
+    assert operations(second).count(ca.OP_SIN) == 1
+    assert len(operations(second)) < 0.8 * len(operations(graph))
+
+
+@pytest.mark.parametrize(
+    ("place", "change", "message"),
+    [
+        (2, {"again": ("x", "flag")}, "expected some of its inputs"),
+        (1, {"again": ("z",)}, "expected it right after a call of the same function"),
+        (2, {"inputs": ("y", "x", "z")}, "expected it right after a call of the same function"),
+        (1, {"only_if": "x"}, "expected the first such call without only_if"),
+        (2, {"again": ("x",)}, "but it changes 'z', too"),
+    ],
+)
+def test_a_call_again_comes_after_one_of_the_same(place, change, message):
+    program = growing_program(("z",))
+    check_program(program)
+    steps = list(program.steps)
+    steps[place] = replace(steps[place], **change)
+    with pytest.raises(ValueError, match=message):
+        check_program(replace(program, steps=tuple(steps)))
 
 
 def test_the_short_way_goes_by_an_input():

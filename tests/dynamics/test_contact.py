@@ -102,6 +102,16 @@ def test_a_change_of_the_active_set_is_noticed(velocity, gain, changed):
     assert bool(numbers(point.check(motion(gain)))) is changed
 
 
+@pytest.mark.parametrize("gain", [(0, 0, 0), (FAST, 0, 0), (-2 * FAST, 0, 0), (0, FAST, 0)])
+@pytest.mark.parametrize("velocity", [[SLOW, 0, 0], [FAST, 0, 0]])
+def test_the_secant_never_asks_for_another_iteration(velocity, gain):
+    """It goes by the velocity at the start, which no iteration changes; motors may still ask for one."""
+    point = contact(velocity, friction="secant")
+    assert not numbers(point.check(motion(gain)))
+    again = contact(velocity, gain=gain, slip=(1, 0, 0), count=1, friction="secant")
+    np.testing.assert_array_equal(tangential(again), tangential(point))
+
+
 def test_an_iterate_holds_what_the_iteration_found():
     gain = [-0.5 * FAST, 0.1, 0.2]
     found = Iterate.of(contact([FAST, 0, 0], count=1, slip=(1, 0, 0)).next_iterate(motion(gain)))

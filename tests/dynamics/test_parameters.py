@@ -12,7 +12,7 @@ from tripod import TRIPOD
 
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.forces.parameters import PARAMETERS, parameter_defaults
+from ce_gym.dynamics.forces.parameters import ELASTIC_FACTORS, PARAMETERS, parameter_defaults
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import LinearConstraint, Robot, load_robot
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
 BASE, ARM = "plate", "forearm"
 NAMES = [name.replace("BODY", body) for name in PARAMETERS for body in (BASE, ARM)[: 1 + ("BODY" in name)]]
-NAMES = [name.replace("ROTOR", "elbow_rotor") for name in NAMES if "drive_stiffness:" not in name]
+NAMES = [name.replace("ROTOR", "elbow_rotor") for name in NAMES if name not in [f"{k}:ROTOR" for k in ELASTIC_FACTORS]]
 
 
 @pytest.fixture(scope="module")
@@ -163,15 +163,17 @@ def test_link_inertia_is_that_about_the_centre_of_mass(tripod: Robot, states):
     assert_different(ours, results(tripod, states))
 
 
-def test_stiffness_of_one_drive():
+@pytest.mark.parametrize("kind", ELASTIC_FACTORS)
+def test_figures_of_one_elastic_drive(kind: str):
     leg = load_robot("mini_cheetah")
     one = next(elastic for elastic in leg.elastic if elastic.rotor == "HR_knee_rotor")
-    others = (replace(e, stiffness=1.3 * e.stiffness) if e is one else e for e in leg.elastic)
+    figure = kind.removeprefix("drive_")
+    others = (replace(e, **{figure: 1.3 * getattr(e, figure)}) if e is one else e for e in leg.elastic)
     soft, rng = Model(replace(leg, elastic=tuple(others)), "elastic"), np.random.default_rng(0)
     model = Model(leg, "elastic")
     q, v = model.standing_q + np.r_[np.zeros(19), rng.normal(0, 0.05, 12)], rng.normal(0, 1.0, model.nv)
     plain = StepOptions(0.002, control="torque")
-    declared = step_function(model.mechanism, replace(plain, parameters=("drive_stiffness:HR_knee_rotor",)))
+    declared = step_function(model.mechanism, replace(plain, parameters=(f"{kind}:HR_knee_rotor",)))
     given = {"q": q, "v": v, "diverged": 0.0, "target": np.zeros(12)}
     ours, theirs = declared(**given, parameters=1.3)["v_next"], step_function(soft.mechanism, plain)(**given)["v_next"]
     np.testing.assert_allclose(ours.full(), theirs.full(), rtol=1e-9, atol=1e-9)

@@ -1,12 +1,15 @@
 # pyright: reportAttributeAccessIssue=false
 """Sub-steps as something to time: our Simulator's and MuJoCo's rollout of the same robot from the same pose.
 
-Targets jitter around the standing pose on both sides. (MuJoCo's compiled modules carry no types, hence the line above.)
+Targets jitter around the standing pose on both sides, which go on for half a second and then stand up again: a robot
+that falls by itself is not timed on the ground. (MuJoCo's compiled modules carry no types, hence the line above.)
 """
 
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Sequence
+from itertools import count, islice
 
 import mujoco
 import numpy as np
@@ -24,20 +27,29 @@ from ce_gym.sim.substeps import substeps
 
 SUBSTEPS = 4
 """Sub-steps of one call: one step of a policy."""
-SHORTEST = 2048
-"""Fewest robots times calls that are timed together."""
 OUTPUTS = ("torque", "contact_forces")
+TARGETS = 8
+"""How many sets of targets take turns, one for each call."""
+AGAIN = 25
+"""Calls after which robots begin again from the standing pose."""
+TOGETHER = 4096 * AGAIN
+"""Robots times calls that are timed together: of batches up to 4096, whole half seconds."""
 
 
-def ours(model: Model, dtype: str, num_envs: int, num_threads: int, dt: float) -> Competitor:
+def ours(
+    model: Model, dtype: str, num_envs: int, num_threads: int, dt: float, seldom: Sequence[str] = ()
+) -> Competitor:
     """Return calls of `Simulator.step`, copying of targets included; one unit of work is one robot's sub-step."""
-    sim = Simulator(model, num_envs, dt, dtype, num_threads)
-    calls = max(1, SHORTEST // num_envs)
-    targets = np.ascontiguousarray(stand.targets(model.robot, num_envs, min(calls, 8), seed=2).swapaxes(0, 1))
+    sim = Simulator(model, num_envs, dt, dtype, num_threads, seldom=seldom)
+    start, made = sim.snapshot(), count()
+    calls = max(1, TOGETHER // num_envs)
+    targets = np.ascontiguousarray(stand.targets(model.robot, num_envs, TARGETS, seed=2).swapaxes(0, 1))
 
     def run() -> None:
-        for i in range(calls):
-            sim.step(targets[i % len(targets)], n_substeps=SUBSTEPS)
+        for i in islice(made, calls):
+            if i % AGAIN == 0:
+                sim.restore(start)
+            sim.step(targets[i % TARGETS], n_substeps=SUBSTEPS)
 
     return Competitor(run, num_envs * calls * SUBSTEPS)
 
@@ -80,14 +92,18 @@ def mujoco_batch(robot: Robot, level: str, num_envs: int, num_threads: int, dt: 
 
 def theirs(batch: Batch, robot: Robot) -> Competitor:
     """Return a rollout; one unit of work is one robot's step."""
-    calls = max(1, 32 // batch.num_envs)
+    calls = AGAIN * max(1, 32 // batch.num_envs)
     moved = [robot.independent.index(name) for name in robot.driven]  # passive joints have no actuator
-    control = np.repeat(stand.targets(robot, batch.num_envs, 1, seed=2)[..., moved], SUBSTEPS, axis=1)
-    out = np.empty((batch.num_envs, SUBSTEPS, batch.states.shape[1]))
+    targets = stand.targets(robot, batch.num_envs, TARGETS, seed=2)[..., moved]
+    controls = [np.repeat(targets[:, i : i + 1], SUBSTEPS, axis=1) for i in range(TARGETS)]
+    out, start, made = np.empty((batch.num_envs, SUBSTEPS, batch.states.shape[1])), batch.states.copy(), count()
 
     def run() -> None:
-        for _ in range(calls):
-            batch.trajectory(control, out)
+        for i in islice(made, calls):
+            if i % AGAIN == 0:
+                batch.states[:] = start
+            batch.trajectory(controls[i % TARGETS], out)
+            batch.states[:] = out[:, -1]
 
     return Competitor(run, batch.num_envs * SUBSTEPS * calls)
 

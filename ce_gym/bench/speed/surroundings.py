@@ -1,5 +1,7 @@
 """What scenes cost: spheres that are seldom near, links that push each other apart, height and range scans, in turn.
 
+Besides, how deep links are in each other that are pressed on each other, see `pressed.py`.
+
 Sub-steps are compared with those on the feet alone, by the same targets; links stand apart, move about, or are pressed
 on each other in most robots. Environment steps are compared with those of the same task that does not look.
 """
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved, ratio
+from ce_gym.bench.speed.pressed import pressed_together, with_parents
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.self_contact import distance
 from ce_gym.envs.task.tasks import VELOCITY
@@ -51,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="mini_cheetah", help="name or path of a robot with feet")
     parser.add_argument("--env", default="ce_gym/MiniCheetahVelocity-v0", help="id of an environment of it")
     parser.add_argument(
-        "--parts", nargs="+", default=("spheres", "pairs", *SCANS), choices=("spheres", "pairs", *SCANS)
+        "--parts", nargs="+", default=("spheres", "pairs", *SCANS), choices=("spheres", "pairs", *SCANS, "depth")
     )
     parser.add_argument("--num-envs", type=int, default=512, help="robots in a batch")
     parser.add_argument("--rounds", type=int, default=100, help="how often each is timed")
@@ -60,6 +63,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
     report, model, n = Report("surroundings"), Model(arguments.robot), arguments.num_envs
+    if "depth" in arguments.parts:
+        pressed = pressed_together(model, with_parents(model, neighbours(model)[:2]))
+        report.tables += pressed.tables
+        report.requirements += pressed.requirements
+    if not set(arguments.parts) - {"depth"}:
+        return report
     rows: list[tuple[Cell, ...]] = []
     for dtype in DTYPES:
         cases = (spheres(model, n, dtype) if "spheres" in arguments.parts else {}) | (

@@ -166,8 +166,8 @@ class _KernelText:
             yield "}"
 
     def _steps(self, steps: Sequence[Step | Repeat]) -> Iterator[str]:
-        """Steps in order. Neighbouring calls that are equal but for `only_if` are one loop: the code stands once."""
-        for _, same in groupby(steps, lambda s: replace(s, only_if="") if isinstance(s, Call) else s):
+        """Steps in order. Neighbouring calls equal but for `only_if` and `again` are one loop: the code stands once."""
+        for _, same in groupby(steps, lambda s: replace(s, only_if="", again=()) if isinstance(s, Call) else s):
             equal = list(same)
             step = equal[0]
             if isinstance(step, Repeat | While):

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import casadi
 
 from ce_gym.compile.lowering import math as vector_math
 from ce_gym.compile.lowering.decided import decided
-from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, SELECT, Graph, graph_of
+from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, KEPT, SELECT, Graph, graph_of, sources
 from ce_gym.compile.lowering.ordering import ordered
+from ce_gym.compile.lowering.parted import Part, Places, parted
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 
@@ -27,6 +29,7 @@ def lower_function(
     apart: bool = False,
     zero: int | None = None,
     same: frozenset[tuple[int, int]] = frozenset(),
+    part: Part | None = None,
 ) -> None:
     """Emit `function` at the builder's position.
 
@@ -38,11 +41,16 @@ def lower_function(
         apart: whether no output shares memory with an input.
         same: inputs and outputs that share their memory; what is only handed on is not stored again.
         zero: an input that is zero, if one is: what is left out where it is leaves the bits of the rest as they are.
+        part: which part of it, if it is made in parts.
 
     Raises:
         NotImplementedError: for an operation that has no vector form.
     """
-    graph = graph_of(function) if zero is None else short_graph(function, zero)
+    if part:
+        *both, kept = parts_of(function, part.changing, zero)
+        graph = both[part.number]
+    else:
+        graph, kept = left_graph(function, zero), {}
     lowering = _Lowering(v, function.name())
     loads = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
     places = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
@@ -55,6 +63,8 @@ def lower_function(
         if k not in values:
             if k in graph.constants:
                 values[k] = lowering.constant(graph.constants[k])
+            elif part and graph.ops[k] == KEPT:
+                values[k] = v.load(part.memory, kept[k])
             else:
                 which, nonzero = function.instruction_input(k)
                 place = which, loads[which][nonzero]
@@ -76,9 +86,13 @@ def lower_function(
     stored = set[tuple[int, int]]()
     for k in ordered(graph):
         values[k] = lowering.operation(graph.ops[k], [value(a) for a in graph.operands[k]])
+        if part and k in kept:
+            v.store(values[k], part.memory, kept[k])
         for which, position in leave[k] if apart else ():
             v.store(values[k], outputs[which], position)
             stored.add((which, position))
+    if part and part.number == 0:
+        return
     for k, to in leave.items():
         for which, position in to:
             results[which][position] = value(k)
@@ -88,11 +102,17 @@ def lower_function(
                 v.store(result, pointer, position)
 
 
-def short_graph(function: casadi.Function, zero: int) -> Graph:
-    """Return the graph of a function where an input is zero."""
+def left_graph(function: casadi.Function, zero: int | None = None) -> Graph:
+    """Return the graph of a function, or what is left of it where an input is zero."""
     graph = graph_of(function)
-    sources = [k for k, op in enumerate(graph.ops) if op == casadi.OP_INPUT]
-    return decided(graph, {k for k in sources if function.instruction_input(k)[0] == zero})
+    return graph if zero is None else decided(graph, sources(function, graph, (zero,)))
+
+
+@lru_cache(maxsize=4)  # each is asked for three times, one after the other
+def parts_of(function: casadi.Function, changing: frozenset[int], zero: int | None) -> tuple[Graph, Graph, Places]:
+    """Return the parts of a function, or of what is left of it, and what goes from one to the other; see `parted`."""
+    graph = left_graph(function, zero)
+    return parted(graph, sources(function, graph, changing))
 
 
 def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:

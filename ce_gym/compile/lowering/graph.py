@@ -8,15 +8,16 @@ and GPUs that follow IEEE 754 give the same bits. About 70 % of a step's CasADi 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import casadi
 
-REMOVED, SELECT, FMA, FMS, FNMA = -1, -2, -3, -4, -5
+REMOVED, SELECT, FMA, FMS, FNMA, KEPT = -1, -2, -3, -4, -5, -6
 """Operations that CasADi lacks: removed by a rewriting; of (a, b, c): `b if a else c`, `a b + c`, `a b - c`,
-`c - a b`."""
+`c - a b`; and a value that another function has left."""
 
-NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, REMOVED)
+NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, REMOVED, KEPT)
 """Nothing is computed for these."""
 
 
@@ -61,6 +62,12 @@ def graph_of(function: casadi.Function) -> Graph:
     _use_reciprocals(graph)
     _fuse_multiply_adds(graph)
     return graph
+
+
+def sources(function: casadi.Function, graph: Graph, inputs: Collection[int]) -> set[int]:
+    """Return the nodes of a graph that are some inputs of its function."""
+    nodes = [k for k, op in enumerate(graph.ops) if op == casadi.OP_INPUT]
+    return {k for k in nodes if function.instruction_input(k)[0] in inputs}
 
 
 def _instructions(function: casadi.Function) -> Graph:

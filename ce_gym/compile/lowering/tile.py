@@ -11,10 +11,11 @@ from llvmlite import ir
 
 from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.layout import Layout
-from ce_gym.compile.lowering.function import lower_function
+from ce_gym.compile.lowering.function import lower_function, parts_of
 from ce_gym.compile.lowering.lookup import Table, emit_lookup
 from ce_gym.compile.lowering.lookup_grid import emit_grid_lookup
 from ce_gym.compile.lowering.lookup_values import emit_value_lookup
+from ce_gym.compile.lowering.parted import Part
 from ce_gym.compile.lowering.random import emit_uniform
 from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
 from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While
@@ -62,7 +63,10 @@ class _TileWork:
         remaining = builder.sub(num_envs, self.first_env)
         self.valid_lanes = self._smaller(remaining, INT(self.vectors.lanes))
         self.lanes = {b.name: self._lanes_of(b, scratch, tile) for b in program.buffers if b.kind != "table"}
-        self.bodies: dict[tuple[casadi.Function, int | None, Same], ir.Function] = {}
+        self.bodies: dict[tuple[casadi.Function, int | None, Same, int | None], ir.Function] = {}
+        repeated = [call for call in program.calls if isinstance(call, Call) and call.again and parts == 1]
+        self.again = {call.function: _changing(call) for call in repeated}
+        self.memory = {call.function: self._kept(call) for call in {call.function: call for call in repeated}.values()}
 
     def any_lane(self, name: str) -> Value:
         """Whether a buffer of size 1 is not zero in some lane."""
@@ -224,13 +228,31 @@ class _TileWork:
     def _call_version(self, call: Call) -> None:
         """Call the whole function, or what is left of it."""
         if not call.short_if_zero:
-            self._call_body(call, self._body(call))
+            self._call_parts(call)
             return
         with self.builder.if_else(self.any_lane(call.short_if_zero)) as (whole, short):
             with whole:
-                self._call_body(call, self._body(call))
+                self._call_parts(call)
             with short:
-                self._call_body(call, self._body(call, call.inputs.index(call.short_if_zero)))
+                self._call_parts(call, call.inputs.index(call.short_if_zero))
+
+    def _kept(self, call: Call) -> Value:
+        """Memory for what the first part of a function leaves, of one tile at a time."""
+        zeros = {None, call.inputs.index(call.short_if_zero) if call.short_if_zero else None}
+        count = max(len(parts_of(call.function, _changing(call), zero)[-1]) for zero in zeros)
+        with self.builder.goto_entry_block():
+            memory = self.builder.alloca(self.vectors.float_type, INT(count))
+        memory.align = ALIGNMENT
+        return memory
+
+    def _call_parts(self, call: Call, zero: int | None = None) -> None:
+        """Call it, or its parts that are needed."""
+        if call.function not in self.again:
+            self._call_body(call, self._body(call, zero))
+            return
+        pointers = [self.lanes[name] for name in call.inputs + call.outputs]
+        for part in (1,) if call.again else (0, 1):
+            self.builder.call(self._body(call, zero, part), [*pointers, self.memory[call.function]])
 
     def _call_body(self, call: Call, body: ir.Function) -> None:
         """Call it as often as it takes: for every part of the lanes, and of the buffers."""
@@ -247,25 +269,27 @@ class _TileWork:
             first = [b.mul(time, INT(n * parts)) if goes else INT(0) for n, goes in zip(numel, goes_on, strict=True)]
             b.call(body, [b.gep(pointer, [b.add(at, part)]) for pointer, at in zip(narrow, first, strict=True)])
 
-    def _body(self, call: Call, zero: int | None = None) -> ir.Function:
+    def _body(self, call: Call, zero: int | None = None, part: int | None = None) -> ir.Function:
         """A function's own LLVM function, the first time it is asked for; what is left of it if an input is zero."""
-        key = call.function, zero, _same(call) if zero is not None else frozenset()
+        key = call.function, zero, _same(call) if zero is not None else frozenset(), part
         if key not in self.bodies:
             self.bodies[key] = self._emitted(*key)
         return self.bodies[key]
 
-    def _emitted(self, function: casadi.Function, zero: int | None, same: Same) -> ir.Function:
-        """A function as one long block that the optimiser sees alone."""
+    def _emitted(self, function: casadi.Function, zero: int | None, same: Same, part: int | None) -> ir.Function:
+        """A function, or a part of it, as one long block that the optimiser sees alone."""
         pointer = VectorBuilder(None, self.layout.dtype, self.parts).float_type.as_pointer()
-        signature = ir.FunctionType(ir.VoidType(), [pointer] * (function.n_in() + function.n_out()))
+        count = function.n_in() + function.n_out() + (part is not None)
+        signature = ir.FunctionType(ir.VoidType(), [pointer] * count)
         body = ir.Function(self.builder.module, signature, f"call_{len(self.bodies)}")
         body.linkage = "internal"
         body.attributes.add("noinline")
         body.attributes.alignstack = ALIGNMENT  # else spilled vectors straddle two cache lines each
         vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype, self.parts)
-        inputs, outputs = body.args[: function.n_in()], body.args[function.n_in() :]
+        inputs, outputs = body.args[: function.n_in()], body.args[function.n_in() :][: function.n_out()]
         apart = self.program.compact and self._is_apart(function)
-        lower_function(vectors, function, inputs, outputs, apart, zero, same)
+        which = None if part is None else Part(part, self.again[function], body.args[-1])
+        lower_function(vectors, function, inputs, outputs, apart, zero, same, which)
         vectors.builder.ret_void()
         return body
 
@@ -277,6 +301,11 @@ class _TileWork:
 
     def _smaller(self, a: Value, b: Value) -> Value:
         return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
+
+
+def _changing(call: Call) -> frozenset[int]:
+    """Inputs that may have changed since the call before."""
+    return frozenset(call.inputs.index(name) for name in call.again)
 
 
 def _same(call: Call) -> Same:

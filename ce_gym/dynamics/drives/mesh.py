@@ -142,7 +142,7 @@ def mesh_figures(scene: Scene, elastic: Elasticity) -> tuple[SX, SX, SX]:
     """
     figures, share = scene.figures, 1.0 if elastic.linear or elastic.backlash else 0.5
     k, d = share * elastic.stiffness * figures.drive_stiffness, share * elastic.damping * figures.drive_damping
-    return k, d, elastic.backlash * figures.backlash
+    return k, d, elastic.backlash * elastic.play * figures.backlash
 
 
 def gap_of(elastic: Elasticity, k: SX, backlash: SX) -> SX:

@@ -14,7 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX, skew
 from ce_gym.dynamics.forces.contact import Compliance
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
-from ce_gym.model.drives import Battery, Motor
+from ce_gym.model.drives import Battery, Elasticity, Motor
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 PARAMETERS = {
@@ -33,6 +33,8 @@ PARAMETERS = {
     "drive_damping": "factor on their damping [-], 1",
     "backlash": "factor on their backlash [-], 1",
     "drive_stiffness:ROTOR": "factor on the stiffness of the elastic transmission of one rotor [-], 1",
+    "drive_damping:ROTOR": "the same on its damping [-], 1",
+    "backlash:ROTOR": "the same on its backlash [-], 1",
     "motor_damping": "viscous friction of the rotors of limited motors [N m s/rad], n_motors",
     "motor_friction": "dry friction of the rotors of limited motors [N m], n_motors",
     "drive_friction": "factor on what friction of limited motors has more of at rest and under load [-], 1",
@@ -47,6 +49,8 @@ PARAMETERS = {
     "com_shift:BODY": "shift of the centre of mass of a body, in its frame [m], 3",
 }
 """What can be declared, with unit and size; BODY stands for the name of a link, ROTOR for that of a rotor."""
+ELASTIC_FACTORS = "drive_stiffness", "drive_damping", "backlash"
+"""What each elastic transmission has a factor on, and all of them together."""
 
 
 @dataclass
@@ -109,7 +113,7 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
     plain |= {f"com_shift:{link}": np.zeros(3) for link in links}
     plain |= {f"link_inertia:{link}": np.ones(1) for link in links}
     plain |= {f"rotor_inertia:{rotor.name}": np.ones(1) for rotor in robot.rotors()}
-    plain |= {f"drive_stiffness:{elastic.rotor}": np.ones(1) for elastic in robot.elastic}
+    plain |= {f"{kind}:{elastic.rotor}": np.ones(1) for kind in ELASTIC_FACTORS for elastic in robot.elastic}
     for name in names:
         if name not in plain:
             expected = f"one of {', '.join(PARAMETERS)}, BODY being a link, ROTOR a rotor"
@@ -195,10 +199,8 @@ def with_drives(robot: Robot, given: Mapping[str, SX]) -> Robot:
     if rubbing := _each(joints, given, {"joint_damping": "damping", "joint_friction": "friction"}):
         moved = dict(zip(robot.commanded, rubbing, strict=True))
         changed["bodies"] = tuple(replace(b, joint=moved.get(b.name, b.joint)) for b in robot.bodies)
-    if any(name.startswith("drive_stiffness:") for name in given):
-        factors = [given.get(f"drive_stiffness:{elastic.rotor}", 1.0) for elastic in robot.elastic]
-        both = zip(robot.elastic, factors, strict=True)
-        changed["elastic"] = tuple(replace(elastic, stiffness=elastic.stiffness * factor) for elastic, factor in both)
+    if any(name.split(":")[0] in ELASTIC_FACTORS and ":" in name for name in given):
+        changed["elastic"] = tuple(_with_factors(elastic, given) for elastic in robot.elastic)
     return replace(robot, **changed) if changed else robot
 
 
@@ -248,6 +250,12 @@ def _with_air(motor: Motor, given: Mapping[str, SX]) -> Motor:
     if "cogging" in given and motor.cogging:
         motor = replace(motor, cogging=tuple((n, given["cogging"] * size, at) for n, size, at in motor.cogging))  # type: ignore[misc]
     return motor
+
+
+def _with_factors(elastic: Elasticity, given: Mapping[str, SX]) -> Elasticity:
+    stiffness, damping, play = (given.get(f"{kind}:{elastic.rotor}", 1.0) for kind in ELASTIC_FACTORS)
+    figures = {"stiffness": elastic.stiffness * stiffness, "damping": elastic.damping * damping}
+    return replace(elastic, **figures, play=elastic.play * play)  # type: ignore[arg-type]
 
 
 def _with_factor(spin: Spin, given: Mapping[str, SX]) -> Spin:
