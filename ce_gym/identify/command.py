@@ -7,10 +7,13 @@ import os
 from pathlib import Path
 from typing import Any
 
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.viewer.console import examples
 
 CONTROLS = ("position", "torque", "motor_position", "motor_torque")
+ENCODERS = ("joints", "rotors", "both")
+OSCILLATING = {"dt": 1e-3, "high": 20.0}
+"""Rows [s] and highest frequency [Hz] of simulated logs of transmissions that stretch."""
 
 
 def add_identify_command(subparsers: Any) -> None:
@@ -25,6 +28,7 @@ def add_identify_command(subparsers: Any) -> None:
             "identify mini_cheetah chirps.csv --simulate 60",
             "identify mini_cheetah chirps.csv",
             "identify my_robot.yaml log.csv --control motor_torque --fix link_inertia:hip_link",
+            "identify my_robot.yaml log.csv --transmission elastic --substep 0.0005",
         ),
     )
     parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or path of its YAML file")
@@ -33,10 +37,15 @@ def add_identify_command(subparsers: Any) -> None:
         "--simulate", type=float, metavar="SECONDS", help="write LOG instead, of the robot under chirps"
     )
     parser.add_argument("--control", choices=CONTROLS, default="position", help="what commands mean (default position)")
-    parser.add_argument("--transmission", default="exact", choices=LEVELS, help=f"{', '.join(LEVELS)} (default exact)")
+    levels = (*LEVELS, ELASTIC)
+    parser.add_argument("--transmission", default="exact", choices=levels, help=f"{', '.join(levels)} (default exact)")
     parser.add_argument("--figures", nargs="+", metavar="KIND", help="what to seek, such as rotor_inertia delay")
     parser.add_argument("--fix", nargs="+", default=[], metavar="NAME", help="figures that are known")
     parser.add_argument("--window", type=float, default=0.5, metavar="SECONDS", help="pieces of the log (default 0.5)")
+    parser.add_argument("--substep", type=float, default=1e-3, metavar="SECONDS", help="longest step (default 0.001)")
+    parser.add_argument(
+        "--encoders", choices=ENCODERS, default="joints", help="with --simulate, where they are (default joints)"
+    )
     parser.add_argument("--out", type=Path, metavar="YAML", help="default: beside LOG")
     parser.add_argument("--html", type=Path, metavar="FILE", help="default: beside LOG")
     parser.set_defaults(run=run)
@@ -53,10 +62,12 @@ def run(args: argparse.Namespace) -> int:
     if args.simulate is not None:
         _check_new("LOG", args.log, [Path(args.robot)])
         _check_range("--simulate", args.simulate, 1.0, 3600.0)
-        known = {"control": args.control, "transmission": args.transmission}
+        known = {"control": args.control, "transmission": args.transmission, "encoders": args.encoders}
+        known |= OSCILLATING if args.transmission == ELASTIC else {}
         print(simulate_log(args.robot, args.simulate, **known).save(args.log))
         return 0
     _check_range("--window", args.window, 0.01, 60.0)
+    _check_range("--substep", args.substep, 1e-6, 0.1)
     out, shown = args.out or args.log.with_suffix(".yaml"), args.html or args.log.with_suffix(".html")
     for option, file in (("--out", out), ("--html", shown)):
         _check_new(option, file, [Path(args.robot), args.log])
@@ -69,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
         kinds=args.figures,
         fixed=args.fix,
         window=args.window,
+        substep=args.substep,
     )
     print(report(found))
     base = args.robot

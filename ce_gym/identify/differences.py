@@ -52,10 +52,15 @@ class Differences:
     Args:
         shots: Simulates windows.
         windows: Which.
+
+    Attributes:
+        last: Where transmissions stretch, states a row after the windows that were simulated last, (W, nq + nv).
     """
 
     def __init__(self, shots: Shots, windows: Windows) -> None:
         self.shots, self.windows, self.limbs = shots, windows, Limbs(shots)
+        self._more = int(shots.encoders.joints < shots.model.nq)
+        self.last = np.zeros((0, shots.model.nq + shots.model.nv))
         self._scale = np.array([figure.scale for figure in shots.figures])
         self._steps = np.repeat(STATE_STEPS, (shots.model.nq, shots.model.nv))
 
@@ -79,7 +84,8 @@ class Differences:
                 changed[1 + n_states + k, figure] += STEP * self._scale[figure]
         for k, figure in enumerate(common):
             changed[1 + n_states + n_own + k, figure] += STEP * self._scale[figure]
-        read = self.shots(changed, moved, self.windows.first, self.windows.length)
+        read, last = self.shots.run(changed, moved, self.windows.first, self.windows.length + self._more)
+        read, self.last = read[:, :, : self.windows.length], last[0]
         by_state, by_figure = {}, {}
         for c in numbers:
             change = (read[1:] - read[0])[..., self.limbs.channels[c]]

@@ -21,13 +21,16 @@ from ce_gym.identify.held import held_model
 from ce_gym.identify.log import Log, LogError
 from ce_gym.identify.separable import correlation_time, covariance_of, held_of, hold, known_badly, lines_of
 from ce_gym.identify.shots import Settings, Shots
-from ce_gym.identify.windows import PARTS, Windows, cut, first_states, noise_of_encoders
+from ce_gym.identify.windows import PARTS, Windows, cut, first_states, noise_of_encoders, with_stretches
 from ce_gym.model import Robot, RobotError, load_robot
 from ce_gym.model.errors import unknown
 
 Array = NDArray[np.float64]
 LARGEST_ANGLE = 12.6
 """Of a joint [rad], two turns: what is larger is in degrees."""
+
+UNFIT = 2.0
+"""What is left of a measurement is so many times its noise where figures do not fit."""
 
 
 def identify(
@@ -50,9 +53,9 @@ def identify(
         robot: A description, a name or a path.
         log: What was commanded and measured.
         control: What commands mean: "position", "torque", "motor_position" or "motor_torque", as for `Simulator`.
-        transmission: Level of the simulation; not "elastic".
+        transmission: Level of the simulation.
         kinds: What is sought, some of `ce_gym.identify.figures.KINDS`; by default spin inertia, friction, links'
-            moments of inertia and the delay.
+            moments of inertia and the delay; figures of transmissions, too, where they stretch.
         fixed: Names of figures that are known, such as "rotor_inertia:HR_hip_rotor".
         window: Length of the pieces that are simulated from initial states of their own [s].
         substep: Longest sub-step of the simulation [s].
@@ -72,7 +75,8 @@ def identify(
     described = robot if isinstance(robot, Robot) else load_robot(robot)
     _check_names(described, log)
     model = held_model(described, [*log.commanded, *(name for _, name in log.measured)], transmission)
-    figures = sought(model.robot, kinds or default_kinds(model.robot), fixed, longest_delay)
+    wanted = kinds or default_kinds(model.robot, log.measured)
+    figures = sought(model.robot, wanted, fixed, longest_delay, log.measured)
     log = _ordered(model, log, control)
     shots = Shots(model, log, figures, Settings(control, substep, method, usable_cores()))
     fitted, kept = cut(log, window, longest_delay, held_out)
@@ -95,7 +99,11 @@ def identify(
         std=std,
         covariance=covariance,
         held=tuple(held),
-        cannot_tell=(*lines_of(held, ends), *known_badly(known, x, [figures[i] for i in free])),
+        cannot_tell=(
+            *_fits_badly(log, problem.noise),
+            *lines_of(held, ends),
+            *known_badly(known, x, [figures[i] for i in free]),
+        ),
         noise=problem.noise,
         correlation=correlation,
         held_out=errors[1],
@@ -113,7 +121,9 @@ def _search(shots: Shots, windows: Windows) -> tuple[Problem, Array]:
     first, for figures, states and noise to begin with.
     """
     x = np.array([figure.start / figure.scale for figure in shots.figures])
-    short = Problem(shots, windows.parts(), first_states(shots, windows.parts()), noise_of_encoders(shots.log))
+    parts, start = windows.parts(), np.array([figure.start for figure in shots.figures])
+    states = with_stretches(shots, parts, first_states(shots, parts), start)
+    short = Problem(shots, parts, states, noise_of_encoders(shots.log))
     x = solve(short, x, 1e-3)
     short.weigh(x)
     problem = Problem(shots, windows, short.states[::PARTS], short.noise)
@@ -134,7 +144,7 @@ def _held_out(
     """Return curves, and errors with the figures before and after; initial states are fitted in either case."""
     read, errors = [], []
     for values in both:
-        states = first_states(shots, windows.parts())
+        states = with_stretches(shots, windows.parts(), first_states(shots, windows.parts()), values)
         for pieces in (windows.parts(), windows):
             problem = Problem(shots, pieces, states, noise)
             problem.improve_states(values / problem.scale, 4)
@@ -143,6 +153,16 @@ def _held_out(
         errors.append(np.sqrt(((read[-1] - problem.measured) ** 2).mean(axis=(0, 1))))
     times = windows.rows * shots.log.dt
     return (times, problem.measured, *read), errors  # type: ignore[return-value]
+
+
+def _fits_badly(log: Log, left: Array) -> list[str]:
+    """Return a line if what is left of a measurement is much more than its encoder's noise."""
+    times = left / noise_of_encoders(log)
+    worst = int(times.argmax())
+    if times[worst] < UNFIT:
+        return []
+    why = "the robot has something that is not sought, or the search did not find it; intervals do not hold"
+    return [f"what is left of {':'.join(log.measured[worst])} is {times[worst]:.3g} times its noise: {why}"]
 
 
 def _check_names(robot: Robot, log: Log) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.dynamics.forces.scene import target_names
+from ce_gym.dynamics.model import Model
 from ce_gym.identify.figures import Figure, sought
 from ce_gym.identify.held import held_model
 from ce_gym.identify.log import Log
@@ -18,6 +19,8 @@ from ce_gym.model import Robot, load_robot
 from ce_gym.model.errors import unknown
 
 Array = NDArray[np.float64]
+ENCODERS = "joints", "rotors", "both"
+"""Where encoders can be."""
 
 
 def chirps(n: int, seconds: float, dt: float, low: float = 0.2, high: float = 4.0, period: float = 10.0) -> Array:
@@ -56,6 +59,7 @@ def simulate_log(
     substep: float = 2.5e-4,
     high: float = 6.0,
     seed: int = 0,
+    encoders: str = "joints",
 ) -> Log:
     """Return the log of a robot that hangs in the air and follows chirps, simulated.
 
@@ -65,13 +69,14 @@ def simulate_log(
         dt: Time from row to row [s].
         amplitude: Of chirps about the standing pose [rad or m]; of torques if that is what is controlled [N m or N].
         control: "position" or "torque" for joints, "motor_position" or "motor_torque" for motors.
-        transmission: Level; not "elastic".
+        transmission: Level.
         planted: Figures by name, such as {"rotor_inertia:HR_hip_rotor": 1.3, "delay": 0.004}.
-        noise: Of encoders, at the joints [rad or m].
+        noise: Of encoders, each where it is [rad or m].
         resolution: Of encoders [rad or m]; 0 for none.
         substep: Of the simulation [s], shorter than one would identify with.
         high: Highest frequency [Hz].
         seed: Of the noise.
+        encoders: "joints", "rotors" or "both".
     """
     described = robot if isinstance(robot, Robot) else load_robot(robot)
     model = held_model(described, [body.name for body in described.bodies], transmission)
@@ -82,9 +87,9 @@ def simulate_log(
     elif control == "motor_position":
         q_span = model.spanning(model.standing_q, np.zeros(model.nv))[0]
         commands += q_span[[model.robot.spanning_rows[name][0].start for name in names]]
-    measured = tuple(("angle", name) for name in model.joint_links)
+    measured = encoders_at(model, encoders)
     log = Log(dt, names, commands, measured, np.zeros((len(commands), len(measured))), "simulated log")
-    figures = _planted(model.robot, planted or {})
+    figures = _planted(model.robot, planted or {}, measured)
     shots = Shots(model, log, figures, Settings(control, substep))
     values, state = np.array([[f.start for f in figures]]), np.r_[model.standing_q, np.zeros(model.nv)][None, None]
     exact = shots(values, state, np.array([0]), len(commands))[0, 0]
@@ -93,9 +98,23 @@ def simulate_log(
     return Log(dt, names, commands, measured, read, "simulated log")
 
 
-def _planted(robot: Robot, planted: Mapping[str, float]) -> list[Figure]:
+def encoders_at(model: Model, where: str) -> tuple[tuple[str, str], ...]:
+    """Return what encoders measure, as `Log.measured`.
+
+    Args:
+        model: The robot.
+        where: One of `ENCODERS`.
+    """
+    if where not in ENCODERS:
+        raise unknown("simulate_log", "encoders", where, ENCODERS, "where encoders are")
+    rotors = tuple(rotor.name for rotor in model.robot.rotors())
+    names = {"joints": model.joint_links, "rotors": rotors, "both": (*model.joint_links, *rotors)}[where]
+    return tuple(("angle", name) for name in names)
+
+
+def _planted(robot: Robot, planted: Mapping[str, float], measured: Sequence[tuple[str, str]]) -> list[Figure]:
     kinds = tuple(dict.fromkeys(name.split(":")[0] for name in planted))
-    known = {figure.name: figure for figure in sought(robot, kinds)} if kinds else {}
+    known = {figure.name: figure for figure in sought(robot, kinds, measured=measured)} if kinds else {}
     for name in planted:
         if name not in known:
             raise unknown("simulate_log", "planted", name, known, "the name of a figure")

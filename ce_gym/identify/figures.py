@@ -19,10 +19,25 @@ KINDS = {
     "link_inertia": "factor on each link's moments of inertia about its centre of mass",
     "added_mass": "mass added to each link [kg]",
     "delay": "from a command to the motors [s], one for all",
+    "drive_stiffness": "factor on the stiffness of each elastic transmission",
+    "drive_damping": "factor on its damping",
+    "backlash": "factor on its backlash",
+    "encoder_zero": "what the encoder of each joint reads too much, beside that of its rotor [rad or m]",
 }
 """What can be sought."""
+OF_ENCODERS = "encoder_zero"
+NO_PARAMETERS = "delay", OF_ENCODERS
+"""What is no parameter of the simulator."""
 UNITS = {"motor_damping": "N m s/rad", "motor_friction": "N m", "joint_damping": "N m s/rad", "joint_friction": "N m"}
-UNITS |= {"added_mass": "kg", "delay": "s"}
+UNITS |= {"added_mass": "kg", "delay": "s", OF_ENCODERS: "rad"}
+FACTORS = 0.02, 50.0
+"""Between which factors are sought."""
+LARGE_ZERO = 0.01
+"""What is large for the zero of an encoder at a joint [rad or m]."""
+
+
+ELASTIC = "drive_stiffness", "drive_damping", "backlash", OF_ENCODERS
+"""What there is where transmissions stretch."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +86,25 @@ class Figure:
         return UNITS.get(self.kind, "-")
 
 
-def default_kinds(robot: Robot) -> tuple[str, ...]:
-    """Return what is sought unless one says: friction of motors where there are motors, otherwise of joints."""
+def default_kinds(robot: Robot, measured: Sequence[tuple[str, str]] = ()) -> tuple[str, ...]:
+    """Return what is sought unless one says: friction of motors where there are motors, otherwise of joints.
+
+    Where transmissions stretch, their figures, and what encoders of joints read too much beside those of rotors.
+    """
     spins = ("rotor_inertia",) if any(robot.rotors()) else ()
     rubs = "motor" if robot.motors else "joint"
-    return (*spins, f"{rubs}_damping", f"{rubs}_friction", "link_inertia", "delay")
+    kinds = (*spins, f"{rubs}_damping", f"{rubs}_friction", "link_inertia", "delay")
+    stretch = tuple(kind for kind in ELASTIC if _of_kind(robot, kind, 1.0, measured))
+    return (*kinds, *stretch)
 
 
-def sought(robot: Robot, kinds: Sequence[str], fixed: Sequence[str] = (), longest_delay: float = 0.03) -> list[Figure]:
+def sought(
+    robot: Robot,
+    kinds: Sequence[str],
+    fixed: Sequence[str] = (),
+    longest_delay: float = 0.03,
+    measured: Sequence[tuple[str, str]] = (),
+) -> list[Figure]:
     """Return the figures of a robot.
 
     Args:
@@ -86,6 +112,7 @@ def sought(robot: Robot, kinds: Sequence[str], fixed: Sequence[str] = (), longes
         kinds: Some of `KINDS`.
         fixed: Names of figures that are known, such as "rotor_inertia:HR_hip_rotor".
         longest_delay: [s]
+        measured: What the log has, as `Log.measured`.
 
     Raises:
         RobotError: There is no such kind, or no such figure.
@@ -93,7 +120,7 @@ def sought(robot: Robot, kinds: Sequence[str], fixed: Sequence[str] = (), longes
     for kind in kinds:
         if kind not in KINDS:
             raise unknown("identify", "figure", kind, KINDS, "a kind of figure")
-    found = [figure for kind in kinds for figure in _of_kind(robot, kind, longest_delay)]
+    found = [figure for kind in kinds for figure in _of_kind(robot, kind, longest_delay, measured)]
     for name in fixed:
         if name not in [figure.name for figure in found]:
             raise unknown(
@@ -105,8 +132,10 @@ def sought(robot: Robot, kinds: Sequence[str], fixed: Sequence[str] = (), longes
     return left
 
 
-def _of_kind(robot: Robot, kind: str, longest_delay: float) -> list[Figure]:
+def _of_kind(robot: Robot, kind: str, longest_delay: float, measured: Sequence[tuple[str, str]] = ()) -> list[Figure]:
     limb = limbs_of(robot)
+    if kind in ELASTIC:
+        return _of_elastic(robot, kind, measured)
     if kind == "delay":
         return [Figure(kind, "", 0.0, longest_delay / 10, 0.0, longest_delay, longest_delay / 3, -1)]
     if kind in ("rotor_inertia", "link_inertia"):
@@ -114,12 +143,26 @@ def _of_kind(robot: Robot, kind: str, longest_delay: float) -> list[Figure]:
             "rotor_inertia": [body.name for body in robot.rotors()],
             "link_inertia": [body.name for body in robot.bodies if body.kind == "link"],
         }[kind]
-        return [Figure(kind, name, 1.0, 1.0, 0.02, 50.0, 1.0, limb[name]) for name in names]
+        return [Figure(kind, name, 1.0, 1.0, *FACTORS, 1.0, limb[name]) for name in names]
     if kind == "added_mass":
         links = [body for body in robot.bodies if body.kind == "link"]
         masses = [(body.name, body.inertial.mass) for body in links]
         return [Figure(kind, name, 0.0, 0.0, -0.95 * m, 20 * m, m, limb[name]) for name, m in masses if m > 0]
     return _losses(robot, kind, limb)
+
+
+def _of_elastic(robot: Robot, kind: str, measured: Sequence[tuple[str, str]]) -> list[Figure]:
+    """Return figures of transmissions that stretch; there is no factor on what the robot's file has as 0."""
+    limb = limbs_of(robot)
+    if kind != OF_ENCODERS:
+        field = kind.removeprefix("drive_")
+        named = [e.rotor for e in robot.elastic if e.stretch in robot.independent and getattr(e, field) > 0]
+        return [Figure(kind, name, 1.0, 1.0, *FACTORS, 1.0, limb[name]) for name in named]
+    read = {name for what, name in measured if what == "angle"}
+    behind = {e.rotor for e in robot.elastic if e.stretch in robot.independent and e.rotor in read}
+    tied = {name for tie in robot.constraints if behind & set(tie.bodies) for name in tie.bodies}
+    joints = [name for name in robot.commanded if name in tied & read]
+    return [Figure(kind, name, 0.0, 0.0, -10.0, 10.0, LARGE_ZERO, limb[name]) for name in joints]
 
 
 def _losses(robot: Robot, kind: str, limb: dict[str, int]) -> list[Figure]:

@@ -97,7 +97,7 @@ class Problem:
         least = np.repeat(1 / np.square(LARGEST_STEPS), (self.shots.model.nq, self.shots.model.nv))
         for _ in range(steps):
             base, by_state = self._differences.by_states(self.values(x), self.states)
-            new = np.stack([self.states, self.guess, *[self.states] * len(DAMPINGS)])
+            new = np.stack([self.states, self.guess, *[self.states] * len(DAMPINGS), *self._going_on()])
             for c in self.limbs.numbers:
                 rows, r = self.limbs.states[c], self._weighed(self.measured - base, c)
                 J = by_state[c] / self._noise_of(c)
@@ -108,6 +108,17 @@ class Problem:
                     new[2 + k][:, rows] += np.linalg.solve(damped, JT @ r)[..., 0]
             if self._choose(x, new) < SETTLED:
                 break
+
+    def _going_on(self) -> list[Array]:
+        """Return states as the window before ends, and with its stretches alone: flanks that rattle are no cubics."""
+        last, n, nq = self._differences.last, self.shots.encoders.joints, self.shots.model.nq
+        if n == nq:
+            return []
+        after = np.flatnonzero(self.windows.first[:-1] + self.windows.length == self.windows.first[1:])
+        whole, stretches = self.states.copy(), self.states.copy()
+        whole[after + 1] = last[after]
+        stretches[:, n:nq], stretches[:, nq + n :] = whole[:, n:nq], whole[:, nq + n :]
+        return [whole, stretches]
 
     def _choose(self, x: Array, states: Array) -> float:
         """Take from several states (K, W, nq + nv) those that fit best, for each limb of each window.

@@ -10,7 +10,7 @@ from ce_gym.model.description import Body, Pose, Robot
 from ce_gym.model.errors import RobotError, unknown
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.frames import Placement
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 
 def held_model(robot: Robot, names: Collection[str], transmission: str) -> Model:
@@ -22,10 +22,10 @@ def held_model(robot: Robot, names: Collection[str], transmission: str) -> Model
         transmission: Level of the simulation.
 
     Raises:
-        RobotError: The level has coordinates that no encoder of the log tells, or a joint turns about all axes.
+        RobotError: There is no such level, or a joint turns about all axes.
     """
-    if transmission not in LEVELS:
-        raise unknown("identify", "transmission", transmission, LEVELS, "a level at which nothing stretches")
+    if transmission not in (levels := (*LEVELS, ELASTIC)):
+        raise unknown("identify", "transmission", transmission, levels, "a transmission level")
     model = Model(held(robot, names), transmission)
     if model.nq != model.nv:
         raise RobotError(f"{robot.name}: identify: expected joints about or along one axis, no ball joints")

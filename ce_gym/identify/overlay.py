@@ -13,6 +13,11 @@ from ce_gym.model.formats.reading import read_yaml
 from ce_gym.model.table import table_text
 
 COLUMNS = "figure", "estimate", "95 % interval", "unit"
+SAID = {
+    "delay": "commands reach the motors after {value:.6g} s, identified",
+    "encoder_zero": "the encoder of {of} reads {value:.4g} too much beside that of its rotor, identified",
+}
+"""What is no figure of a robot's file, and a note in it."""
 
 
 def report(found: Identified) -> str:
@@ -73,13 +78,12 @@ def overlay(found: Identified, robot: str) -> str:
         f"# Identified from {Path(found.log.source).name}; estimate and standard deviation.",
         f"robot: {json.dumps(robot)}",
     ]
-    delay = [(f, v) for f, v in zip(found.figures, found.values, strict=True) if f.kind == "delay"]
-    notes = [f"commands reach the motors after {v:.6g} s, identified" for _, v in delay]
+    figures = [(found.figures[i], found.values[i], found.std[i]) for i in found.sought]
+    notes = [SAID[f.kind].format(of=f.of, value=value) for f, value, _ in figures if f.kind in SAID]
     notes += list(found.cannot_tell)
     if notes:
         lines += ["notes:", *(f'  - "{note}"' for note in notes)]
-    written = [(found.figures[i], found.values[i], found.std[i]) for i in found.sought]
-    written = [each for each in written if each[0].kind != "delay"]
+    written = [each for each in figures if each[0].kind not in SAID]
     kinds = dict.fromkeys(figure.kind for figure, _, _ in written)
     lines.append("identified:" if kinds else "identified: {}")
     for kind in kinds:

@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
-from ce_gym.identify.figures import Figure
+from ce_gym.identify.figures import NO_PARAMETERS, OF_ENCODERS, Figure
 from ce_gym.identify.log import Log, LogError
 from ce_gym.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
 LARGEST_BATCH = 4096
 """Robots that are simulated at once."""
+LEAST_STRETCH = 1e-3
+"""How much less than joints transmissions stretch where encoders do not tell which of them it is."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,9 @@ class Encoders:
         model: The robot.
         log: Whose columns say what is measured.
 
+    Attributes:
+        tell_stretches: Whether they tell how far transmissions stretch, if any does.
+
     Raises:
         LogError: A column is of nothing that the robot has, or angles do not tell where all joints are.
     """
@@ -65,6 +70,7 @@ class Encoders:
         self._linear = bool(np.abs(G - G[0]).max() < 1e-12)
         self._G, self._q0 = G[0], model.standing_q
         self._z0 = self._exact(model.standing_q, still)
+        self.tell_stretches = bool(np.linalg.matrix_rank(G[0][self._angle]) == model.nv)
         by_angles = G[0][self._angle][:, : self.joints]
         if np.linalg.matrix_rank(by_angles) < self.joints:
             lost = np.abs(np.linalg.svd(by_angles)[2][-1]).argmax()
@@ -87,16 +93,19 @@ class Encoders:
         return z + self._z0
 
     def positions(self, z: Array) -> Array:
-        """Return positions (W, nq) at which angles are as measured (W, size), least squares; nothing stretches."""
-        n, still = self.joints, np.zeros((len(z), self.model.nv))
-        q = np.tile(self.model.standing_q, (len(z), 1))
+        """Return positions (W, nq) at which angles are as measured (W, size), least squares.
+
+        Transmissions stretch where encoders of joints and of rotors tell so, else next to nothing.
+        """
+        share = np.where(np.arange(self.model.nq) < self.joints, 1.0, LEAST_STRETCH)
+        still, q = np.zeros((len(z), self.model.nv)), np.tile(self.model.standing_q, (len(z), 1))
         for _ in range(1 if self._linear else 8):
             missing = (z - self(q, still))[:, self._angle]
             if self._linear:
-                q[:, :n] += missing @ np.linalg.pinv(self._G[self._angle, :n]).T
+                q += missing @ np.linalg.pinv(self._G[self._angle] * share).T * share
                 continue
-            G = self.model.explicit_constraint(q, still)[0][:, [self._rates[k] for k in self._angle], :n]
-            q[:, :n] += (np.linalg.pinv(G) @ missing[..., None])[..., 0]
+            G = self.model.explicit_constraint(q, still)[0][:, [self._rates[k] for k in self._angle]]
+            q += share * (np.linalg.pinv(G * share) @ missing[..., None])[..., 0]
         return q
 
 
@@ -113,10 +122,13 @@ class Shots:
     def __init__(self, model: Model, log: Log, figures: Sequence[Figure], settings: Settings) -> None:
         self.model, self.log, self.figures, self.settings = model, log, list(figures), settings
         self.encoders = Encoders(model, log)
-        self.parameters = tuple(dict.fromkeys(f.parameter for f in figures if f.kind != "delay"))
+        self.parameters = tuple(dict.fromkeys(f.parameter for f in figures if f.kind not in NO_PARAMETERS))
         self.substeps = max(1, round(np.ceil(log.dt / settings.substep - 1e-9)))
         self._sims: dict[int, Simulator] = {}
         order = self._simulator(1).target_names
+        angles = [name if kind == "angle" else "" for kind, name in log.measured]
+        zeros = [(k, angles.index(f.of)) for k, f in enumerate(figures) if f.kind == OF_ENCODERS]
+        self._zeros = np.array(zeros, dtype=np.int64).reshape(-1, 2)
         self._sum = np.vstack([np.zeros(len(order)), np.cumsum(log.commands, axis=0)])  # integral over time, in rows
 
     def _simulator(self, n: int) -> Simulator:
@@ -140,12 +152,17 @@ class Shots:
         Returns:
             Shape (C, W, length, n_measured).
         """
+        return self.run(values, states, first, length)[0]
+
+    def run(self, values: Array, states: Array, first: NDArray[np.int64], length: int) -> tuple[Array, Array]:
+        """Return that, and states at the last row, shape (C, W, nq + nv)."""
         most = max(1, LARGEST_BATCH // len(values))
         pieces = range(0, len(first), most)
         parts = [self._batch(values, states[:, i : i + most], first[i : i + most], length) for i in pieces]
-        return np.concatenate(parts, axis=1)
+        read, last = zip(*parts, strict=True)
+        return np.concatenate(read, axis=1), np.concatenate(last, axis=1)
 
-    def _batch(self, values: Array, states: Array, first: NDArray[np.int64], length: int) -> Array:
+    def _batch(self, values: Array, states: Array, first: NDArray[np.int64], length: int) -> tuple[Array, Array]:
         C, W, nq = len(values), len(first), self.model.nq
         sim, steps = self._simulator(C * W), self.substeps
         for name in self.parameters:
@@ -167,7 +184,10 @@ class Shots:
             before = after
             if (k + 1) % steps == 0:
                 read.append(self.encoders(sim.q, sim.v))
-        return np.stack(read, axis=1).reshape(C, W, length, -1)
+        shown = np.stack(read, axis=1).reshape(C, W, length, -1)
+        for figure, column in self._zeros:
+            shown[..., column] += values[:, figure, None, None]
+        return shown, np.hstack([sim.q, sim.v]).reshape(C, W, -1)
 
     def _default(self, name: str) -> Array:
         return parameter_defaults(self.model.robot, self.model.robot.material, (name,))[name]

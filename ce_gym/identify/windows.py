@@ -11,6 +11,8 @@ from ce_gym.identify.log import Log, LogError
 from ce_gym.identify.shots import Shots
 
 Array = NDArray[np.float64]
+SETTLING = 0.03
+"""How long transmissions are given until they stretch as their load has them [s]."""
 PARTS = 5
 """Windows of the first search are so many times shorter."""
 
@@ -72,6 +74,19 @@ def first_states(shots: Shots, windows: Windows) -> Array:
     q = shots.encoders.positions(fit[:, 0])
     ahead = shots.encoders.positions(fit[:, 0] + 1e-3 * fit[:, 1])
     return np.hstack([q, (ahead - q) / 1e-3])
+
+
+def with_stretches(shots: Shots, windows: Windows, states: Array, values: Array) -> Array:
+    """Return states with stretches that encoders do not tell as they are at figures (P,) once they have settled."""
+    n = shots.encoders.joints
+    if shots.encoders.tell_stretches:
+        return states
+    lead = int(min(windows.first.min(), round(SETTLING / shots.log.dt)))
+    earlier = Windows(windows.first - lead, lead + 1)
+    _, last = shots.run(values[None], first_states(shots, earlier)[None], earlier.first, earlier.length)
+    settled, nq = states.copy(), shots.model.nq
+    settled[:, n:nq], settled[:, nq + n :] = last[0, :, n:nq], last[0, :, nq + n :]
+    return settled
 
 
 def noise_of_encoders(log: Log) -> Array:

@@ -158,6 +158,7 @@ class Elasticity:
         backlash: Play: how far the rotor turns from one flank to the other, the joints held [rad].
         preload: Of a belt: the torque at which one of its strands goes slack, beyond which it is half as stiff [N m];
             infinite for what pulls and pushes alike.
+        play: Factor on the backlash [-]; with a backlash of 0 there are no flanks, whatever it is.
     """
 
     rotor: str
@@ -165,6 +166,7 @@ class Elasticity:
     damping: float = 0.0
     backlash: float = 0.0
     preload: float = float("inf")
+    play: float = 1.0
 
     @property
     def stretch(self) -> str:

@@ -8,15 +8,20 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.dynamics import Model
 from ce_gym.identify import Figure, Identified, identify, simulate_log
+from ce_gym.identify.excite import ENCODERS, encoders_at
 from ce_gym.identify.figures import default_kinds, sought
-from ce_gym.identify.held import held
-from ce_gym.model import Robot, load_robot
+from ce_gym.identify.held import held_model
+from ce_gym.model import load_robot
+from ce_gym.model.mechanism import ELASTIC, LEVELS, without_stretches
 
 Array = NDArray[np.float64]
 FACTORS, SHARES, DELAYS = (0.7, 1.4), (0.3, 1.5), (0.002, 0.012)
@@ -24,7 +29,31 @@ FACTORS, SHARES, DELAYS = (0.7, 1.4), (0.3, 1.5), (0.002, 0.012)
 COVERED = 0.91, 0.99
 """Of 95 % intervals."""
 LARGEST_ERROR = 0.02
-SUBSTEP = 5e-3
+RATES = {False: {"dt": 5e-3, "substep": 5e-3, "high": 6.0}, True: {"dt": 1e-3, "substep": 1e-3, "high": 20.0}}
+"""Of rows and steps [s], and the highest frequency of chirps [Hz]; where transmissions stretch, they oscillate."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is identified.
+
+    Attributes:
+        model: A leg.
+        encoders: Where its encoders are, one of `ENCODERS`.
+        seconds: Length of a log.
+        noise: Of encoders [rad].
+    """
+
+    model: Model
+    encoders: str = "joints"
+    seconds: float = 8.0
+    noise: float = 2e-4
+
+    @property
+    def figures(self) -> list[Figure]:
+        """Which are planted and sought."""
+        measured = encoders_at(self.model, self.encoders)
+        return sought(self.model.robot, default_kinds(self.model.robot, measured), measured=measured)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,19 +62,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limb", default="HR_knee_link", help="a link of the leg that is identified")
     parser.add_argument("--trials", type=int, default=200, help="how many logs")
     parser.add_argument("--seconds", type=float, default=8.0, help="length of each")
-    parser.add_argument("--noise", type=float, default=2e-4, help="of encoders, at the joints [rad]")
+    parser.add_argument("--noise", type=float, default=2e-4, help="of encoders, each where it is [rad]")
+    parser.add_argument("--transmission", default="exact", choices=(*LEVELS, ELASTIC), help="level (default exact)")
+    parser.add_argument("--encoders", default="joints", choices=ENCODERS, help="where they are (default joints)")
 
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
     report, began = Report("identification"), time.process_time()
-    leg = held(load_robot(arguments.robot), [arguments.limb])
-    names = [figure.name for figure in sought(leg, default_kinds(leg))]
-    trials = [trial(leg, seed, arguments.seconds, arguments.noise) for seed in range(arguments.trials)]
+    leg = held_model(load_robot(arguments.robot), [arguments.limb], arguments.transmission)
+    subject = Subject(leg, arguments.encoders, arguments.seconds, arguments.noise)
+    names = [figure.name for figure in subject.figures]
+    trials = [trial(subject, seed) for seed in range(arguments.trials)]
     errors, stds = np.moveaxis(np.array(trials), 1, 0)
     rows = tabulate(names, errors, stds)
     columns = ("figure", "trials", "covered", "rms error / std", "rms error", "median std", "largest error")
-    title = f"{leg.name}, {arguments.limb}: {arguments.trials} logs of {arguments.seconds:g} s, errors relative"
+    title = f"{leg.robot.name}, {arguments.limb}, {arguments.transmission}, encoders at {arguments.encoders}"
+    title += f": {arguments.trials} logs of {arguments.seconds:g} s, errors relative"
     report.tables.append(Table(title, columns, tuple(rows)))
     low, high = COVERED
     claim = f"intervals of each figure hold it in {100 * low:g} to {100 * high:g} % of trials"
@@ -60,19 +93,21 @@ def run(arguments: argparse.Namespace) -> Report:
     return report
 
 
-def trial(leg: Robot, seed: int, seconds: float, noise: float) -> Array:
+def trial(subject: Subject, seed: int) -> Array:
     """Return errors of estimates and standard deviations, relative to the truth, shape (2, P); 0 where it is held."""
-    planted = draw(leg, seed)
-    log = simulate_log(leg, seconds, planted=planted, amplitude=0.5, noise=noise, substep=SUBSTEP, seed=seed)
-    found = identify(leg, log, substep=SUBSTEP)
+    planted, level = draw(subject, seed), subject.model.mechanism.level
+    rates, leg = RATES[level == ELASTIC], without_stretches(subject.model.robot)
+    known: dict[str, Any] = {"transmission": level, "encoders": subject.encoders, "noise": subject.noise, **rates}
+    log = simulate_log(leg, subject.seconds, planted=planted, amplitude=0.5, seed=seed, **known)
+    found = identify(leg, log, substep=rates["substep"], transmission=level)
     truth = combined(found, planted)
     return np.stack([(found.values - truth) / truth, found.std / truth])
 
 
-def draw(robot: Robot, seed: int) -> dict[str, float]:
+def draw(subject: Subject, seed: int) -> dict[str, float]:
     """Return figures to plant, by name."""
     rng = np.random.default_rng([seed, 20])
-    return {figure.name: _drawn(figure, rng) for figure in sought(robot, default_kinds(robot))}
+    return {figure.name: _drawn(figure, rng) for figure in subject.figures}
 
 
 def _drawn(figure: Figure, rng: np.random.Generator) -> float:

@@ -16,10 +16,11 @@ from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import mat3
 from ce_gym.model.formats.reading import Section
 
-KINDS = (  # in the order in which they are laid over: a link's factor is one on what the file has
-    *("link_inertia", "added_mass"),
-    *("rotor_inertia", "motor_damping", "motor_friction", "joint_damping", "joint_friction"),
-)
+RUBBING = "motor_damping", "motor_friction", "joint_damping", "joint_friction"
+OF_DRIVES = "drive_stiffness", "drive_damping", "backlash"
+KINDS = "link_inertia", "added_mass", "rotor_inertia", *RUBBING, *OF_DRIVES
+"""In the order in which they are laid over: a link's factor is one on what the file has."""
+MAY_VANISH = *RUBBING, "drive_damping", "backlash"
 
 
 def with_identified(robot: Robot, section: Section) -> Robot:
@@ -33,8 +34,8 @@ def with_identified(robot: Robot, section: Section) -> Robot:
         for name, value in part.numbers():
             if name not in (known := _owners(robot, kind)):
                 raise unknown(section.file, part.path, name, known, "what has such a figure")
-            if kind != "added_mass" and not (value > 0 or (value == 0 and kind.split("_")[0] in ("motor", "joint"))):
-                raise bad(section.file, part.key(name), value, "more than 0, or 0 for friction")
+            if kind != "added_mass" and not (value > 0 or (value == 0 and kind in MAY_VANISH)):
+                raise bad(section.file, part.key(name), value, "more than 0, or 0 for friction, damping and backlash")
             robot = _with(robot, kind, name, value)
     return robot
 
@@ -46,11 +47,16 @@ def _owners(robot: Robot, kind: str) -> tuple[str, ...]:
         return tuple(motor.rotor for motor in robot.motors)
     if kind.startswith("joint"):
         return robot.commanded
+    if kind in OF_DRIVES:
+        return tuple(elastic.rotor for elastic in robot.elastic)
     return tuple(body.name for body in robot.bodies if body.kind == "link")
 
 
 def _with(robot: Robot, kind: str, name: str, value: float) -> Robot:
-    figure = kind.split("_")[1]
+    figure = kind.split("_")[-1]
+    if kind in OF_DRIVES:
+        now = next(getattr(elastic, figure) for elastic in robot.elastic if elastic.rotor == name)
+        return replace(robot, elastic=_changed(robot.elastic, "rotor", name, {figure: value * now}))
     if kind.startswith("motor"):
         return replace(robot, motors=_changed(robot.motors, "rotor", name, {figure: value}))
     body = robot.body(name)
