@@ -6,20 +6,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from casadi import DM, SX, Function
 
 pytest.importorskip("mujoco")
+
+import mujoco
 
 from ce_gym import Model, Simulator
 from ce_gym.bench.accuracy import adaptive
 from ce_gym.bench.accuracy import benchmark as accuracy
-from ce_gym.bench.accuracy import contact as accuracy_contact
 from ce_gym.bench.accuracy import coulomb as accuracy_coulomb
 from ce_gym.bench.accuracy import curves as accuracy_curves
-from ce_gym.bench.accuracy import references as accuracy_references
 from ce_gym.bench.accuracy.curves import Curve, Measured, Point, comparisons, rms_error, time_to
 from ce_gym.bench.accuracy.ours import Ours
 from ce_gym.bench.accuracy.peers import Family, Peer
+from ce_gym.bench.accuracy.references import contact as accuracy_contact
+from ce_gym.bench.accuracy.references import restated as accuracy_restated
+from ce_gym.bench.accuracy.references import smooth as accuracy_references
 from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Scene
+from ce_gym.bench.accuracy.statements import GROUNDS
+from ce_gym.model.checks.collisions import colliding
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -29,7 +35,9 @@ def short(name: str, holds: int) -> Scene:
     return replace(scene, drive=scene.drive[:holds], push=None if scene.push is None else scene.push[:holds])
 
 
-@pytest.mark.parametrize(("name", "holds"), [("belt_leg", 5), ("tumble", 10), ("four_bar", 5), ("stiff_1e3", 3)])
+@pytest.mark.parametrize(
+    ("name", "holds"), [("belt_leg", 5), ("tumble", 10), ("four_bar", 5), ("stiff_1e3", 3), ("elastic", 3)]
+)
 def test_two_codes_agree_on_smooth_scenes(name: str, holds: int):
     scene = short(name, holds)
     truth = accuracy_references.ours(scene, 40)
@@ -43,6 +51,16 @@ def test_two_codes_agree_on_a_block(name: str):
     limit = Ours(scene, "extrapolated", "exact", "tangent", 1).run(2000)
     assert np.abs(limit[-1] - scene.q).max() > 1e-4
     assert rms_error(scene, accuracy_contact.block(scene, 600), limit) < 1e-7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "holds"), [("stairs", 10), ("shanks", 10), ("biped", 5)])
+def test_two_codes_agree_on_robots_that_touch(name: str, holds: int):
+    """On the edge of a step, between links, and on feet behind rods and springs."""
+    scene = short(name, holds)
+    error = rms_error(scene, accuracy_contact.robot(scene, 8000), Ours(scene, *scene.ours[1], 1).run(1000))
+    coarse = rms_error(scene, Ours(scene, *scene.ours[1], 1).run(10), Ours(scene, *scene.ours[1], 1).run(1000))
+    assert error < 3e-5 < 10 * error + 3e-5 < coarse
 
 
 @pytest.mark.slow
@@ -92,6 +110,80 @@ def test_a_block_slides_as_far_as_coulomb_says():
     for scene in ("breakaway", "slide"):
         assert finest[scene, "ce_gym extrapolated, tangent friction"] == pytest.approx(1.0, abs=0.01)
         assert finest[scene, "MuJoCo RK4"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_stairs_restated_are_the_terrain():
+    terrain, x = SCENES["stairs"]().terrain, SX.sym("x")
+    heights = Function("stairs", [x], list(accuracy_restated.stairs(terrain, x)))
+    places = np.linspace(0.0, 1.2, 2001)
+    found = np.array([np.array(part).ravel() for part in heights(places[None])]).T
+    np.testing.assert_allclose(found, terrain.at(places, 0.0)[:, :2], atol=1e-12)
+
+
+def test_segments_are_nearest_where_sampling_finds_them():
+    rng, shares = np.random.default_rng(0), np.linspace(0.0, 1.0, 301)
+    ends = [SX.sym(name, 3) for name in "abcd"]
+    nearest = Function("nearest", ends, list(accuracy_restated.nearest(*ends)))
+    for _ in range(50):
+        a, b, c, d = rng.normal(size=(4, 3))
+        here, there = (np.array(place).ravel() for place in nearest(a, b, c, d))
+        sampled = (a + shares[:, None] * (b - a))[:, None] - (c + shares[:, None] * (d - c))[None]
+        assert np.linalg.norm(here - there) == pytest.approx(np.linalg.norm(sampled, axis=2).min(), abs=1e-3)
+        for place, (start, end) in ((here, (a, b)), (there, (c, d))):
+            share = (place - start) @ (end - start) / ((end - start) @ (end - start))
+            assert -1e-9 < share < 1 + 1e-9
+            np.testing.assert_allclose(place, start + share * (end - start), atol=1e-9)
+
+
+@pytest.mark.parametrize("ground", GROUNDS)
+def test_mujoco_has_the_stairs(ground):
+    """Seen from above, away from edges, which are round in ours, sharp in boxes and steep in triangles."""
+    scene = SCENES["stairs"]()
+    model = Family(scene, "armature", stiff=False, ground=ground).model
+    data = mujoco.MjData(model)
+    data.qpos[2] = 100.0
+    mujoco.mj_forward(model, data)
+    for x in (-0.5, 0.1, 0.35, 0.7, 1.5):
+        down = mujoco.mj_ray(
+            model, data, np.array([x, 0.1, 5.0]), np.array([0.0, 0.0, -1.0]), None, 1, -1, np.zeros(1, np.int32)
+        )
+        assert 5.0 - down == pytest.approx(scene.terrain.at(x, 0.1)[0], abs=1e-6)
+
+
+def test_mujoco_has_the_springs_of_transmissions():
+    """It comes to our solution of the elastic leg with its fourth-order method, and rigid drives do not."""
+    scene = short("elastic", 3)
+    truth = accuracy_references.ours(scene, 40)
+    springs, rigid = Family(scene, "elastic", stiff=False), Family(scene, "exact", stiff=True)
+    assert not springs.tied
+    assert rms_error(scene, Peer(springs, "RK4", 100).run(), truth) < 1e-8
+    assert rms_error(scene, Peer(rigid, "RK4", 100).run(), truth) > 1e-5
+
+
+def test_mujoco_lets_only_the_pairs_touch():
+    """Legs swung inwards meet in MuJoCo as they do here: as deep, at as many places, and without friction."""
+    scene = SCENES["shanks"]()
+    family, model = Family(scene, "armature", stiff=False), Model(scene.robot)
+    data, q = mujoco.MjData(family.model), scene.q.copy()
+    for i, name in enumerate(model.joint_links):
+        q[7 + i] += {"R": 0.55, "L": -0.55}[name[1]] if name.endswith("_abad_link") else 0.0
+        data.qpos[family.model.joint(name).qposadr[0]] = q[7 + i]
+    data.qpos[:7] = q[:7]
+    mujoco.mj_forward(family.model, data)
+    places, turns = model.body_poses(q)
+    depths = []
+    for first, second in colliding(scene.robot, scene.touching):
+        ends = [
+            places[model.body_names.index(one.body)] + turns[model.body_names.index(one.body)] @ np.array(end)
+            for one in (first, second)
+            for end in (one.start, one.end)
+        ]
+        here, there = (np.array(place).ravel() for place in accuracy_restated.nearest(*map(DM, ends)))
+        depths.append(first.radius + second.radius - np.linalg.norm(here - there))
+    assert min(depths) > 1e-3
+    assert data.ncon == len(depths)
+    np.testing.assert_allclose(sorted(-data.contact.dist), sorted(depths), atol=1e-6)
+    assert (data.contact.dim == 1).all()
 
 
 def test_error_counts_a_turn_once():

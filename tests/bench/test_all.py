@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 from pathlib import Path
 
@@ -18,32 +19,61 @@ ROOT = Path(__file__).parents[2]
 def test_the_page_has_what_was_missed_and_what_was_skipped(tmp_path: Path, monkeypatch, capsys):
     told = {"instructions": "", "gpu": "skipped: no GPU was found"}
 
-    def one(part, out, quick):
+    def one(part, command, out):
         if not told[part.name]:
             bars = [Requirement("at most 1", "2", False), Requirement("at least 1", "2", True)]
             report = Report(part.name, [Table("Counts", ("robot", "n"), (("leg", 3),))], bars)
             (out / f"{part.name}.json").write_text(report.as_json(), encoding="utf-8")
+            (out / part.name).mkdir()
+            (out / part.name / "curves.png").touch()
         return told[part.name]
 
     monkeypatch.setattr(everything, "_one", one)
     assert command.main(["all", "--out", str(tmp_path), "--only", "instructions", "gpu"]) == 0
     page = (tmp_path / "index.md").read_text()
-    assert all(part in page for part in ("**missed**: at most 1: 2", "| leg | 3 |", "no GPU was found"))
+    assert all(
+        part in page
+        for part in ("**missed**: at most 1: 2", "| leg | 3 |", "no GPU was found", "![](instructions/curves.png)")
+    )
     assert "1 of 2 met" in capsys.readouterr().out
 
 
 def test_a_benchmark_runs_in_a_process_of_its_own(tmp_path: Path):
     part = next(part for part in everything.PARTS if part.name == "tracking")
-    assert everything._one(part, tmp_path, quick=True) == ""
+    assert everything._one(part, part.command([], True), tmp_path) == ""
     assert [bar.met for bar in everything.read(tmp_path / "tracking.json").requirements] == [True, True]
 
 
 def test_every_part_is_a_benchmark():
-    assert {part.name for part in everything.PARTS} <= set(command.BENCHMARKS)
+    assert {part.name.split()[0] for part in everything.PARTS} <= set(command.BENCHMARKS)
+
+
+@pytest.mark.parametrize("part", everything.PARTS, ids=lambda part: part.file)
+@pytest.mark.parametrize("quick", [True, False])
+def test_every_part_takes_its_arguments(part: everything.Part, quick: bool, tmp_path: Path):
+    """A part that is given what it does not know would be named as failed, hours later."""
+    line = part.command(["given", "given"][: 2 if part.name == "servo" else bool(part.files)], quick)
+    benchmark, parser = command.load(line[0]), argparse.ArgumentParser(exit_on_error=False)
+    benchmark.add_arguments(parser)
+    parser.parse_args([*line[1:], *(["--out", str(tmp_path)] if part.out else [])])
+
+
+def test_what_needs_files_of_others_is_skipped_without_them(tmp_path: Path, capsys):
+    assert command.main(["all", "--out", str(tmp_path), "--only", "servo", "files"]) == 0
+    assert (tmp_path / "index.md").read_text().count("skipped: no --") == 4  # in the table and in each chapter
+    assert "skipped: no --servo" in capsys.readouterr().out
+
+
+def test_tables_are_written_as_csv(tmp_path: Path):
+    assert command.main(["all", "--out", str(tmp_path), "--quick", "--only", "tracking"]) == 0
+    lines = (tmp_path / "tracking_1.csv").read_text().splitlines()
+    assert len(lines) > 2
+    assert "`python -m ce_gym.bench tracking`" in (tmp_path / "index.md").read_text()
 
 
 def test_figures_are_found_with_their_commits(tmp_path: Path):
     (tmp_path / "docs").mkdir()
+    (tmp_path / ".git").touch()
     (tmp_path / "README.md").write_text("| x | 3 | `python -m ce_gym.bench speed --rounds 9` at 1a2b3c4 |\n")
     (tmp_path / "docs" / "a.md").write_text(
         "`python -m ce_gym.bench speed` times\n\n`python -m ce_gym.bench growth`, at 0123456:"
@@ -75,3 +105,42 @@ def exists(name: str) -> bool:
 @pytest.mark.parametrize("name", sorted({figure.benchmark for figure in stale.figures(ROOT)}))
 def test_figures_name_benchmarks_that_exist(name: str):
     assert name in command.BENCHMARKS
+
+
+def test_tables_of_figures_are_found_with_what_their_section_names(tmp_path: Path):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / ".git").touch()
+    (tmp_path / "docs" / "a.md").write_text("# Words\n\n| a | b |\n|---|---|\n| x | y 3 |\n")
+    table = "| a | b |\n|---|---|\n| x | 3.5 |\n| y | ±4 |\n"
+    by_script = "```sh\npython train/a.py\n```\n\nAt 1a2b3c4:\n\n"
+    sections = "By `make speed`:\n\n", by_script, "At commit 1a2b3c4:\n\n"
+    (tmp_path / "README.md").write_text("".join(f"## Section\n\n{said}{table}" for said in sections))
+    found = list(stale.measurements(tmp_path))
+    assert [(t.page, t.command, t.commit) for t in found] == [
+        ("README.md", True, False),
+        ("README.md", True, False),  # "At": what names a commit is "at" or "commit"
+        ("README.md", False, True),
+    ]
+    assert [t.line for t in found] == [5, 17, 25]
+
+
+def test_stale_outside_a_clone_is_one_line(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(stale, "ROOT", tmp_path)
+    with pytest.raises(SystemExit, match="expected a clone of the repository"):
+        command.main(["stale"])
+
+
+WITHOUT = {
+    ("docs/numerics.md", "`Simulator(method=...)`"),  # orders of methods
+    ("docs/scene.md", "name"),  # sizes of parameters
+    ("docs/terrain.md", "a step of 0.1 m, cell"),  # follows from the figures in it
+    ("docs/scene.md", "scene"),  # of code that was tried and left out
+}
+"""Tables of numbers that no command measures."""
+
+
+def test_tables_of_figures_have_commands():
+    """In their section, or where their page begins; that of the studies of exactness has them in its protocol."""
+    tables = [t for t in stale.measurements(ROOT) if not t.command and t.page != "docs/exactness.md"]
+    without = {(t.page, t.columns.split("|")[1].strip()) for t in tables}
+    assert without <= WITHOUT

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from ce_gym.bench.measure import machine
@@ -57,3 +58,11 @@ def test_ratio_takes_the_smaller_estimate():
     compared = ratio(Timing((4.0, 6.0, 10.0)), Timing((2.0, 1.0, 2.0)))
     assert (compared.of_best, compared.median, compared.lowest, compared.highest) == (4.0, 5.0, 2.0, 6.0)
     assert compared.cautious == 4.0
+
+
+def test_figures_of_numpy_are_written():
+    report = Report("a", [Table("t", ("x", "y"), ((np.float64(0.5), np.int64(3)),))], [])
+    report.requirements.append(Requirement("one", "two", np.bool_(True)))
+    written = json.loads(report.as_json())
+    assert written["tables"][0]["rows"] == [[0.5, 3]]
+    assert written["requirements"][0]["met"] is True

@@ -51,9 +51,42 @@ def test_picture(tmp_path: Path):
 
 def test_command(tmp_path: Path, capsys):
     file = tmp_path / "stability.json"
-    assert command.main(["stability", "--quick", "--skip", "cases", "robots", "--json", str(file)]) == 0
+    assert command.main(["stability", "--quick", "--skip", "cases", "robots", "beside", "--json", str(file)]) == 0
     assert "mini_cheetah" in capsys.readouterr().out
     written = json.loads(file.read_text())
     rows = written["tables"][0]["rows"]
     assert len(rows) == 2 * len(stability_grid.STIFFNESSES)
     assert [r["met"] for r in written["requirements"]][:3] == [True, True, True]
+
+
+@pytest.fixture
+def resting():
+    pytest.importorskip("mujoco")
+    from ce_gym.bench.stability import resting
+
+    return resting
+
+
+def test_what_comes_to_rest(resting):
+    still, drifting = np.zeros((60, 3)), 0.02 * resting.HOLD * np.arange(60)[:, None] * np.ones(3)
+    assert resting.rest(still).still
+    assert resting.rest(drifting).speed == pytest.approx(0.02)
+    assert not resting.rest(drifting).still
+    assert not resting.rest(np.nan * still).finite
+
+
+def test_legs_are_held_against_each_other_and_not_let_go(resting):
+    scene = resting.resting("shanks", 2.0)
+    assert scene.holds == 100
+    np.testing.assert_array_equal(scene.drive[30], scene.drive[-1])
+    assert np.abs(scene.drive[-1] - scene.drive[0]).max() > 0.5
+
+
+@pytest.mark.slow
+def test_cells_beside_mujoco(resting):
+    """A cell of ours that moves where one of MuJoCo's is at rest is named."""
+    table, behind = resting.measure(("shanks",), (4,), 2.0)
+    ways = [row[1] for row in table.rows]
+    assert len(ways) == len(set(ways)) == 3 + 4 * 3  # levels and stiff equalities, four integrators
+    assert behind == []
+    assert all("lost" not in row[2] for row in table.rows[:3])

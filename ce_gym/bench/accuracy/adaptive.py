@@ -127,14 +127,11 @@ def run(arguments: argparse.Namespace) -> Report:
 def measure(scene: Scene, tolerances: Sequence[float], steps: Sequence[int], rounds: int) -> list[Delivered]:
     """Measure a scene at all tolerances, and our methods at all fixed steps, taking turns."""
     _, limit, known = reference(scene)
-    batches = {few: Ours(scene, "adaptive", "exact", "tangent", number) for few, number in NUM_ENVS.items()}
-    exact = replace(scene, ours=tuple(way for way in scene.ours if way[1] == "exact"))
+    batches = {few: Ours(scene, "adaptive", scene.exact, "tangent", number) for few, number in NUM_ENVS.items()}
+    exact = replace(scene, ours=tuple(way for way in scene.ours if way[1] == scene.exact and way[0] != "adaptive"))
     sides = our_sides(exact, steps, limit)
-    of = [batches[asked > FINE] for asked in tolerances]
-    sides += [
-        Side(NAME, i, partial(batch.run, 1, asked), batch.num_envs, limit)
-        for i, (asked, batch) in enumerate(zip(tolerances, of, strict=True))
-    ]
+    of = {asked: batches[asked > FINE] for asked in tolerances}
+    sides += [Side(NAME, asked, partial(batch.run, 1, asked), batch.num_envs, limit) for asked, batch in of.items()]
     paths: dict[Side, Array] = {}
     counts: dict[Side, tuple[float, float, float]] = {}
 
@@ -143,7 +140,7 @@ def measure(scene: Scene, tolerances: Sequence[float], steps: Sequence[int], rou
             paths[side] = side.run()
             if side.name == NAME:
                 names = ("steps_taken", "retries", "steps_missed")
-                counts[side] = tuple(float(of[side.n].arrays[name].mean()) for name in names)  # type: ignore[assignment]
+                counts[side] = tuple(float(of[side.dt].arrays[name].mean()) for name in names)  # type: ignore[assignment]
 
         return work
 
@@ -151,7 +148,7 @@ def measure(scene: Scene, tolerances: Sequence[float], steps: Sequence[int], rou
     seconds = {side: timings[str(i)].best / (side.robots * scene.duration) for i, side in enumerate(sides)}
     errors = {side: rms_error(scene, paths[side], limit) for side in sides}
     for name in dict.fromkeys(side.name for side in sides if side.name != NAME):
-        points = [Point(HOLD / s.n, seconds[s], errors[s], errors[s]) for s in sides if s.name == name]
+        points = [Point(s.dt, seconds[s], errors[s], errors[s]) for s in sides if s.name == name]
         known.curves.append(Curve(*name, tuple(points)))
     return [
         delivered(known, asked, errors[side], seconds[side], counts[side])

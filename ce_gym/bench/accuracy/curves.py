@@ -15,11 +15,12 @@ from functools import partial
 
 import numpy as np
 
-from ce_gym.bench.accuracy import contact as accuracy_contact
-from ce_gym.bench.accuracy import references as accuracy_references
 from ce_gym.bench.accuracy.ours import Ours
 from ce_gym.bench.accuracy.peers import Family, Peer
+from ce_gym.bench.accuracy.references import contact as accuracy_contact
+from ce_gym.bench.accuracy.references import smooth as accuracy_references
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.bench.accuracy.statements import GROUNDS, Stating
 from ce_gym.bench.measure.timing import Competitor, interleaved
 
 OUR_STEPS = (1, 2, 5, 10, 20, 50, 100, 200)
@@ -29,6 +30,8 @@ PEER_STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 NUM_ENVS = {True: 256, False: 64}
 """Robots in a batch of ours, with few steps to a hold or many."""
 FEW_STEPS = 20
+TOLERANCES = (0.3, 0.1, 0.03, 1e-2, 1e-3, 1e-4, 1e-5)
+"""Of our steps that adapt [rad or m]."""
 MARGIN = 10.0
 """How far below an error two references have to agree for it to count."""
 
@@ -38,7 +41,7 @@ class Point:
     """One step length of one method.
 
     Attributes:
-        dt: [s].
+        dt: [s]; of steps that adapt, the tolerance [rad or m].
         seconds: Time for one robot and simulated second [s].
         truth: Error against the truth; not a number if the robot diverged.
         own: Error against the method's own limit.
@@ -149,7 +152,7 @@ def measure(scene: Scene, our_steps: Sequence[int], peer_steps: Sequence[int], r
     seconds = {side: timings[str(i)].best / (side.robots * scene.duration) for i, side in enumerate(sides)}
     for name in dict.fromkeys(side.name for side in sides):
         points = [
-            Point(HOLD / s.n, seconds[s], rms_error(scene, paths[s], truth), rms_error(scene, paths[s], s.limit))
+            Point(s.dt, seconds[s], rms_error(scene, paths[s], truth), rms_error(scene, paths[s], s.limit))
             for s in sides
             if s.name == name
         ]
@@ -163,14 +166,14 @@ class Side:
 
     Attributes:
         name: Code, level and method.
-        n: Steps to a hold.
+        dt: Length of a step [s]; of steps that adapt, the tolerance [rad or m].
         run: Runs through the scene and returns positions, shape (n_holds, nq).
         robots: How many at a time.
         limit: What the method tends to, shape (n_holds, nq).
     """
 
     name: tuple[str, str, str]
-    n: int
+    dt: float
     run: Callable[[], Array]
     robots: int
     limit: Array
@@ -187,10 +190,10 @@ def reference(scene: Scene) -> tuple[Array, Array, Measured]:
         )
     explicit, n = (accuracy_contact.robot, 40_000) if scene.robot.independent else (accuracy_contact.block, 400)
     truth = explicit(scene, n)
-    fine = Ours(scene, "extrapolated", "exact", "tangent", 1)
+    fine = Ours(scene, "extrapolated", scene.exact, "tangent", 1)
     limit = fine.run(4000)
     measured = Measured(scene, rms_error(scene, limit, truth))
-    measured.limits["ce_gym", "exact"] = rms_error(scene, fine.run(2000), limit)
+    measured.limits["ce_gym", scene.exact] = rms_error(scene, fine.run(2000), limit)
     return truth, limit, measured
 
 
@@ -198,21 +201,25 @@ def our_sides(scene: Scene, steps: Sequence[int], exact: Array) -> list[Side]:
     """Return our methods at all step lengths; approximate levels tend to a truth of their own."""
     sides = []
     for method, level, friction in scene.ours:
-        limit = exact if level == "exact" else accuracy_references.ours(scene, scene.reference // 2, level)
+        limit = exact if level == scene.exact else accuracy_references.ours(scene, scene.reference // 2, level)
         name = ("ce_gym", level, method if friction == "tangent" else f"{method}, {friction}")
         batches = {few: Ours(scene, method, level, friction, number) for few, number in NUM_ENVS.items()}
+        if method == "adaptive":  # as long as a tolerance allows, a hold at most
+            several = batches[True]
+            runs = [(tolerance, partial(several.run, 1, tolerance)) for tolerance in TOLERANCES]
+            sides += [Side(name, tolerance, run, several.num_envs, limit) for tolerance, run in runs]
+            continue
         for n in steps:
             batch = batches[n <= FEW_STEPS]
-            sides.append(Side(name, n, partial(batch.run, n), batch.num_envs, limit))
+            sides.append(Side(name, HOLD / n, partial(batch.run, n), batch.num_envs, limit))
     return sides
 
 
 def peer_sides(scene: Scene, steps: Sequence[int], measured: Measured) -> list[Side]:
     """Return MuJoCo's levels, ways to hold equalities and integrators at all step lengths."""
-    families = [Family(scene, level, stiff=False) for level in scene.levels]
-    families += [
-        Family(scene, level, stiff=True) for level, soft in zip(scene.levels, families, strict=True) if soft.tied
-    ]
+    grounds: tuple[Stating | None, ...] = (None,) if scene.terrain is None else GROUNDS
+    families = [Family(scene, level, False, ground) for ground in grounds for level in scene.levels]
+    families += [Family(scene, soft.level, True, soft.ground) for soft in families if soft.tied]
     sides = []
     for family in families:
         finest = PEER_LIMIT if scene.robot.independent else 4 * PEER_LIMIT
@@ -221,7 +228,7 @@ def peer_sides(scene: Scene, steps: Sequence[int], measured: Measured) -> list[S
         for integrator in INTEGRATORS:
             for n in [n for n in steps if integrator != "RK4" or n <= MOST_STEPS_RK4]:
                 run = Peer(family, integrator, n).run
-                sides.append(Side(("MuJoCo", family.name, integrator), n, run, 1, limit))
+                sides.append(Side(("MuJoCo", family.name, integrator), HOLD / n, run, 1, limit))
     return sides
 
 
@@ -279,7 +286,7 @@ def comparisons(measured: Measured) -> list[Comparison]:
 
     Ours are the exact curves, MuJoCo's all of them. Ends where the limit of ours is known no better.
     """
-    ours = [curve for curve in measured.curves if curve.code == "ce_gym" and curve.level == "exact"]
+    ours = [curve for curve in measured.curves if curve.code == "ce_gym" and curve.level == measured.scene.exact]
     theirs = [curve for curve in measured.curves if curve.code == "MuJoCo"]
     coarse = [min((e for c in side if (e := measured.errors(c)[0]) > 0), default=1.0) for side in (ours, theirs)]
     found, exponent = [], min(-1, math.floor(math.log10(max(coarse))))

@@ -9,7 +9,9 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.control import control_sizes
 from ce_gym.sim.kernels import load_step_kernel
+from ce_gym.sim.placement import Placement
 from ce_gym.sim.schema import FIRST
+from ce_gym.sim.substeps import FRAME, HEIGHTS
 from ce_gym.sim.tiles import tiles, write_rows
 
 
@@ -33,7 +35,9 @@ class Ours:
             material=scene.robot.material,
             friction=friction,
             method=method,
+            ground="flat" if scene.terrain is None else "field",
             parameters=() if scene.push is None else ("gravity",),
+            self_collisions=scene.touching,
         )
         self.kernel = load_step_kernel(self.model, options, (), "float64")
         self.arrays = {
@@ -41,12 +45,18 @@ class Ours:
             for name, buffer in self.kernel.buffers.items()
             if buffer.kind == "tiles"
         }
+        self.tables: dict[str, Array] = {}
+        if scene.terrain is not None:
+            self.tables[HEIGHTS] = scene.terrain.heights
+            write_rows(self.arrays[FRAME], np.array([*scene.terrain.origin, scene.terrain.cell]))
         self.starts = self._starts()
         joints = len(self.model.joint_links)
         self.targets = [np.ascontiguousarray(np.broadcast_to(row, (num_envs, joints))) for row in scene.drive]
 
     def run(self, n: int, tolerance: float | None = None) -> Array:
         """Run through the scene; returns positions of the first robot at the end of every hold, (n_holds, nq).
+
+        Stretches of transmissions are not among them.
 
         Args:
             n: Sub-steps to a hold.
@@ -59,12 +69,12 @@ class Ours:
             for name in control_sizes(self.model.robot.layout):
                 self.arrays[name][:] = {"step_length": HOLD / n / FIRST, "tolerance": tolerance}.get(name, 0.0)
             self.arrays["retries"][:] = 0.0
-        path = np.empty((self.scene.holds, self.model.nq))
+        path, given = np.empty((self.scene.holds, len(self.scene.q))), self.arrays | self.tables
         for i, target in enumerate(self.targets):
             if self.scene.push is not None:
                 self.arrays["parameters"][:] = (np.array(self.scene.robot.gravity) + self.scene.push[i])[:, None]
-            self.kernel(self.arrays | {"target": target}, self.num_envs, repeats={"n_substeps": n})
-            path[i] = self.arrays["q"][0, :, 0]
+            self.kernel(given | {"target": target}, self.num_envs, repeats={"n_substeps": n})
+            path[i] = self.arrays["q"][0, : path.shape[1], 0]
         if self.arrays["diverged"].max() > 0.5:
             path[:] = np.nan
         return path
@@ -73,19 +83,20 @@ class Ours:
         """Rows of every state array at the start: robots differ a little, or all would need the same iterations."""
         model, scene = self.model, self.scene
         base = 7 if scene.robot.floating else 0
-        q = np.tile(scene.q, (self.num_envs, 1))
-        noise = scene.spread * np.random.default_rng(0).normal(size=(self.num_envs, model.nq - base + 1))
+        q, v = np.zeros((self.num_envs, model.nq)), np.zeros((self.num_envs, model.nv))
+        q[:, : len(scene.q)], v[:, : len(scene.v)] = scene.q, scene.v  # stretches, if any, come last
+        noise = scene.spread * np.random.default_rng(0).normal(size=(self.num_envs, len(scene.q) - base + 1))
         noise[0] = 0.0
-        q[:, base:] += noise[:, 1:]
+        q[:, base : len(scene.q)] += noise[:, 1:]
         if base:
             q[:, 2] += noise[:, 0]
-        rows = {"q": q, "v": np.tile(scene.v, (self.num_envs, 1)), "diverged": np.zeros((self.num_envs, 1))}
+        rows = {"q": q, "v": v, "diverged": np.zeros((self.num_envs, 1))}
         if model.contact_names:
-            centres, _ = model.contact_points(q, rows["v"])
-            radius = np.array([contact.radius for contact in scene.robot.contacts])
-            rows["load"] = scene.robot.material.stiffness * np.maximum(radius - centres[..., 2], 0.0)
-        if "anchor" in self.arrays:
-            rows["anchor"] = np.zeros((self.num_envs, self.arrays["anchor"].shape[1]))
+            depth = Placement(model, model.contact_names, scene.terrain).depth(q)
+            rows["load"] = scene.robot.material.stiffness * depth
+        for name in ("anchor", "pressed"):
+            if name in self.arrays:
+                rows[name] = np.zeros((self.num_envs, self.arrays[name].shape[1]))
         if "dependent" in self.arrays:
             rows["dependent"] = model.dependent_guess(q)
         return rows

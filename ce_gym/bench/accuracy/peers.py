@@ -14,17 +14,20 @@ import numpy as np
 from mujoco import rollout
 
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.bench.accuracy.statements import Stating, ratios, stated
 from ce_gym.dynamics.model import Model
 from ce_gym.export import mujoco_model
 from ce_gym.export.mujoco_batch import STATE
 from ce_gym.export.mujoco_model import STIFF, Settings
+from ce_gym.model.mechanism import ELASTIC
 
 mujoco.set_mju_user_warning(lambda _: None)  # it would write to a file; `Peer.diverged` says what matters
 
 
-def compiled(scene: Scene, level: str, stiff: bool = False) -> mujoco.MjModel:
+def compiled(scene: Scene, level: str, stiff: bool = False, ground: Stating | None = None) -> mujoco.MjModel:
     """Compile a scene for MuJoCo at a transmission level; torques act on the joints directly, without actuators."""
-    model = mujoco_model.compiled(scene.robot, level, Settings(1e-3, solimp=STIFF if stiff else None))
+    robot, level, also = stated(scene, level, ground)
+    model = mujoco_model.compiled(robot, level, Settings(1e-3, solimp=STIFF if stiff else None), also)
     if scene.control == "torque":
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     return model
@@ -48,11 +51,16 @@ def initial_state(scene: Scene, model: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
-def forces(scene: Scene, model: mujoco.MjModel, hold: int) -> Array:
+def forces(scene: Scene, model: mujoco.MjModel, hold: int, level: str) -> Array:
     """Return applied generalised forces during a hold, MuJoCo's coordinates, shape (nv,)."""
     force = np.zeros(model.nv)
     if scene.control == "torque":
-        for name, torque in zip(scene.robot.independent, scene.drive[hold], strict=True):
+        names, torques = scene.robot.independent, scene.drive[hold]
+        if level == ELASTIC:  # motors turn rotors
+            names, of = tuple(elastic.rotor for elastic in scene.robot.elastic), ratios(scene.robot)
+            W = np.array([[of[rotor].get(joint, 0.0) for joint in scene.robot.independent] for rotor in names])
+            torques = np.linalg.solve(W.T, torques)
+        for name, torque in zip(names, torques, strict=True):
             force[model.joint(name).dofadr[0]] = torque
     if scene.push is not None:  # at the origin of the base, which is its centre of mass
         force[:3] += model.body_mass[1] * scene.push[hold]
@@ -66,19 +74,22 @@ class Family:
         scene: The scene.
         level: Transmission level.
         stiff: Whether equalities are held as stiffly as the step allows, or by MuJoCo's default.
+        ground: What states the ground, if it is not flat.
     """
 
-    def __init__(self, scene: Scene, level: str, stiff: bool) -> None:
-        self.scene, self.stiff = scene, stiff
-        self.name = f"{level}, stiff equalities" if stiff else level
-        self.model = compiled(scene, level, stiff)
+    def __init__(self, scene: Scene, level: str, stiff: bool, ground: Stating | None = None) -> None:
+        self.scene, self.level, self.stiff, self.ground = scene, level, stiff, ground
+        of = [ground.__name__.replace("_", " ")] if ground else []
+        self.name = ", ".join([level, *of, *(["stiff equalities"] if stiff else [])])
+        self.model = compiled(scene, level, stiff, ground)
         self.start = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, initial_state(scene, self.model), self.start, STATE)
         if scene.control == "torque":
             self.spec = mujoco.mjtState.mjSTATE_QFRC_APPLIED
-            self.control = np.array([forces(scene, self.model, i) for i in range(scene.holds)])
+            self.control = np.array([forces(scene, self.model, i, level) for i in range(scene.holds)])
         else:
-            self.spec, self.control = mujoco.mjtState.mjSTATE_CTRL, scene.drive
+            driven = [scene.robot.commanded.index(name) for name in scene.robot.driven]
+            self.spec, self.control = mujoco.mjtState.mjSTATE_CTRL, scene.drive[:, driven]
 
     @property
     def tied(self) -> bool:

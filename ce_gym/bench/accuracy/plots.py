@@ -21,12 +21,15 @@ OURS = {
     "euler": ("ce_gym, Euler", SKY, "o-"),
     "euler, secant": ("ce_gym, Euler, secant friction", GREEN, "v-"),
     "extrapolated": ("ce_gym, extrapolated", BLUE, "s-"),
+    "extrapolated, secant": ("ce_gym, extrapolated, secant friction", GREEN, "s-"),
+    "adaptive": ("ce_gym, steps that adapt", BLUE, "*-"),
+    "adaptive, secant": ("ce_gym, steps that adapt, secant friction", GREEN, "*-"),
     "rk4": ("ce_gym, RK4", "black", "D-"),
 }
 APPROXIMATE = ("ce_gym, armature or coupled, Euler", GREY, "o-")
 COLORS = {"": ORANGE, "exact": "#CC79A7", "stiff": RED}
 """MuJoCo's: without rotors, rotors as bodies or loops at its default, and held stiffly."""
-VARIANTS = {"": "without rotor bodies", "exact": "rotors and loops as equalities", "stiff": "the same, stiff"}
+VARIANTS = {"": "without rotor bodies", "exact": "with rotor bodies", "stiff": "the same, stiff"}
 MARKERS = {"Euler": "o", "implicitfast": "^", "discrete": "s", "RK4": "D"}
 
 
@@ -41,12 +44,12 @@ def draw(measured: list[Measured], out: Path) -> Path:
         handles = {}
         for panel, m in zip(panels.flat, measured, strict=False):
             for curve in m.curves:
-                label, look = _look(curve)
+                label, look = _look(curve, m.scene.exact)
                 points = [(p.seconds, m.error(p)) for p in curve.points if 0 < m.error(p) < math.inf]
                 if points:
                     x, y = zip(*points, strict=True)
                     (handles[label],) = panel.plot([1e6 * t for t in x], y, label=label, **look)
-            floor = MARGIN * m.known(next(c for c in m.curves if c.level == "exact"))
+            floor = MARGIN * m.known(next(c for c in m.curves if c.level == m.scene.exact))
             panel.axhline(floor, color=GREY, linewidth=0.8, linestyle=":")
             panel.set(xscale="log", yscale="log", title=m.scene.title, ylim=(floor / 3, None))
         for panel in list(panels.flat)[len(measured) :]:
@@ -65,13 +68,13 @@ def draw(measured: list[Measured], out: Path) -> Path:
     return path
 
 
-def _look(curve: Curve) -> tuple[str, dict[str, Any]]:
+def _look(curve: Curve, exact: str) -> tuple[str, dict[str, Any]]:
     """Return label and style of a curve."""
     if curve.code == "ce_gym":
-        label, color, line = OURS[curve.method] if curve.level == "exact" else APPROXIMATE
-        dashed = curve.level != "exact"
+        label, color, line = OURS[curve.method] if curve.level == exact else APPROXIMATE
+        dashed = curve.level != exact
         return label, {"color": color, "marker": line[0], "linestyle": "--" if dashed else "-", "zorder": 5}
-    kind = "stiff" if "stiff" in curve.level else "exact" if curve.level == "exact" else ""
+    kind = "stiff" if "stiff" in curve.level else "exact" if curve.level.split(",")[0] in ("exact", exact) else ""
     marker = MARKERS[curve.method]
     label = f"MuJoCo {curve.method}, {VARIANTS[kind]}"
     return label, {"color": COLORS[kind], "marker": marker, "linestyle": "--", "markerfacecolor": "none"}

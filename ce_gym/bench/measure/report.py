@@ -89,7 +89,7 @@ class Report:
             "requirements": [vars(r) for r in self.requirements],
             "remarks": self.remarks,
         }
-        return json.dumps(content, indent=2) + "\n"
+        return json.dumps(content, indent=2, default=lambda scalar: scalar.item()) + "\n"  # of numpy
 
 
 def cell_text(cell: Cell) -> str:

@@ -1,7 +1,7 @@
 """The benchmarks of speed, accuracy and stability, one after the other, as one page with their CSV and JSON.
 
-Each runs in a process of its own, so that none finds memory or kernels of another; what a machine lacks is named as
-skipped. `--quick` takes about ten minutes, everything up to two hours.
+Each runs in a process of its own, so that none finds memory or kernels of another; what a machine lacks, and what needs
+files of others that were not given, is named as skipped. `--quick` takes about ten minutes, everything up to two hours.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,27 +25,53 @@ class Part:
     """A benchmark of the page.
 
     Attributes:
-        name: Its name.
+        name: Its name, and a study of it if it has several.
         out: Whether it writes files into a folder `--out`.
         quick: Arguments of the short run; None if it is left out there.
+        full: Arguments of the long one.
+        files: Name of the option with the files of others that it needs.
     """
 
     name: str
     out: bool = False
     quick: tuple[str, ...] | None = ()
+    full: tuple[str, ...] = ()
+    files: str = ""
+
+    @property
+    def file(self) -> str:
+        """What names of its files begin with."""
+        return self.name.replace(" ", "_")
+
+    def command(self, given: Sequence[str], quick: bool) -> list[str]:
+        """Return the arguments of `python -m ce_gym.bench`, but for where to write."""
+        return [*self.name.split(), *given, *((self.quick or ()) if quick else self.full)]
 
 
+FEW = ("--rounds", "3")
 PARTS = (
     Part("instructions"),
     Part("tracking"),
+    Part("paper", out=True, quick=None),
     Part("speed", out=True, quick=("--quick",)),
-    Part("growth", quick=("--joints", "2", "5", "10", "20", "--robots", "1", "64", "4096", "--rounds", "3")),
-    Part("throughput", quick=("--rounds", "3")),
-    Part("derivatives", quick=("--rounds", "3")),
+    Part("beside", quick=("--robots", "mini_cheetah", "tello", *FEW)),
+    Part("growth", quick=("--joints", "2", "5", "10", "20", "--robots", "1", "64", "4096", *FEW)),
+    Part("throughput", quick=FEW),
+    Part("surroundings", quick=("--parts", "spheres", "pairs", "--rounds", "10")),
+    Part("derivatives", quick=FEW),
+    Part("gradients", quick=None),
     Part("friction"),
-    Part("stability", out=True, quick=("--quick",)),
+    Part("stability", quick=("--quick",)),
     Part("accuracy", out=True, quick=("--quick",)),
-    Part("adaptive", out=True, quick=None),
+    Part("adaptive", out=True, quick=("--quick",)),
+    Part("exactness controllers", out=True, quick=("--quick",)),
+    Part("exactness contacts", out=True, quick=("--quick",)),
+    Part("exactness designs", out=True, quick=("--quick",)),
+    Part("identification", quick=("--trials", "3"), full=("--trials", "50")),
+    Part("servo", files="servo"),
+    Part("files", files="files"),
+    Part("soak", quick=("--minutes", "0.5", "--env", "ce_gym/MiniCheetahVelocity-v0"), full=("--minutes", "5")),
+    Part("fuzz", quick=("--minutes", "0.3")),
     Part("gpu", quick=None),
 )
 MISSING = 2
@@ -57,6 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("report"), help="folder of the page and of everything else")
     parser.add_argument("--quick", action="store_true", help="short runs, without the longest")
     parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME", help=", ".join(names))
+    parser.add_argument("--servo", nargs="+", default=[], metavar="PATH", help="logs and figures, as of `servo`")
+    parser.add_argument("--files", nargs=1, default=[], metavar="FOLDER", help="robot files of others, as of `files`")
 
 
 def run(arguments: argparse.Namespace) -> Report:
@@ -67,16 +96,20 @@ def run(arguments: argparse.Namespace) -> Report:
     rows = []
     for part in shown(wanted, "benchmarks"):
         start = time.perf_counter()
-        said = _one(part, arguments.out, arguments.quick)
-        found = read(arguments.out / f"{part.name}.json")
+        given = getattr(arguments, part.files) if part.files else []
+        lacking = bool(part.files) and not given
+        command = part.command(given, arguments.quick)
+        said = f"skipped: no --{part.files}" if lacking else _one(part, command, arguments.out)
+        found = Report(part.name) if lacking else read(arguments.out / f"{part.file}.json")
         rows.append((part.name, round((time.perf_counter() - start) / 60.0, 1), said or _bars(found.requirements)))
         report.requirements += [Requirement(f"{part.name}: {r.claim}", r.measured, r.met) for r in found.requirements]
-        pages.append(chapter(part.name, said, found))
+        pages.append(chapter(" ".join(command), said, found, arguments.out / part.file))
     report.tables.append(Table("Benchmarks", ("benchmark", "minutes", "bars"), tuple(rows)))
     head = [f"# Benchmarks at {commit()}", "", *(f"- {key}: {value}" for key, value in machine.describe().items())]
+    _write_tables(arguments.out, wanted)
     page = arguments.out / "index.md"
     page.write_text("\n".join([*head, "", report.tables[0].as_markdown(), "", *pages]), encoding="utf-8")
-    report.remarks.append(f"Written to {page}; beside it the JSON of each, and the files of those that write some.")
+    report.remarks.append(f"Written to {page}; beside it the JSON and the tables of each, and further files.")
     return report
 
 
@@ -97,22 +130,33 @@ def read(path: Path) -> Report:
     return Report(content["name"], tables, bars, content["remarks"], machine=content["machine"])
 
 
-def chapter(name: str, said: str, found: Report) -> str:
-    """Return what the page says of one benchmark: its command, its bars, met or missed alike, and its tables."""
+def chapter(command: str, said: str, found: Report, folder: Path) -> str:
+    """Return what the page says of one benchmark: its command, bars, met or missed alike, pictures and tables."""
+    pictures = [part for file in sorted(folder.glob("*.png")) for part in (f"![]({folder.name}/{file.name})", "")]
     bars = [f"- {'met' if bar.met else '**missed**'}: {bar.claim}: {bar.measured}" for bar in found.requirements]
     tables = [part for table in found.tables for part in (table.as_markdown(), "")]
     remarks = [part for remark in found.remarks for part in (remark, "")]
-    return "\n".join([f"## {name}", "", f"`python -m ce_gym.bench {name}`", "", said, *bars, "", *tables, *remarks])
+    head = [f"## {found.name}", "", f"`python -m ce_gym.bench {command}`", ""]
+    return "\n".join(
+        [*head, *([said, ""] if said else []), *bars, *([""] if bars else []), *pictures, *tables, *remarks]
+    )
 
 
-def _one(part: Part, out: Path, quick: bool) -> str:
+def _write_tables(out: Path, parts: Sequence[Part]) -> None:
+    """Write every table as CSV."""
+    for part in parts:
+        for i, table in enumerate(read(out / f"{part.file}.json").tables, start=1):
+            table.write_csv(out / f"{part.file}_{i}.csv")
+
+
+def _one(part: Part, command: Sequence[str], out: Path) -> str:
     """Run one, its text in a file; returns what went wrong, nothing if all went well."""
-    record = out / f"{part.name}.json"
+    record = out / f"{part.file}.json"
     record.unlink(missing_ok=True)
-    arguments = [*(["--out", str(out / part.name)] if part.out else []), *(part.quick or () if quick else ())]
-    command = [sys.executable, "-m", "ce_gym.bench", part.name, *arguments, "--json", str(record)]
-    with (out / f"{part.name}.txt").open("w", encoding="utf-8") as text:
-        finished = subprocess.run(command, stdout=text, stderr=subprocess.PIPE, text=True, check=False)
+    folder = ["--out", str(out / part.file)] if part.out else []
+    line = [sys.executable, "-m", "ce_gym.bench", *command, *folder, "--json", str(record)]
+    with (out / f"{part.file}.txt").open("w", encoding="utf-8") as text:
+        finished = subprocess.run(line, stdout=text, stderr=subprocess.PIPE, text=True, check=False)
     if record.exists():
         return ""
     last = (finished.stderr.strip().splitlines() or ["without a word"])[-1]

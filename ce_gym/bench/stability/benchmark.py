@@ -1,12 +1,13 @@
 """Stability: every time step, stiffness and slip speed on every robot; tests of others; endurance; and a map of it all.
 
-The parts are in stability_grid.py (the map), stability_cases.py (tests of small mechanisms), stability_robots.py
-(endurance) and stability_plots.py.
+The parts are in grid.py (the map), cases.py (tests of small mechanisms), robots.py (endurance), resting.py (MuJoCo on
+the same cells) and plots.py.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import itertools
 from pathlib import Path
 
@@ -27,6 +28,10 @@ PATIENCE, COLLAPSE, STANDING, FUZZ = 120.0, 3.0, 600.0, 1_000_000
 """Longest time to come to rest [s], time of a collapse [s], time of standing [s], robot-steps of random torques."""
 RETRY = 6
 """Halvings of a step for those whom random torques break."""
+PARTS = ("map", "cases", "robots", "beside")
+BESIDE = ("drop_3cm", "drop_3cm elastic", "stairs", "shanks", "biped")
+RESTING = 20.0
+"""Scenes that come to rest beside MuJoCo, and how long they have [s]."""
 DRIFT = 1e-3
 """Largest drift of a robot that stands [m]."""
 
@@ -38,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dt", type=float, nargs="+", default=list(grid.STEPS), metavar="S", help="time steps of the map"
     )
     parser.add_argument("--quick", action="store_true", help="one robot, two time steps, short waits: a minute")
-    parser.add_argument("--skip", nargs="+", default=[], choices=("map", "cases", "robots"), help="parts to leave out")
+    parser.add_argument("--skip", nargs="+", default=[], choices=PARTS, help="parts to leave out")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="also draw the map to a PNG file")
 
 
@@ -62,6 +67,8 @@ def run(arguments: argparse.Namespace) -> Report:
     if "robots" not in arguments.skip:
         standing, fuzz = (60.0, 100_000) if quick else (STANDING, FUZZ)
         report_robots(report, models, standing, fuzz)
+    if "beside" not in arguments.skip:
+        report_beside(report, BESIDE[:1] if quick else BESIDE, (4, 1) if quick else None)
     return report
 
 
@@ -142,3 +149,16 @@ def report_robots(report: Report, models: dict[str, Model], standing: float, fuz
         Requirement("random torques up to the limits: none lost", f"{lost}", lost == 0),
         Requirement(f"the same with up to {RETRY} halvings of a step that fails", f"{given_up}", given_up == 0),
     ]
+
+
+def report_beside(report: Report, names: tuple[str, ...], steps: tuple[int, ...] | None) -> None:
+    """Add what comes to rest beside MuJoCo, with every integrator; nothing without it."""
+    if importlib.util.find_spec("mujoco") is None:
+        report.remarks.append("Cells beside MuJoCo: skipped, mujoco is not installed.")
+        return
+    from ce_gym.bench.stability import resting
+
+    table, behind = resting.measure(names, steps or resting.STEPS, RESTING)
+    report.tables.append(table)
+    text = ", ".join(behind) or "none moves"
+    report.requirements.append(Requirement("beside MuJoCo: at rest wherever some way of its is", text, not behind))

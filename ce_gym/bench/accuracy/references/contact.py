@@ -4,7 +4,8 @@ The law is that of `ce_gym.dynamics.forces.contact` in the limit of no step leng
 out at v_n pushes with lam = max(0, k d - c v_n). Its bristle s follows the sliding velocity, s' = v_t, as far as
 |s| <= mu lam / k_t; it resists with min(1, mu lam / |x|) x, where x = k_t s + (mu lam / v_s) v_t. Nothing here is
 linearised, predicted or taken one step ahead, so the steps have to be tiny. The block is plain numpy and rigid-body
-mechanics; robots take the acceleration from `Model`'s forward dynamics under wrenches. Midpoint rule throughout.
+mechanics; robots take the acceleration from `Model`'s forward dynamics under wrenches. Midpoint rule throughout. On
+stairs a sphere meets the plane that their surface has where a sphere on the plane under its centre would touch it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from ce_gym.bench.accuracy.references import restated
+from ce_gym.bench.accuracy.references.restated import Moving, passive, plane, pressed
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
 from ce_gym.compile import Buffer, Call, Program, Repeat, aligned_zeros, lane_count, load_kernel, source_fingerprint
 from ce_gym.dynamics.model import Model
@@ -85,13 +88,17 @@ def robot(scene: Scene, n: int) -> Array:
     """Return positions of a robot at the end of every hold, with `n` steps to a hold, shape (n_holds, nq)."""
     model = Model(scene.robot)
 
+    ground = "" if scene.terrain is None else f"{scene.terrain} {scene.terrain.heights[:, 0].tolist()}"
+    sources = source_fingerprint(__name__, restated.__name__)
+    key = f"{sources} {model_key(model)} {ground} {scene.touching}"
+
     def build() -> Program:
-        step = _midpoint_step(model)
+        step = _midpoint_step(scene)
         buffers = [Buffer(name, step.numel_in(name), "tiles") for name in step.name_in()]
-        call = Call(step, tuple(step.name_in()), ("q", "v", "s"))
+        call = Call(step, tuple(step.name_in()), tuple(step.name_in()[: step.n_out()]))
         return Program(f"{scene.robot.name} explicit contact", tuple(buffers), (Repeat("n", (call,)),))
 
-    kernel = load_kernel(f"{source_fingerprint(__name__)} {model_key(model)}", build, "float64")
+    kernel = load_kernel(key, build, "float64")
     lanes = lane_count("float64")
     arrays = {name: aligned_zeros((1, buffer.size, lanes), "float64") for name, buffer in kernel.buffers.items()}
     arrays["q"][0], arrays["v"][0], arrays["dt"][:] = scene.q[:, None], scene.v[:, None], HOLD / n
@@ -103,23 +110,24 @@ def robot(scene: Scene, n: int) -> Array:
     return path
 
 
-def _midpoint_step(model: Model) -> ca.Function:
-    """Trace one explicit midpoint step of a floating robot under position control, feet against the plane z = 0."""
+def _midpoint_step(scene: Scene) -> ca.Function:
+    """Trace one explicit midpoint step of a floating robot under position control, against the ground and itself."""
+    model = Model(scene.robot)
     q, v, s = SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("s", 2 * len(model.contact_names))
     target, h = SX.sym("target", len(model.joint_links)), SX.sym("dt")
-    q_rate, v_rate, slide, reach = _rates(model, q, v, s, target)
+    q_rate, v_rate, slide, reach = _rates(scene, model, q, v, s, target)
     half = q + h / 2 * q_rate, v + h / 2 * v_rate, _bent_symbols(s + h / 2 * slide, reach)
-    q_rate, v_rate, slide, reach = _rates(model, *half, target)
+    q_rate, v_rate, slide, reach = _rates(scene, model, *half, target)
     q_next = q + h * q_rate
     q_next[3:7] /= ca.norm_2(q_next[3:7])
     after = [q_next, v + h * v_rate, _bent_symbols(s + h * slide, reach)]
-    names = ["q", "v", "s"]
-    return ca.Function(
-        "step", [q, v, s, target, h], after, [*names, "target", "dt"], [f"{name}_next" for name in names]
-    )
+    n = 3 if s.numel() else 2  # no bristles without contacts
+    names, state = ["q", "v", "s"][:n], [q, v, s][:n]
+    given, ends = [*state, target, h], [f"{name}_next" for name in names]
+    return ca.Function("step", given, after[:n], [*names, "target", "dt"], ends)
 
 
-def _rates(model: Model, q: SX, v: SX, s: SX, target: SX) -> tuple[SX, SX, SX, list[SX]]:
+def _rates(scene: Scene, model: Model, q: SX, v: SX, s: SX, target: SX) -> tuple[SX, SX, SX, list[SX]]:
     """Return time derivatives of positions and velocities, sliding velocities, and how far bristles may bend."""
     law, robot = model.robot.material, model.robot
     w, x, y, z = ca.vertsplit(q[3:7])
@@ -128,11 +136,14 @@ def _rates(model: Model, q: SX, v: SX, s: SX, target: SX) -> tuple[SX, SX, SX, l
     w, x, y, z = ca.vertsplit(unit)
     turning = ca.blockcat([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) @ v[:3] / 2
     poses = model.casadi_function("body_poses")
-    base = poses(q)[1][:, :3]
+    places = poses(q)
+    base = places[1][:, :3]
     q_rate = ca.vertcat(base @ v[3:6], turning, v[6:])
     at_q, along = SX.sym("q", model.nq), SX.sym("q_rate", model.nq)
-    R_of_q = poses(at_q)[1]
-    rotations, turns = ca.Function("turns", [at_q, along], [R_of_q, ca.jtimes(R_of_q, at_q, along)])(q, q_rate)
+    at_p, R_of_q = poses(at_q)
+    rotations, turns, moving = ca.Function(
+        "turns", [at_q, along], [R_of_q, *(ca.jtimes(x, at_q, along) for x in (R_of_q, at_p))]
+    )(q, q_rate)
 
     centres, velocities = model.casadi_function("contact_points")(q, v)
     wrenches, slides, reaches = [SX(6, 1) for _ in robot.bodies], [], []
@@ -140,22 +151,28 @@ def _rates(model: Model, q: SX, v: SX, s: SX, target: SX) -> tuple[SX, SX, SX, l
         which = model.body_names.index(sphere.body)
         columns = slice(3 * which, 3 * which + 3)
         spin = turns[:, columns] @ rotations[:, columns].T  # of the body, as a skew matrix
-        arm = SX([0.0, 0.0, -sphere.radius])
+        height, n = plane(scene.terrain, centres[0, i], sphere.radius)
+        arm, depth = -sphere.radius * n, sphere.radius - n[2] * (centres[2, i] - height)
         at, velocity = centres[:, i] + arm, velocities[:, i] + spin @ arm
-        lam = ca.if_else(at[2] < 0, ca.fmax(-law.stiffness * at[2] - law.damping * velocity[2], 0), 0)
-        cone = law.friction * lam
-        trial = law.bristle * s[2 * i : 2 * i + 2] + cone / law.slip_speed * velocity[:2]
-        force = ca.vertcat(-ca.fmin(1, cone / ca.sqrt(ca.sumsqr(trial) + 1e-30)) * trial, lam)
+        out = ca.dot(n, velocity)
+        lam = ca.if_else(depth > 0, ca.fmax(law.stiffness * depth - law.damping * out, 0), 0)
+        cone, slide, flat = law.friction * lam, velocity - out * n, s[2 * i : 2 * i + 2]
+        bristle = ca.vertcat(flat, -ca.dot(n[:2], flat) / n[2])  # in the plane
+        trial = law.bristle * bristle + cone / law.slip_speed * slide
+        force = -ca.fmin(1, cone / ca.sqrt(ca.sumsqr(trial) + 1e-30)) * trial + lam * n
         wrenches[which] += ca.vertcat(ca.cross(at, force), force)
-        slides.append(ca.if_else(lam > 0, velocity[:2], 0))
-        reaches.append(cone / law.bristle)
+        slides.append(ca.if_else(lam > 0, slide[:2], 0))
+        reaches.append(cone / law.bristle * ca.sqrt((ca.sumsqr(flat) + 1e-30) / (ca.sumsqr(bristle) + 1e-30)))
+    bodies = Moving(model.body_names, (places[0], places[1]), turns, moving)
+    for which, wrench in pressed(scene, bodies):
+        wrenches[which] += wrench
     kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
     torques = []
     for i, name in enumerate(robot.independent):
         joint = robot.body(name).joint
         asked = kp.get(name, 0.0) * (target[i] - q[7 + i]) - kd.get(name, 0.0) * v[6 + i]
-        torques.append(ca.fmin(joint.torque, ca.fmax(-joint.torque, asked)) - joint.damping * v[6 + i])
-    tau = ca.vertcat(SX(6, 1), *torques)
+        torques.append(ca.fmin(joint.torque, ca.fmax(-joint.torque, asked)))
+    tau = ca.vertcat(SX(6, 1), *torques) - passive(model, q, v)
     v_rate = model.casadi_function("forward_dynamics_with_wrenches")(q, v, tau, ca.vertcat(*wrenches))
     return q_rate, v_rate, ca.vertcat(*slides), reaches
 

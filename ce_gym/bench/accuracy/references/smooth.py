@@ -4,26 +4,38 @@
 One is our eighth-order method with tiny steps, evaluated by CasADi. The other takes MuJoCo's mass matrix, bias forces
 and equality Jacobian, lets the spanning joints (rotors are bodies) accelerate only in the null space of that Jacobian,
 which MuJoCo itself does not do, and integrates them with the classical fourth-order method, in MuJoCo's coordinates.
+Where transmissions stretch, what their springs do is written down here once more.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
 from ce_gym.bench.accuracy.peers import compiled, forces, initial_state, positions
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.bench.accuracy.statements import ratios
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.mechanism import ELASTIC
 
 
-def ours(scene: Scene, n: int, level: str = "exact") -> Array:
-    """Return positions at the end of every hold from rk8 with `n` steps to a hold, shape (n_holds, nq)."""
-    model = Model(scene.robot, transmission=level)
+def ours(scene: Scene, n: int, level: str | None = None) -> Array:
+    """Return positions at the end of every hold from rk8 with `n` steps to a hold, shape (n_holds, nq).
+
+    Args:
+        scene: The scene.
+        n: Steps to a hold.
+        level: Transmission level; the one that leaves nothing out if None.
+    """
+    model = Model(scene.robot, transmission=level or scene.exact)
     step = step_function(model.mechanism, StepOptions(HOLD / n, scene.control, method="rk8"))
-    state = {"q": scene.q, "v": scene.v, "diverged": np.zeros(1)}
+    q, v = (np.pad(x, (0, n_all - len(x))) for x, n_all in ((scene.q, model.nq), (scene.v, model.nv)))
+    state = {"q": q, "v": v, "diverged": np.zeros(1)}
     if "dependent" in step.name_in():
         state["dependent"] = model.dependent_guess(scene.q)
     path = []
@@ -32,7 +44,7 @@ def ours(scene: Scene, n: int, level: str = "exact") -> Array:
         for _ in range(n):
             result = step(**state, **given)
             state = {name: result[f"{name}_next"] for name in state}
-        path.append(np.array(state["q"]).ravel())
+        path.append(np.array(state["q"]).ravel()[: len(scene.q)])
     return np.array(path)
 
 
@@ -63,7 +75,9 @@ class _Constrained:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self.model = compiled(scene, "exact")
+        self.model = compiled(scene, scene.exact)
+        self.model.tendon_stiffness[:], self.model.tendon_damping[:] = 0.0, 0.0
+        self.springs = springs(scene, self.model)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.data = initial_state(scene, self.model)
         self.mass = np.zeros((self.model.nv, self.model.nv))
@@ -92,7 +106,13 @@ class _Constrained:
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_fullM(model, data, self.mass)
-        force = self._force(qpos, qvel, hold) + data.qfrc_passive - data.qfrc_bias - self.mass @ drift
+        force = (
+            self._force(qpos, qvel, hold)
+            - self.springs(qpos, qvel)
+            + data.qfrc_passive
+            - data.qfrc_bias
+            - self.mass @ drift
+        )
         a = drift + basis @ np.linalg.solve(basis.T @ self.mass @ basis, basis.T @ force)
         return np.concatenate([self._motion(qpos, qvel), a])
 
@@ -104,7 +124,7 @@ class _Constrained:
         return y
 
     def _force(self, qpos: Array, qvel: Array, hold: int) -> Array:
-        force, scene = forces(self.scene, self.model, hold), self.scene
+        force, scene = forces(self.scene, self.model, hold, self.scene.exact), self.scene
         if scene.control == "position":
             kp, kd = dict(scene.robot.gains.kp), dict(scene.robot.gains.kd)
             y = positions(scene, self.model, qpos)[7 if scene.robot.floating else 0 :]
@@ -124,6 +144,18 @@ class _Constrained:
         w, x, y, z = qpos[3:7]
         turning = 0.5 * np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) @ qvel[3:6]
         return np.concatenate([qvel[:3], turning, qvel[6:]])
+
+
+def springs(scene: Scene, model: mujoco.MjModel) -> Callable[[Array, Array], Array]:
+    """Return the generalised forces, MuJoCo's coordinates, that springs of transmissions resist with."""
+    if scene.exact != ELASTIC:
+        return lambda qpos, qvel: np.zeros(model.nv)
+    ties, stretch = ratios(scene.robot), np.zeros((len(scene.robot.elastic), model.nv))
+    for row, elastic in zip(stretch, scene.robot.elastic, strict=True):
+        for name, ratio in {elastic.rotor: -1.0, **ties[elastic.rotor]}.items():
+            row[model.joint(name).dofadr[0]] = -ratio
+    k, d = (np.array([getattr(e, figure) for e in scene.robot.elastic]) for figure in ("stiffness", "damping"))
+    return lambda qpos, qvel: stretch.T @ (k * (stretch @ qpos) + d * (stretch @ qvel))
 
 
 def _null_space(J: Array) -> Array:

@@ -1,0 +1,34 @@
+"""The scenes of the accuracy benchmark: which robot, from where, driven how and for how long."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ce_gym.bench.accuracy.scenarios.blocks import BLOCK_FRICTION, GRAVITY, blocks
+from ce_gym.bench.accuracy.scenarios.feet import biped, drop, stairs, trot
+from ce_gym.bench.accuracy.scenarios.flight import belt_leg, elastic_leg, four_bar, humanoid, stiff_leg, tello, tumble
+from ce_gym.bench.accuracy.scenarios.links import shanks
+from ce_gym.bench.accuracy.scenarios.scene import HOLD, Array, Scene
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "humanoid": humanoid,
+    "tumble": tumble,
+    "four_bar": four_bar,
+    "tello": tello,
+    "belt_leg": belt_leg,
+    "stiff_1e3": lambda: stiff_leg(1e3),
+    "stiff_1e4": lambda: stiff_leg(1e4),
+    "stiff_1e5": lambda: stiff_leg(1e5),
+    "drop_3cm": lambda: drop(0.03, 0.3),
+    "drop_30cm": lambda: drop(0.3, 0.5),
+    "drop_100cm": lambda: drop(1.0, 0.7),
+    "trot": trot,
+    **blocks(),
+    "elastic": elastic_leg,
+    "stairs": stairs,
+    "shanks": shanks,
+    "biped": biped,
+}
+"""All scenes, made when called for."""
+
+__all__ = ["BLOCK_FRICTION", "GRAVITY", "HOLD", "SCENES", "Array", "Scene"]

@@ -1,0 +1,133 @@
+# pyright: reportAttributeAccessIssue=false
+"""What MJCF of the project's export leaves out, said in MuJoCo's terms: springs of transmissions, stairs, capsules.
+
+(MuJoCo's compiled modules carry no types, hence the line above.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import TypeAlias
+
+import mujoco
+import numpy as np
+
+from ce_gym.bench.accuracy.scenarios import Scene
+from ce_gym.export.joint_ties import joint_ties
+from ce_gym.model import Robot
+from ce_gym.model.checks.collisions import capsules_of
+from ce_gym.model.mechanism import ELASTIC, build_mechanism
+
+Stating: TypeAlias = Callable[[Scene, mujoco.MjSpec], None]
+"""Adds something of a scene to a description."""
+
+
+def stated(scene: Scene, level: str, ground: Stating | None) -> tuple[Robot, str, Callable[[mujoco.MjSpec], None]]:
+    """Return the robot that is to be exported, at which level, and what completes its description."""
+
+    def also(spec: mujoco.MjSpec) -> None:
+        for say in said:
+            say(scene, spec)
+
+    said = [ground] if ground else []
+    if scene.touching:
+        said.append(capsules)
+    if level != ELASTIC:
+        return scene.robot, level, also
+    rotors = tuple(elastic.rotor for elastic in scene.robot.elastic)
+    ties = tuple(tie for tie in scene.robot.constraints if not set(rotors) & set(tie.bodies))
+    free = replace(scene.robot, constraints=ties, independent=(*scene.robot.independent, *rotors), elastic=())
+    said.append(tendons)
+    return free, "exact", also
+
+
+def ratios(robot: Robot) -> dict[str, dict[str, float]]:
+    """Return how far each rotor turns for a unit of each independent joint, by rotor and joint."""
+    ties = joint_ties(build_mechanism(robot, "exact", eliminate=False))
+    return {rotor.name: ties[rotor.name].ratios for rotor in robot.rotors()}
+
+
+def tendons(scene: Scene, spec: mujoco.MjSpec) -> None:
+    """Let rotors turn freely but for tendons, whose length is the stretch, with stiffness and damping."""
+    of = ratios(scene.robot)
+    for elastic in scene.robot.elastic:
+        tendon = spec.add_tendon(name=f"{elastic.rotor}_spring", springlength=[0.0, 0.0])
+        tendon.stiffness[0], tendon.damping[0] = elastic.stiffness, elastic.damping
+        tendon.wrap_joint(elastic.rotor, 1.0)
+        for joint, ratio in of[elastic.rotor].items():
+            tendon.wrap_joint(joint, -ratio)
+
+
+def capsules(scene: Scene, spec: mujoco.MjSpec) -> None:
+    """Add the capsules of links that push each other apart, without friction; each pair has a bit of its own."""
+    for i, pair in enumerate(scene.touching):
+        for link, bits in zip(pair, ({"contype": 2 << i}, {"conaffinity": 2 << i}), strict=True):
+            for capsule in capsules_of(scene.robot, link):
+                masks = {"contype": 0, "conaffinity": 0, **bits}
+                spec.body(link).add_geom(
+                    type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+                    fromto=[*capsule.start, *capsule.end],
+                    size=[capsule.radius, 0.0, 0.0],
+                    condim=1,
+                    **masks,
+                )
+
+
+HALF_WIDTH, DEEP = 3.0, 1.0
+"""Of stairs in MuJoCo, to either side and downwards [m]."""
+
+
+def boxes(scene: Scene, spec: mujoco.MjSpec) -> None:
+    """Add a box for every step of stairs, sharp where a field of ours is round."""
+    x, heights, cell = _profile(scene)
+    edges = [*np.flatnonzero(np.diff(heights)), len(heights) - 1]
+    for first, last in pairwise(edges):
+        start, end = (x[i] + cell / 2 for i in (first, last))
+        half = [(end - start) / 2 + (HALF_WIDTH if last == edges[-1] else 0.0), HALF_WIDTH, DEEP / 2]
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[start + half[0], 0.0, heights[last] - DEEP / 2],
+            size=half,
+            **_ground(scene),
+        )
+
+
+def height_field(scene: Scene, spec: mujoco.MjSpec) -> None:
+    """Add the heights of the stairs as MuJoCo's height field, flat triangles between them, in place of the plane."""
+    spec.delete(spec.geom("ground"))
+    x, heights, cell = _profile(scene)
+    before = round(1.0 / cell)  # on level ground before and after
+    heights = np.pad(heights, before, mode="edge")
+    long, most = (len(heights) - 1) * cell / 2, heights.max()
+    field = spec.add_hfield(
+        name="stairs",
+        size=[long, HALF_WIDTH, most, DEEP],
+        nrow=2,
+        ncol=len(heights),
+        userdata=np.tile(heights / most, 2).tolist(),
+    )
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname=field.name,
+        pos=[x[0] - before * cell + long, 0.0, 0.0],
+        **_ground(scene),
+    )
+
+
+GROUNDS: tuple[Stating, ...] = (boxes, height_field)
+"""MuJoCo's ways to say what stairs are."""
+
+
+def _profile(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return places along x, heights and the distance between places [m] of a field that is alike along y."""
+    terrain = scene.terrain
+    assert terrain is not None  # statements of the ground are asked for where there is a field
+    heights = terrain.heights[:, 0]
+    return terrain.origin[0] + terrain.cell * np.arange(len(heights)), heights, terrain.cell
+
+
+def _ground(scene: Scene) -> dict[str, object]:
+    """Return what geoms of the ground have in common: only contact spheres touch them."""
+    return {"friction": [scene.robot.material.friction, 0.005, 0.0001], "contype": 0, "conaffinity": 1}
