@@ -323,6 +323,13 @@ def test_the_live_page_is_the_same_and_a_narrow_window_keeps_all(twins: list[Rol
 
 
 SCAN = [(x, y) for x in (-0.4, 0.1, 0.6) for y in (-0.3, 0.0, 0.3)]
+FOOT = {"link": "FL_knee_link", "at": [[0.02, 0.0, -0.19], [-0.02, 0.0, -0.19]], "points": [[0.1, 0.0], [-0.1, 0.05]]}
+RAYS = {
+    "link": "Floating Base",
+    "at": [[0.2, 0.0, 0.05]],
+    "rays": [[0.8, 0.0, -0.6], [0.6, 0.64, -0.48], [0.6, 0.0, 0.8]],
+}
+SCANS = [{"link": "", "at": [[0.0, 0.0, 0.0]], "points": SCAN}, FOOT, {**RAYS, "reach": 1.2, "steps": 24}]
 
 
 @pytest.fixture(scope="module")
@@ -335,7 +342,7 @@ def on_stones(twins: list[Rollout], tmp_path_factory: pytest.TempPathFactory):
         q = twin.q.copy()
         q[:, 3], q[:, 6] = np.cos(0.25), np.sin(0.25)
         q[:, 2] += ground.at(q[:, 0], q[:, 1])[:, 0]
-        raised.append(replace(twin, q=q, ground=ground, scan=SCAN))
+        raised.append(replace(twin, q=q, ground=ground, scan=SCANS))
     file = write_html(raised, tmp_path_factory.mktemp("stones") / "stones.html", spacing=0.0)
     with Chromium(file.as_uri() + "#t=1", size=(700, 500)) as browser:
         browser.until("fields.length === 1")
@@ -355,19 +362,26 @@ def test_the_ground_is_where_the_model_says(on_stones) -> None:
     assert browser.run(f"(() => {{ viewer.scene.updateMatrixWorld(); return {same}; }})()")
 
 
+def drawn(ground: Terrain, places: np.ndarray) -> np.ndarray:
+    """Heights of what is drawn of a field, which has a vertex at each half cell."""
+    half = ground.cell / 2
+    low = ground.origin + half * np.floor((places - ground.origin) / half)
+    s, t = (places - low).T / half
+    z00, z01, z10, z11 = (ground.at(*(low + half * np.array(c)).T)[:, 0] for c in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    return (1 - s) * ((1 - t) * z00 + t * z01) + s * ((1 - t) * z10 + t * z11)
+
+
 def test_the_height_scan_is_on_the_ground_and_turns_with_the_heading(on_stones, tmp_path: Path) -> None:
     browser, ground = on_stones
-    dots = np.reshape(browser.run("Array.from(fields[0].dots.geometry.attributes.position.array)"), (-1, 3))
+    dots = np.reshape(browser.run("Array.from(fields[0].dots.geometry.attributes.position.array)"), (-1, 3))[
+        : len(SCAN)
+    ]
     x, y, z, w = browser.run("node(fields[0].bodies[0]).object.quaternion.toArray()")
     base = browser.run("node(fields[0].bodies[0]).object.position.toArray()")
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     turned = np.array(SCAN) @ [[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]]
     np.testing.assert_allclose(dots[:, :2], base[:2] + turned, atol=1e-5)
-    half = ground.cell / 2  # what is drawn has a vertex at each of these distances
-    low = ground.origin + half * np.floor((dots[:, :2] - ground.origin) / half)
-    s, t = (dots[:, :2] - low).T / half
-    z00, z01, z10, z11 = (ground.at(*(low + half * np.array(c)).T)[:, 0] for c in ((0, 0), (0, 1), (1, 0), (1, 1)))
-    expected = (1 - s) * ((1 - t) * z00 + t * z01) + s * ((1 - t) * z10 + t * z11)
+    expected = drawn(ground, dots[:, :2])
     np.testing.assert_allclose(dots[:, 2], expected + 0.01, atol=1e-5)
     assert np.ptp(expected) > 0.01
     with_dots = pixels(browser, tmp_path / "dots.png")
@@ -375,6 +389,38 @@ def test_the_height_scan_is_on_the_ground_and_turns_with_the_heading(on_stones, 
     without = pixels(browser, tmp_path / "none.png")
     browser.run("fields[0].dots.visible = true; viewer.set_dirty()")
     assert (np.abs(with_dots - without).max(-1) > 40).sum() > 20
+
+
+def test_scans_of_feet_and_rays_end_where_the_sensors_look(on_stones, twins: list[Rollout], tmp_path: Path) -> None:
+    """Against the model's own poses; rays, of which one looks up, end on the ground or at their reach."""
+    browser, ground = on_stones
+    frame = round(browser.run("animator.time") / STEP)
+    q = twins[0].q[frame].copy()
+    q[3], q[6] = np.cos(0.25), np.sin(0.25)
+    q[2] += ground.at(q[0], q[1])[0]
+    model = Model(ROBOT)
+    positions, rotations = (dict(zip(model.body_names, rows[0], strict=True)) for rows in model.body_poses(q[None]))
+    dots = np.reshape(browser.run("Array.from(fields[0].dots.geometry.attributes.position.array)"), (-1, 3))[
+        len(SCAN) :
+    ]
+    middle = (positions[FOOT["link"]] + np.array(FOOT["at"]) @ rotations[FOOT["link"]].T).mean(0)
+    turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    np.testing.assert_allclose(dots[:2, :2], middle[:2] + np.array(FOOT["points"]) @ turn, atol=2e-4)
+    lines = np.reshape(browser.run("Array.from(fields[0].lines.geometry.attributes.position.array)"), (-1, 2, 3))
+    start = positions[RAYS["link"]] + rotations[RAYS["link"]] @ RAYS["at"][0]
+    np.testing.assert_allclose(lines[:, 0], np.tile(start, (3, 1)), atol=2e-4)
+    reached = np.linalg.norm(lines[:, 1] - start, axis=1)
+    along = np.array(RAYS["rays"]) @ rotations[RAYS["link"]].T
+    np.testing.assert_allclose(lines[:, 1], start + reached[:, None] * along, atol=3e-4)
+    np.testing.assert_allclose(dots[2:], lines[:, 1] + [0.0, 0.0, 0.01], atol=1e-5)
+    assert reached[2] == pytest.approx(1.2, abs=1e-4)
+    np.testing.assert_allclose(lines[:2, 1, 2], drawn(ground, lines[:2, 1, :2]), atol=2e-3)  # by regula falsi
+    assert (reached[:2] < 1.1).all()
+    seen = pixels(browser, tmp_path / "rays.png")
+    browser.run("fields[0].lines.visible = false; viewer.set_dirty()")
+    without = pixels(browser, tmp_path / "none.png")
+    browser.run("fields[0].lines.visible = true; viewer.set_dirty()")
+    assert (np.abs(seen - without).max(-1) > 10).sum() > 50
 
 
 def test_the_ground_is_seen_and_its_relief(on_stones, tmp_path: Path) -> None:

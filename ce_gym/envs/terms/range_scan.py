@@ -10,12 +10,11 @@ from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.recursion.kinematics import constant
 from ce_gym.envs.terms.context import TermContext
-from ce_gym.envs.terms.grid import check_of
+from ce_gym.envs.terms.grid import check_of, numbers, ray_directions, turned
 
 MOST_PLACES = 4000
 """How many places one sensor looks at, rays times steps."""
@@ -63,46 +62,25 @@ def range_scan(
         ValueError: One line that names the parameter, its value and what was expected.
     """
     check, three = check_of("range_scan"), "three numbers"
-    check("position", position, _numbers(position, 3), three)
-    check("rotation", rotation, _numbers(rotation, 3), three)
+    check("position", position, numbers(position, 3), three)
+    check("rotation", rotation, numbers(rotation, 3), three)
     for name, value, least in (("reach", reach, 1e-3), ("drift", drift, 0)):
-        check(name, value, _numbers([value], 1) and value >= least, f"a length from {least:g} m on")
-    check("dropout", dropout, _numbers([dropout], 1) and 0 <= dropout < 1, "a share from 0 up to 1")
+        check(name, value, numbers([value], 1) and value >= least, f"a length from {least:g} m on")
+    check("dropout", dropout, numbers([dropout], 1) and 0 <= dropout < 1, "a share from 0 up to 1")
     check("steps", steps, isinstance(steps, int) and steps >= 1, "a whole number from 1 on")
     bodies = s.kinematics.bodies
     link = link or s.mechanism.robot.bodies[0].name
     check("link", link, link in bodies, f"one of {', '.join(bodies)}")
-    directions = _ray_directions(rays, view, pattern)
+    directions = ray_directions(rays, view, pattern)
     check("rays", rays, directions.shape[1] * steps <= MOST_PLACES, f"at most {MOST_PLACES} rays times steps")
     body = bodies[link]
     start = body.point_position(constant(np.array(position, dtype=float)))
-    along = body.R @ ca.DM(_turned(rotation) @ directions)
+    along = body.R @ ca.DM(turned(rotation) @ directions)
     hit = _hit(s, start, along, reach, steps)
     reading = ca.if_else(hit < reach, hit + (drift * s.drift("offset") if drift else 0), reach)
     if dropout:
         reading = ca.if_else(s.chance(reading.numel()) < dropout, reach, reading)
     return scale * ca.fmax(0, ca.fmin(reach, reading))
-
-
-def _ray_directions(rays: Sequence[int], view: Sequence[float], pattern: str) -> NDArray:
-    """Return unit vectors in the sensor's frame, rows from the top, columns from the left, shape (3, n)."""
-    check = check_of("range_scan")
-    whole = isinstance(rays, Sequence) and len(rays) == 2 and all(isinstance(n, int) and n >= 1 for n in rays)
-    check("rays", rays, whole, "two whole numbers from 1 on")
-    widest = np.pi if pattern == "camera" else 2 * np.pi
-    angles = _numbers(view, 2) and all(0 <= x < widest + 1e-9 for x in view)
-    check("view", view, angles, f"two angles from 0 to {widest:.2f}")
-    check("pattern", pattern, pattern in ("lidar", "camera"), "'lidar' or 'camera'")
-    if pattern == "camera":
-        up, left = (
-            np.tan(v / 2) * np.linspace(1, -1, n) if n > 1 else np.zeros(1) for v, n in zip(view, rays, strict=True)
-        )
-        z, y = (x.ravel() for x in np.meshgrid(up, left, indexing="ij"))
-        seen = np.stack([np.ones_like(y), y, z])
-        return seen / np.linalg.norm(seen, axis=0)
-    up, left = (v / 2 * np.linspace(1, -1, n) if n > 1 else np.zeros(1) for v, n in zip(view, rays, strict=True))
-    e, a = (x.ravel() for x in np.meshgrid(up, left, indexing="ij"))
-    return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
 def _hit(s: TermContext, start: SX, along: SX, reach: float, steps: int) -> SX:
@@ -137,17 +115,3 @@ def _hit(s: TermContext, start: SX, along: SX, reach: float, steps: int) -> SX:
             ca.if_else(into, here, under),
         )
     return ca.if_else(above[0] <= 0, 0, low + (high - low) * over / ca.fmax(over - under, SMALLEST))
-
-
-def _turned(rotation: Sequence[float]) -> NDArray:
-    """Rotation of roll, pitch and yaw about the link's fixed axes x, y, z."""
-    (a, b, c), (d, e, f) = np.cos(rotation), np.sin(rotation)
-    about_x = np.array([[1, 0, 0], [0, a, -d], [0, d, a]])
-    about_y = np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
-    return np.array([[c, -f, 0], [f, c, 0], [0, 0, 1]]) @ about_y @ about_x
-
-
-def _numbers(values: object, count: int) -> bool:
-    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
-        return False
-    return all(isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in values)

@@ -14,7 +14,7 @@ from ce_gym.dynamics.model import Model
 from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.sim.batch import Snapshot
 from ce_gym.viewer.rollouts.driving import made
-from ce_gym.viewer.rollouts.scan import scan_points
+from ce_gym.viewer.rollouts.scan import scans_of
 
 Array = NDArray[np.float64]
 Act = Callable[[Any], NDArray[np.float32]]
@@ -46,7 +46,7 @@ class LiveRobot:
         model: The robot.
         dt: Length of a control step [s].
         terrain: The ground, None where it is flat.
-        scan: Where its height scan looks, see `Rollout.scan`.
+        scan: Where its height and range scans look, see `Rollout.scan`.
         command_range: Bounds of the commands that the task draws, shape (3, 2).
 
     Raises:
@@ -60,7 +60,7 @@ class LiveRobot:
         self._act = act or (lambda _: np.zeros((1, program.n_actions), np.float32))
         self.model: Model = program.model
         self.dt, self.terrain = native.dt, field_of(program.task.terrain)
-        self.scan = scan_points(program)
+        self.scan = scans_of(program)
         self.command_range = np.array(program.task.command_range, float)
         draw = SX.sym("draw", program.randomised.n_draws)
         self._values = ca.Function("values", [draw], [program.randomised.values(draw)])

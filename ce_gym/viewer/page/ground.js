@@ -68,20 +68,19 @@ function drawField(mesh) {
   };
   mesh.material.customProgramCacheKey = () => `field of ${count}`;
   mesh.material.needsUpdate = true;  // it may have been drawn before
-  const dots = field.scan && drawScan(mesh, field);
-  fields.push({ mesh, places, bodies: field.bodies, dots });
+  fields.push({ mesh, places, bodies: field.bodies, ...(field.scans && drawScans(mesh, field)) });
   viewer.set_dirty();
 }
 
-// Points of a height scan, on the field.
-function drawScan(mesh, field) {
-  const geometry = new MeshCat.THREE.BufferGeometry();
-  geometry.setAttribute("position", new MeshCat.THREE.BufferAttribute(new Float32Array(3 * field.scan.length), 3));
-  const look = new MeshCat.THREE.PointsMaterial({ color: field.color, size: 5, sizeAttenuation: false });
-  const dots = new MeshCat.THREE.Points(geometry, look);
-  dots.frustumCulled = false;
-  mesh.add(dots);
-  return dots;
+// What scans look at, dots on the field, and the rays of range scans, lines to them.
+function drawScans(mesh, { scans, color }) {
+  const { BufferGeometry, BufferAttribute, Points, PointsMaterial, LineSegments, LineBasicMaterial } = MeshCat.THREE;
+  const count = key => scans.reduce((sum, scan) => sum + (scan[key] || []).length, 0);
+  const shape = size => new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(3 * size), 3));
+  const dots = new Points(shape(count("points") + count("rays")), new PointsMaterial({ color, size: 5, sizeAttenuation: false }));
+  const lines = new LineSegments(shape(2 * count("rays")), new LineBasicMaterial({ color, transparent: true, opacity: 0.35 }));
+  for (const drawn of [dots, lines]) { drawn.frustumCulled = false; mesh.add(drawn); }
+  return { dots, lines };
 }
 
 // Height of what is drawn of a field, between its vertices.
@@ -95,16 +94,46 @@ function heightOf(mesh, x, y) {
   return (1 - s) * ((1 - t) * z(0, 0) + t * z(0, 1)) + s * ((1 - t) * z(1, 0) + t * z(1, 1));
 }
 
-// The grid turns with the heading of the base, not with roll and pitch.
-function moveScan({ mesh, dots, bodies }) {
-  const base = node(bodies[0]).object, ahead = new MeshCat.THREE.Vector3(1, 0, 0).applyQuaternion(base.quaternion);
-  const length = Math.hypot(ahead.x, ahead.y) || 1, c = ahead.x / length, s = ahead.y / length;
-  const place = dots.geometry.attributes.position;
-  mesh.userData.field.scan.forEach(([forward, left], i) => {
-    const x = base.position.x + c * forward - s * left, y = base.position.y + s * forward + c * left;
-    place.setXYZ(i, x, y, heightOf(mesh, x, y) + 0.01);  // above the ground, to be seen
-  });
-  place.needsUpdate = true;
+// Where a ray meets the field, marched as the sensor does it, or where it ends.
+function hitOf(mesh, start, along, { reach, steps }) {
+  const at = distance => start.clone().addScaledVector(along, distance);
+  const above = distance => { const { x, y, z } = at(distance); return z - heightOf(mesh, x, y); };
+  let low = 0, over = above(0);
+  if (over <= 0) return start;
+  for (let k = 1; k <= steps; k++) {
+    let high = reach * k / steps, under = above(high);
+    if (under > 0) { [low, over] = [high, under]; continue; }
+    const middle = low + (high - low) * over / (over - under), here = above(middle);
+    if (here > 0) [low, over] = [middle, here]; else [high, under] = [middle, here];
+    return at(low + (high - low) * over / (over - under));
+  }
+  return at(reach);
+}
+
+// Grids turn with the heading of the base, not with roll and pitch; rays turn with their link.
+function moveScans({ mesh, dots, lines, bodies }) {
+  const { Vector3, Matrix4 } = MeshCat.THREE, base = node(bodies[0]).object, field = mesh.userData.field;
+  const ahead = new Vector3(1, 0, 0).applyQuaternion(base.quaternion), length = Math.hypot(ahead.x, ahead.y) || 1;
+  const c = ahead.x / length, s = ahead.y / length, [dot, end] = [dots, lines].map(drawn => drawn.geometry.attributes.position);
+  let i = 0, j = 0;
+  mesh.updateWorldMatrix(true, false);
+  for (const scan of field.scans) {
+    const link = node(scan.path).object;
+    link.updateWorldMatrix(true, false);
+    const pose = new Matrix4().copy(mesh.matrixWorld).invert().multiply(link.matrixWorld), middle = new Vector3();
+    for (const place of scan.at) middle.addScaledVector(new Vector3(...place).applyMatrix4(pose), 1 / scan.at.length);
+    for (const [forward, left] of scan.points || []) {
+      const x = middle.x + c * forward - s * left, y = middle.y + s * forward + c * left;
+      dot.setXYZ(i++, x, y, heightOf(mesh, x, y) + 0.01);  // above the ground, to be seen
+    }
+    for (const along of scan.rays || []) {
+      const hit = hitOf(mesh, middle, new Vector3(...along).transformDirection(pose), scan);
+      dot.setXYZ(i++, hit.x, hit.y, hit.z + 0.01);
+      end.setXYZ(j++, middle.x, middle.y, middle.z);
+      end.setXYZ(j++, hit.x, hit.y, hit.z);
+    }
+  }
+  dot.needsUpdate = end.needsUpdate = true;
 }
 
 // Lets the ground follow the robots' bases. Objects with images appear some time after their commands.
@@ -116,5 +145,5 @@ function moveFields() {
   for (const { places, bodies } of fields) {
     bodies.forEach((path, i) => { const { x, y } = node(path).object.position; places[i].set(x, y); });
   }
-  fields.filter(field => field.dots).forEach(moveScan);
+  fields.filter(field => field.dots).forEach(moveScans);
 }

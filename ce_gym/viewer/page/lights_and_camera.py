@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -79,7 +79,7 @@ def field_command(
     bodies: Sequence[str],
     reach: float,
     fading: float = FADING,
-    scan: Sequence[Sequence[float]] = (),
+    scans: Sequence[Mapping[str, Any]] = (),
 ) -> Command:
     """Return the command that draws ground that is not flat; `ground.js` gives it its shape.
 
@@ -89,11 +89,11 @@ def field_command(
         bodies: Scene paths of the bodies around which it is drawn.
         reach: How far around them [m].
         fading: Share of that from which on it fades into the horizon.
-        scan: Points of a height scan about the first body, see `Rollout.scan`.
+        scans: See `Rollout.scan`, each with the scene path of its link as `path`; points turn with the first body.
     """
     data = {**as_json(ground), "bodies": list(bodies), "reach": float(reach), "fading": fading, "steep": STEEP}
-    if scan:
-        data |= {"scan": [list(point) for point in scan], "color": three.hex_color(SCAN_COLOR)}
+    if scans:
+        data |= {"scans": list(scans), "color": three.hex_color(SCAN_COLOR)}
     return _tiled(path, three.plane(TILE, TILE), np.eye(4), userData={"field": data})
 
 

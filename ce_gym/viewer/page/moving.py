@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +14,12 @@ from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.page import three
 from ce_gym.viewer.page.lights_and_camera import TILE, camera_commands, eye, field_command, surroundings
 from ce_gym.viewer.page.poses import PosedModel
-from ce_gym.viewer.page.robot import body_paths, extent, robot_commands
+from ce_gym.viewer.page.robot import body_paths, extent, placed_scans, robot_commands
 from ce_gym.viewer.page.scene import GHOST_OPACITY, GHOST_TINTS
 from ce_gym.viewer.rollouts.ground_patch import around, level, reach
 
 Array = NDArray[np.float64]
-Scan = Sequence[Sequence[float]]
+Scan = Sequence[Mapping[str, Any]]
 
 WORLD, SURROUNDINGS = "/world", "/surroundings"
 BLOCK = 4.0  # edge of the squares of the world that share a piece of ground that is not flat [m]
@@ -32,7 +33,7 @@ class MovingScene:
         q: Positions in a typical pose, shape (nq,); they set how far the camera is away.
         count: How many there are.
         terrain: The ground, the plane z = 0 if None.
-        scan: Where the first robot's height scan looks, see `Rollout.scan`.
+        scan: Where the first robot's scans look, see `Rollout.scan`.
 
     Attributes:
         paths: Scene path of each body, by name, for each robot.
@@ -52,7 +53,7 @@ class MovingScene:
         self.stand_on(terrain, scan)
 
     def stand_on(self, terrain: Terrain | None, scan: Scan = ()) -> None:
-        """Change the ground, and where the first robot's height scan looks."""
+        """Change the ground, and where the first robot's scans look."""
         self._terrain, self._scan = terrain, scan
         self._block: tuple[int, int] | None = None  # the piece of ground that the page has
 
@@ -104,6 +105,7 @@ class MovingScene:
             return None
         block = BLOCK * np.array([[row, column], [row + 1, column + 1]])
         ground, root = around(self._terrain, block), self.paths[0][self.robot.bodies[0].name]
-        command = field_command(f"{WORLD}/ground", ground, [root], reach(ground, block), scan=self._scan)
+        scans = placed_scans(self._scan, self.robot, f"{WORLD}/0")
+        command = field_command(f"{WORLD}/ground", ground, [root], reach(ground, block), scans=scans)
         self._block = (row, column)
         return json.dumps(command).encode()

@@ -6,13 +6,15 @@ do not shrink between frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.model.description import Body, Robot, Shape
 from ce_gym.model.frames import Placement
+from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.meshes.triangles import MOST, Triangles
 from ce_gym.viewer.page import animation, three
 from ce_gym.viewer.page.belts import Part, belt_parts
@@ -29,6 +31,20 @@ def body_paths(robot: Robot, root: str) -> dict[str, str]:
         parent = root if body.parent is None else paths[body.parent]
         paths[body.name] = f"{parent}/{body.name.replace('/', '_')}"
     return paths
+
+
+def placed_scans(scans: Sequence[Mapping[str, Any]], robot: Robot, root: str) -> list[dict[str, Any]]:
+    """Return scans, see `Rollout.scan`, with the scene path of each one's link as `path`.
+
+    Raises:
+        ViewerError: A link is none of the robot's.
+    """
+    paths = body_paths(robot, root)
+    links = {"": next(iter(paths.values())), **paths}
+    for scan in scans:
+        if scan["link"] not in links:
+            raise ViewerError(f"scan: link={scan['link']!r}; expected one of {', '.join(paths)}")
+    return [{**scan, "path": links[scan["link"]]} for scan in scans]
 
 
 def robot_commands(

@@ -17,7 +17,7 @@ from ce_gym.viewer.meshes.triangles import MOST
 from ce_gym.viewer.page import animation, arrows, three
 from ce_gym.viewer.page.lights_and_camera import camera_commands, eye, field_command, surroundings
 from ce_gym.viewer.page.poses import PosedModel, PosedRollout, smooth
-from ce_gym.viewer.page.robot import body_paths, robot_commands
+from ce_gym.viewer.page.robot import body_paths, placed_scans, robot_commands
 from ce_gym.viewer.page.three import Color, Command
 from ce_gym.viewer.rollouts.ground_patch import around, clear_view, reach
 from ce_gym.viewer.rollouts.rollout import Rollout
@@ -139,12 +139,14 @@ def _fields(runs: Sequence[PosedRollout], poses: Sequence[Array], spacing: float
         for index, run in enumerate(runs):
             far = min(spacing / 2, reach(grounds[index], run.middle))
             piece = around(grounds[index], run.middle, far)
-            yield field_command(f"{ROOT}/ground_{index}", piece, [bases[index]], far, 0.8, run.rollout.scan)
+            scans = placed_scans(run.rollout.scan, run.robot, run.path)
+            yield field_command(f"{ROOT}/ground_{index}", piece, [bases[index]], far, 0.8, scans)
             yield three.set_transform(f"{ROOT}/ground_{index}", poses[index])
         return
     everywhere = np.concatenate([run.middle for run in runs])
     widest = max(grounds, key=lambda ground: reach(ground, everywhere))
-    yield field_command(f"{ROOT}/ground", widest, bases, reach(widest, runs[0].middle), scan=runs[0].rollout.scan)
+    scans = placed_scans(runs[0].rollout.scan, runs[0].robot, runs[0].path)
+    yield field_command(f"{ROOT}/ground", widest, bases, reach(widest, runs[0].middle), scans=scans)
     yield three.set_transform(f"{ROOT}/ground", poses[0])
 
 

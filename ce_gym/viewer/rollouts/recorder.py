@@ -27,7 +27,7 @@ class Recorder:
         contact_names: Which contacts the forces belong to; empty means all of the robot's.
         signal_names: Of what else is recorded for plots.
         terrain: The ground, of which the part around the robot's path is kept; None if it is flat.
-        scan: Where a height scan looks, see `Rollout.scan`.
+        scan: Where height and range scans look, see `Rollout.scan`.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Recorder:
         contact_names: Sequence[str] = (),
         signal_names: Sequence[str] = (),
         terrain: Terrain | None = None,
-        scan: Sequence[Sequence[float]] = (),
+        scan: Sequence[Mapping[str, Any]] = (),
     ) -> None:
         self._terrain = terrain
         self._fixed: dict[str, Any] = {

@@ -21,7 +21,7 @@ from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.rollouts.recorder import Recorder
 from ce_gym.viewer.rollouts.rollout import Rollout
-from ce_gym.viewer.rollouts.scan import scan_points
+from ce_gym.viewer.rollouts.scan import scans_of
 
 Act = Callable[[Any], NDArray[np.float32]]
 """Actions for observations, both as the environment has them."""
@@ -125,7 +125,7 @@ def _recorder(native: BaseEnv, field: Terrain | None, label: str, info: Mapping[
         contact_names=native.contact_names,
         signal_names=names,
         terrain=field,
-        scan=scan_points(native.batch.program),
+        scan=scans_of(native.batch.program),
     )
 
 

@@ -58,7 +58,10 @@ class Rollout:
         contact_names: Which contacts the forces belong to, for simulations of some contacts only; empty means all of
             the robot's, in its order.
         ground: The ground around the robot's path, see `rollouts.ground_patch.around`; None if flat.
-        scan: Where the robot's height scan looks, ahead of and to the left of its base [m], a pair for each point.
+        scan: Where the robot's scans look, a mapping for each. `link` ("" for the base) has a sensor in the mean of the
+            places `at`, in its frame [m]. It looks straight down on `points`, pairs ahead of and to the left of there
+            [m], which turn with the base's heading; or along `rays`, unit vectors in the link's frame, `reach` [m] far
+            in so many `steps`. Pairs alone are points about the base.
     """
 
     robot: str
@@ -76,7 +79,7 @@ class Rollout:
     info: Mapping[str, str] = field(default_factory=dict)
     contact_names: Sequence[str] = ()
     ground: Terrain | None = None
-    scan: Sequence[Sequence[float]] = ()
+    scan: Sequence[Any] = ()
 
     def __post_init__(self) -> None:
         frames = np.size(self.times)
@@ -95,7 +98,7 @@ class Rollout:
         if named and found and named != found:
             raise RolloutError(f"contact_names has {named} names; contact_forces has {found} contacts")
         object.__setattr__(self, "signal_names", tuple(self.signal_names))
-        object.__setattr__(self, "scan", _pairs(self.scan))
+        object.__setattr__(self, "scan", _scans(self.scan))
         if len(self.signal_names) != self.signals.shape[1]:
             raise RolloutError(
                 f"signal_names has {len(self.signal_names)} names; signals has {self.signals.shape[1]} columns"
@@ -127,7 +130,7 @@ class Rollout:
             "info": {str(key): str(value) for key, value in self.info.items()},
             "contact_names": list(self.contact_names),
             "signal_names": list(self.signal_names),
-            **({"scan": [list(point) for point in self.scan]} if self.scan else {}),
+            **({"scans": list(self.scan)} if self.scan else {}),
         }
         ground: dict[str, Any] = {}
         if self.ground is not None:
@@ -170,11 +173,28 @@ def _numbers(name: str, value: Any) -> Array:
         raise RolloutError(f"{name} is not an array of numbers") from None
 
 
-def _pairs(points: Any) -> tuple[tuple[float, float], ...]:
-    found = _numbers("scan", points)
-    if found.size and (found.ndim != 2 or found.shape[1] != 2 or not np.isfinite(found).all()):
-        raise RolloutError(f"scan has shape {found.shape}; expected finite x and y of each point")
-    return tuple((float(x), float(y)) for x, y in found.reshape(-1, 2))
+def _scans(given: Any) -> tuple[dict[str, Any], ...]:
+    """Return scans as plain data, checked."""
+    if not len(given):
+        return ()
+    if not isinstance(given[0], Mapping):
+        given = [{"link": "", "at": [[0.0, 0.0, 0.0]], "points": given}]
+    return tuple(_scan(one) for one in given)
+
+
+def _scan(given: Mapping[str, Any]) -> dict[str, Any]:
+    looks, march = ("rays", 3) if "rays" in given else ("points", 2), ("reach", "steps")
+    found: dict[str, Any] = {"link": str(given.get("link", ""))}
+    for name, size in (("at", 3), looks):
+        rows = _numbers("scan", given.get(name, ()))
+        if rows.ndim != 2 or rows.shape[1] != size or not np.isfinite(rows).all():
+            raise RolloutError(f"scan: {name} has shape {rows.shape}; expected rows of {size} finite numbers")
+        found[name] = rows.tolist()
+    for name in march if "rays" in given else ():
+        if not (isinstance(given.get(name), int | float) and 0 < given[name] <= 1e4):
+            raise RolloutError(f"scan: {name} is {given.get(name)!r}; expected a number from 0 to 10000")
+        found[name] = given[name]
+    return found
 
 
 def _check_array(name: str, value: Array, ndim: int, frames: int) -> None:
@@ -232,7 +252,10 @@ def _read_header(entry: NDArray[Any]) -> dict[str, Any]:
             raise RolloutError(
                 f"header key {key!r} is {header.get(key)!r}; expected {getattr(kind, '__name__', 'a number')}"
             )
-    return {key: header[key] for key in expected} | {"ground": header.get("ground"), "scan": header.get("scan", [])}
+    return {key: header[key] for key in expected} | {
+        "ground": header.get("ground"),
+        "scan": header.get("scans", header.get("scan", [])),
+    }
 
 
 def _read_ground(figures: Any, numbers: Any) -> Terrain | None:

@@ -12,7 +12,7 @@ from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.policies import Policy, environment_of
 from ce_gym.viewer.page.moving import MovingScene
 from ce_gym.viewer.rollouts.driving import made
-from ce_gym.viewer.rollouts.scan import scan_points
+from ce_gym.viewer.rollouts.scan import scans_of
 
 POLICIES = ("policy.*", "present/policy.*", "checkpoints/policy_*")
 """Where a run keeps policies."""
@@ -61,7 +61,7 @@ class Walker:
         self._observation, _ = self._env.reset(seed=0)
         program = native.batch.program
         self._model = program.model
-        ground, scan = field_of(program.task.terrain), scan_points(program)
+        ground, scan = field_of(program.task.terrain), scans_of(program)
         self.scene = MovingScene(self._model, self._model.standing_q, terrain=ground, scan=scan)
 
     def fits(self, policy: Policy) -> bool:
