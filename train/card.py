@@ -16,6 +16,7 @@ import single_blas  # noqa: F401
 # isort: split
 
 import argparse
+import importlib
 import json
 import math
 import re
@@ -48,6 +49,9 @@ from ce_gym.policies import (
     shelf,
     write_npz,
 )
+
+OWN_SETTINGS = ("shac", "distill")
+"""Learners that have other settings than PPO."""
 
 FINER = 5
 """Sub-steps are that much shorter in one judgement: a policy may live on their length."""
@@ -139,11 +143,9 @@ def command(record: dict[str, Any]) -> str:
 
 def _settings_of(record: dict[str, Any]) -> type:
     """The dataclass of the settings of the learner that a record names."""
-    if record.get("learner") != "shac":
+    if (name := record.get("learner")) not in OWN_SETTINGS:
         return Settings
-    from shac import Settings as Analytic  # says what is missing where its extra is not installed
-
-    return Analytic
+    return importlib.import_module(name).Settings  # says what is missing where its extra is not installed
 
 
 def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, float]], name: str) -> str:
@@ -285,7 +287,11 @@ def portable(record: dict[str, Any]) -> dict[str, Any]:
     terrain = kwargs.get("terrain")
     if isinstance(terrain, Mapping) and "file" in terrain:  # a copy lies beside the policy
         kwargs["terrain"] = {**terrain, "file": Path(terrain["file"]).name}
-    return record | {"resumed_from": Path(resumed).name if resumed else None, "env_kwargs": kwargs}
+    settings = dict(record["settings"])
+    if "teacher" in settings:
+        settings["teacher"] = Path(settings["teacher"]).name
+    own = {"env_kwargs": kwargs, "settings": settings}
+    return record | {"resumed_from": Path(resumed).name if resumed else None} | own
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -165,6 +165,12 @@ class BaseEnv(EzPickle):
         """Length of each observation block, in order."""
         return self.batch.program.observation_sizes
 
+    @property
+    def critic_structure(self) -> dict[str, int]:
+        """Length of each block of the critic's observation, in order; the policy's if the critic sees no more."""
+        program = self.batch.program
+        return dict(program.probe.sizes) if program.critic_size else program.observation_sizes
+
     def policy_spec(self) -> dict[str, Any]:
         """Return what is needed to run a policy of this environment elsewhere; see `ce_gym.envs.policy_spec`."""
         return policy_spec(self.batch.program, self.task)

@@ -1,0 +1,48 @@
+"""Gradient of a network's squared error, for a student that learns what a teacher would have done.
+
+Knows numbers only; layouts are those of `networks.py`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from networks import CHUNK, ZERO, _backwards, _forwards, _gather
+from numba import njit as numba_njit
+
+njit = partial(numba_njit, error_model="numpy")
+
+
+@njit(cache=True, nogil=True)
+def squared_error_gradient(theta, sizes, kind, observations, labels, rows, gradient, work):
+    """Add the gradient of the mean squared error of outputs, over rows and outputs; return that mean.
+
+    Args:
+        theta: Parameters of the network.
+        sizes: Of its layers, the observation first.
+        kind: Activation, see `networks.KINDS`.
+        observations: Shape (n, n_obs).
+        labels: What outputs should have been, shape (n, n_out).
+        rows: The samples that count.
+        gradient: By theta, added to.
+        work: Buffers of `networks.make_work`.
+    """
+    values, d, other, turned = work
+    n_out, total = sizes[-1], 0.0
+    weight = np.float32(1.0 / (len(rows) * n_out))
+    for start in range(0, len(rows), CHUNK):
+        chosen = rows[start : start + CHUNK]
+        n = len(chosen)
+        _gather(observations, chosen, values)
+        found = _forwards(theta, sizes, kind, values, n)
+        by_output = d[: found.size].reshape(found.shape)
+        for i in range(n):
+            for j in range(n_out):
+                error = found[i, j] - labels[chosen[i], j]
+                total += error * error
+                by_output[i, j] = np.float32(2) * weight * error
+            for j in range(n_out, by_output.shape[1]):
+                by_output[i, j] = ZERO
+        _backwards(theta, sizes, kind, values, n, d, other, turned, gradient)
+    return total * weight
