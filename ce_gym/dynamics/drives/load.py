@@ -84,8 +84,7 @@ def supply_after(
         for i, (place, motor) in enumerate(zip(cluster.places, cluster.motors, strict=True)):
             torque = motors.windings[place].tau - motors.windings[place].slope @ motion.ydd
             full = scene.figures.strength * supply.line(place, motor)
-            answer = ca.if_else(motors.on_line.get(place, SX(0)), ca.sign(torque) * full, 0)
-            work[place] = Work(torque, speed[i], answer)
+            work[place] = Work(torque, speed[i], motors.on_line.get(place, SX(0)) * full)
     return ca.vertcat(SX(0, 1), *supply.after(robot.motors, work, dt))
 
 
