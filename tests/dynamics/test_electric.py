@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
-from ce_gym.model import Battery, Heat, Motor, Robot
+from ce_gym.model import Battery, Heat, LinearConstraint, Motor, Robot
 from ce_gym.model.drives import DriveFriction
 
 COPPER, K = 3.93e-3, 0.1
@@ -242,6 +242,22 @@ def test_parameters_are_the_figures_of_the_robot(name, value, change):
 
 def with_motor(robot: Robot, **figures: Any) -> Robot:
     return replace(robot, motors=tuple(replace(motor, **figures) for motor in robot.motors))
+
+
+@pytest.mark.parametrize("asked", [4.0, -9.0, 50.0])
+def test_a_gear_that_turns_backwards_mirrors_its_motor(asked):
+    """A ratio of the other sign: the same table to the bit, and torques and speeds of the rotor the other way."""
+    lossy = DriveFriction(0.02, 5.0, 1.0, 0.1, 0.2, efficiency=0.8, backdriving_efficiency=0.6)
+    robot = table(heat=HEAT, cogging=TEETH, battery=BATTERY, drive_friction=lossy, bandwidth=30.0)
+    gear = LinearConstraint("gear", (("rotor", 1.0), ("table", RATIO)))
+    teeth = tuple((order, size, -phase) for order, size, phase in TEETH)
+    turned = with_motor(replace(robot, constraints=(gear,)), cogging=teeth)
+    outputs = ("motor_torque", "motor_speed", "energy")
+    one, other = (run(it, [asked], 0.002, 100, outputs, q=[0.2], v=[3.0]) for it in (robot, turned))
+    for name, values in one.items():
+        sign = -1 if name in ("motor_torque", "motor_speed", "winding") else 1
+        expected = values * [-1, -1, 1] if name == "carried" else sign * values
+        np.testing.assert_array_equal(other[name], expected, err_msg=name)
 
 
 def test_ideal_motors_and_plain_ones_cost_what_they_did():

@@ -7,9 +7,13 @@ The rest of the robot does to the coordinates of a cluster what its motion takes
 gravity, contacts, springs and the motion of what carries the cluster, but not its own inertia: of a pendulum gravity
 alone. It goes to the rotors as torques do. Where a transmission stretches it is the torque of its mesh.
 
-Friction under load goes by means over the last step, and in iterations by those of the iteration before. That can be a
-step late, but friction always takes energy, whatever it goes by. Where there was no step before, rotors at rest are
-held in the first iteration, which tells what it takes.
+Friction under load goes by means over the last step: of one made in parts over the last part, of one made in stages
+over its last stage, and within it over the stage before; what was refused leaves nothing. In further iterations, where
+something asks for any, it goes by those of the last iteration in which motors stuck, slipped and were limited as they
+were taken to be: a rotor that is wrongly taken to stick is stopped by a blow. That can be a step late, an error of
+first order; so methods that extrapolate ask for a second iteration in every stage. Friction always takes energy,
+whatever it goes by. Where there was no step before, rotors at rest are held in the first iteration, which tells what
+it takes.
 """
 
 from __future__ import annotations
@@ -84,8 +88,7 @@ def supply_after(
         for i, (place, motor) in enumerate(zip(cluster.places, cluster.motors, strict=True)):
             torque = motors.windings[place].tau - motors.windings[place].slope @ motion.ydd
             full = scene.figures.strength * supply.line(place, motor)
-            answer = ca.if_else(motors.on_line.get(place, SX(0)), ca.sign(torque) * full, 0)
-            work[place] = Work(torque, speed[i], answer)
+            work[place] = Work(torque, speed[i], motors.on_line.get(place, SX(0)) * full)
     return ca.vertcat(SX(0, 1), *supply.after(robot.motors, work, dt))
 
 

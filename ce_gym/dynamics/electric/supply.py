@@ -19,7 +19,9 @@ class Work:
     Attributes:
         torque: Of its winding, at the end of the step [N m].
         speed: Of its rotor, likewise [rad/s].
-        answer: How its torque rises with its share of the nominal voltage, 0 where the voltage does not limit it [N m].
+        answer: How its torque at that speed rises with its share of the nominal voltage [N m]: on the line forwards,
+            `stall (share - speed / velocity)`, by `stall`, also where the torque is the other way; on that backwards by
+            `-stall`; else not.
     """
 
     torque: SX

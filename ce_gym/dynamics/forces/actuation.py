@@ -246,7 +246,8 @@ def deliver(
             force.limited[yd.numel() + place] = one
             tau[i], free[i, i] = one.given, one.free
             own[i, i] = ca.if_else(one.at_high, forwards, ca.if_else(one.at_low, backwards, 0))
-            force.on_line[place] = own[i, i] > 0
+            backwards_on_line = ca.if_else(one.at_low, backwards > 0, 0)
+            force.on_line[place] = ca.if_else(one.at_high, forwards > 0, -backwards_on_line)
         windings.append((place, tau[i], own[i, i]))
         if motor.cogging and model.at_motors:
             teeth, stiffness = cogging(motor.cogging, cluster.angles[i], speed[i], dt)

@@ -17,6 +17,8 @@ from ce_gym.model.drives import DriveFriction, Motor
 
 Line: TypeAlias = tuple[SX, SX]
 """A torque [N m] at the present speed, and how it falls with the rotor's acceleration [kg m^2]."""
+STILL = 1e-30
+"""Of the Stribeck speed, where a power below 1 is cut off: at rest its derivative is infinite, and gradients NaN."""
 
 
 class MotorModel(Protocol):
@@ -182,7 +184,10 @@ def most_friction(constant: float | SX, drive: DriveFriction | None, speed: SX, 
         squares = drive.stribeck_square_external * other**2, drive.stribeck_square_motor * motor**2
         at_rest += _by_direction(motor, other, *squares)
     if ca.sparsify(at_rest).nnz():
-        total += at_rest * ca.exp(-((ca.fabs(speed) / drive.stribeck_speed) ** drive.stribeck_exponent))
+        share = ca.fabs(speed) / drive.stribeck_speed
+        if drive.stribeck_exponent < 1:
+            share = ca.fmax(share, STILL)
+        total += at_rest * ca.exp(-(share**drive.stribeck_exponent))
     return constant + drive.factor * total
 
 

@@ -90,7 +90,7 @@ class SaturatedForce(JointForce):
         limited: The torques that are kept within limits, at their places in the iterate.
         held: Rows of `y` that dry friction holds, each with 1 if it does, else 0.
         windings: Torques of motors, by their places, before what they lose.
-        on_line: Whether the voltage limits them, likewise.
+        on_line: On which torque-speed line each is, likewise: 1 forwards, -1 backwards, 0 where it is on none.
         sampled: What a sampled controller holds after the step, as `State.held` is.
         count: Above 0, which says that there is an iterate.
     """

@@ -101,8 +101,9 @@ class State:
         anchor: Horizontal deflections of the contacts' bristles, world axes [m], shape (2 n_contacts,); empty without.
         dependent: Where the dependent coordinates that no formula gives will be, roughly, shape (n_guess,).
         pressed: Force between each pair of capsules over the last step [N], shape (n_pairs,).
-        carried: Over the last step the torque of each motor whose friction depends on it, then what all else did to
-            each of their rotors [N m], and 1; zeros where there was no step before, shape (2 n_loaded + 1,).
+        carried: Over the last step, of parts or stages the last, the torque of each motor whose friction depends
+            on it, then what all else did to each of their rotors [N m], and 1; zeros where there was no step before,
+            shape (2 n_loaded + 1,).
         winding: Torque at the end of the last step of each motor whose torque lags [N m], shape (n_lagging,).
         supply: How much the winding of each motor that grows warm is warmer than the air, then each of their housings
             [K], and how far the battery's voltage is below that without load [V], if there is one.

@@ -42,6 +42,7 @@ from ce_gym.dynamics.recursion.ce_aba import (
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, steadying_couples, turning_momentum
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
+from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactSphere
 from ce_gym.model.mechanism import Mechanism
@@ -230,7 +231,8 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
     for force in (*saturated, *solved.meshes):
         unconverged = ca.logic_or(force.check(motion), unconverged)
     if solved.carried.numel():
-        unconverged = ca.logic_or(unconverged, solved.carried[-1] < 0.5)
+        extrapolates = METHODS[scene.options.method].estimates
+        unconverged = ca.logic_or(unconverged, (iterate if extrapolates else solved.carried)[-1] < 0.5)
     # Converged lanes keep their iterate, so re-running their tile reproduces their result; those of motors are fixed
     # points by themselves.
     parts = split(iterate, [c.law.size for c in touches])
@@ -242,7 +244,8 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
     )
     of_friction = stacked([force.next_iterate(motion) for force in solved.friction])
     of_meshes = stacked([force.next_iterate(motion) for force in solved.meshes])
-    of_carried = ca.if_else(unconverged, after.carried, solved.carried)
+    sound = ca.logic_and(unconverged, ca.logic_not(motors.check(motion)))  # rotors that stop within a step carry a blow
+    of_carried = ca.if_else(sound, after.carried, solved.carried)
     end = iterate.numel() - of_meshes.numel() - of_carried.numel()
     of_friction = ca.if_else(unconverged, of_friction, iterate[end - of_friction.numel() : end])
     return Stepped(
