@@ -265,7 +265,10 @@ class Model(Evaluator):
         return np.swapaxes(angular, -1, -2), np.swapaxes(linear, -1, -2)
 
     def contact_points(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-        """Return centres [m] and velocities [m/s] of the contact spheres in the world, each shape (..., n, 3)."""
+        """Return centres [m] and velocities [m/s] of the contact spheres in the world, each shape (..., n, 3).
+
+        Of one that moves around a rim, those of the rim's centre.
+        """
         position, velocity = self._evaluate("contact_points", q, v)
         return np.swapaxes(position, -1, -2), np.swapaxes(velocity, -1, -2)
 

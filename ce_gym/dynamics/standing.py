@@ -65,7 +65,8 @@ def check_standing(mechanism: Mechanism) -> None:
     placed = mechanism.robot.floating and mechanism.robot.pose.height != 0.0  # a height of 0 is one that nobody gave
     for contact in mechanism.robot.contacts if placed else ():
         centre = standing.p[contact.body] + standing.R[contact.body] @ np.array(contact.position)
-        if centre[2] - contact.radius < -DEEPEST_CONTACT:
+        lean = float(np.hypot(*(standing.R[contact.body] @ np.array(contact.axis))[:2]))
+        if centre[2] - contact.radius - contact.rim * lean < -DEEPEST_CONTACT:
             expected = f"a height that keeps contact {contact.name!r}, now {centre[2]:.3g} m high, above ground"
             raise bad(file, "pose.height", mechanism.robot.pose.height, expected)
 

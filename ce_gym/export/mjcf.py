@@ -16,7 +16,7 @@ from ce_gym.dynamics.standing import standing_pose, turned
 from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf_equalities import MJCF_JOINTS, add_ties, check_expressible, held_rotors, joint_armature
 from ce_gym.export.mjcf_text import quaternion, text
-from ce_gym.model.description import Robot, Shape
+from ce_gym.model.description import ContactSphere, Robot, Shape
 from ce_gym.model.errors import bad
 from ce_gym.model.mechanism import ELASTIC, MovingBody, build_mechanism
 
@@ -163,11 +163,18 @@ def _add_body(
         _add_shape(element, shape)
     for contact in robot.contacts:
         if contact.body == body.name:
-            sphere = {"type": "sphere", "size": text(max(contact.radius, SMALLEST_RADIUS))}
             collides = {"friction": text((robot.material.friction, 0.005, 0.0001)), "contype": "1", "conaffinity": "0"}
             place = {"name": contact.name, "pos": text(contact.position)}
-            ET.SubElement(element, "geom", {**place, **sphere, **collides, "rgba": "0.2 0.2 0.2 0.5"})
+            ET.SubElement(element, "geom", {**place, **_solid(contact), **collides, "rgba": "0.2 0.2 0.2 0.5"})
     return element
+
+
+def _solid(contact: ContactSphere) -> dict[str, str]:
+    """Return what a contact is: a sphere, or a disc as thick as the sphere that moves around its rim."""
+    radius = max(contact.radius, SMALLEST_RADIUS)
+    if not contact.rim:
+        return {"type": "sphere", "size": text(radius)}
+    return {"type": "cylinder", "size": text((contact.rim + contact.radius, radius)), "zaxis": text(contact.axis)}
 
 
 def _add_inertial(element: ET.Element, spatial: Array) -> None:

@@ -131,14 +131,16 @@ class Body:
 
 @dataclass(frozen=True)
 class ContactSphere:
-    """A sphere fixed to a body that may touch the ground.
+    """A sphere fixed to a body that may touch the ground, or one that moves around a rim to where it does.
 
     Attributes:
         name: Unique among contacts.
         body: Name of the body that carries it.
-        position: Centre in the body frame [m].
+        position: Centre in the body frame [m]; that of the rim for one that moves.
         radius: [m]; zero is a point.
         group: Free label, such as "foot", "knee" or "torso", by which tasks choose contacts.
+        rim: Radius of the circle on which the sphere's centre moves [m]; 0 for a sphere that is fixed.
+        axis: Of that circle in the body frame, a unit vector.
     """
 
     name: str
@@ -146,6 +148,8 @@ class ContactSphere:
     position: Vec3
     radius: float
     group: str = "foot"
+    rim: float = 0.0
+    axis: Vec3 = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.dynamics.forces.ground import above, lift
+from ce_gym.dynamics.forces.ground import above, lift, reach
 from ce_gym.dynamics.model import Model
 from ce_gym.sim.terrain import Terrain
 
@@ -25,18 +25,32 @@ class Placement:
     def __init__(self, model: Model, contacts: Sequence[str], terrain: Terrain | None) -> None:
         self._model, self._terrain = model, terrain
         self._chosen = [model.contact_names.index(name) for name in contacts]
-        self._radius = np.array([model.robot.contacts[i].radius for i in self._chosen])
+        spheres = [model.robot.contacts[i] for i in self._chosen]
+        self._carriers = [model.body_names.index(sphere.body) for sphere in spheres]
+        self._radius = np.array([sphere.radius for sphere in spheres])
+        self._rim = np.array([sphere.rim for sphere in spheres])
+        self._axes = np.array([sphere.axis for sphere in spheres]).reshape(-1, 3)
 
     def depth(self, q: ArrayLike) -> NDArray:
         """Return how deep each sphere is in the ground, 0 if it is above [m], shape (..., n_contacts)."""
-        return np.maximum(self._radius - above(*self._over_ground(q)), 0)
+        over = self._over_ground(q)
+        return np.maximum(self._reach(q, *over[2:]) - above(*over), 0)
 
     def lift(self, q: ArrayLike) -> float:
         """Return how far to raise a robot for no contact to be deeper in the terrain than it is in flat ground [m]."""
         if self._terrain is None or not self._chosen:
             return 0.0
-        over = self._over_ground(q)
-        return float(lift(np.minimum(over[0], self._radius), *over).max())
+        over, level = self._over_ground(q), self._reach(q)
+        allowed = np.minimum(over[0], level) + (self._reach(q, *over[2:]) - level)
+        return float(lift(allowed, *over).max())
+
+    def _reach(self, q: ArrayLike, slope_x: ArrayLike = 0.0, slope_y: ArrayLike = 0.0) -> NDArray:
+        """Return how far each contact reaches from its centre towards ground of these slopes [m]."""
+        if not self._rim.any():
+            return self._radius
+        rotations = self._model.body_poses(q)[1][..., self._carriers, :, :]
+        axes = np.moveaxis(np.einsum("...cij,cj->...ci", rotations, self._axes), -1, 0)
+        return reach(self._radius, self._rim, axes, np.asarray(slope_x), np.asarray(slope_y))
 
     def _over_ground(self, q: ArrayLike) -> tuple[Any, ...]:
         """Return z of the centres [m], and height [m] and slopes of the ground under them."""

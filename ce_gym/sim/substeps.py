@@ -174,7 +174,7 @@ def look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> Parts:
     m, planes = touching.numel_out(0) // 2, planes_function(mechanism, options)
     buffers += [Buffer("touching", 2 * m, "scratch"), Buffer("found", 3 * m, "scratch")]
     beside = (
-        Call(touching, tuple(touching.name_in()), ("touching",)),
+        Call(touching, (*state[: touching.n_in() - 2], "places", "ground"), ("touching",)),
         Lookup(HEIGHTS, FRAME, "touching", "found"),
         Call(planes, tuple(planes.name_in()), ("ground",)),
     )

@@ -118,3 +118,34 @@ def test_a_link_without_primitives_is_refused(contacts):
     for link, said in (("trunk", "a mesh"), ("hoof", "hoof")):
         with pytest.raises(RobotError, match=said):
             contacts(f"foot: {{body: {link}, shape: collision}}")
+
+
+def test_a_cylinder_that_rolls_is_its_two_rims(contacts):
+    """Each a circle about the cylinder's axis, rounded inwards."""
+    rims = contacts(
+        "w: {body: leg, shape: cylinder, size: [0.1, 0.04], radius: 0.01, rpy: [1.5707963267948966, 0, 0], rolls: true}"
+    )
+    assert [(rim.name, rim.radius) for rim in rims] == [("w_rim1", 0.01), ("w_rim2", 0.01)]
+    np.testing.assert_allclose([rim.rim for rim in rims], 0.09)
+    assert places(rims) == {(0.0, -0.01, 0.0), (0.0, 0.01, 0.0)}
+    np.testing.assert_allclose([rim.axis for rim in rims], [[0, -1, 0]] * 2, atol=1e-12)
+    assert len(contacts("w: {body: leg, shape: cylinder, size: [0.1, 0.04], face: -z, rolls: true}")) == 1
+
+
+@pytest.mark.parametrize(
+    ("entry", "key", "told"),
+    [
+        ("shape: box, size: [1, 1, 1], rolls: true", "rolls", "True: expected `shape: cylinder`"),
+        ("shape: collision, rolls: true", "rolls", "True: expected `shape: cylinder`"),
+        ("radius: 0.1, position: [0, 0, 0], rolls: true", "rolls", "True: expected `shape: cylinder`"),
+        ("shape: cylinder, size: [1, 1], rolls: true, rim: 8", "rim", "8: expected none"),
+        ("shape: cylinder, size: [1, 1], rolls: fast", "rolls", "'fast': expected true or false"),
+        ("shape: cylinder, size: [1, 1], rolls: true, face: +x", "face", "'+x': expected +z or -z"),
+    ],
+)
+def test_what_cannot_roll(contacts, entry: str, key: str, told: str):
+    with pytest.raises(RobotError) as error:
+        contacts(f"w: {{body: leg, {entry}}}")
+    assert f"contacts.w.{key}" in str(error.value)
+    assert told in str(error.value)
+    assert "\n" not in str(error.value)

@@ -29,11 +29,14 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import casadi as ca
+import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, cross, mirrored, skew, symmetric_blocks
+from ce_gym.dynamics.forces.ground import above_deepest, sine
 from ce_gym.dynamics.forces.law import Motion
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms
-from ce_gym.dynamics.recursion.kinematics import BodyState
+from ce_gym.dynamics.recursion.kinematics import BodyState, constant
+from ce_gym.model.description import ContactSphere
 
 FORCE_FLOOR = 1e-6
 """Pull that counts as none [N]."""
@@ -85,21 +88,25 @@ class Touch:
     anchor: SX
 
 
-def touch_ground(body: BodyState, position: SX, radius: float, height: SX, normal: SX, load: SX, anchor: SX) -> Touch:
+def touch_ground(body: BodyState, sphere: ContactSphere, height: SX, normal: SX, load: SX, anchor: SX) -> Touch:
     """Place a sphere against the plane that the ground is nearby.
+
+    The deepest point of one that rolls is where it is at the start, as a sphere's is: another point of the body at each
+    step, which moves as the body there does. Bristles are deflections in the world and need not know.
 
     Args:
         body: Kinematics of the body that carries it.
-        position: Centre of the sphere in the body frame [m], shape (3,).
-        radius: [m].
+        sphere: Which one.
         height: Of the ground under the centre [m].
         normal: Unit normal of the ground there, world axes, shape (3,).
         load: Its normal force over the last step [N].
         anchor: Horizontal deflection of its bristle, world axes [m], shape (2,), or (0,) for none.
     """
     n = body.R.T @ normal
-    depth = radius - normal[2] * (body.point_position(position)[2] - height)
-    point = position - radius * n
+    centre, axis = constant(np.array(sphere.position)), constant(np.array(sphere.axis))
+    cosine = ca.dot(axis, n)
+    depth = sphere.radius + sphere.rim * sine(cosine) - normal[2] * (body.point_position(centre)[2] - height)
+    point = centre - above_deepest(sphere.radius, sphere.rim, n, axis, cosine)
     velocity, drift = body.point_velocity(point), body.drift[3:] + cross(body.drift[:3], point)
     deflection = SX(3, 1)
     if anchor.numel():  # in the tangent plane: the normal has no part in it

@@ -3,7 +3,8 @@
 A sphere touches sloping ground beside the place under its centre. So the field is looked up twice: under the centre,
 and where a sphere on the plane found there would touch it. The plane at the second place is the one that the sphere
 meets, but for errors of second order in how much the ground turns over a radius. With the first alone forces would not
-be normal to the path on which a sphere can roll, and energy would grow. Spheres without radius need no second look.
+be normal to the path on which a sphere can roll, and energy would grow. Spheres without radius need no second look. One
+that moves around a rim is looked up likewise, beside the centre of the rim.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
+from ce_gym.dynamics.forces.ground import above_deepest
 from ce_gym.dynamics.forces.scene import StepOptions, symbolic_state
-from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
+from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.dynamics.stepping.step import contact_places, contact_spheres
 from ce_gym.model.mechanism import Mechanism
 
@@ -26,26 +28,39 @@ def places_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
         Function (q) or, for a robot whose loops need guesses, (q, dependent) -> x and y of each centre [m], shape
         (2 n_contacts,).
     """
-    state = symbolic_state(mechanism, options)
-    kinematics = outward_velocity_pass(mechanism, state.q, SX(*state.v.shape), state.dependent)
-    given = {name: value for name, value in state.items() if name in ("q", "dependent")}
+    given, kinematics = _posed(mechanism, options)
     return traced("places", given, {"places": ca.vec(contact_places(mechanism, options, kinematics))})
 
 
 def touching_function(mechanism: Mechanism, options: StepOptions) -> ca.Function | None:
-    """Trace where the spheres with a radius would touch a plane.
+    """Trace where the spheres with a radius, and rims, would touch a plane.
 
     Returns:
-        Function (places, ground) -> x and y of the touching points [m], shape (2 m,), from the centres and the height
-        and slopes under them, shape (3 n_contacts,); None if no sphere has a radius.
+        Function (places, ground) or, for a robot with rims, (q, places, ground), or with `dependent` as for
+        `places_function`, -> x and y of the touching points [m], shape (2 m,), from the centres and the height and
+        slopes under them, shape (3 n_contacts,); None if no sphere has a radius.
     """
     radius, round_ones, places, ground = _spheres(mechanism, options)
     if not round_ones:
         return None
     slope = ground[1:, round_ones]
     lean = slope * ca.repmat(radius / ca.sqrt(1 + ca.sum1(slope**2)), 2, 1)
-    touching = ca.vec(places[:, round_ones] + lean)
-    return traced("touching", {"places": ca.vec(places), "ground": ca.vec(ground)}, {"touching": touching})
+    given = {"places": ca.vec(places), "ground": ca.vec(ground)}
+    if any(sphere.rim for sphere in contact_spheres(mechanism, options)):
+        state, lean = _leaning(mechanism, options, slope, round_ones)
+        given = state | given
+    return traced("touching", given, {"touching": ca.vec(places[:, round_ones] + lean)})
+
+
+def _leaning(mechanism: Mechanism, options: StepOptions, slope: SX, round_ones: list[int]) -> tuple[dict[str, SX], SX]:
+    """Return what the axes of rims depend on, and x and y from centres to where spheres touch planes, shape (2, m)."""
+    given, kinematics = _posed(mechanism, options)
+    spheres, ways = contact_spheres(mechanism, options), [SX(2, 0)]
+    for i, column in zip(round_ones, ca.horzsplit(slope), strict=True):
+        axis = kinematics.bodies[spheres[i].body].R @ constant(np.array(spheres[i].axis))
+        normal = ca.vertcat(-column, 1) / ca.sqrt(1 + ca.sumsqr(column))
+        ways.append(-above_deepest(spheres[i].radius, spheres[i].rim, normal, axis, ca.dot(axis, normal))[:2])
+    return given, ca.horzcat(*ways)
 
 
 def planes_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
@@ -64,9 +79,17 @@ def planes_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
     return traced("planes", {name: ca.vec(value) for name, value in given.items()}, {"ground_next": ca.vec(planes)})
 
 
+def _posed(mechanism: Mechanism, options: StepOptions) -> tuple[dict[str, SX], Kinematics]:
+    """Return symbols for positions, with guesses if there are any, and where they put the bodies."""
+    state = symbolic_state(mechanism, options)
+    kinematics = outward_velocity_pass(mechanism, state.q, SX(*state.v.shape), state.dependent)
+    return {name: value for name, value in state.items() if name in ("q", "dependent")}, kinematics
+
+
 def _spheres(mechanism: Mechanism, options: StepOptions) -> tuple[SX, list[int], SX, SX]:
-    """Return radii of the spheres that have one, which those are, and symbols for the places and ground of all."""
-    radius = np.array([sphere.radius for sphere in contact_spheres(mechanism, options)])
-    round_ones = np.flatnonzero(radius).tolist()
+    """Return radii of what is round, which spheres and rims those are, and symbols for the places and ground of all."""
+    spheres = contact_spheres(mechanism, options)
+    radius = np.array([sphere.radius for sphere in spheres])
+    round_ones = np.flatnonzero(radius + np.array([sphere.rim for sphere in spheres])).tolist()
     places, ground = SX.sym("places", 2, len(radius)), SX.sym("ground", 3, len(radius))
     return SX(ca.DM(radius[round_ones])).T, round_ones, places, ground

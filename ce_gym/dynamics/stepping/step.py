@@ -294,15 +294,16 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> l
     contacts, options = [], scene.options
     normal, friction = normal_law(options.normal_law, options.material), FRICTION[options.friction]
     for i, sphere in enumerate(contact_spheres(scene.mechanism, options)):
-        body, position = kinematics.bodies[sphere.body], constant(np.array(sphere.position))
+        body = kinematics.bodies[sphere.body]
         height, up = SX(0), constant(np.array([0.0, 0.0, 1.0]))
         if options.ground == "field":
             height, slope = scene.ground[0, i], scene.ground[1:, i]
             if scene.looked_up.numel():
-                height += ca.dot(slope, body.point_position(position)[:2] - scene.looked_up[:, i])
+                centre = body.point_position(constant(np.array(sphere.position)))
+                height += ca.dot(slope, centre[:2] - scene.looked_up[:, i])
             up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
-        touch = touch_ground(body, position, sphere.radius, height, up, state.load[i], anchor)
+        touch = touch_ground(body, sphere, height, up, state.load[i], anchor)
         near = scene.near if sphere.name in options.seldom else None
         contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt, near=near))
     return contacts

@@ -14,10 +14,10 @@ import numpy as np
 from ce_gym.compile import Buffer, Call, Lookup, Step
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
-from ce_gym.dynamics.forces.ground import above, lift
+from ce_gym.dynamics.forces.ground import above, lift, reach
 from ce_gym.dynamics.forces.parameters import figures
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.recursion.kinematics import constant, outward_velocity_pass
+from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.envs.task.curriculum import Curriculum
 from ce_gym.envs.task.sampling import Sampler
 from ce_gym.envs.task.terrain_kinds import PLATFORM
@@ -63,20 +63,35 @@ class Ground:
             seen: The buffer `SEEN`.
         """
         spheres = self.mechanism.robot.contacts
-        centres = sphere_centres(self.mechanism, {"q": q} | ({} if dependent is None else {"dependent": dependent}))
+        state = {"q": q} | ({} if dependent is None else {"dependent": dependent})
+        centres, axes = sphere_centres(self.mechanism, state), sphere_axes(self.mechanism, state)
         chosen = [i for i, sphere in enumerate(spheres) if sphere.name in self.contacts]
         under, z = ca.reshape(seen[3:], 3, -1), centres[2, :]
-        needed = [lift(ca.fmin(z[i], spheres[i].radius), z[i], *ca.vertsplit(under[:, i])) for i in chosen]
+        needed = []
+        for i in chosen:
+            height, *slopes = ca.vertsplit(under[:, i])
+            level = reach(spheres[i].radius, spheres[i].rim, axes[:, i])
+            more = reach(spheres[i].radius, spheres[i].rim, axes[:, i], *slopes) - level
+            needed.append(lift(ca.fmin(z[i], level) + more, z[i], height, *slopes))
         return ca.mmax(ca.vertcat(*needed)) if needed else seen[0]
 
 
 def sphere_centres(mechanism: Mechanism, state: Mapping[str, SX]) -> SX:
     """Return where the contact spheres of a robot are [m], shape (3, n_spheres); `dependent` is used if it is there."""
-    q, spheres = state["q"], mechanism.robot.contacts
-    at_rest = SX(mechanism.robot.layout.nv, 1)
-    bodies = outward_velocity_pass(mechanism, q, at_rest, state.get("dependent")).bodies
-    points = [bodies[s.body].point_position(constant(np.array(s.position))) for s in spheres]
+    bodies = _at_rest(mechanism, state).bodies
+    points = [bodies[s.body].point_position(constant(np.array(s.position))) for s in mechanism.robot.contacts]
     return ca.horzcat(SX(3, 0), *points)
+
+
+def sphere_axes(mechanism: Mechanism, state: Mapping[str, SX]) -> SX:
+    """Return about what they move, those that do, in the world, shape (3, n_spheres)."""
+    bodies = _at_rest(mechanism, state).bodies
+    axes = [bodies[s.body].R @ constant(np.array(s.axis)) for s in mechanism.robot.contacts]
+    return ca.horzcat(SX(3, 0), *axes)
+
+
+def _at_rest(mechanism: Mechanism, state: Mapping[str, SX]) -> Kinematics:
+    return outward_velocity_pass(mechanism, state["q"], SX(mechanism.robot.layout.nv, 1), state.get("dependent"))
 
 
 def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str, SX], seen: SX | None) -> SX:
@@ -90,11 +105,11 @@ def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str,
     """
     parameters = state.get("parameters", SX(0, 1))
     stiffness = figures(mechanism.robot, options.material, options.parameters, parameters).compliance.stiffness
-    centres, load = sphere_centres(mechanism, state), []
+    centres, axes, load = sphere_centres(mechanism, state), sphere_axes(mechanism, state), []
     for i, sphere in enumerate(mechanism.robot.contacts):
         if sphere.name in options.contacts:
-            ground = SX(3, 1) if seen is None else seen[3 * i + 3 : 3 * i + 6]
-            depth = sphere.radius - above(centres[2, i], *ca.vertsplit(ground))
+            height, *slopes = ca.vertsplit(SX(3, 1) if seen is None else seen[3 * i + 3 : 3 * i + 6])
+            depth = reach(sphere.radius, sphere.rim, axes[:, i], *slopes) - above(centres[2, i], height, *slopes)
             load.append(stiffness * ca.fmax(depth, 0))
     return ca.vertcat(*load)
 

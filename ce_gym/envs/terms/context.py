@@ -17,6 +17,7 @@ from ce_gym.compile import Grid
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX, quaternion_product
 from ce_gym.dynamics.forces.ground import above as over_ground
+from ce_gym.dynamics.forces.ground import above_deepest, reach
 from ce_gym.dynamics.recursion.derived import spanning_coordinates
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.dynamics.standing import standing_pose
@@ -283,16 +284,25 @@ class TermContext:
         return [speeds[rotor.name] for rotor in self.mechanism.robot.rotors()]
 
     def lowest_points(self, group: str) -> list[tuple[str, SX, SX]]:
-        """Return body, height above the ground [m] and velocity (3,) [m/s] of each contact sphere of a group."""
+        """Return body, height above the ground [m] and velocity (3,) [m/s] of each contact sphere of a group.
+
+        One that moves around a rim is where it is lowest: the velocity is that of the body there, none if it rolls.
+        """
         points = []
         for i, sphere in enumerate(self.mechanism.robot.contacts):
             if sphere.group == group:
                 body = self.kinematics.bodies[sphere.body]
                 centre = constant(np.array(sphere.position))
-                velocity, above = body.R @ body.point_velocity(centre), body.point_position(centre)[2]
+                above, slopes = body.point_position(centre)[2], []
                 if self._ground.numel():
-                    above = over_ground(above, *ca.vertsplit(self._ground[3 * i + 3 : 3 * i + 6]))
-                points.append((sphere.body, above - sphere.radius, velocity))
+                    height, *slopes = ca.vertsplit(self._ground[3 * i + 3 : 3 * i + 6])
+                    above = over_ground(above, height, *slopes)
+                axis = constant(np.array(sphere.axis))
+                if sphere.rim:
+                    up = body.R[2, :].T
+                    centre = centre - above_deepest(0.0, sphere.rim, up, axis, ca.dot(axis, up))
+                away = reach(sphere.radius, sphere.rim, body.R @ axis, *slopes)
+                points.append((sphere.body, above - away, body.R @ body.point_velocity(centre)))
         return points
 
     @property
@@ -302,8 +312,10 @@ class TermContext:
         spheres: dict[str, list[SX]] = {}
         for sphere in self.mechanism.robot.contacts:
             if sphere.group == "foot":
-                centre = self.kinematics.bodies[sphere.body].point_position(constant(np.array(sphere.position)))
-                spheres.setdefault(sphere.body, []).append(centre - np.array([0.0, 0.0, sphere.radius]))
+                body = self.kinematics.bodies[sphere.body]
+                away = reach(sphere.radius, sphere.rim, body.R @ constant(np.array(sphere.axis)))
+                centre = body.point_position(constant(np.array(sphere.position)))
+                spheres.setdefault(sphere.body, []).append(centre - ca.vertcat(0.0, 0.0, away))
         return [
             ca.vertcat(sum(p[:2] for p in points) / len(points), ca.mmin(ca.horzcat(*[p[2] for p in points])))
             for points in spheres.values()

@@ -172,6 +172,9 @@ def _check_contacts(robot: Robot, file: str) -> None:
             raise bad(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
         check_finite(file, f"{key}.position", contact.position)
         check_not_negative(file, f"{key}.radius", contact.radius, " [m]")
+        check_not_negative(file, f"{key}.rim", contact.rim, " [m]")
+        if len(contact.axis) != 3 or not math.isclose(math.hypot(*contact.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
+            raise bad(file, f"{key}.axis", contact.axis, "a unit axis")
     _check_capsules(robot, file)
     for name in ("stiffness", "damping", "friction", "bristle", "dissipation"):
         value = getattr(robot.material, name)

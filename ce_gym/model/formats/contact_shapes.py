@@ -1,11 +1,12 @@
 """Primitives that may touch the ground -> the contact spheres that stand for them.
 
-| primitive | spheres                                                | on a plane                                |
-|-----------|--------------------------------------------------------|-------------------------------------------|
-| sphere    | itself                                                 | exact                                     |
-| capsule   | the two at its ends                                    | exact                                     |
-| box       | at its eight corners                                   | exact                                     |
-| cylinder  | on both rims, evenly, the first towards x              | up to `1 - cos(pi / n)` radii short of it |
+| primitive  | spheres                                                | on a plane                                |
+|------------|--------------------------------------------------------|-------------------------------------------|
+| sphere     | itself                                                 | exact                                     |
+| capsule    | the two at its ends                                    | exact                                     |
+| box        | at its eight corners                                   | exact                                     |
+| cylinder   | on both rims, evenly, the first towards x              | up to `1 - cos(pi / n)` radii short of it |
+| that rolls | one on each rim, which moves around it to the ground   | exact but where it stands on a face       |
 
 With a radius, boxes and cylinders are rounded inwards by it, and stay as large as they are. None of these spheres
 sticks out of its primitive; what a field of heights raises between two of them passes unnoticed.
@@ -51,6 +52,12 @@ def spheres_of(kind: str, size: tuple[float, ...], radius: float = 0.0, rim: int
         yield from _numbered("_rim", np.array(points), radius)
     else:
         raise ValueError(f"{kind!r}; expected sphere, capsule, box or cylinder")
+
+
+def rims_of(size: tuple[float, ...], radius: float = 0.0) -> list[Sphere]:
+    """Return the rims of a cylinder that rolls, as spheres at their centres; arguments as for `spheres_of`."""
+    half = size[1] / 2 - radius
+    return [*_numbered("_rim", np.array([[0.0, 0.0, half], [0.0, 0.0, -half]]), radius)]
 
 
 def on_face(spheres: list[Sphere], face: str) -> list[Sphere]:

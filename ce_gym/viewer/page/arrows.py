@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.dynamics.forces.ground import above_deepest
 from ce_gym.viewer.page import animation, three
 from ce_gym.viewer.page.fallback_shapes import frame_along
 from ce_gym.viewer.page.poses import PosedRollout, smooth
@@ -85,7 +86,9 @@ def force_arrows(run: PosedRollout) -> Iterator[Arrow]:
         centre = run.positions[:, index] + run.rotations[:, index] @ np.array(sphere.position)
         vector = limited(1.5 * force * run.radius / weight, LONGEST * run.radius)
         path = f"{run.path}/contact forces/{name.replace('/', '_')}"
-        yield Arrow(path, FORCE_COLOR, 0.035 * run.radius, centre - [0.0, 0.0, sphere.radius], vector)
+        axis, up = run.rotations[:, index] @ np.array(sphere.axis), np.array([0.0, 0.0, 1.0])
+        start = centre - above_deepest(sphere.radius, sphere.rim, up, axis, axis[:, 2:])
+        yield Arrow(path, FORCE_COLOR, 0.035 * run.radius, start, vector)
 
 
 def speed_arrows(run: PosedRollout) -> Iterator[Arrow]:

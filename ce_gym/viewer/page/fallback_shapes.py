@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.description import Body, Robot, Shape
+from ce_gym.model.description import Body, ContactSphere, Robot, Shape
 from ce_gym.model.frames import Placement, Vec3
 from ce_gym.viewer.meshes.triangles import MOST, Triangles, drawn_meshes
 from ce_gym.viewer.meshes.visuals import visuals_of
@@ -41,8 +41,16 @@ def stick_figure(robot: Robot) -> dict[str, tuple[Shape, ...]]:
         if np.linalg.norm(end) > 1e-6:
             shapes[name].append(_stick(np.array(end), 0.5 * radius))
     for sphere in robot.contacts:
-        shapes[sphere.body].append(_ball(DARK, max(sphere.radius, 0.5 * radius), Placement(sphere.position)))
+        shapes[sphere.body].append(_touching(sphere, max(sphere.radius, 0.5 * radius)))
     return {name: tuple(items) for name, items in shapes.items()}
+
+
+def _touching(sphere: ContactSphere, radius: float) -> Shape:
+    """Return a ball for a contact sphere, a disc for one that moves around a rim."""
+    if not sphere.rim:
+        return _ball(DARK, radius, Placement(sphere.position))
+    size = sphere.rim + sphere.radius, 2 * sphere.radius or 0.2 * radius
+    return Shape("cylinder", size, _along(np.array(sphere.axis), sphere.position), (*DARK, 1.0))
 
 
 def _ball(color: Color, radius: float, placement: Placement = AT_ORIGIN) -> Shape:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ce_gym.model.description import Capsule, ContactSphere, Shape
 from ce_gym.model.errors import bad, unknown
-from ce_gym.model.formats.contact_shapes import FACES, on_face, spheres_of
+from ce_gym.model.formats.contact_shapes import FACES, on_face, rims_of, spheres_of
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform_point, vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.yaml.constraints import frame_named
@@ -20,6 +20,8 @@ from ce_gym.model.frames import Placement
 
 SIZES = {"box": 3, "cylinder": 2, "capsule": 2}
 """How many lengths a primitive has: edges, or radius and length along z [m]."""
+AXIS = (0.0, 0.0, 1.0)
+"""Of contacts that do not roll, which have no use for one."""
 MOST_ON_RIM = 64
 """Most spheres on one rim of a cylinder."""
 
@@ -32,7 +34,8 @@ def read_contacts(section: Section, links: Links) -> Iterator[ContactSphere]:
             raise bad(entry.file, entry.key("body"), entry.text("body"), "a body that moves")
         group, kind = entry.text("group", "foot"), entry.text("shape", "sphere", ("sphere", *SIZES, "collision"))
         if kind == "sphere":
-            entry.allow("body", "shape", "position", "radius", "group")
+            entry.allow("body", "shape", "position", "radius", "group", "rolls")
+            _rolls(entry, kind)
             centre = transform_point(frame, vec3(entry.vector("position", 3)))
             yield ContactSphere(name, body, centre, entry.number("radius"), group)
             continue
@@ -40,8 +43,10 @@ def read_contacts(section: Section, links: Links) -> Iterator[ContactSphere]:
         for i, shape in enumerate(shapes):
             stem = f"{name}_{i + 1}" if len(shapes) > 1 else name
             pose = compose(frame, shape.placement)
+            axis = vec3([row[2] for row in pose.rotation])
             for suffix, centre, radius in _spheres(entry, shape):
-                yield ContactSphere(f"{stem}{suffix}", body, transform_point(pose, vec3(centre)), radius, group)
+                at, rim = transform_point(pose, vec3(centre)), shape.size[0] - radius if _rolls(entry, kind) else 0.0
+                yield ContactSphere(f"{stem}{suffix}", body, at, radius, group, rim, axis if rim else AXIS)
 
 
 def read_capsules(section: Section, links: Links) -> Iterator[Capsule]:
@@ -73,7 +78,7 @@ def read_pairs(file: Section, links: Links) -> tuple[tuple[str, str], ...]:
 
 
 def _primitive(entry: Section, kind: str) -> Shape:
-    entry.allow("body", "shape", "size", "position", "rpy", "radius", "face", "rim", "group")
+    entry.allow("body", "shape", "size", "position", "rpy", "radius", "face", "rim", "rolls", "group")
     size = entry.vector("size", SIZES[kind])
     if min(size) < 0.0 or (kind != "capsule" and min(size) == 0.0):
         raise bad(entry.file, entry.key("size"), list(size), "lengths above 0 [m]")
@@ -81,9 +86,21 @@ def _primitive(entry: Section, kind: str) -> Shape:
     return Shape(kind, size, Placement(vec3(entry.vector("position", 3, (0.0, 0.0, 0.0))), turned))  # type: ignore[arg-type]
 
 
+def _rolls(entry: Section, kind: str) -> bool:
+    """Return whether contacts move around the rims of a cylinder."""
+    rolls = entry.get("rolls", False)
+    if not isinstance(rolls, bool):
+        raise bad(entry.file, entry.key("rolls"), rolls, "true or false")
+    if rolls and kind != "cylinder":
+        raise bad(entry.file, entry.key("rolls"), rolls, f"`shape: cylinder` with it, and not {kind}")
+    if rolls and "rim" in entry:
+        raise bad(entry.file, entry.key("rim"), entry.get("rim"), "none: with `rolls`, each rim is one contact")
+    return rolls
+
+
 def _collisions(entry: Section, links: Links) -> Iterator[Shape]:
     """Iterate over the <collision> elements of a link."""
-    entry.allow("body", "shape", "radius", "face", "rim", "group")
+    entry.allow("body", "shape", "radius", "face", "rim", "rolls", "group")
     link = entry.text("body")
     shapes = links.collisions.get(link, ())
     if not shapes or None in shapes:
@@ -102,4 +119,8 @@ def _spheres(entry: Section, shape: Shape) -> list[tuple[str, np.ndarray, float]
     if rim not in range(3, MOST_ON_RIM + 1):
         raise bad(entry.file, entry.key("rim"), rim, f"a whole number from 3 to {MOST_ON_RIM}, of spheres on a rim")
     face = entry.text("face", "", FACES)
+    if _rolls(entry, shape.type):
+        if face not in ("", "+z", "-z"):
+            raise bad(entry.file, entry.key("face"), face, "+z or -z: one of the two rims of what rolls")
+        return on_face(rims_of(shape.size, radius), face)
     return on_face(list(spheres_of(shape.type, shape.size, radius, int(rim))), face)
