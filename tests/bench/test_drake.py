@@ -48,7 +48,7 @@ def test_what_is_asked_of_an_integrator_is_no_step():
         )
         return Curve(code, "exact", method, points)
 
-    ours, steps = curve("ce_gym", "m", 1.0, (1e-1, 1e-5)), curve("Drake", "discrete", 10.0, (1e-1, 1e-2))
+    ours, steps = curve("ce_gym", "m", 1.0, (1e-3, 1e-5)), curve("Drake", "discrete", 10.0, (1e-1, 1e-2))
     asked = curve("Drake", ERROR_CONTROL, 50.0, (1e-3, 1e-5))
     measured = Measured(short("tumble", 1), 1e-6, [ours, steps, asked])
     found = comparisons(measured, "Drake")

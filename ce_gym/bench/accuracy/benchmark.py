@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> Report:
 def peer_tables(measured: list[Measured], code: str) -> list[Table]:
     """Return what there is to say about a peer: times, and how well it is known what it is held against."""
     known = reference_table(measured) if code == "MuJoCo" else limit_table(measured, code)
-    return [time_table(measured, code), known]
+    return [table for table in (time_table(measured, code), known) if table.rows]
 
 
 def time_table(measured: list[Measured], code: str = "MuJoCo") -> Table:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-SKIPPED = "Drake: skipped, it is not installed (pip install drake; wheels exist for Linux and macOS)."
+SKIPPED = "Drake: skipped, it is not installed (the extra `drake`; wheels exist for few systems)."
 
 
 def available() -> bool:
