@@ -230,7 +230,8 @@ def test_writes_picture_and_tables(tmp_path, monkeypatch):
     monkeypatch.setattr(accuracy, "QUICK_STEPS", (1, 5))
     scene = short("belt_leg", 3)
     monkeypatch.setitem(SCENES, "belt_leg", lambda: scene)
-    report = accuracy.run(argparse.Namespace(out=tmp_path / "new", scenes=["belt_leg"], rounds=1, quick=True))
+    given = argparse.Namespace(out=tmp_path / "new", scenes=["belt_leg"], peers=["MuJoCo"], rounds=1, quick=True)
+    report = accuracy.run(given)
     assert {path.name for path in (tmp_path / "new").iterdir()} == {"accuracy.png", "accuracy.csv", "accuracy.md"}
     with (tmp_path / "new" / "accuracy.csv").open() as file:
         rows = list(csv.DictReader(file))

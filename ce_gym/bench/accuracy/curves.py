@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -32,6 +33,8 @@ NUM_ENVS = {True: 256, False: 64}
 FEW_STEPS = 20
 TOLERANCES = (0.3, 0.1, 0.03, 1e-2, 1e-3, 1e-4, 1e-5)
 """Of our steps that adapt [rad or m]."""
+ERROR_CONTROL = "error control"
+"""Method of a peer's curve whose points are not steps but what was asked of an integrator."""
 MARGIN = 10.0
 """How far below an error two references have to agree for it to count."""
 
@@ -58,8 +61,8 @@ class Curve:
     """One method of one code on one scene.
 
     Attributes:
-        code: "ce_gym" or "MuJoCo".
-        level: Transmission level, and for MuJoCo how its equalities are held.
+        code: "ce_gym", "MuJoCo" or "Drake".
+        level: Transmission level, and for peers what else decides about the limit: how equalities are held, the law.
         method: Time-stepping method and solver.
         points: From long steps to short ones.
     """
@@ -131,18 +134,22 @@ class Comparison:
         return self.theirs / self.ours if self.ours and self.theirs else None
 
 
-def measure(scene: Scene, our_steps: Sequence[int], peer_steps: Sequence[int], rounds: int) -> Measured:
+def measure(
+    scene: Scene, our_steps: Sequence[int], peer_steps: Sequence[int], rounds: int, more: Sequence[More] = ()
+) -> Measured:
     """Measure all curves of a scene, competitors taking turns.
 
     Args:
         scene: The scene.
         our_steps: Steps to a hold of our methods.
-        peer_steps: The same of peers.
+        peer_steps: The same of MuJoCo's; none leaves it out.
         rounds: How often each point is timed.
+        more: Other peers, where they are installed.
     """
     truth, ours_limit, measured = reference(scene)
     sides = our_sides(scene, our_steps, ours_limit)
-    sides += peer_sides(scene, peer_steps, measured)
+    sides += peer_sides(scene, peer_steps, measured) if peer_steps else []
+    sides += [side for peers in more for side in peers(scene, truth, measured)]
     paths: dict[Side, Array] = {}
 
     def runner(side: Side) -> Callable[[], None]:
@@ -177,6 +184,10 @@ class Side:
     run: Callable[[], Array]
     robots: int
     limit: Array
+
+
+More: TypeAlias = Callable[[Scene, Array, Measured], list[Side]]
+"""Sides of another peer from a scene, its truth and what is measured of it, which gets the limits of that peer."""
 
 
 def reference(scene: Scene) -> tuple[Array, Array, Measured]:
@@ -281,14 +292,15 @@ def time_to(curve: Curve, errors: Sequence[float], error: float) -> float | None
     return seconds
 
 
-def comparisons(measured: Measured) -> list[Comparison]:
+def comparisons(measured: Measured, code: str = "MuJoCo") -> list[Comparison]:
     """Compare both sides at every decade of error, from the first that takes one of them more than its longest step.
 
-    Ours are the exact curves, MuJoCo's all of them. Ends where the limit of ours is known no better.
+    Ours are the exact curves, those of the peer `code` all it has. Ends where the limit of ours is known no better.
     """
     ours = [curve for curve in measured.curves if curve.code == "ce_gym" and curve.level == measured.scene.exact]
-    theirs = [curve for curve in measured.curves if curve.code == "MuJoCo"]
-    coarse = [min((e for c in side if (e := measured.errors(c)[0]) > 0), default=1.0) for side in (ours, theirs)]
+    theirs = [curve for curve in measured.curves if curve.code == code]
+    stepping = [curve for curve in theirs if curve.method != ERROR_CONTROL]
+    coarse = [min((e for c in side if (e := measured.errors(c)[0]) > 0), default=1.0) for side in (ours, stepping)]
     found, exponent = [], min(-1, math.floor(math.log10(max(coarse))))
     while 10.0**exponent >= MARGIN * min(measured.known(curve) for curve in ours):
         level = 10.0**exponent

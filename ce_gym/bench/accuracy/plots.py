@@ -1,6 +1,6 @@
 """The picture of the accuracy benchmark: one panel for each scene, error against time. Needs matplotlib.
 
-Lines are ours in blue and green, MuJoCo's in orange, red and grey; the palette is that of Okabe and Ito.
+Lines are ours in blue and green, MuJoCo's in orange and red, Drake's in yellow; the palette is that of Okabe and Ito.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ APPROXIMATE = ("ce_gym, armature or coupled, Euler", GREY, "o-")
 COLORS = {"": ORANGE, "exact": "#CC79A7", "stiff": RED}
 """MuJoCo's: without rotors, rotors as bodies or loops at its default, and held stiffly."""
 VARIANTS = {"": "without rotor bodies", "exact": "with rotor bodies", "stiff": "the same, stiff"}
+DRAKE, DRAKE_MARKERS = "#B8A000", {"discrete": "P", "fixed steps": "X", "error control": "*"}
+"""Yellow, dark enough for thin lines."""
 MARKERS = {"Euler": "o", "implicitfast": "^", "discrete": "s", "RK4": "D"}
 
 
@@ -74,6 +76,9 @@ def _look(curve: Curve, exact: str) -> tuple[str, dict[str, Any]]:
         label, color, line = OURS[curve.method] if curve.level == exact else APPROXIMATE
         dashed = curve.level != exact
         return label, {"color": color, "marker": line[0], "linestyle": "--" if dashed else "-", "zorder": 5}
+    if curve.code == "Drake":
+        marker = DRAKE_MARKERS[curve.method]
+        return f"Drake, {curve.method}", {"color": DRAKE, "marker": marker, "linestyle": ":", "markerfacecolor": "none"}
     kind = "stiff" if "stiff" in curve.level else "exact" if curve.level.split(",")[0] in ("exact", exact) else ""
     marker = MARKERS[curve.method]
     label = f"MuJoCo {curve.method}, {VARIANTS[kind]}"

@@ -1,0 +1,165 @@
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
+"""A scene as a diagram of Drake's: the robot at a transmission level, its drives and the ground.
+
+The diagram is Drake's own C++ throughout, so that one call runs a scene: a source that holds targets or torques, the
+plant, and a log of what is recorded at the end of every hold.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import PdControllerGains, SpatialInertia, UnitInertia
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, ZeroOrderHold
+from pydrake.trajectories import PiecewisePolynomial
+
+from ce_gym.bench.accuracy.drake_peer.description import to_urdf
+from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.export.joint_ties import Tie, joint_ties
+from ce_gym.export.mjcf import SMALLEST_MASS, mass_properties
+from ce_gym.export.mjcf_equalities import joint_armature
+from ce_gym.model.mechanism import Mechanism, build_mechanism
+
+logging.getLogger("drake").setLevel(logging.ERROR)  # half spaces do not touch deformable bodies, TAMSI goes: no news
+
+BEFORE = 1e-9
+"""How long before its hold a target is given [s]: steps begin at multiples of a length that rounds."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """A scene in Drake.
+
+    Attributes:
+        diagram: Source, plant and log.
+        plant: The robot.
+        log: Of the plant's state.
+        mechanism: What it was made from.
+    """
+
+    diagram: Any
+    plant: Any
+    log: Any
+    mechanism: Mechanism
+
+
+def stated(scene: Scene, level: str, dt: float, approximation: str) -> Stated:
+    """State a scene at a transmission level.
+
+    Args:
+        scene: The scene: torques or targets of joints, with a constant push at most.
+        level: "none", "armature" or "exact".
+        dt: Length of discrete steps [s]; 0 is a plant in continuous time.
+        approximation: "sap", "similar", "lagged" or "tamsi" of a discrete plant.
+    """
+    mechanism = build_mechanism(scene.robot, level, eliminate=False)
+    builder = DiagramBuilder()
+    contact = bool(scene.robot.contacts)
+    how = {} if dt == 0.0 else {"discrete_contact_approximation": approximation}
+    config = MultibodyPlantConfig(
+        time_step=dt,
+        use_sampled_output_ports=False,
+        contact_model="point",
+        stiction_tolerance=scene.robot.material.slip_speed,
+        **how,
+    )
+    plant, _ = AddMultibodyPlant(config, builder)
+    ties = joint_ties(mechanism)
+    (instance,) = Parser(plant).AddModelsFromString(to_urdf(mechanism, ties), "urdf")
+    _add_couplers(plant, mechanism, ties)
+    _add_actuators(plant, scene, joint_armature(mechanism, ties))
+    push = np.zeros(3) if scene.push is None else scene.push[0]
+    plant.mutable_gravity_field().set_gravity_vector(np.array(scene.robot.gravity) + push)
+    if contact:
+        _add_contacts(plant, scene, hunt_crossley=approximation != "sap" or dt == 0.0)
+    plant.Finalize()
+    _drive(builder, plant, instance, scene, dt)
+    log = LogVectorOutput(plant.get_state_output_port(), builder, HOLD)
+    return Stated(builder.Build(), plant, log, mechanism)
+
+
+def _add_couplers(plant: MultibodyPlant, mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:
+    """Tie every joint that follows from a single other one; the rest are tendons of the description."""
+    for name in mechanism.bodies:
+        if name in ties and name not in ties[name].ratios and len(ties[name].ratios) == 1:
+            ((other, ratio),) = ties[name].ratios.items()
+            joints = (plant.GetJointByName(joint) for joint in (name, other))
+            plant.AddCouplerConstraint(*joints, ratio, ties[name].offset)
+
+
+def _add_actuators(plant: MultibodyPlant, scene: Scene, armature: dict[str, float]) -> None:
+    """Add a motor to every driven joint, with reflected inertia, gains and the limit of its torque."""
+    robot = scene.robot
+    kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
+    for name in robot.independent:
+        motor = plant.AddJointActuator(name, plant.GetJointByName(name), robot.body(name).joint.torque)
+        motor.set_default_rotor_inertia(armature.get(name, 0.0))
+        motor.set_default_gear_ratio(1.0)
+        if scene.control == "position":
+            motor.set_controller_gains(PdControllerGains(p=kp.get(name, 0.0), d=kd.get(name, 0.0)))
+
+
+def _add_contacts(plant: MultibodyPlant, scene: Scene, hunt_crossley: bool) -> None:
+    """Add contact spheres on a rigid half space; damping is ours, or that of ours at the load of standing."""
+    robot, law = scene.robot, scene.robot.material
+    properties, ground = ProximityProperties(), ProximityProperties()
+    friction = CoulombFriction(law.friction, law.friction)
+    weight = robot.total_mass * float(np.linalg.norm(robot.gravity))
+    damping = law.damping * len(robot.contacts) / weight if hunt_crossley else None
+    AddContactMaterial(dissipation=damping, point_stiffness=law.stiffness, friction=friction, properties=properties)
+    AddContactMaterial(
+        dissipation=0.0 if hunt_crossley else None, point_stiffness=1e12, friction=friction, properties=ground
+    )
+    properties.AddProperty("material", "relaxation_time", law.damping / law.stiffness)
+    ground.AddProperty("material", "relaxation_time", 0.0)
+    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", ground)
+    for contact in robot.contacts:
+        place = RigidTransform(np.array(contact.position))
+        body = plant.GetBodyByName(contact.body)
+        plant.RegisterCollisionGeometry(body, place, Sphere(contact.radius), contact.name, properties)
+
+
+def _drive(builder: DiagramBuilder, plant: MultibodyPlant, instance: Any, scene: Scene, dt: float) -> None:
+    """Hold targets or torques; a plant in continuous time needs an event at every change, which a hold makes."""
+    if not plant.num_actuators():
+        return
+    drive = scene.drive if scene.control == "torque" else np.hstack([scene.drive, np.zeros_like(scene.drive)])
+    breaks = HOLD * np.arange(scene.holds + 1) - BEFORE
+    samples = np.vstack([drive, drive[-1:]]).T
+    source = builder.AddSystem(TrajectorySource(PiecewisePolynomial.ZeroOrderHold(breaks, samples)))
+    output = source.get_output_port()
+    if dt == 0.0:
+        hold = builder.AddSystem(ZeroOrderHold(HOLD, len(samples)))
+        builder.Connect(output, hold.get_input_port())
+        output = hold.get_output_port()
+    torque = scene.control == "torque"
+    builder.Connect(
+        output, plant.get_actuation_input_port() if torque else plant.get_desired_state_input_port(instance)
+    )
+
+
+def put_inertias(stated: Stated, context: Any) -> None:
+    """Put the published inertias in place of the stand-ins."""
+    for moving in stated.mechanism.bodies.values():
+        mass, com, inertia = mass_properties(moving.inertia)
+        mass = max(mass, SMALLEST_MASS)  # inertia is stated for a unit mass
+        about_origin = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
+        unit = about_origin / mass
+        spatial = SpatialInertia(mass, com, UnitInertia(*unit.diagonal(), unit[0, 1], unit[0, 2], unit[1, 2]), True)
+        stated.plant.GetBodyByName(moving.name).SetSpatialInertiaInBodyFrame(context, spatial)
+
+
+def rotation(quaternion: Array) -> Array:
+    """Return the rotation matrix, shape (3, 3), of a quaternion wxyz."""
+    w, x, y, z = quaternion
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2.0 * (w * K + K @ K)
