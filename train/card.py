@@ -287,11 +287,11 @@ def portable(record: dict[str, Any]) -> dict[str, Any]:
     terrain = kwargs.get("terrain")
     if isinstance(terrain, Mapping) and "file" in terrain:  # a copy lies beside the policy
         kwargs["terrain"] = {**terrain, "file": Path(terrain["file"]).name}
-    settings = dict(record["settings"])
+    own: dict[str, Any] = {"resumed_from": Path(resumed).name if resumed else None, "env_kwargs": kwargs}
+    settings = record.get("settings", {})
     if "teacher" in settings:
-        settings["teacher"] = Path(settings["teacher"]).name
-    own = {"env_kwargs": kwargs, "settings": settings}
-    return record | {"resumed_from": Path(resumed).name if resumed else None} | own
+        own["settings"] = {**settings, "teacher": Path(settings["teacher"]).name}
+    return record | own
 
 
 def main(argv: list[str] | None = None) -> int:
