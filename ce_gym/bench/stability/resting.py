@@ -31,9 +31,8 @@ WATCHED = 25
 """Holds over which speeds are taken, at the end."""
 AT_REST = 1e-3
 """Largest root mean square speed, from positions [m/s and rad/s]: what can be seen."""
-
-
 STRETCHING = f" {ELASTIC}"
+"""What names of scenes end with whose transmissions stretch."""
 
 
 @dataclass(frozen=True)
