@@ -96,7 +96,7 @@ def teacher_columns(teacher: Policy, name: str, native: Any, kwargs: Mapping[str
         if key not in known:
             raise PolicyError(f"{name}: sees {key}; expected it among what the critic sees: {', '.join(known)}")
         wanted, given = there.get(key, {}), here.get(key, {})
-        if known[key] != size or any(given.get(name) != value for name, value in wanted.items()):
+        if known[key] != size or any(given.get(one) != value for one, value in wanted.items()):
             raise PolicyError(
                 f"{name}: sees {key} of {wanted}, {size} numbers; here it has {given}, {known[key]} numbers"
             )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from ce_gym.identify.held import limbs_of
 from ce_gym.model.description import Robot
+from ce_gym.model.drives import ELASTIC_FACTORS
 from ce_gym.model.errors import RobotError, unknown
 
 KINDS = {
@@ -26,6 +27,8 @@ KINDS = {
 }
 """What can be sought."""
 OF_ENCODERS = "encoder_zero"
+OF_ELASTIC = *ELASTIC_FACTORS, OF_ENCODERS
+"""What there is where transmissions stretch."""
 NO_PARAMETERS = "delay", OF_ENCODERS
 """What is no parameter of the simulator."""
 UNITS = {"motor_damping": "N m s/rad", "motor_friction": "N m", "joint_damping": "N m s/rad", "joint_friction": "N m"}
@@ -34,10 +37,6 @@ FACTORS = 0.02, 50.0
 """Between which factors are sought."""
 LARGE_ZERO = 0.01
 """What is large for the zero of an encoder at a joint [rad or m]."""
-
-
-ELASTIC = "drive_stiffness", "drive_damping", "backlash", OF_ENCODERS
-"""What there is where transmissions stretch."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def default_kinds(robot: Robot, measured: Sequence[tuple[str, str]] = ()) -> tup
     spins = ("rotor_inertia",) if any(robot.rotors()) else ()
     rubs = "motor" if robot.motors else "joint"
     kinds = (*spins, f"{rubs}_damping", f"{rubs}_friction", "link_inertia", "delay")
-    stretch = tuple(kind for kind in ELASTIC if _of_kind(robot, kind, 1.0, measured))
+    stretch = tuple(kind for kind in OF_ELASTIC if _of_kind(robot, kind, 1.0, measured))
     return (*kinds, *stretch)
 
 
@@ -134,7 +133,7 @@ def sought(
 
 def _of_kind(robot: Robot, kind: str, longest_delay: float, measured: Sequence[tuple[str, str]] = ()) -> list[Figure]:
     limb = limbs_of(robot)
-    if kind in ELASTIC:
+    if kind in OF_ELASTIC:
         return _of_elastic(robot, kind, measured)
     if kind == "delay":
         return [Figure(kind, "", 0.0, longest_delay / 10, 0.0, longest_delay, longest_delay / 3, -1)]

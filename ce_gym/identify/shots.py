@@ -155,7 +155,7 @@ class Shots:
         return self.run(values, states, first, length)[0]
 
     def run(self, values: Array, states: Array, first: NDArray[np.int64], length: int) -> tuple[Array, Array]:
-        """Return that, and states at the last row, shape (C, W, nq + nv)."""
+        """Return what a call does, and states at the last row, shape (C, W, nq + nv); arguments as there."""
         most = max(1, LARGEST_BATCH // len(values))
         pieces = range(0, len(first), most)
         parts = [self._batch(values, states[:, i : i + most], first[i : i + most], length) for i in pieces]

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+ELASTIC_FACTORS = "drive_stiffness", "drive_damping", "backlash"
+"""What each elastic transmission can have a factor on, and all of them together."""
+
 
 @dataclass(frozen=True)
 class DriveFriction:

@@ -17,11 +17,10 @@ from typing import TypeAlias
 import numpy as np
 
 from ce_gym.bench.accuracy.ours import Ours
-from ce_gym.bench.accuracy.peers import Family, Peer
+from ce_gym.bench.accuracy.peers import Peer, families
 from ce_gym.bench.accuracy.references import contact as accuracy_contact
 from ce_gym.bench.accuracy.references import smooth as accuracy_references
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
-from ce_gym.bench.accuracy.statements import GROUNDS, Stating
 from ce_gym.bench.measure.timing import Competitor, interleaved
 
 OUR_STEPS = (1, 2, 5, 10, 20, 50, 100, 200)
@@ -228,11 +227,8 @@ def our_sides(scene: Scene, steps: Sequence[int], exact: Array) -> list[Side]:
 
 def peer_sides(scene: Scene, steps: Sequence[int], measured: Measured) -> list[Side]:
     """Return MuJoCo's levels, ways to hold equalities and integrators at all step lengths."""
-    grounds: tuple[Stating | None, ...] = (None,) if scene.terrain is None else GROUNDS
-    families = [Family(scene, level, False, ground) for ground in grounds for level in scene.levels]
-    families += [Family(scene, soft.level, True, soft.ground) for soft in families if soft.tied]
     sides = []
-    for family in families:
+    for family in families(scene):
         finest = PEER_LIMIT if scene.robot.independent else 4 * PEER_LIMIT
         limit, coarser = (Peer(family, "RK4", n).run() for n in (finest, finest // 2))
         measured.limits["MuJoCo", family.name] = rms_error(scene, coarser, limit)

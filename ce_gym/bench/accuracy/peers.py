@@ -14,7 +14,7 @@ import numpy as np
 from mujoco import rollout
 
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
-from ce_gym.bench.accuracy.statements import Stating, ratios, stated
+from ce_gym.bench.accuracy.statements import GROUNDS, Stating, ratios, stated
 from ce_gym.dynamics.model import Model
 from ce_gym.export import mujoco_model
 from ce_gym.export.mujoco_batch import STATE
@@ -95,6 +95,13 @@ class Family:
     def tied(self) -> bool:
         """Whether there are equalities to hold."""
         return self.model.neq > 0
+
+
+def families(scene: Scene) -> list[Family]:
+    """Return MuJoCo's ways to state a scene: grounds and levels, then equalities held stiffly where there are any."""
+    grounds: tuple[Stating | None, ...] = (None,) if scene.terrain is None else GROUNDS
+    soft = [Family(scene, level, False, ground) for ground in grounds for level in scene.levels]
+    return [*soft, *(Family(scene, one.level, True, one.ground) for one in soft if one.tied)]
 
 
 class Peer:

@@ -15,9 +15,8 @@ import numpy as np
 
 from ce_gym.bench.accuracy.curves import INTEGRATORS
 from ce_gym.bench.accuracy.ours import Ours
-from ce_gym.bench.accuracy.peers import Family, Peer
+from ce_gym.bench.accuracy.peers import Peer, families
 from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Array, Scene
-from ce_gym.bench.accuracy.statements import GROUNDS
 from ce_gym.bench.measure.report import Cell, Table
 from ce_gym.model.mechanism import ELASTIC
 from ce_gym.viewer.console import shown
@@ -31,9 +30,8 @@ WATCHED = 25
 """Holds over which speeds are taken, at the end."""
 AT_REST = 1e-3
 """Largest root mean square speed, from positions [m/s and rad/s]: what can be seen."""
-
-
 STRETCHING = f" {ELASTIC}"
+"""What names of scenes end with whose transmissions stretch."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +78,7 @@ def cells(scene: Scene, steps: tuple[int, ...]) -> Iterator[tuple[str, int, Rest
         ours = Ours(scene, method, scene.exact, "tangent", 1)
         for n in steps:
             yield f"ce_gym, {method}", n, rest(ours.run(n, TOLERANCE if method == "adaptive" else None))
-    grounds = (None,) if scene.terrain is None else GROUNDS
-    families = [Family(scene, level, False, ground) for level, ground in itertools.product(scene.levels, grounds)]
-    families += [Family(scene, soft.level, True, soft.ground) for soft in families if soft.tied]
-    for family, integrator in itertools.product(families, INTEGRATORS):
+    for family, integrator in itertools.product(families(scene), INTEGRATORS):
         for n in steps:
             yield f"MuJoCo {family.name}, {integrator}", n, rest(Peer(family, integrator, n).run())
 

@@ -96,7 +96,7 @@ def touch_ground(body: BodyState, sphere: ContactSphere, height: SX, normal: SX,
 
     Args:
         body: Kinematics of the body that carries it.
-        sphere: Which one.
+        sphere: The sphere, or the rim around which one moves.
         height: Of the ground under the centre [m].
         normal: Unit normal of the ground there, world axes, shape (3,).
         load: Its normal force over the last step [N].

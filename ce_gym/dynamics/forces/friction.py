@@ -55,7 +55,7 @@ class Tangent:
 
 
 class Secant:
-    """One solve, whatever happens."""
+    """One solve: what happens to a contact in it does not ask for another."""
 
     iterations = 0
 
@@ -66,7 +66,7 @@ class Secant:
         return TangentialForce(share * x, share * slope, SX(3, 1), SX(3, 1))
 
     def check(self, contact: LinearContact, slip: SX, gain: SX) -> SX:
-        """Return that nothing has changed: another iteration would take the same secant."""
+        """Return 0: another iteration would take the same secant."""
         return SX(0)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 FLAT = 0.01
-"""How far a disc leans whose point is half way out or so [rad]; a wheel is larger by the half of its square."""
+"""How far a disc leans whose point is 0.7 of the way out [rad]; a wheel is larger by half of its square, as a share."""
 
 
 def above(z: Any, height: Any, slope_x: Any, slope_y: Any) -> Any:

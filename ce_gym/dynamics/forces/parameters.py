@@ -14,7 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX, skew
 from ce_gym.dynamics.forces.contact import Compliance
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
-from ce_gym.model.drives import Battery, Elasticity, Motor
+from ce_gym.model.drives import ELASTIC_FACTORS, Battery, Elasticity, Motor
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 PARAMETERS = {
@@ -49,8 +49,6 @@ PARAMETERS = {
     "com_shift:BODY": "shift of the centre of mass of a body, in its frame [m], 3",
 }
 """What can be declared, with unit and size; BODY stands for the name of a link, ROTOR for that of a rotor."""
-ELASTIC_FACTORS = "drive_stiffness", "drive_damping", "backlash"
-"""What each elastic transmission has a factor on, and all of them together."""
 
 
 @dataclass

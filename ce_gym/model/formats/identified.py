@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 
 from ce_gym.model.description import Body, Robot
+from ce_gym.model.drives import ELASTIC_FACTORS
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import mat3
 from ce_gym.model.formats.reading import Section
 
 RUBBING = "motor_damping", "motor_friction", "joint_damping", "joint_friction"
-OF_DRIVES = "drive_stiffness", "drive_damping", "backlash"
-KINDS = "link_inertia", "added_mass", "rotor_inertia", *RUBBING, *OF_DRIVES
+KINDS = "link_inertia", "added_mass", "rotor_inertia", *RUBBING, *ELASTIC_FACTORS
 """In the order in which they are laid over: a link's factor is one on what the file has."""
 MAY_VANISH = *RUBBING, "drive_damping", "backlash"
+"""What may be 0."""
 
 
 def with_identified(robot: Robot, section: Section) -> Robot:
@@ -47,14 +48,14 @@ def _owners(robot: Robot, kind: str) -> tuple[str, ...]:
         return tuple(motor.rotor for motor in robot.motors)
     if kind.startswith("joint"):
         return robot.commanded
-    if kind in OF_DRIVES:
+    if kind in ELASTIC_FACTORS:
         return tuple(elastic.rotor for elastic in robot.elastic)
     return tuple(body.name for body in robot.bodies if body.kind == "link")
 
 
 def _with(robot: Robot, kind: str, name: str, value: float) -> Robot:
     figure = kind.split("_")[-1]
-    if kind in OF_DRIVES:
+    if kind in ELASTIC_FACTORS:
         now = next(getattr(elastic, figure) for elastic in robot.elastic if elastic.rotor == name)
         return replace(robot, elastic=_changed(robot.elastic, "rotor", name, {figure: value * now}))
     if kind.startswith("motor"):

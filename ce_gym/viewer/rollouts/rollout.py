@@ -192,7 +192,7 @@ def _scan(given: Mapping[str, Any]) -> dict[str, Any]:
         found[name] = rows.tolist()
     for name in march if "rays" in given else ():
         if not (isinstance(given.get(name), int | float) and 0 < given[name] <= 1e4):
-            raise RolloutError(f"scan: {name} is {given.get(name)!r}; expected a number from 0 to 10000")
+            raise RolloutError(f"scan: {name} is {given.get(name)!r}; expected a number above 0, at most 10000")
         found[name] = given[name]
     return found
 

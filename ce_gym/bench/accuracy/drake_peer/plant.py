@@ -23,7 +23,7 @@ from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, ZeroOr
 from pydrake.trajectories import PiecewisePolynomial
 
 from ce_gym.bench.accuracy.drake_peer.description import to_urdf
-from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.bench.accuracy.scenarios import HOLD, Scene
 from ce_gym.export.joint_ties import Tie, joint_ties
 from ce_gym.export.mjcf import SMALLEST_MASS, mass_properties
 from ce_gym.export.mjcf_equalities import joint_armature
@@ -156,10 +156,3 @@ def put_inertias(stated: Stated, context: Any) -> None:
         unit = about_origin / mass
         spatial = SpatialInertia(mass, com, UnitInertia(*unit.diagonal(), unit[0, 1], unit[0, 2], unit[1, 2]), True)
         stated.plant.GetBodyByName(moving.name).SetSpatialInertiaInBodyFrame(context, spatial)
-
-
-def rotation(quaternion: Array) -> Array:
-    """Return the rotation matrix, shape (3, 3), of a quaternion wxyz."""
-    w, x, y, z = quaternion
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + 2.0 * (w * K + K @ K)

@@ -11,12 +11,12 @@ from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
 
 STATED = ("humanoid", "tumble", "belt_leg", "stiff_1e3", "drop_3cm", "stick", "breakaway", "slide")
 """Scenes that are stated in Drake. A push that varies would need a system of Python's; loops, links that touch, springs
-of belts and stairs are not stated; gains above 1e3 N m/rad, on which integrators
-spend minutes, and all landings but one are left out to keep the benchmark short."""
+of belts and stairs are not stated; gains above 1e3 N m/rad, the trot and all landings but one, on which integrators
+spend minutes, are left out to keep the benchmark short."""
 STEPS, STEPS_IN_CONTACT = (1, 2, 5, 10, 20, 50, 100, 200), (1, 2, 5, 10, 20, 50, 100)
 """Steps to a hold."""
 FIXED = (1, 2, 5, 10, 20, 50)
-"""The same of Runge and Kutta's methods without error control."""
+"""The same of Runge-Kutta methods without error control."""
 ACCURACIES, LOW_ORDER = tuple(10.0**-k for k in range(1, 12)), tuple(10.0**-k for k in range(1, 6))
 """Asked of integrators: of those of high order, and of CENIC and of those whose level leaves something out."""
 LIMIT = 200
