@@ -55,7 +55,7 @@ class Rest:
 def resting(name: str, time: float) -> Scene:
     """Return a scene that holds what it asks for when it is most, for some time [s].
 
-    "NAME elastic" is the scene whose robot's transmissions stretch, with backlash, which MuJoCo has no words for.
+    "NAME elastic" is the scene whose robot's transmissions stretch, with backlash, which MuJoCo cannot state.
     """
     scene = SCENES[name.removesuffix(STRETCHING)]()
     if name.endswith(STRETCHING):
