@@ -75,6 +75,10 @@ class Settings:
     training: Mapping[str, Any]
 
 
+SENSOR_ERRORS = ("drift", "shift", "dropout", "delay")
+"""Parameters of observation blocks that the critic does not see."""
+
+
 def teacher_columns(teacher: Policy, name: str, native: Any, kwargs: Mapping[str, Any]) -> NDArray[np.intp]:
     """Return where the teacher finds its observation in the critic's, shape (n_obs,).
 
@@ -96,7 +100,8 @@ def teacher_columns(teacher: Policy, name: str, native: Any, kwargs: Mapping[str
         if key not in known:
             raise PolicyError(f"{name}: sees {key}; expected it among what the critic sees: {', '.join(known)}")
         wanted, given = there.get(key, {}), here.get(key, {})
-        if known[key] != size or any(given.get(one) != value for one, value in wanted.items()):
+        named = {*wanted, *given} - {*SENSOR_ERRORS}
+        if known[key] != size or any(given.get(one) != wanted.get(one) for one in named):
             raise PolicyError(
                 f"{name}: sees {key} of {wanted}, {size} numbers; here it has {given}, {known[key]} numbers"
             )
