@@ -175,6 +175,13 @@ def test_other_parameters_of_a_block_are_one_line(tmp_path):
         train(job(tmp_path, settings=["teacher=mini_cheetah_stairs"], env_kwargs=kwargs))
 
 
+def test_a_parameter_that_the_teacher_leaves_alone_is_one_line(tmp_path):
+    kwargs = load_env_args(Settings.folder / "mini_cheetah_stairs.yaml")
+    kwargs["observations"]["height_scan"] |= {"clip": 0.5}
+    with pytest.raises(PolicyError, match=r"sees height_scan of .*here it has .*'clip': 0.5"):
+        train(job(tmp_path, settings=["teacher=mini_cheetah_stairs"], env_kwargs=kwargs))
+
+
 def test_a_teacher_with_a_history_is_one_line(tmp_path):
     with pytest.raises(PolicyError, match="mini_cheetah_rough: history=3; expected a teacher that sees the present"):
         train(job(tmp_path, settings=["teacher=mini_cheetah_rough"]))
