@@ -21,6 +21,7 @@ def flat_map(dt: float, **changes) -> stability_grid.Map:
     """A map without a fault, but for the changes."""
     shape = stability_grid.SHAPE
     figures = {"finite": np.ones(shape, bool), "chatter": np.full(shape, 1e-9), "gain": np.zeros(shape)}
+    figures |= {"source": np.full(shape, "motion"), "when": np.zeros(shape)}
     return stability_grid.Map(**({"dt": dt, "settled": 1.0, "excess": np.full(shape, -0.1)} | figures | changes))
 
 
@@ -31,13 +32,26 @@ def test_one_bad_cell_misses_its_bar(name: str, value: float, bar: int):
     good = flat_map(0.001)
     report = Report("stability")
     stability.report_map(report, {"robot": [good]})
-    assert [r.met for r in report.requirements] == [True] * 4
+    assert [r.met for r in report.requirements] == [True] * 5
     cells = getattr(good, name).copy()
     cells[2, 1] = value
     report = Report("stability")
     stability.report_map(report, {"robot": [good, flat_map(0.002, **{name: cells})]})
-    assert [r.met for r in report.requirements] == [i != bar for i in range(4)]
+    assert [r.met for r in report.requirements] == [i != bar for i in range(4)] + [name != "gain"]
     assert "39 of 40" in report.requirements[bar].measured
+
+
+def test_cells_in_which_energy_rises_are_listed_with_what_adds_most():
+    """Those that are lost have no energy; the bar counts steps below 5 ms only."""
+    gain, finite = np.zeros(stability_grid.SHAPE), np.ones(stability_grid.SHAPE, bool)
+    gain[2, 1], gain[0, 0], finite[0, 0] = 1e-6, 1.0, False
+    source = np.full(stability_grid.SHAPE, "stops")
+    fine, coarse = (flat_map(dt, gain=gain, finite=finite, source=source) for dt in (0.002, 0.005))
+    report = Report("stability")
+    stability.report_map(report, {"robot": [fine, coarse]})
+    cells = report.tables[1].rows
+    assert cells == tuple(("robot", dt, "1e+05", 10.0, 1e-6, "stops", 0.0) for dt in (2.0, 5.0))
+    assert report.requirements[-1].measured == "19 of 20, 1 by stops"
 
 
 def test_picture(tmp_path: Path):

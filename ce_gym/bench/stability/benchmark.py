@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import itertools
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ PARTS = ("map", "cases", "robots", "beside")
 BESIDE = ("drop_3cm", "drop_3cm elastic", "stairs", "shanks", "biped")
 RESTING = 20.0
 """Scenes that come to rest beside MuJoCo, and how long they have [s]."""
+FINE = 5.0
+"""Steps below which no energy should rise at all [ms]."""
 DRIFT = 1e-3
 """Largest drift of a robot that stands [m]."""
 
@@ -101,12 +104,29 @@ def report_map(report: Report, maps: dict[str, list[grid.Map]]) -> None:
     passive = int((gain <= grid.ROUNDING).sum())
     text = f"{passive} of {n}, worst {gain.max():.1e} of the energy lost"
     met(Requirement("map: energy with springs and bristles never rises, without motors", text, passive == n))
+    report_rises(report, maps)
     report.remarks.append(
         "Speed at rest: rms over all coordinates and 100 steps in a row [m/s and rad/s], once below the bar or when "
         "the time is up. Energy gained: largest rise above the lowest so far, springs included; kinetic and potential: "
         "highest above the start; both as shares of the energy that a robot loses when it collapses. What is gained at "
         "coarse steps is in stiff springs that a corner dips into within a step; they do not give it back."
     )
+
+
+def report_rises(report: Report, maps: dict[str, list[grid.Map]]) -> None:
+    """Add a row for each cell in which the sum of all energies rises, and the bar below 5 ms."""
+    rows: list[tuple[Cell, ...]] = []
+    for name, m in ((name, m) for name, steps in maps.items() for m in steps):
+        for i, j in np.argwhere(m.finite & (m.gain > grid.ROUNDING)):
+            cell = (name, 1e3 * m.dt, f"{grid.STIFFNESSES[i]:.0e}", 1e3 * grid.SLIP_SPEEDS[j])
+            rows.append((*cell, float(m.gain[i, j]), str(m.source[i, j]), float(m.when[i, j])))
+    columns = ("robot", "dt [ms]", "k [N/m]", "slip speed [mm/s]", "gained / lost", "by", "most at [s]")
+    title = "Cells in which energy with springs and bristles rises, and what adds most where it rises most"
+    report.tables.append(Table(title, columns, tuple(rows)))
+    fine = [str(row[5]) for row in rows if float(str(row[1])) < FINE]
+    n = sum(m.finite.size for steps in maps.values() for m in steps if 1e3 * m.dt < FINE)
+    said = ", ".join([f"{n - len(fine)} of {n}", *(f"{count} by {source}" for source, count in Counter(fine).items())])
+    report.requirements.append(Requirement(f"map: the same below {FINE:g} ms", said, not fine))
 
 
 def report_cases(report: Report) -> None:
