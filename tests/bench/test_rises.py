@@ -18,13 +18,13 @@ from ce_gym.sim import Simulator
 DT = 0.004
 
 
-def step(model: Model, q, v) -> tuple[Largest, np.ndarray]:
+def step(model: Model, q, v, torque: float = 0.0) -> tuple[Largest, np.ndarray]:
     """Return one step as `Largest`, which takes it whatever it does to the energy, and the energy after it."""
     sim = Simulator(model, 1, DT, control="torque", outputs=("energy", "contact_forces"))
     sim.set_state(q, v)
     before = sim.snapshot()
     largest = Largest.none(before, sim.contact_forces)
-    sim.step(np.zeros(len(model.joint_links)))
+    sim.step(np.full(len(model.joint_links), torque))
     largest.take(7, np.ones(1), before, sim.snapshot(), sim.contact_forces)
     return largest, sim.energy
 
@@ -61,8 +61,8 @@ def test_a_stop_acts_by_the_velocity_at_the_start():
     foot = ContactSphere("foot", "link", (0.0, 0.0, 1.0), 0.1)  # in the air
     model = Model(Robot("slider", (link,), (), ("link",), (foot,), gravity=(0.0, 0.0, 0.0)))
     k, c = limit_stiffness(model.robot, "link")
-    for start in (0.05, -0.5):  # deeper; so fast out of it that the stop would have to pull
-        largest, _ = step(model, [0.101], [start])
+    for start, torque in ((0.05, 0.0), (-0.1, 200.0)):  # deeper; out of it, but for a force that turns it round
+        largest, _ = step(model, [0.101], [start], torque)
         after = float(largest.after["v"][0, 0])
         added = sources(model, largest, np.zeros(1), DT)[0, SOURCES.index("stops")]
         pushed = -k * (DT * after) ** 2 / 2 - c * after**2 * DT
