@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
+from ce_gym.bench.page.depends import ROOT, benchmark_file
 from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
@@ -25,21 +26,13 @@ BENCHMARKS = (
 
 def summary(name: str) -> str:
     """Return the first docstring line of a benchmark, without importing it."""
-    source = _source(name).read_text(encoding="utf-8")
+    source = (ROOT / benchmark_file(name)).read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
 
 
 def load(name: str) -> ModuleType:
     """Import a benchmark."""
-    path = _source(name).relative_to(Path(__file__).parent).with_suffix("")
-    return importlib.import_module(".".join(["ce_gym.bench", *path.parts]))
-
-
-def _source(name: str) -> Path:
-    """Return the file of a benchmark: a module here, the module `benchmark` of a package, or a module in one."""
-    here = Path(__file__).parent
-    candidates = (here / f"{name}.py", here / name / "benchmark.py", *here.glob(f"*/{name}.py"))
-    return next(path for path in candidates if path.exists())
+    return importlib.import_module(benchmark_file(name).removesuffix(".py").replace("/", "."))
 
 
 def listing() -> str:

@@ -1,34 +1,30 @@
-"""Figures of README and docs: which have changed code behind them since their commit, and which do not name one.
+"""Figures of README and docs: behind which something else is computed since their commit, and which do not name one.
 
-A figure names its command and its commit, "`python -m ce_gym.bench speed` at 1a2b3c4". It is stale when files have
-changed since that the benchmark runs: model, physics and compiler, and environments where it steps them. Tables of
-figures whose section names no commit are listed, too: nobody can say whether they are stale.
+A figure names its command and its commit, "`python -m ce_gym.bench speed` at 1a2b3c4". It is stale when what the
+command depends on does something else than at that commit (`depends.py`). What nobody claims of today's code, a study
+or a training of hours, says "written at 1a2b3c4" and is a record: listed, never stale. Tables of figures whose section
+names neither are listed, too: nobody can say whether they are stale.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
-import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from ce_gym.bench.measure.report import Report, Table
+from ce_gym.bench.page import depends
 
-ROOT = Path(__file__).resolve().parents[3]
-PHYSICS = ("ce_gym/model", "ce_gym/dynamics", "ce_gym/compile", "ce_gym/sim")
-STEPS = (*PHYSICS, "ce_gym/envs")
-STEPPING = ("throughput", "derivatives", "soak", "gradients")
-"""Benchmarks that step environments."""
-
-FIGURE = re.compile(r"`python -m ce_gym\.bench (\w+)[^`]*`,? at ([0-9a-f]{7,40})\b")
-
-
+FIGURE = re.compile(r"`(?:python )?(?:-m ce_gym\.bench (\w+)|(train/\w+\.py))[^`]*`,? at ([0-9a-f]{7,40})\b")
+RECORD = re.compile(r"\bwritten at ([0-9a-f]{7,40})\b")
 COMMIT = re.compile(r"\b(?:at|commit) `?[0-9a-f]{7,40}\b")
 COMMAND = re.compile(r"`(?:python |make |train/|tests/|docs/)[^`]+`|^(?:python|make) ", re.MULTILINE)
 """What a section calls the command that its figures come from."""
 NUMBER = re.compile(r"[-−+±<>≈~*\[(]*\d")
+NAMED = 3
+"""Files that are named behind a figure."""
 MEASURED = 0.4
 """Share of a table's cells, its first column left out, that are numbers if it is one of figures."""
 
@@ -59,13 +55,13 @@ class Figure:
     Attributes:
         page: File, relative to the repository.
         line: Line in it.
-        benchmark: Name of the benchmark.
+        command: Name of the benchmark, or file of the script; empty for a record.
         commit: Commit that it was measured at.
     """
 
     page: str
     line: int
-    benchmark: str
+    command: str
     commit: str
 
 
@@ -75,22 +71,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Report:
     """List the figures; fails if one is stale."""
-    report = Report("stale")
-    rows = [(f.page, f.line, f.benchmark, f.commit, changed(f)) for f in figures(ROOT)]
-    columns = ("page", "line", "benchmark", "measured at", "files changed since")
+    report, found = Report("stale"), list(figures(depends.ROOT))
+    rows = []
+    for f in found:
+        if f.command:
+            different = changed(f)
+            named = ", ".join(name.removeprefix("ce_gym/") for name in different[:NAMED])
+            more = f" and {len(different) - NAMED} more" if len(different) > NAMED else ""
+            rows.append((f.page, f.line, f.command, f.commit, named + more))
+    columns = ("page", "line", "command", "measured at", "does something else since")
     report.tables.append(Table("Figures that name a commit", columns, tuple(rows)))
-    unknown = [(t.page, t.line, t.columns[:60]) for t in measurements(ROOT) if not t.commit]
+    records = tuple((f.page, f.line, f.commit) for f in found if not f.command)
+    report.tables.append(Table("Records of what was found then", ("page", "line", "written at"), records))
+    unknown = [(t.page, t.line, t.columns[:60]) for t in measurements(depends.ROOT) if not t.commit]
     report.tables.append(Table("Tables whose commit is not recorded", ("page", "line", "columns"), tuple(unknown)))
     report.failed = any(row[-1] for row in rows)
     return report
 
 
 def figures(root: Path) -> Iterator[Figure]:
-    """Yield every such figure of README and docs."""
+    """Yield every such figure and record of README and docs."""
     for path in pages(root):
+        page = path.relative_to(root).as_posix()
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            for benchmark, commit in FIGURE.findall(line):
-                yield Figure(path.relative_to(root).as_posix(), number, benchmark, commit)
+            yield from (Figure(page, number, name or script, commit) for name, script, commit in FIGURE.findall(line))
+            yield from (Figure(page, number, "", commit) for commit in RECORD.findall(line))
 
 
 def measurements(root: Path) -> Iterator[Measurements]:
@@ -123,20 +128,15 @@ def pages(root: Path) -> tuple[Path, ...]:
     return root / "README.md", *sorted((root / "docs").glob("*.md"))
 
 
-def rooms(benchmark: str) -> tuple[str, ...]:
-    """Return the folders whose code a benchmark's figures depend on."""
-    return STEPS if benchmark in STEPPING else PHYSICS
-
-
-def changed(figure: Figure) -> int:
-    """Return how many files of the figure's rooms differ from its commit.
+def changed(figure: Figure) -> list[str]:
+    """Return the files that a figure depends on and that do something else than at its commit.
 
     Raises:
         SystemExit: If this is no repository that knows the commit.
     """
-    command = ["git", "-C", str(ROOT), "diff", "--name-only", figure.commit, "--", *rooms(figure.benchmark)]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)
-    if finished.returncode:
-        known = f"expected a commit of the repository at {ROOT}"
-        raise SystemExit(f"ce_gym.bench: {figure.page}:{figure.line}: commit {figure.commit}: {known}")
-    return len(finished.stdout.splitlines())
+    named = figure.command
+    try:
+        return depends.changed(named if named.endswith(".py") else depends.benchmark_file(named), figure.commit)
+    except LookupError:
+        known = f"expected a commit of the repository at {depends.ROOT}"
+        raise SystemExit(f"ce_gym.bench: {figure.page}:{figure.line}: commit {figure.commit}: {known}") from None
