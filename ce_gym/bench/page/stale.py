@@ -18,7 +18,7 @@ from ce_gym.bench.measure.report import Report, Table
 from ce_gym.bench.page import depends
 
 FIGURE = re.compile(r"`(?:python )?(?:-m ce_gym\.bench (\w+)|(train/\w+\.py))[^`]*`,? at ([0-9a-f]{7,40})\b")
-RECORD = re.compile(r"\bwritten at ([0-9a-f]{7,40})\b")
+RECORD = re.compile(r"\bwritten at ([0-9a-f]{7,40})\b", re.IGNORECASE)
 COMMIT = re.compile(r"\b(?:at|commit) `?[0-9a-f]{7,40}\b")
 COMMAND = re.compile(r"`(?:python |make |train/|tests/|docs/)[^`]+`|^(?:python|make) ", re.MULTILINE)
 """What a section calls the command that its figures come from."""
