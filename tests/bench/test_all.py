@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -139,6 +140,7 @@ def test_stale_outside_a_clone_is_one_line(tmp_path: Path, monkeypatch):
 WITHOUT = {
     ("docs/numerics.md", "`Simulator(method=...)`"),  # orders of methods
     ("docs/scene.md", "name"),  # sizes of parameters
+    ("docs/gpu.md", "what"),  # what is required, and not measured
     ("docs/terrain.md", "a step of 0.1 m, cell"),  # follows from the figures in it
     ("docs/scene.md", "scene"),  # of code that was tried and left out
 }
@@ -148,5 +150,15 @@ WITHOUT = {
 def test_tables_of_figures_have_commands():
     """In their section, or where their page begins; that of the studies of exactness has them in its protocol."""
     tables = [t for t in stale.measurements(ROOT) if not t.command and t.page != "docs/exactness.md"]
-    without = {(t.page, t.columns.split("|")[1].strip()) for t in tables}
-    assert without <= WITHOUT
+    assert names(tables) <= WITHOUT
+
+
+def test_tables_of_figures_have_commits():
+    """That they were measured at, or written at if they are records."""
+    without = names(t for t in stale.measurements(ROOT) if not t.commit)
+    assert without <= WITHOUT, f"`python -m ce_gym.bench stale` lists them: {without - WITHOUT}"
+
+
+def names(tables: Iterable[stale.Measurements]) -> set[tuple[str, str]]:
+    """Return page and first column of tables."""
+    return {(t.page, t.columns.split("|")[1].strip()) for t in tables}
