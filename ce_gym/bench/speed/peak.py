@@ -21,10 +21,11 @@ from ce_gym.compile import (
     source_fingerprint,
 )
 
-CHAINS, LINKS = 16, 80
-"""So many chains that they hide the latency of two units and stay in registers; so long that loads do not matter."""
+CHAINS, LINKS = 16, 4
+"""So many chains that they hide the latency of two units and stay in registers. Code goes through one chain after the
+other, as that needs fewest registers: links of all chains must fit into what a CPU looks ahead."""
 
-REPEATS = 20_000
+REPEATS = 400_000
 """Several milliseconds: a core that has done scalar work takes a while to reach its pace in vector work."""
 
 
