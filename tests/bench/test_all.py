@@ -13,6 +13,7 @@ from ce_gym.bench import __main__ as command
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.bench.page import all as everything
 from ce_gym.bench.page import depends, stale
+from ce_gym.bench.page.chapter import Chapter
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,6 +38,18 @@ def test_the_page_has_what_was_missed_and_what_was_skipped(tmp_path: Path, monke
         for part in ("**missed**: at most 1: 2", "| leg | 3 |", "no GPU was found", "![](instructions/curves.png)")
     )
     assert "1 of 2 met" in capsys.readouterr().out
+    shown = (tmp_path / "index.html").read_text()
+    parts = '<b class="missed">missed</b> at most 1: 2', "<td class=n>3</td>", "<p>skipped: no GPU was found</p>"
+    parts += 'src="instructions/curves.png"', 'href="instructions_1.csv"', 'href="#instructions"', 'id="instructions"'
+    assert [part for part in parts if part not in shown] == []
+
+
+def test_a_page_says_what_others_wrote_and_does_not_run_it():
+    table = Table("<b>", ("a", "b"), (("<i>", 1.5), ("x", None)))
+    shown = Chapter("speed", "", Report("<speed>", [table], remarks=["a < b"]), Path("x")).as_html()
+    assert [part for part in ("<i>", "<b>") if part in shown] == []
+    wanted = "&lt;i&gt;", "a &lt; b", "<th class=n>b</th>", "<td class=n></td>", "<th>a</th>"
+    assert [part for part in wanted if part not in shown] == []
 
 
 def test_a_benchmark_runs_in_a_process_of_its_own(tmp_path: Path):

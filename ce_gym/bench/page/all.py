@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ce_gym.bench.measure import machine
 from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.bench.page.chapter import Chapter, page_html
 from ce_gym.viewer.console import shown
 
 
@@ -89,10 +90,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Report:
-    """Run the benchmarks, and write `index.md`."""
+    """Run the benchmarks, and write `index.md` and `index.html`."""
     arguments.out.mkdir(parents=True, exist_ok=True)
     wanted = [part for part in PARTS if part.name in arguments.only and not (arguments.quick and part.quick is None)]
-    report, pages = Report("all"), []
+    report, chapters = Report("all"), list[Chapter]()
     rows = []
     for part in shown(wanted, "benchmarks"):
         start = time.perf_counter()
@@ -103,13 +104,15 @@ def run(arguments: argparse.Namespace) -> Report:
         found = Report(part.name) if lacking else read(arguments.out / f"{part.file}.json")
         rows.append((part.name, round((time.perf_counter() - start) / 60.0, 1), said or _bars(found.requirements)))
         report.requirements += [Requirement(f"{part.name}: {r.claim}", r.measured, r.met) for r in found.requirements]
-        pages.append(chapter(" ".join(command), said, found, arguments.out / part.file))
+        chapters.append(Chapter(" ".join(command), said, found, arguments.out / part.file))
     report.tables.append(Table("Benchmarks", ("benchmark", "minutes", "bars"), tuple(rows)))
-    head = [f"# Benchmarks at {commit()}", "", *(f"- {key}: {value}" for key, value in machine.describe().items())]
     _write_tables(arguments.out, wanted)
+    title, facts, summary = f"Benchmarks at {commit()}", machine.describe(), report.tables[0]
+    head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in facts.items()), "", summary.as_markdown(), ""]
     page = arguments.out / "index.md"
-    page.write_text("\n".join([*head, "", report.tables[0].as_markdown(), "", *pages]), encoding="utf-8")
-    report.remarks.append(f"Written to {page}; beside it the JSON and the tables of each, and further files.")
+    page.write_text("\n".join([*head, *(chapter.as_markdown() for chapter in chapters)]), encoding="utf-8")
+    page.with_suffix(".html").write_text(page_html(title, facts, summary, chapters), encoding="utf-8")
+    report.remarks.append(f"Written to {page} and .html; beside it JSON and tables of each, and further files.")
     return report
 
 
@@ -128,18 +131,6 @@ def read(path: Path) -> Report:
     tables = [Table(t["title"], tuple(t["columns"]), tuple(map(tuple, t["rows"]))) for t in content["tables"]]
     bars = [Requirement(**requirement) for requirement in content["requirements"]]
     return Report(content["name"], tables, bars, content["remarks"], machine=content["machine"])
-
-
-def chapter(command: str, said: str, found: Report, folder: Path) -> str:
-    """Return what the page says of one benchmark: its command, bars, met or missed alike, pictures and tables."""
-    pictures = [part for file in sorted(folder.glob("*.png")) for part in (f"![]({folder.name}/{file.name})", "")]
-    bars = [f"- {'met' if bar.met else '**missed**'}: {bar.claim}: {bar.measured}" for bar in found.requirements]
-    tables = [part for table in found.tables for part in (table.as_markdown(), "")]
-    remarks = [part for remark in found.remarks for part in (remark, "")]
-    head = [f"## {found.name}", "", f"`python -m ce_gym.bench {command}`", ""]
-    return "\n".join(
-        [*head, *([said, ""] if said else []), *bars, *([""] if bars else []), *pictures, *tables, *remarks]
-    )
 
 
 def _write_tables(out: Path, parts: Sequence[Part]) -> None:
