@@ -54,6 +54,13 @@ def test_cells_in_which_energy_rises_are_listed_with_what_adds_most():
     assert report.requirements[-1].measured == "19 of 20, 1 by stops"
 
 
+def test_joints_can_be_damped_otherwise():
+    robot = stability.load_robot("mini_cheetah")
+    other = stability.damped(robot, 0.7)
+    assert {other.body(name).joint.damping for name in robot.independent} == {0.7}
+    assert stability.damped(robot, None) is robot
+
+
 def test_picture(tmp_path: Path):
     pytest.importorskip("matplotlib")
     lost = np.ones(stability_grid.SHAPE, bool)

@@ -10,6 +10,7 @@ import argparse
 import importlib.util
 import itertools
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from ce_gym.bench.stability import plots as stability_plots
 from ce_gym.bench.stability import robots as stability_robots
 from ce_gym.bench.stability.cases import CASES
 from ce_gym.dynamics.model import Model
-from ce_gym.model import load_robot
+from ce_gym.model import Robot, load_robot
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.viewer.console import shown
 
@@ -47,6 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--quick", action="store_true", help="one robot, two time steps, short waits: a minute")
     parser.add_argument("--skip", nargs="+", default=[], choices=PARTS, help="parts to leave out")
+    parser.add_argument(
+        "--joint-damping",
+        type=float,
+        metavar="D",
+        help="of all joints of these robots [N m s/rad], instead of their own",
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE", help="also draw the map to a PNG file")
 
 
@@ -54,7 +61,7 @@ def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
     quick = arguments.quick
     robots = arguments.robot[:1] if quick else arguments.robot
-    models = {name: Model(load_robot(name)) for name in robots}
+    models = {name: Model(damped(load_robot(name), arguments.joint_damping)) for name in robots}
     report = Report("stability")
     if "map" not in arguments.skip:
         steps = (0.002, 0.01) if quick else arguments.dt
@@ -73,6 +80,14 @@ def run(arguments: argparse.Namespace) -> Report:
     if "beside" not in arguments.skip:
         report_beside(report, BESIDE[:1] if quick else BESIDE, (4, 1) if quick else None)
     return report
+
+
+def damped(robot: Robot, damping: float | None) -> Robot:
+    """Return a robot with another damping at all its independent joints [N m s/rad]; itself for None."""
+    if damping is None:
+        return robot
+    joints = {name: replace(robot.body(name).joint, damping=damping) for name in robot.independent}
+    return replace(robot, bodies=tuple(replace(b, joint=joints.get(b.name, b.joint)) for b in robot.bodies))
 
 
 def report_map(report: Report, maps: dict[str, list[grid.Map]]) -> None:
