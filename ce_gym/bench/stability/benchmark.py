@@ -48,12 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--quick", action="store_true", help="one robot, two time steps, short waits: a minute")
     parser.add_argument("--skip", nargs="+", default=[], choices=PARTS, help="parts to leave out")
-    parser.add_argument(
-        "--joint-damping",
-        type=float,
-        metavar="D",
-        help="of all joints of these robots [N m s/rad], instead of their own",
-    )
+    damping = "of all joints of these robots [N m s/rad], instead of their own"
+    parser.add_argument("--joint-damping", type=float, metavar="D", help=damping)
     parser.add_argument("--picture", type=Path, metavar="FILE", help="also draw the map to a PNG file")
 
 
