@@ -45,7 +45,7 @@ class Largest:
     def none(cls, rows: Rows, forces: Array) -> Largest:
         """Return that of robots that have made no step."""
         n, copies = len(forces), [{name: array.copy() for name, array in rows.items()} for _ in range(2)]
-        return cls(np.zeros(n), np.zeros(n, dtype=np.int64), *copies, forces.copy())
+        return cls(np.zeros(n), np.zeros(n, dtype=np.int64), *copies, forces.copy())  # type: ignore[call-arg]  # two of them
 
     def take(self, step: int, rise: Array, before: Rows, after: Rows, forces: Array) -> None:
         """Keep a step for those whose energy rises more in it than in any so far."""
