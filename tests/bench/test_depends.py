@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from ce_gym.bench.page import depends
+from ce_gym.bench.page import depends, stale
 from ce_gym.bench.page.source import Source
 
 FILES = {
@@ -123,3 +124,20 @@ def test_texts_of_errors_do_not_count():
 def test_a_commit_that_is_not_there(repository: Path):
     with pytest.raises(LookupError):
         depends.changed(SPEED, "1234567")
+
+
+def test_the_report_names_what_is_stale_and_lists_records_apart(repository: Path):
+    git = ["git", "-C", str(repository), "rev-parse", "--short=7", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    said = f"`python -m ce_gym.bench speed` at {commit}.\n\nBy `train/script.py`, written at {commit}.\n"
+    (repository / "README.md").write_text(said)
+    report = stale.run(argparse.Namespace())
+    assert not report.failed
+    assert [row[-1] for row in report.tables[0].rows] == [""]
+    (repository / "ce_gym/b.py").write_text(FILES["ce_gym/b.py"].replace("3", "4"))
+    (repository / "train/other.py").write_text("def learn():\n    return 2\n")
+    _forget()
+    report = stale.run(argparse.Namespace())
+    assert report.failed
+    assert report.tables[0].rows == (("README.md", 1, "speed", commit, "b.py"),)
+    assert report.tables[1].rows == (("README.md", 3, commit),)
