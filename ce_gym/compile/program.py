@@ -60,8 +60,8 @@ class Call:
             independent of their neighbours it must change nothing in a lane where the buffer is zero.
         times: how often the function is applied, to the next part each time of those buffers that are so many times as
             large as what it takes or returns.
-        short_if_zero: an input of size 1; a tile where it is zero in all lanes computes what is left of the function
-            then, to the same bits.
+        short_if_zero: an output of size 1 by which the function itself chooses; a tile where it is zero in all lanes
+            computes what is left of the rest then, to the same bits.
         again: inputs; no others have changed since the call before, which is of the same function, and what does not
             follow from them may be taken from there.
     """
@@ -209,8 +209,8 @@ def check_program(program: Program) -> None:
                 read = (*read, call.only_if)
             if call.short_if_zero:
                 _check_flag(f"{place}: short_if_zero", buffers.get(call.short_if_zero))
-                if call.short_if_zero not in call.inputs:
-                    raise ValueError(f"{place}: short_if_zero {call.short_if_zero!r}, expected one of its inputs")
+                if call.short_if_zero not in call.outputs:
+                    raise ValueError(f"{place}: short_if_zero {call.short_if_zero!r}, expected one of its outputs")
         if unset := [name for name in read if name not in written]:
             raise ValueError(f"{place}: reads {unset[0]!r}, expected an earlier call to write it first")
         written.update(call.outputs)

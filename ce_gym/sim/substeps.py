@@ -11,7 +11,7 @@ import casadi as ca
 from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step, While
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.stepping.choice import NEAR, chooses, near_function
+from ce_gym.dynamics.stepping.choice import chooses
 from ce_gym.dynamics.stepping.control import beginning_function as beginning_of_interval
 from ce_gym.dynamics.stepping.control import control_function, control_sizes
 from ce_gym.dynamics.stepping.ground_lookup import places_function, planes_function, touching_function
@@ -19,7 +19,7 @@ from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import beginning_function, judging_function, mending_function
 from ce_gym.dynamics.stepping.plan import MOVED, OFF, Plan, Rates, Stage
 from ce_gym.dynamics.stepping.step import iterations_needed
-from ce_gym.dynamics.stepping.trace import combination_function, iteration_function, step_function
+from ce_gym.dynamics.stepping.trace import NEAR, combination_function, iteration_function, step_function
 from ce_gym.model.mechanism import Mechanism
 
 TIMES = "n_substeps"
@@ -55,22 +55,23 @@ def substeps(
     kept = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
     if len(kept) < len(outputs):
         return substeps(mechanism, options, tuple(kept))
-    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground", NEAR)}
+    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground")}
     sizes |= {"retries": 1, **kept} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= control_sizes(mechanism.robot.layout) if plan.controlled else {}
     fractions = {TRIED: 1.0} | ({_own(plan, stage): stage.length for stage in plan.stages} if staged else {})
     told = kept | measured
     buffers, try_part = _staged(mechanism, options, function, told) if staged else _whole(mechanism, options, function)
+    clear = [Call(_zeros(function, name), (), (name,)) for name in function.name_in() if name == "near_iterate"]
     begin = (beginning_of_interval if plan.controlled else beginning_function)(fractions)
     take = (_take_step if plan.controlled else _take_part)(mechanism, options, kept, fractions)
     started = tuple(begin.name_out())
     buffers += [Buffer(name, 1, "scratch") for name in started]
     begins = Call(begin, tuple(begin.name_in()), started)
-    return sizes, buffers, (Repeat(TIMES, (begins, While("unfinished", (*try_part, *take)))),)
+    return sizes, buffers, (*clear, Repeat(TIMES, (begins, While("unfinished", (*try_part, *take)))))
 
 
-ITERATES = {"near_iterate": NEAR, "iterate": ""}
-"""Buffers of iterates, and where they are needed."""
+ITERATES = ("near_iterate", "iterate")
+"""Buffers of iterates: of what is seldom near, zero between the stages of steps, and of all else."""
 TRIED = "tried"
 """What names of buffers begin with that have the state after a part of a step that is tried, and what it reports."""
 Parts: TypeAlias = tuple[list[Buffer], tuple[Call | Lookup, ...]]
@@ -126,12 +127,12 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
     asked = tuple(name for name in outputs if name in iteration.name_out())
     state = [name for name in iteration.name_in() if f"{name}_next" in iteration.name_out() and name not in ITERATES]
     iterates = {name: iteration.numel_in(name) for name in ITERATES if name in iteration.name_in()}
-    zeros = {name: ca.Function("zeros", [], [SX(ca.DM.zeros(size))]) for name, size in iterates.items()}
     sizes = {name: iteration.numel_in(name) for name in state} | {name: iteration.numel_out(name) for name in asked}
     scratch = {f"{_own(plan, stage)}_{name}": size for stage in plan.stages for name, size in sizes.items()}
     scratch |= iterates | {"unconverged": 1}
-    near = near_function(mechanism, options) if chooses(options) else None
-    scratch |= {NEAR: 1} if near else {}
+    zeros = {name: _zeros(iteration, name) for name in iterates}
+    near = (NEAR,) if NEAR in iteration.name_out() else ()
+    scratch |= dict.fromkeys(near, 1)
     buffers = look_up(mechanism, options)[0] if "ground" in iteration.name_in() else []
     each: list[Call | Lookup] = []
     ground_at: str | None = None
@@ -143,16 +144,12 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
             ground_at = stage.start
         here = {name: f"{start}{name}" for name in state} | {DT: f"{own}_dt"}
         given = tuple(here.get(name, name) for name in iteration.name_in())
-        left = (*(f"{own}_{name}" for name in state), *iterates, "unconverged", *(f"{own}_{name}" for name in asked))
-        repeats = min(stage.iterations, most)
-        short = ""
-        if near:
-            each.append(Call(near, tuple(here.get(name, name) for name in near.name_in()), (NEAR,)))
-            short = NEAR
-        each += [Call(zeros[name], (), (name,), only_if=ITERATES[name]) for name in iterates]
-        each.append(Call(iteration, given, left, short_if_zero=short))
-        further = Call(iteration, given, left, only_if="unconverged", short_if_zero=short, again=tuple(iterates))
-        each += [further] * repeats
+        left = (*(f"{own}_{name}" for name in state), *iterates, "unconverged", *near)
+        left = (*left, *(f"{own}_{name}" for name in asked))
+        each += [Call(zeros[name], (), (name,)) for name in iterates if name != "near_iterate"]
+        first = Call(iteration, given, left, short_if_zero="".join(near))
+        each += [first] + [replace(first, only_if="unconverged", again=tuple(iterates))] * min(stage.iterations, most)
+        each += [Call(zeros["near_iterate"], (), ("near_iterate",), only_if=NEAR)] if near else []
     if not plan.single:
         combine = combination_function(mechanism, options, outputs)
         tried = {f"{TRIED}_{name.removesuffix('_next')}": combine.numel_out(name) for name in combine.name_out()}
@@ -160,6 +157,11 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
         each.append(Call(combine, given, tuple(tried)))
         scratch |= tried
     return buffers + [Buffer(name, size, "scratch") for name, size in scratch.items()], tuple(each)
+
+
+def _zeros(iteration: ca.Function, name: str) -> ca.Function:
+    """Return the function that sets an iterate to zero."""
+    return ca.Function("zeros", [], [SX(ca.DM.zeros(iteration.numel_in(name)))])
 
 
 def look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> Parts:

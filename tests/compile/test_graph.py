@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ce_gym.compile import Buffer, Call, Program, aligned_zeros, load_kernel
-from ce_gym.compile.lowering.function import left_graph
+from ce_gym.compile.lowering.function import parts_of, versions_of
 from ce_gym.compile.lowering.graph import (
     FMA,
     FMS,
@@ -18,9 +18,7 @@ from ce_gym.compile.lowering.graph import (
     REMOVED,
     SELECT,
     graph_of,
-    sources,
 )
-from ce_gym.compile.lowering.parted import parted
 from ce_gym.compile.program import check_program
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
@@ -126,18 +124,24 @@ def test_a_step_takes_far_fewer_operations():
 
 
 def choosing():
-    """A function of x, y, z that reckons more where z is not zero, from a product that is used elsewhere, too."""
-    product = X * Y
-    more = ca.if_else(Z, product * product + ca.sin(Y), 0)
-    chosen = ca.if_else(ca.logic_and(Z, X > 0), product + more, product + X)
-    return ca.Function("choosing", [X, Y, Z], [chosen, ca.logic_or(Z, X < 0)])
+    """A function of x, y, z that reckons more where z + y > 1, from a product that is used elsewhere, too."""
+    product, choice = X * Y, Z + Y > 1
+    more = ca.if_else(choice, product * product + ca.sin(Y), 0)
+    chosen = ca.if_else(ca.logic_and(choice, X > 0), product + more, product + X)
+    return ca.Function("choosing", [X, Y, Z], [chosen, ca.logic_or(choice, X < 0), choice])
 
 
-def test_what_is_left_where_an_input_is_zero():
+CHOICE = 2
+"""Which output of that says what is chosen."""
+
+
+def test_what_is_left_where_a_choice_is_zero():
     """Choices are made, what was not chosen is gone, and what was not fused in the whole is not fused now."""
-    whole, left = graph_of(choosing()), left_graph(choosing(), 2)
-    assert ca.OP_SIN in operations(whole)
-    assert sorted(operations(left)) == sorted([ca.OP_MUL, ca.OP_ADD, ca.OP_LT, ca.OP_OR])
+    says, whole, left = versions_of(choosing(), CHOICE)
+    assert sorted(operations(says.graph)) == sorted([ca.OP_ADD, ca.OP_LT])
+    assert operations(whole.graph) == operations(graph_of(choosing()))
+    assert ca.OP_SIN in operations(whole.graph)
+    assert sorted(operations(left.graph)) == sorted([ca.OP_MUL, ca.OP_ADD, ca.OP_LT, ca.OP_OR])
     alone = graph_of(ca.Function("alone", [X, Y], [X * Y + X, X < 0]))
     assert FMA in operations(alone)
 
@@ -151,27 +155,28 @@ def test_a_tile_takes_the_short_way_to_the_same_bits():
     function, results = choosing(), []
 
     def program(short):
-        buffers = [Buffer(name, 1, "tiles") for name in ("x", "y", "z", "value", "truth")]
+        buffers = [Buffer(name, 1, "tiles") for name in ("x", "y", "z", *NAMES[1])]
         return Program("choosing", tuple(buffers), (Call(function, *NAMES, short_if_zero=short),))
 
-    for short in ("", "z"):
+    for short in ("", "choice"):
         kernel = load_kernel(f"choosing {short}", partial(program, short), "float64")
         n = 3 * kernel.lanes
         rows = np.random.default_rng(2).uniform(-1, 1, (3, n))
-        rows[2, kernel.lanes :] = 0.0
-        rows[2, -1] = 1.0  # the second tile has zeros alone, the third one robot that is none
+        rows[2, kernel.lanes :] = -1.0
+        rows[2, -1] = 3.0  # the second tile chooses nothing, of the third one robot something
         arrays = {name: row.reshape(3, 1, kernel.lanes).copy() for name, row in zip("xyz", rows, strict=True)}
-        arrays |= {name: np.zeros_like(arrays["x"]) for name in ("value", "truth")}
+        arrays |= {name: np.zeros_like(arrays["x"]) for name in NAMES[1]}
         arrays = {name: aligned(value) for name, value in arrays.items()}
         kernel(arrays, n)
-        results.append((arrays["value"].copy(), arrays["truth"].copy()))
+        results.append([arrays[name].copy() for name in NAMES[1]])
     np.testing.assert_array_equal(results[0], results[1])
     expected = np.array([[float(v) for v in function(*row)] for row in rows.T]).T
     np.testing.assert_allclose(results[1][0].ravel(), expected[0], rtol=1e-15, atol=1e-15)
     np.testing.assert_array_equal(results[1][1].ravel(), expected[1])
+    assert results[1][CHOICE].any(axis=(1, 2)).tolist() == [True, False, True]
 
 
-NAMES = (("x", "y", "z"), ("value", "truth"))
+NAMES = (("x", "y", "z"), ("value", "truth", "choice"))
 
 
 def aligned(values):
@@ -182,52 +187,72 @@ def aligned(values):
 
 
 def growing():
-    """A function of x, y and an iterate z, of which a sine and a choice by y do not follow from z: (value, z, flag)."""
-    shared = ca.sin(X) + X * Y
-    chosen = ca.if_else(Y, shared * Z, Z)
-    following = chosen + ca.if_else(Y, ca.sqrt(shared * shared + 1), X) * Z + X
-    return ca.Function("growing", [X, Y, Z], [following - X * Y, following, ca.logic_and(following < 20, X > 0)])
+    """A function of x, y and an iterate z, of which a sine and a choice do not follow from z.
+
+    It returns value, z, flag, and the choice, whose terms are needed where it is made, too.
+    """
+    shared, height = ca.sin(X) + X * Y, ca.exp(-Y * Y) + Y
+    choice = height > 1
+    chosen = ca.if_else(choice, shared * Z + height, Z)
+    following = chosen + ca.if_else(choice, ca.sqrt(shared * shared + 1), X) * Z + X
+    flag = ca.logic_and(following < 20, X > 0)
+    return ca.Function("growing", [X, Y, Z], [following - shared, following, flag, choice])
 
 
-GIVEN, LEFT = ("x", "y", "z"), ("value", "z", "flag")
+GIVEN, LEFT = ("x", "y", "z"), ("value", "z", "flag", "choice")
 
 
 def growing_program(again, short=""):
     function, first = growing(), ca.Function("first", [X], [0.5 + ca.if_else(X > 2, X, 0)])
     calls = [Call(first, ("x",), ("z",)), Call(function, GIVEN, LEFT, short_if_zero=short)]
     calls += [Call(function, GIVEN, LEFT, only_if="flag", short_if_zero=short, again=again)] * 3
-    buffers = [Buffer(name, 1, "tiles") for name in ("x", "y", "value")]
+    buffers = [Buffer(name, 1, "tiles") for name in ("x", "y", "value", "choice")]
     return Program("growing", (*buffers, Buffer("z", 1, "scratch"), Buffer("flag", 1, "scratch")), tuple(calls))
 
 
 def test_what_does_not_follow_from_an_iterate_is_in_the_first_part():
-    graph = graph_of(growing())
-    first, second, places = parted(graph, sources(growing(), graph, {2}))
-    assert ca.OP_SIN in operations(first)
-    assert ca.OP_SQRT in operations(first)
-    assert not {ca.OP_SIN, ca.OP_SQRT} & set(operations(second))
-    assert sorted(operations(first) + operations(second)) == sorted(operations(graph))
-    assert set(places) == {k for k, op in enumerate(second.ops) if op == KEPT} != set()
+    parts = parts_of(growing(), frozenset({2}))
+    (none, second), first = *parts.versions, parts.first.graph
+    assert none.is_empty
+    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} <= set(operations(first))
+    assert not {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} & set(operations(second.graph))
+    assert sorted(operations(first) + operations(second.graph)) == sorted(operations(graph_of(growing())))
+    assert parts.first.keeps == {k for k, op in enumerate(second.graph.ops) if op == KEPT} != set()
+
+
+def test_what_only_a_choice_asks_for_is_in_parts_of_its_own():
+    """The root is, and of what the choice takes what is short is made again; the sine is needed in any case."""
+    parts = parts_of(growing(), frozenset({2}), LEFT.index("choice"))
+    (before, last), (none, left) = parts.versions
+    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_LT} <= set(operations(parts.first.graph))
+    assert ca.OP_SQRT not in operations(parts.first.graph)
+    assert {ca.OP_SQRT, ca.OP_EXP} <= set(operations(before.graph))
+    assert none.is_empty
+    assert len(operations(left.graph)) < len(operations(last.graph))
+    assert parts.first.leaves | last.leaves == parts.first.leaves | left.leaves == set(range(len(LEFT)))
+    with pytest.raises(ValueError, match="output 2 is a choice; expected one that does not follow"):
+        parts_of(growing(), frozenset({2}), LEFT.index("flag"))
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("short", ["", "y"])
+@pytest.mark.parametrize("short", ["", "choice"])
 def test_a_call_again_goes_by_what_the_first_one_left_to_the_same_bits(short, dtype):
-    """Where the loop ends at once, late or never, and for what is left of the function where an input is zero."""
+    """Where the loop ends at once, late or never, and for what is left of the function where its choice is zero."""
     results = []
     for again in ((), ("z",)):
         kernel = load_kernel(f"growing {again} {short}", partial(growing_program, again, short), dtype)
         n = 4 * kernel.lanes
         rows = np.random.default_rng(2).uniform(-1, 3, (2, n)).astype(dtype)
-        rows[1, kernel.lanes : 3 * kernel.lanes] = 0.0  # the second tile and the third take the short way
+        rows[1, kernel.lanes : 3 * kernel.lanes] = -1.0  # the second tile and the third take the short way
         rows[0, 2 * kernel.lanes : 3 * kernel.lanes] = -1.0  # which makes one call, the fourth makes several again
         arrays = {name: row.reshape(4, 1, kernel.lanes) for name, row in zip("xy", rows, strict=True)}
-        arrays |= {"value": np.zeros_like(arrays["x"])}
+        arrays |= {name: np.zeros_like(arrays["x"]) for name in ("value", "choice")}
         arrays = {name: aligned(value) for name, value in arrays.items()}
         kernel(arrays, n)
-        results.append(arrays["value"].copy())
+        results.append([arrays[name].copy() for name in ("value", "choice")])
     np.testing.assert_array_equal(results[0], results[1])
     assert np.isfinite(results[1]).all()
+    assert results[1][1].any(axis=(1, 2)).tolist() == [True, False, False, True]
 
 
 def test_a_second_iteration_of_a_step_takes_kinematics_from_the_first():
@@ -235,11 +260,11 @@ def test_a_second_iteration_of_a_step_takes_kinematics_from_the_first():
     model = Model("mini_cheetah")
     options = StepOptions(contacts=tuple(c.name for c in model.robot.contacts if c.group == "foot"))
     function = iteration_function(model.mechanism, options)
-    graph = graph_of(function)
-    first, second, _ = parted(graph, sources(function, graph, {function.name_in().index("iterate")}))
-    assert operations(first).count(ca.OP_SIN) == 12
+    parts = parts_of(function, frozenset({function.name_in().index("iterate")}))
+    second = parts.versions[0][-1].graph
+    assert operations(parts.first.graph).count(ca.OP_SIN) == 12
     assert operations(second).count(ca.OP_SIN) == 1
-    assert len(operations(second)) < 0.8 * len(operations(graph))
+    assert len(operations(second)) < 0.8 * len(operations(graph_of(function)))
 
 
 @pytest.mark.parametrize(
@@ -261,8 +286,8 @@ def test_a_call_again_comes_after_one_of_the_same(place, change, message):
         check_program(replace(program, steps=tuple(steps)))
 
 
-def test_the_short_way_goes_by_an_input():
-    buffers = tuple(Buffer(name, 1, "tiles") for name in ("x", "y", "z", "value", "truth", "other"))
+def test_the_short_way_goes_by_an_output():
+    buffers = tuple(Buffer(name, 1, "tiles") for name in ("x", "y", "z", *NAMES[1], "other"))
     program = Program("choosing", buffers, (Call(choosing(), *NAMES, short_if_zero="other"),))
-    with pytest.raises(ValueError, match="short_if_zero 'other', expected one of its inputs"):
+    with pytest.raises(ValueError, match="short_if_zero 'other', expected one of its outputs"):
         check_program(program)

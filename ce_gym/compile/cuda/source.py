@@ -21,7 +21,8 @@ import numpy as np
 from ce_gym.compile.cuda.prelude import prelude
 from ce_gym.compile.cuda.writer import Writer
 from ce_gym.compile.layout import Layout, layout_of
-from ce_gym.compile.lowering.function import lower_function
+from ce_gym.compile.lowering.function import lower_function, versions_of
+from ce_gym.compile.lowering.parted import Part
 from ce_gym.compile.program import Buffer, Call, Grid, Lookup, Program, Repeat, Step, While, check_program
 
 BLOCK, BLOCKS = 128, 2
@@ -98,8 +99,8 @@ class _KernelText:
     def __init__(self, program: Program, layout: Layout):
         self.program, self.layout = program, layout
         self.sizes = {b.name: b.size for b in program.buffers}
-        self.names: dict[tuple[casadi.Function, int | None], str] = {}
-        self.places: Counter[tuple[casadi.Function, int | None]] = Counter()
+        self.names: dict[tuple[casadi.Function, int | None, int], str] = {}
+        self.places: Counter[tuple[casadi.Function, int | None, int]] = Counter()
         self.grids: dict[Grid, str] = {}
 
     def signature(self) -> str:
@@ -201,13 +202,13 @@ class _KernelText:
         yield f"    {call}"
 
     def _version(self, call: Call) -> str:
-        """The call of a whole function, or of what is left of it."""
+        """The call of a whole function, or of its choice and of what that leaves."""
         values, short = ", ".join(f"{name}_" for name in (*call.inputs, *call.outputs)), call.short_if_zero
-        whole = f"{self._function(call.function)}({values});"
         if not short:
-            return whole
-        left = f"{self._function(call.function, call.inputs.index(short))}({values});"
-        return f"{{ if ({short}_[0] != 0) {whole} else {left} }}"
+            return f"{self._function(call.function)}({values});"
+        choice = call.outputs.index(short)
+        says, whole, left = (f"{self._function(call.function, choice, part)}({values});" for part in range(3))
+        return f"{{ {says} if ({short}_[0] != 0) {whole} else {left} }}"
 
     def _look_up(self, lookup: Lookup) -> str:
         n, table = self.sizes[lookup.points] // 2, lookup.table
@@ -218,10 +219,14 @@ class _KernelText:
         name = "look_up" if lookup.slopes else "look_up_values"
         return f"{name}<{n}>(all_{table}, rows_{table}, columns_{table}, {lanes});"
 
-    def _function(self, function: casadi.Function, zero: int | None = None) -> str:
-        """Name of a traced function's own C function, for one more place; of what is left where an input is zero."""
-        self.places[function, zero] += 1
-        return self.names.setdefault((function, zero), f"{function.name()}_{len(self.names)}")
+    def _function(self, function: casadi.Function, choice: int | None = None, part: int = 1) -> str:
+        """Name of a traced function's own C function, for one more place.
+
+        Of one with a choice, an output, there are three: the choice, all of it, and what is left where that is zero.
+        """
+        key = function, choice, part
+        self.places[key] += 1
+        return self.names.setdefault(key, f"{function.name()}_{len(self.names)}")
 
     def constants(self) -> list[str]:
         """The grids that have been named."""
@@ -234,19 +239,20 @@ class _KernelText:
     def functions(self) -> list[str]:
         """The C functions that have been named: inlined, but for a long one that is called from several places."""
         texts = []
-        for (function, zero), name in self.names.items():
-            called = self.places[function, zero] > 1 and function.n_instructions() > LONG
+        for (function, choice, part), name in self.names.items():
+            called = self.places[function, choice, part] > 1 and function.n_instructions() > LONG
             inline = "__noinline__" if called else "__forceinline__"
-            texts.append(_function_text(name, function, self.layout.dtype, inline, zero))
+            taken = None if choice is None else versions_of(function, choice)[part]
+            texts.append(_function_text(name, function, self.layout.dtype, inline, taken))
         return texts
 
 
-def _function_text(name: str, function: casadi.Function, dtype: str, inline: str, zero: int | None) -> str:
+def _function_text(name: str, function: casadi.Function, dtype: str, inline: str, part: Part | None) -> str:
     """A traced function. Loads come before stores in the text, so that an output may be an input's array."""
     inputs = [f"in{i}" for i in range(function.n_in())]
     outputs = [f"out{i}" for i in range(function.n_out())]
     writer: Any = Writer(dtype)  # stands in for the vector builder
-    lower_function(writer, function, inputs, outputs, zero=zero)
+    lower_function(writer, function, inputs, outputs, part=part)
     arguments = [f"const real* {name}" for name in inputs] + [f"real* {name}" for name in outputs]
     head = f"static __device__ {inline} void {name}({', '.join(arguments)})"
     return "\n".join([head, "{", *_indented(writer.lines), "}", ""])

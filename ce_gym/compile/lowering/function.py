@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 
 import casadi
 
 from ce_gym.compile.lowering import math as vector_math
-from ce_gym.compile.lowering.decided import decided
 from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, KEPT, SELECT, Graph, graph_of, sources
 from ce_gym.compile.lowering.ordering import ordered
-from ce_gym.compile.lowering.parted import Part, Places, parted
+from ce_gym.compile.lowering.parted import Part, Parts, parted, versions
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 
@@ -27,7 +25,6 @@ def lower_function(
     inputs: Sequence[Value],
     outputs: Sequence[Value],
     apart: bool = False,
-    zero: int | None = None,
     same: frozenset[tuple[int, int]] = frozenset(),
     part: Part | None = None,
 ) -> None:
@@ -40,17 +37,13 @@ def lower_function(
         outputs: pointer to the first vector of each function output; structural zeros are written as 0.
         apart: whether no output shares memory with an input.
         same: inputs and outputs that share their memory; what is only handed on is not stored again.
-        zero: an input that is zero, if one is: what is left out where it is leaves the bits of the rest as they are.
-        part: which part of it, if it is made in parts.
+        part: which part of it, if not all.
 
     Raises:
         NotImplementedError: for an operation that has no vector form.
     """
-    if part:
-        *both, kept = parts_of(function, part.changing, zero)
-        graph = both[part.number]
-    else:
-        graph, kept = left_graph(function, zero), {}
+    part = part or Part(graph_of(function), frozenset(range(function.n_out())))
+    graph = part.graph
     lowering = _Lowering(v, function.name())
     loads = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
     places = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
@@ -63,8 +56,8 @@ def lower_function(
         if k not in values:
             if k in graph.constants:
                 values[k] = lowering.constant(graph.constants[k])
-            elif part and graph.ops[k] == KEPT:
-                values[k] = v.load(part.memory, kept[k])
+            elif graph.ops[k] == KEPT:
+                values[k] = v.load(part.memory, part.places[k])
             else:
                 which, nonzero = function.instruction_input(k)
                 place = which, loads[which][nonzero]
@@ -86,33 +79,40 @@ def lower_function(
     stored = set[tuple[int, int]]()
     for k in ordered(graph):
         values[k] = lowering.operation(graph.ops[k], [value(a) for a in graph.operands[k]])
-        if part and k in kept:
-            v.store(values[k], part.memory, kept[k])
+        if k in part.keeps:
+            v.store(values[k], part.memory, part.places[k])
         for which, position in leave[k] if apart else ():
             v.store(values[k], outputs[which], position)
             stored.add((which, position))
-    if part and part.number == 0:
-        return
     for k, to in leave.items():
         for which, position in to:
             results[which][position] = value(k)
-    for which, pointer in enumerate(outputs):
+    for which in sorted(part.leaves):
+        pointer = outputs[which]
         for position, result in enumerate(results[which]):
             if (which, position) not in stored and not handed_on(which, position):
                 v.store(result, pointer, position)
 
 
-def left_graph(function: casadi.Function, zero: int | None = None) -> Graph:
-    """Return the graph of a function, or what is left of it where an input is zero."""
+def parts_of(function: casadi.Function, changing: frozenset[int], choice: int | None = None) -> Parts:
+    """Take a function apart, given its inputs that change and its output that is a choice, if one is; see `parted`."""
     graph = graph_of(function)
-    return graph if zero is None else decided(graph, sources(function, graph, (zero,)))
+    return parted(graph, _outputs(function, graph), sources(function, graph, changing), choice)
 
 
-@lru_cache(maxsize=4)  # each is asked for three times, one after the other
-def parts_of(function: casadi.Function, changing: frozenset[int], zero: int | None) -> tuple[Graph, Graph, Places]:
-    """Return the parts of a function, or of what is left of it, and what goes from one to the other; see `parted`."""
-    graph = left_graph(function, zero)
-    return parted(graph, sources(function, graph, changing))
+def versions_of(function: casadi.Function, choice: int) -> tuple[Part, Part, Part]:
+    """Return a function's choice, all of it, and what is left where the choice is zero, each by itself."""
+    graph = graph_of(function)
+    return versions(graph, _outputs(function, graph), choice)
+
+
+def _outputs(function: casadi.Function, graph: Graph) -> list[set[int]]:
+    """Nodes of each output."""
+    outputs: list[set[int]] = [set() for _ in range(function.n_out())]
+    for k, op in enumerate(graph.ops):
+        if op == casadi.OP_OUTPUT:
+            outputs[function.instruction_output(k)[0]].add(k)
+    return outputs
 
 
 def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TypeAlias
 
 import casadi
@@ -15,7 +16,7 @@ from ce_gym.compile.lowering.function import lower_function, parts_of
 from ce_gym.compile.lowering.lookup import Table, emit_lookup
 from ce_gym.compile.lowering.lookup_grid import emit_grid_lookup
 from ce_gym.compile.lowering.lookup_values import emit_value_lookup
-from ce_gym.compile.lowering.parted import Part
+from ce_gym.compile.lowering.parted import Part, Parts
 from ce_gym.compile.lowering.random import emit_uniform
 from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
 from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While
@@ -63,10 +64,11 @@ class _TileWork:
         remaining = builder.sub(num_envs, self.first_env)
         self.valid_lanes = self._smaller(remaining, INT(self.vectors.lanes))
         self.lanes = {b.name: self._lanes_of(b, scratch, tile) for b in program.buffers if b.kind != "table"}
-        self.bodies: dict[tuple[casadi.Function, int | None, Same, int | None], ir.Function] = {}
-        repeated = [call for call in program.calls if isinstance(call, Call) and call.again and parts == 1]
+        self.bodies: dict[tuple[casadi.Function, Same, Part | None], ir.Function] = {}
+        repeated = [call for call in program.calls if isinstance(call, Call) and call.again]
         self.again = {call.function: _changing(call) for call in repeated}
-        self.memory = {call.function: self._kept(call) for call in {call.function: call for call in repeated}.values()}
+        self.taken_apart: dict[tuple[casadi.Function, str], Parts] = {}
+        self.memory: dict[casadi.Function, Value] = {}
 
     def any_lane(self, name: str) -> Value:
         """Whether a buffer of size 1 is not zero in some lane."""
@@ -226,37 +228,52 @@ class _TileWork:
             self._call_version(call)
 
     def _call_version(self, call: Call) -> None:
-        """Call the whole function, or what is left of it."""
+        """Call the whole function, or those of its parts that are needed."""
+        if (parts := self._parts_of(call)) is None:
+            self._call_body(call)
+            return
+        if not call.again:
+            self._call_part(call, parts.first)
         if not call.short_if_zero:
-            self._call_parts(call)
+            self._call_rest(call, parts.versions[0])
             return
         with self.builder.if_else(self.any_lane(call.short_if_zero)) as (whole, short):
-            with whole:
-                self._call_parts(call)
-            with short:
-                self._call_parts(call, call.inputs.index(call.short_if_zero))
+            for branch, version in zip((whole, short), parts.versions, strict=True):
+                with branch:
+                    self._call_rest(call, version)
 
-    def _kept(self, call: Call) -> Value:
-        """Memory for what the first part of a function leaves, of one tile at a time."""
-        zeros = {None, call.inputs.index(call.short_if_zero) if call.short_if_zero else None}
-        count = max(len(parts_of(call.function, _changing(call), zero)[-1]) for zero in zeros)
-        with self.builder.goto_entry_block():
-            memory = self.builder.alloca(self.vectors.float_type, INT(count))
-        memory.align = ALIGNMENT
-        return memory
+    def _parts_of(self, call: Call) -> Parts | None:
+        """How a function is taken apart, if it is."""
+        changing = self.again.get(call.function, frozenset())
+        if self.parts > 1 or not (changing or call.short_if_zero):
+            return None
+        key = call.function, call.short_if_zero
+        if key not in self.taken_apart:
+            choice = call.outputs.index(call.short_if_zero) if call.short_if_zero else None
+            self.taken_apart[key] = parts_of(call.function, changing, choice)
+        return self.taken_apart[key]
 
-    def _call_parts(self, call: Call, zero: int | None = None) -> None:
-        """Call it, or its parts that are needed."""
-        if call.function not in self.again:
-            self._call_body(call, self._body(call, zero))
-            return
+    def _call_rest(self, call: Call, parts: tuple[Part, ...]) -> None:
+        """Call what follows a first part; of a further call what changes."""
+        for part in parts[-1:] if call.again else parts:
+            if not part.is_empty:
+                self._call_part(call, part)
+
+    def _call_part(self, call: Call, part: Part) -> None:
         pointers = [self.lanes[name] for name in call.inputs + call.outputs]
-        for part in (1,) if call.again else (0, 1):
-            self.builder.call(self._body(call, zero, part), [*pointers, self.memory[call.function]])
+        self.builder.call(self._body(call, part), [*pointers, self._memory(call.function, part)])
 
-    def _call_body(self, call: Call, body: ir.Function) -> None:
-        """Call it as often as it takes: for every part of the lanes, and of the buffers."""
-        b, parts, f = self.builder, self.parts, call.function
+    def _memory(self, function: casadi.Function, part: Part) -> Value:
+        """Memory for what the parts of a function leave to each other, of one tile at a time."""
+        if function not in self.memory:
+            with self.builder.goto_entry_block():
+                self.memory[function] = self.builder.alloca(self.vectors.float_type, INT(max(len(part.places), 1)))
+            self.memory[function].align = ALIGNMENT
+        return self.memory[function]
+
+    def _call_body(self, call: Call) -> None:
+        """Call it whole, as often as it takes: for every part of the lanes, and of the buffers."""
+        b, parts, f, body = self.builder, self.parts, call.function, self._body(call)
         pointers = [self.lanes[name] for name in call.inputs + call.outputs]
         if parts == call.times == 1:
             b.call(body, pointers)
@@ -269,14 +286,15 @@ class _TileWork:
             first = [b.mul(time, INT(n * parts)) if goes else INT(0) for n, goes in zip(numel, goes_on, strict=True)]
             b.call(body, [b.gep(pointer, [b.add(at, part)]) for pointer, at in zip(narrow, first, strict=True)])
 
-    def _body(self, call: Call, zero: int | None = None, part: int | None = None) -> ir.Function:
-        """A function's own LLVM function, the first time it is asked for; what is left of it if an input is zero."""
-        key = call.function, zero, _same(call) if zero is not None else frozenset(), part
+    def _body(self, call: Call, part: Part | None = None) -> ir.Function:
+        """The LLVM function of a function or of a part of it, the first time it is asked for."""
+        same = _same(call) if call.short_if_zero else frozenset()
+        key = call.function, same, part
         if key not in self.bodies:
-            self.bodies[key] = self._emitted(*key)
+            self.bodies[key] = self._emitted(call.function, same, part)
         return self.bodies[key]
 
-    def _emitted(self, function: casadi.Function, zero: int | None, same: Same, part: int | None) -> ir.Function:
+    def _emitted(self, function: casadi.Function, same: Same, part: Part | None) -> ir.Function:
         """A function, or a part of it, as one long block that the optimiser sees alone."""
         pointer = VectorBuilder(None, self.layout.dtype, self.parts).float_type.as_pointer()
         count = function.n_in() + function.n_out() + (part is not None)
@@ -288,8 +306,8 @@ class _TileWork:
         vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype, self.parts)
         inputs, outputs = body.args[: function.n_in()], body.args[function.n_in() :][: function.n_out()]
         apart = self.program.compact and self._is_apart(function)
-        which = None if part is None else Part(part, self.again[function], body.args[-1])
-        lower_function(vectors, function, inputs, outputs, apart, zero, same, which)
+        part = part and replace(part, memory=body.args[-1])
+        lower_function(vectors, function, inputs, outputs, apart, same, part)
         vectors.builder.ret_void()
         return body
 

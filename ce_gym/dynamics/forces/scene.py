@@ -73,7 +73,7 @@ class Scene:
             flat ground.
         looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_contacts);
             empty if that is where they are.
-        near: 1 where what is seldom near acts, 0 where it is left out; None if all acts always.
+        choosing: Whether what is seldom near is left out where it is not; else all acts always.
     """
 
     mechanism: Mechanism
@@ -81,7 +81,7 @@ class Scene:
     figures: Figures
     ground: SX
     looked_up: SX = field(default_factory=SX)
-    near: SX | None = None
+    choosing: bool = False
 
 
 def make_scene(mechanism: Mechanism, options: StepOptions, parameters: SX, ground: SX) -> Scene:

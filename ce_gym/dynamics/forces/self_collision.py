@@ -123,7 +123,6 @@ def meeting(
     compliance: Compliance,
     normal: NormalLaw,
     dt: float,
-    near: SX | None = None,
 ) -> Pair:
     """Place two capsules against each other.
 
@@ -134,7 +133,6 @@ def meeting(
         compliance: What they are made of; friction is left out.
         normal: Law of the force.
         dt: Step length [s].
-        near: 1 where it may act, 0 where it does not; None if it always may.
     """
     axes = [[constant(np.array(end)) for end in (one.start, one.end)] for one in capsules]
     placed = [[body.point_position(end) for end in axis] for axis, body in zip(axes, bodies, strict=True)]
@@ -152,7 +150,7 @@ def meeting(
     still = SX(3, 1)
     touch = Touch(_normal(SX(1)), still, depth, _normal(closing), still, load, still)
     names, ends = f"{first.name} {second.name}", (first, second)
-    return Pair(names, touch, compliance, normal, Frictionless(), dt, ends, near=near)
+    return Pair(names, touch, compliance, normal, Frictionless(), dt, ends)
 
 
 def nearest(a: SX, b: SX, c: SX, d: SX, long: tuple[bool, ...] = (True, True)) -> tuple[SX, SX]:

@@ -42,6 +42,7 @@ from ce_gym.dynamics.recursion.ce_aba import (
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, steadying_couples, turning_momentum
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
+from ce_gym.dynamics.stepping.choice import anything_near
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactSphere
@@ -63,6 +64,7 @@ class Solved:
         meshes: Of the transmissions that stretch, one or none.
         carried: What friction under load went by, as `State.carried` is.
         inertia: Of clusters, without what acts on their coordinates, shape (d, d) each.
+        near: Whether something that is seldom near is, 1 or 0; None if all acts always.
     """
 
     kinematics: Kinematics
@@ -75,6 +77,7 @@ class Solved:
     meshes: list[MeshForce]
     carried: SX
     inertia: dict[int, SX]
+    near: SX | None
 
 
 def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Solved:
@@ -118,6 +121,7 @@ class Acting:
         couples: What steadies the bodies of ball joints, body axes [N m], shape (3,) each, by name.
         gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
         carried: What friction under load goes by, as `State.carried` is.
+        near: Whether something that is seldom near is, 1 or 0; None if all acts always.
     """
 
     kinematics: Kinematics
@@ -130,6 +134,7 @@ class Acting:
     couples: dict[str, SX]
     gravity: dict[str, SX]
     carried: SX
+    near: SX | None
 
     def solved(self, vdot: SX, a: dict[str, SX], inertia: dict[int, SX] | None = None) -> Solved:
         """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each.
@@ -141,7 +146,7 @@ class Acting:
         """
         motion = Motion(vdot[vdot.numel() - self.motors.tau.numel() :], a, self.gravity)
         laws = self.contacts, self.pairs, self.motors, self.friction, self.meshes
-        return Solved(self.kinematics, vdot, motion, *laws, self.carried, inertia or {})
+        return Solved(self.kinematics, vdot, motion, *laws, self.carried, inertia or {}, self.near)
 
 
 def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Acting:
@@ -150,11 +155,12 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     y, yd = state.q[layout.joints_q :], state.v[layout.joints_v :]
     kinematics = outward_velocity_pass(mechanism, state.q, state.v, state.dependent)
 
-    laws, unloaded = touching(scene, kinematics, state, dt), iterate.numel() - state.carried.numel()
+    laws, meeting = touching(scene, kinematics, state, dt), meeting_pairs(scene, kinematics, state, dt)
+    near = only_near(scene, laws, meeting, dt) if scene.choosing else None
+    unloaded = iterate.numel() - state.carried.numel()
     carried = carried_now(state, iterate[unloaded:])
     before = Before.of(mechanism, scene.options, carried, state)
     driven = Motors(scene, kinematics, y, yd, target, dt, before)
-    meeting = meeting_pairs(scene, kinematics, state, dt)
     rubbing = JointFriction(mechanism, kinematics, yd, dt)
     sizes = [law.size for law in (*laws, *meeting, driven, rubbing)]
     *of_contacts, of_motors, of_friction, of_meshes = split(iterate[:unloaded], sizes)
@@ -170,7 +176,7 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     joints = on_coordinates(mechanism, of_balls, of_joints)
     couples = {} if is_moment(dt) else steadying_couples(mechanism, kinematics, dt)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    return Acting(kinematics, contacts, pairs, motors, friction, meshes, joints, couples, gravity, carried)
+    return Acting(kinematics, contacts, pairs, motors, friction, meshes, joints, couples, gravity, carried, near)
 
 
 @dataclass
@@ -304,8 +310,7 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> l
             up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
         touch = touch_ground(body, sphere, height, up, state.load[i], anchor)
-        near = scene.near if sphere.name in options.seldom else None
-        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt, near=near))
+        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt))
     return contacts
 
 
@@ -315,8 +320,18 @@ def meeting_pairs(scene: Scene, kinematics: Kinematics, state: State, dt: float)
     law, pairs = normal_law(options.normal_law, options.material), []
     for i, pair in enumerate(colliding(robot, options.self_collisions)):
         bodies = kinematics.bodies[pair[0].body], kinematics.bodies[pair[1].body]
-        pairs.append(meeting(pair, bodies, state.pressed[i], compliance, law, dt, scene.near))
+        pairs.append(meeting(pair, bodies, state.pressed[i], compliance, law, dt))
     return pairs
+
+
+def only_near(scene: Scene, contacts: list[Contact], pairs: list[Pair], dt: float) -> SX:
+    """Let what is seldom near act only where it is; return whether something is, 1 or 0."""
+    named = zip(scene.options.contacts, contacts, strict=True)
+    seldom = [*[contact for name, contact in named if name in scene.options.seldom], *pairs]
+    near = anything_near([law.touch for law in seldom], dt)
+    for law in seldom:
+        law.near = near
+    return near
 
 
 def contact_spheres(mechanism: Mechanism, options: StepOptions) -> list[ContactSphere]:

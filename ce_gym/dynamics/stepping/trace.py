@@ -29,6 +29,8 @@ SINGULAR = 1e-3
 """A robot whose loops are nearer than this to a singularity (see `Model.nearness`) has diverged."""
 SANE_SPEED = 1e4
 """A robot any of whose velocities is beyond this, or NaN, has diverged [rad/s or m/s]."""
+NEAR = "near"
+"""Name of the buffer that says whether something is that is seldom near."""
 SANE_DISTANCE = 1e6
 """A robot any of whose positions is beyond this, or NaN, has diverged [rad or m]."""
 
@@ -70,8 +72,8 @@ def iteration_function(
         options: The scene.
         outputs: See `step_function`.
         follows: See `step_function`.
-        chooses: Whether what is seldom near is left out where it is not; `near` is one more of what is given then, and
-            `near_iterate` what of the iterate nobody looks at elsewhere.
+        chooses: Whether what is seldom near is left out where it is not; `NEAR`, which is 1 or 0, says it then, and
+            `near_iterate` is what of the iterate nobody looks at elsewhere.
 
     Returns:
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
@@ -84,12 +86,12 @@ def iteration_function(
     parts, iterate = {name: SX.sym(name, len(of)) for name, of in rows.items()}, SX(size, 1)
     for name, part in parts.items():
         iterate[rows[name]] = part
-    choice = {"near": SX.sym("near")} if chooses else {}
-    given.scene = replace(given.scene, **choice)
+    given.scene = replace(given.scene, choosing=chooses)
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
     told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
     left = {f"{name}_next": stepped.iterate[of] for name, of in rows.items()} | {"unconverged": stepped.unconverged}
-    return traced("iteration", given.inputs() | parts | choice, given.guarded(stepped) | left | told)
+    left |= {NEAR: stepped.solved.near} if chooses else {}
+    return traced("iteration", given.inputs() | parts, given.guarded(stepped) | left | told)
 
 
 def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
