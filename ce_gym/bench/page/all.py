@@ -133,7 +133,8 @@ def read(path: Path) -> Report:
 def chapter(command: str, said: str, found: Report, folder: Path) -> str:
     """Return what the page says of one benchmark: its command, bars, met or missed alike, pictures and tables."""
     pictures = [part for file in sorted(folder.glob("*.png")) for part in (f"![]({folder.name}/{file.name})", "")]
-    bars = [f"- {'met' if bar.met else '**missed**'}: {bar.claim}: {bar.measured}" for bar in found.requirements]
+    said_of = {"met": "met", "MISSED": "**missed**", "none": "nothing to judge"}
+    bars = [f"- {said_of[bar.verdict]}: {bar.claim}: {bar.measured}" for bar in found.requirements]
     tables = [part for table in found.tables for part in (table.as_markdown(), "")]
     remarks = [part for remark in found.remarks for part in (remark, "")]
     head = [f"## {found.name}", "", f"`python -m ce_gym.bench {command}`", ""]
@@ -165,4 +166,6 @@ def _one(part: Part, command: Sequence[str], out: Path) -> str:
 
 def _bars(requirements: list[Requirement]) -> str:
     """Return how many bars were met."""
-    return f"{sum(bar.met for bar in requirements)} of {len(requirements)} met" if requirements else "none asked for"
+    judged = [bar.met for bar in requirements if bar.met is not None]
+    nothing = f", {len(requirements) - len(judged)} with nothing to judge" if len(judged) < len(requirements) else ""
+    return f"{sum(judged)} of {len(judged)} met{nothing}" if requirements else "none asked for"
