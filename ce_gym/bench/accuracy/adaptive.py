@@ -20,7 +20,6 @@ import numpy as np
 
 from ce_gym.bench.accuracy.benchmark import as_markdown
 from ce_gym.bench.accuracy.curves import (
-    FINE,
     MARGIN,
     NUM_ENVS,
     OUR_STEPS,
@@ -126,12 +125,11 @@ def run(arguments: argparse.Namespace) -> Report:
 def measure(scene: Scene, tolerances: Sequence[float], steps: Sequence[int], rounds: int) -> list[Delivered]:
     """Measure a scene at all tolerances, and our methods at all fixed steps, taking turns."""
     _, limit, known = reference(scene)
-    batches = {few: Ours(scene, Way("adaptive", scene.exact), number) for few, number in NUM_ENVS.items()}
+    batch = Ours(scene, Way("adaptive", scene.exact), NUM_ENVS)
     fixed = (w for w in scene.ours if (w.level, w.dtype) == (scene.exact, "float64") and w.method != "adaptive")
     exact = replace(scene, ours=tuple(fixed))
     sides = our_sides(exact, steps, limit)
-    of = {asked: batches[asked > FINE] for asked in tolerances}
-    sides += [Side(NAME, asked, partial(batch.run, 1, asked), batch.num_envs, limit) for asked, batch in of.items()]
+    sides += [Side(NAME, asked, partial(batch.run, 1, asked), NUM_ENVS, limit) for asked in tolerances]
     paths: dict[Side, Array] = {}
     counts: dict[Side, tuple[float, float, float]] = {}
 
@@ -140,7 +138,7 @@ def measure(scene: Scene, tolerances: Sequence[float], steps: Sequence[int], rou
             paths[side] = side.run()
             if side.name == NAME:
                 names = ("steps_taken", "retries", "steps_missed")
-                counts[side] = tuple(float(of[side.dt].arrays[name].mean()) for name in names)  # type: ignore[assignment]
+                counts[side] = tuple(float(batch.arrays[name].mean()) for name in names)  # type: ignore[assignment]
 
         return work
 

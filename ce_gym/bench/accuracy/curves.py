@@ -27,13 +27,10 @@ OUR_STEPS = (1, 2, 5, 10, 20, 50, 100, 200)
 """Steps to a hold at which ours is measured."""
 PEER_STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 """The same for peers; the fourth-order method makes no use of the last."""
-NUM_ENVS = {True: 256, False: 64}
-"""Robots in a batch of ours, with few steps to a hold or many."""
-FEW_STEPS = 20
+NUM_ENVS = 256
+"""Robots in a batch of ours."""
 TOLERANCES = (0.3, 0.1, 0.03, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 """Of our steps that adapt [rad or m]."""
-FINE = 3e-5
-"""From which tolerance on batches are those of many steps to a hold."""
 FINEST_SINGLE = 20, 1e-4
 """Most steps to a hold and least tolerance [rad or m] in single precision, where rounding does not show."""
 ERROR_CONTROL = "error control"
@@ -224,15 +221,13 @@ def our_sides(scene: Scene, steps: Sequence[int], exact: Array) -> list[Side]:
     for way in scene.ours:
         limit = exact if way.level == scene.exact else accuracy_references.ours(scene, scene.reference // 2, way.level)
         name, single = ("ce_gym", way.level, way.name), way.dtype == "float32"
-        batches = {few: Ours(scene, way, number) for few, number in NUM_ENVS.items()}
+        batch = Ours(scene, way, NUM_ENVS)
         if way.method == "adaptive":  # as long as a tolerance allows, a hold at most
             for tolerance in (t for t in TOLERANCES if not single or t >= FINEST_SINGLE[1]):
-                batch = batches[tolerance > FINE]
-                sides.append(Side(name, tolerance, partial(batch.run, 1, tolerance), batch.num_envs, limit))
+                sides.append(Side(name, tolerance, partial(batch.run, 1, tolerance), NUM_ENVS, limit))
             continue
         for n in (n for n in steps if not single or n <= FINEST_SINGLE[0]):
-            batch = batches[n <= FEW_STEPS]
-            sides.append(Side(name, HOLD / n, partial(batch.run, n), batch.num_envs, limit))
+            sides.append(Side(name, HOLD / n, partial(batch.run, n), NUM_ENVS, limit))
     return sides
 
 
