@@ -7,7 +7,8 @@ import argparse
 import numpy as np
 import pytest
 
-from ce_gym.bench.speed import pressed, released, surroundings
+from ce_gym.bench.measure.timing import Timing
+from ce_gym.bench.speed import drives, pressed, released, surroundings
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
 
@@ -39,6 +40,27 @@ def test_report():
     assert len(table.rows) == 8
     assert len(report.requirements) == 8
     assert all(row[2] > 0 and row[3] > 0 for row in table.rows)
+
+
+def test_elastic_drives_beside_exact_ones():
+    """Standing, under random targets and walking, the fastest load of each side in every round."""
+    parser = argparse.ArgumentParser()
+    surroundings.add_arguments(parser)
+    report = surroundings.run(parser.parse_args(["--num-envs", "8", "--rounds", "2", "--parts", "drives"]))
+    (table,) = report.tables
+    assert [row[0].split(", ")[1] for row in table.rows[:4]] == [
+        "standing",
+        "random targets",
+        "random targets",
+        "walking",
+    ]
+    assert len(report.requirements) == 8
+    assert all(row[2] > 0 and 0.3 < row[3] < 30 for row in table.rows)
+
+
+def test_the_fastest_load_of_each_round_counts():
+    timings = {"with 0": Timing((3.0, 1.0)), "with 1": Timing((2.0, 5.0)), "without 0": Timing((1.0, 1.0))}
+    assert drives.fastest(timings) == {"with": Timing((2.0, 1.0)), "without": Timing((1.0, 1.0))}
 
 
 def test_links_pressed_on_each_other_are_less_than_a_millimetre_in_each_other():
