@@ -204,7 +204,8 @@ class Simulator:
         if "step_length" in self._arrays:
             rows["step_length"] = np.atleast_1d(self._batch.schema["step_length"].reset)
         if self.contact_names:
-            rows["load"] = self._resting_load(rows["q"])
+            resting = self._resting_load(rows["q"])
+            rows |= {name: resting for name in ("load", "whole_load") if name in self._arrays}
         if "dependent" in self._arrays:
             rows["dependent"] = self.model.dependent_guess(rows["q"])
         with self._section:  # all that can be refused has been

@@ -17,7 +17,7 @@ from ce_gym.dynamics.stepping.control import control_function, control_sizes
 from ce_gym.dynamics.stepping.ground_lookup import places_function, planes_function, touching_function
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import beginning_function, judging_function, mending_function
-from ce_gym.dynamics.stepping.plan import MOVED, OFF, Plan, Rates, Stage
+from ce_gym.dynamics.stepping.plan import LOAD, MOVED, OFF, Plan, Rates, Stage
 from ce_gym.dynamics.stepping.step import iterations_needed
 from ce_gym.dynamics.stepping.trace import NEAR, combination_function, iteration_function, step_function
 from ce_gym.model.mechanism import Mechanism
@@ -143,6 +143,8 @@ def _staged(mechanism: Mechanism, options: StepOptions, iteration: ca.Function, 
             each += look_up(mechanism, options, start)[1]
             ground_at = stage.start
         here = {name: f"{start}{name}" for name in state} | {DT: f"{own}_dt"}
+        if LOAD in here and not stage.start:
+            here[LOAD] = stage.load
         given = tuple(here.get(name, name) for name in iteration.name_in())
         left = (*(f"{own}_{name}" for name in state), *iterates, "unconverged", *near)
         left = (*left, *(f"{own}_{name}" for name in asked))

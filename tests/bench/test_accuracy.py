@@ -23,7 +23,7 @@ from ce_gym.bench.accuracy.peers import Family, Peer
 from ce_gym.bench.accuracy.references import contact as accuracy_contact
 from ce_gym.bench.accuracy.references import restated as accuracy_restated
 from ce_gym.bench.accuracy.references import smooth as accuracy_references
-from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Scene
+from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, SINGLE, Scene, Way
 from ce_gym.bench.accuracy.statements import GROUNDS
 from ce_gym.model.checks.collisions import colliding
 
@@ -48,7 +48,7 @@ def test_two_codes_agree_on_smooth_scenes(name: str, holds: int):
 @pytest.mark.parametrize("name", ["breakaway", "reversal"])
 def test_two_codes_agree_on_a_block(name: str):
     scene = short(name, 5)
-    limit = Ours(scene, "extrapolated", "exact", "tangent", 1).run(2000)
+    limit = Ours(scene, Way("extrapolated"), 1).run(2000)
     assert np.abs(limit[-1] - scene.q).max() > 1e-4
     assert rms_error(scene, accuracy_contact.block(scene, 600), limit) < 1e-7
 
@@ -58,8 +58,8 @@ def test_two_codes_agree_on_a_block(name: str):
 def test_two_codes_agree_on_robots_that_touch(name: str, holds: int):
     """On the edge of a step, between links, and on feet behind rods and springs."""
     scene = short(name, holds)
-    error = rms_error(scene, accuracy_contact.robot(scene, 8000), Ours(scene, *scene.ours[1], 1).run(1000))
-    coarse = rms_error(scene, Ours(scene, *scene.ours[1], 1).run(10), Ours(scene, *scene.ours[1], 1).run(1000))
+    error = rms_error(scene, accuracy_contact.robot(scene, 8000), Ours(scene, scene.ours[1], 1).run(1000))
+    coarse = rms_error(scene, Ours(scene, scene.ours[1], 1).run(10), Ours(scene, scene.ours[1], 1).run(1000))
     assert error < 3e-5 < 10 * error + 3e-5 < coarse
 
 
@@ -67,9 +67,9 @@ def test_two_codes_agree_on_robots_that_touch(name: str, holds: int):
 def test_two_codes_agree_on_a_robot_that_lands():
     scene = short("drop_3cm", 5)
     lower = replace(scene, q=scene.q - 0.03 * np.eye(len(scene.q))[2])
-    limit = Ours(lower, "euler", "exact", "secant", 1).run(8000)
+    limit = Ours(lower, Way("euler", friction="secant"), 1).run(8000)
     error = rms_error(lower, accuracy_contact.robot(lower, 20_000), limit)
-    coarse = rms_error(lower, Ours(lower, "euler", "exact", "secant", 1).run(100), limit)
+    coarse = rms_error(lower, Ours(lower, Way("euler", friction="secant"), 1).run(100), limit)
     assert error < 1e-5 < 10 * error + 1e-5 < coarse
 
 
@@ -80,7 +80,7 @@ def test_a_step_that_is_an_input_is_the_simulators():
     simulator.set_state(scene.q, scene.v)
     for torque in scene.drive:
         simulator.step(torque, 5)
-    path = Ours(scene, "euler", "exact", "tangent", 9).run(5)
+    path = Ours(scene, Way("euler"), 9).run(5)
     np.testing.assert_allclose(path[-1], simulator.q[0], rtol=1e-12, atol=1e-13)
 
 
@@ -222,6 +222,27 @@ def test_comparison_ends_where_references_do():
     assert accuracy.requirement(Measured(scene, 1e-6, [ours, theirs])).met
     slow = curve("ce_gym", [10.0, 100.0, 1000.0], [1e-1, 1e-3, 1e-5])
     assert not accuracy.requirement(Measured(scene, 1e-6, [slow, theirs])).met
+    lost = curve("MuJoCo", [50.0, 500.0, 5000.0], [1e1, 1e1, 1e1])
+    assert accuracy.requirement(Measured(scene, 1e-6, [ours, lost])).verdict == "none"
+
+
+def test_single_precision_is_named_and_double_is_beside_it():
+    scene = short("tumble", 1)
+    double = curve("ce_gym", [2.0, 20.0, 200.0], [1e-1, 1e-3, 1e-5])
+    fast = replace(double.points[0], seconds=1.0)
+    single = Curve("ce_gym", "exact", Way("m", dtype="float32").name, (fast,))
+    theirs = curve("MuJoCo", [50.0, 500.0, 5000.0], [1e-1, 1e-3, 1e-5])
+    found = comparisons(Measured(scene, 1e-6, [double, single, theirs]))
+    assert (found[0].ratio, found[0].double_ratio) == pytest.approx((50.0, 25.0))
+    assert found[0].method.endswith(SINGLE)
+    assert found[2].ratio == found[2].double_ratio == pytest.approx(25.0)
+    assert not found[2].method.endswith(SINGLE)
+
+
+def test_single_precision_is_as_near_as_its_steps_allow():
+    scene = short("drop_3cm", 10)
+    double, single = (Ours(scene, Way("extrapolated", dtype=dtype), 16).run(10) for dtype in ("float64", "float32"))
+    assert 0 < rms_error(scene, single, double) < 1e-5
 
 
 @pytest.mark.slow
@@ -269,7 +290,7 @@ def test_what_adaptive_steps_deliver():
 
 def test_adaptive_steps_are_the_simulators():
     scene = short("belt_leg", 3)
-    batch = Ours(scene, "adaptive", "exact", "tangent", 9)
+    batch = Ours(scene, Way("adaptive"), 9)
     paths = [batch.run(1, tolerance) for tolerance in (1e-2, 1e-4, 1e-2)]
     np.testing.assert_array_equal(paths[0], paths[2])
     simulator = Simulator(

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.forces.scene import TWO_LOADS, StepOptions
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import step_function
-from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Placement, Robot
+from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, LinearConstraint, Placement, Robot
 
 
 def swinging_robot() -> Robot:
@@ -82,6 +82,33 @@ def test_order(method: str, exact):
     errors = [distance(run(method, coarsest / 2**i), exact) for i in range(3)]
     slopes = np.log2(np.array(errors[:-1]) / errors[1:])
     assert slopes[-1] == pytest.approx(METHODS[method].order, abs=0.3), errors
+
+
+def test_extrapolation_keeps_its_order_where_a_foot_slides_and_turns():
+    """Friction goes by the load of the step before: the whole's and the halves' have to be off in the same way."""
+    material = ContactMaterial(1e4, 100.0, 0.5, 1e-3)
+    inertial = Inertial(1.0, (0.0, 0.0, 0.0), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)))
+    rod = Body("rod", "link", None, Placement(), Joint("free"), inertial)
+    foot = ContactSphere("foot", "rod", (0.0, 0.0, -0.3), 0.02)
+    model = Model(Robot("sliding_rod", (rod,), contacts=(foot,), material=material))
+    start = {"q": ca.DM([0, 0, 0.319, 1, 0, 0, 0]), "v": ca.DM([0, 5.0, 0, -0.3, 0, 0]), "load": ca.DM([10.0])}
+
+    def end(dt: float) -> np.ndarray:
+        step = step_function(model.mechanism, StepOptions(dt, "torque", ("foot",), material, method="extrapolated"))
+        names = [name for name in step.name_in() if f"{name}_next" in step.name_out()]
+        path = step.mapaccum("path", round(0.02 / dt), names, [f"{name}_next" for name in names])
+        given = {name: start.get(name, ca.DM.zeros(step.size1_in(name))) for name in names}
+        return path(**given | {"whole_load": start["load"]})["v_next"].full()[:, -1]
+
+    exact = end(2e-6)
+    assert exact[3] - 0.3 * exact[1] < -0.5  # it slides to the end
+    errors = [np.abs(end(dt) - exact).max() for dt in (2e-4, 1e-4, 5e-5)]
+    assert np.log2(errors[0] / errors[2]) / 2 == pytest.approx(2, abs=0.3), errors
+
+
+def test_both_loads_are_there_where_a_stage_asks_for_them():
+    asked = {name for name, plan in METHODS.items() for stage in plan.stages if stage.load == "whole_load"}
+    assert asked == set(TWO_LOADS)
 
 
 def test_reference_agrees_with_another_method(exact):

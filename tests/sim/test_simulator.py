@@ -62,10 +62,12 @@ def test_kernel_follows_the_traced_step(robot: str, level: str, method: str):
     q, v, target = start
     for i in (0, 7, 39):
         n = len(sim.contact_names)
-        state = (q[i], v[i], sim._resting_load(q[i]), np.zeros(2 * n), 0.0)
+        resting = sim._resting_load(q[i])
+        loads = (resting, resting) if method == "extrapolated" else (resting,)
+        state = (q[i], v[i], *loads, np.zeros(2 * n), 0.0)
         for _ in range(10):
             results = [np.array(result).ravel() for result in function(*state, target[i])]
-            state, told = results[:5], dict(zip(outputs, results[5:], strict=True))
+            state, told = results[: len(state)], dict(zip(outputs, results[len(state) :], strict=True))
         np.testing.assert_allclose(sim.q[i], state[0], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(sim.v[i], state[1], rtol=1e-7, atol=1e-7)
         np.testing.assert_allclose(sim.torque[i], told["torque"], rtol=1e-6, atol=1e-6)

@@ -60,7 +60,7 @@ def test_kernel_and_expression_are_one_step(method: str):
     sim = Simulator(model, len(q), dt, method=method, motors="limited", outputs=outputs, retry=0)
     sim.set_state(q, v)
     function = step_function(model.mechanism, sim.options, outputs)
-    names = ("q", "v", "load", "anchor", "diverged")
+    names = ("q", "v", "load", "whole_load", "anchor", "diverged")
     names = tuple(name for name in names if name in function.name_in())
     state = {name: sim._read(name) for name in names}
     for _ in range(12):

@@ -33,15 +33,13 @@ from ce_gym.bench.accuracy.curves import (
     time_to,
 )
 from ce_gym.bench.accuracy.ours import Ours
-from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Array, Scene
+from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Array, Scene, Way
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved
 from ce_gym.viewer.console import shown
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 STEPS = (*OUR_STEPS, 500)
-FINE = 3e-5
-"""From which tolerance on batches are those of many steps to a hold."""
 MEDIAN, WORST, TIME = 3.0, 30.0, 1.3
 """What error delivered over error asked may be, and time over that of the best fixed step."""
 QUICK_SCENES, QUICK_TOLERANCES, QUICK_STEPS = ("tumble", "slide"), (1e-2, 1e-4), (1, 5, 20, 100)
@@ -127,11 +125,11 @@ def run(arguments: argparse.Namespace) -> Report:
 def measure(scene: Scene, tolerances: Sequence[float], steps: Sequence[int], rounds: int) -> list[Delivered]:
     """Measure a scene at all tolerances, and our methods at all fixed steps, taking turns."""
     _, limit, known = reference(scene)
-    batches = {few: Ours(scene, "adaptive", scene.exact, "tangent", number) for few, number in NUM_ENVS.items()}
-    exact = replace(scene, ours=tuple(way for way in scene.ours if way[1] == scene.exact and way[0] != "adaptive"))
+    batch = Ours(scene, Way("adaptive", scene.exact), NUM_ENVS)
+    fixed = (w for w in scene.ours if (w.level, w.dtype) == (scene.exact, "float64") and w.method != "adaptive")
+    exact = replace(scene, ours=tuple(fixed))
     sides = our_sides(exact, steps, limit)
-    of = {asked: batches[asked > FINE] for asked in tolerances}
-    sides += [Side(NAME, asked, partial(batch.run, 1, asked), batch.num_envs, limit) for asked, batch in of.items()]
+    sides += [Side(NAME, asked, partial(batch.run, 1, asked), NUM_ENVS, limit) for asked in tolerances]
     paths: dict[Side, Array] = {}
     counts: dict[Side, tuple[float, float, float]] = {}
 
@@ -140,7 +138,7 @@ def measure(scene: Scene, tolerances: Sequence[float], steps: Sequence[int], rou
             paths[side] = side.run()
             if side.name == NAME:
                 names = ("steps_taken", "retries", "steps_missed")
-                counts[side] = tuple(float(of[side.dt].arrays[name].mean()) for name in names)  # type: ignore[assignment]
+                counts[side] = tuple(float(batch.arrays[name].mean()) for name in names)  # type: ignore[assignment]
 
         return work
 

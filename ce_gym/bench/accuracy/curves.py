@@ -20,18 +20,19 @@ from ce_gym.bench.accuracy.ours import Ours
 from ce_gym.bench.accuracy.peers import Peer, families
 from ce_gym.bench.accuracy.references import contact as accuracy_contact
 from ce_gym.bench.accuracy.references import smooth as accuracy_references
-from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.bench.accuracy.scenarios import HOLD, SINGLE, Array, Scene, Way
 from ce_gym.bench.measure.timing import Competitor, interleaved
 
 OUR_STEPS = (1, 2, 5, 10, 20, 50, 100, 200)
 """Steps to a hold at which ours is measured."""
 PEER_STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 """The same for peers; the fourth-order method makes no use of the last."""
-NUM_ENVS = {True: 256, False: 64}
-"""Robots in a batch of ours, with few steps to a hold or many."""
-FEW_STEPS = 20
-TOLERANCES = (0.3, 0.1, 0.03, 1e-2, 1e-3, 1e-4, 1e-5)
+NUM_ENVS = 256
+"""Robots in a batch of ours."""
+TOLERANCES = (0.3, 0.1, 0.03, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 """Of our steps that adapt [rad or m]."""
+FINEST_SINGLE = 20, 1e-4
+"""Most steps to a hold and least tolerance [rad or m] in single precision, where rounding does not show."""
 ERROR_CONTROL = "error control"
 """Method of a peer's curve whose points are not steps but what was asked of an integrator."""
 MARGIN = 10.0
@@ -117,6 +118,7 @@ class Comparison:
         error: The error.
         ours: Our time for one robot and simulated second [s], None if not reached.
         method: Which method of ours.
+        double: Our time without single precision [s], None if not reached.
         theirs: The peer's [s], None if not reached.
         peer: Which of its settings.
     """
@@ -124,6 +126,7 @@ class Comparison:
     error: float
     ours: float | None
     method: str
+    double: float | None
     theirs: float | None
     peer: str
 
@@ -131,6 +134,11 @@ class Comparison:
     def ratio(self) -> float | None:
         """How many times as long the peer takes; None if not both reach the error."""
         return self.theirs / self.ours if self.ours and self.theirs else None
+
+    @property
+    def double_ratio(self) -> float | None:
+        """The same with ours in double precision."""
+        return self.theirs / self.double if self.double and self.theirs else None
 
 
 def measure(
@@ -200,7 +208,7 @@ def reference(scene: Scene) -> tuple[Array, Array, Measured]:
         )
     explicit, n = (accuracy_contact.robot, 40_000) if scene.robot.independent else (accuracy_contact.block, 400)
     truth = explicit(scene, n)
-    fine = Ours(scene, "extrapolated", scene.exact, "tangent", 1)
+    fine = Ours(scene, Way("extrapolated", scene.exact), 1)
     limit = fine.run(4000)
     measured = Measured(scene, rms_error(scene, limit, truth))
     measured.limits["ce_gym", scene.exact] = rms_error(scene, fine.run(2000), limit)
@@ -210,18 +218,16 @@ def reference(scene: Scene) -> tuple[Array, Array, Measured]:
 def our_sides(scene: Scene, steps: Sequence[int], exact: Array) -> list[Side]:
     """Return our methods at all step lengths; approximate levels tend to a truth of their own."""
     sides = []
-    for method, level, friction in scene.ours:
-        limit = exact if level == scene.exact else accuracy_references.ours(scene, scene.reference // 2, level)
-        name = ("ce_gym", level, method if friction == "tangent" else f"{method}, {friction}")
-        batches = {few: Ours(scene, method, level, friction, number) for few, number in NUM_ENVS.items()}
-        if method == "adaptive":  # as long as a tolerance allows, a hold at most
-            several = batches[True]
-            runs = [(tolerance, partial(several.run, 1, tolerance)) for tolerance in TOLERANCES]
-            sides += [Side(name, tolerance, run, several.num_envs, limit) for tolerance, run in runs]
+    for way in scene.ours:
+        limit = exact if way.level == scene.exact else accuracy_references.ours(scene, scene.reference // 2, way.level)
+        name, single = ("ce_gym", way.level, way.name), way.dtype == "float32"
+        batch = Ours(scene, way, NUM_ENVS)
+        if way.method == "adaptive":  # as long as a tolerance allows, a hold at most
+            for tolerance in (t for t in TOLERANCES if not single or t >= FINEST_SINGLE[1]):
+                sides.append(Side(name, tolerance, partial(batch.run, 1, tolerance), NUM_ENVS, limit))
             continue
-        for n in steps:
-            batch = batches[n <= FEW_STEPS]
-            sides.append(Side(name, HOLD / n, partial(batch.run, n), batch.num_envs, limit))
+        for n in (n for n in steps if not single or n <= FINEST_SINGLE[0]):
+            sides.append(Side(name, HOLD / n, partial(batch.run, n), NUM_ENVS, limit))
     return sides
 
 
@@ -301,10 +307,11 @@ def comparisons(measured: Measured, code: str = "MuJoCo") -> list[Comparison]:
     while 10.0**exponent >= MARGIN * min(measured.known(curve) for curve in ours):
         level = 10.0**exponent
         our_time, method = _fastest(measured, ours, level)
+        double, _ = _fastest(measured, [curve for curve in ours if not curve.method.endswith(SINGLE)], level)
         their_time, settings = _fastest(measured, theirs, level)
         if our_time is None and their_time is None:
             break
-        found.append(Comparison(level, our_time, method, their_time, settings))
+        found.append(Comparison(level, our_time, method, double, their_time, settings))
         exponent -= 1
     return found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
+from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene, Way
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.control import control_sizes
@@ -20,38 +20,37 @@ class Ours:
 
     Args:
         scene: The scene.
-        method: Name of a time-stepping method.
-        level: Transmission level.
-        friction: "tangent" or "secant".
+        way: Method, level, friction and precision.
         num_envs: Robots.
     """
 
-    def __init__(self, scene: Scene, method: str, level: str, friction: str, num_envs: int) -> None:
+    def __init__(self, scene: Scene, way: Way, num_envs: int) -> None:
         self.scene, self.num_envs = scene, num_envs
-        self.model = Model(scene.robot, transmission=level)
+        self.model = Model(scene.robot, transmission=way.level)
         options = StepOptions(
             control=scene.control,
             contacts=self.model.contact_names,
             material=scene.robot.material,
-            friction=friction,
-            method=method,
+            friction=way.friction,
+            method=way.method,
             ground="flat" if scene.terrain is None else "field",
             parameters=() if scene.push is None else ("gravity",),
             self_collisions=scene.touching,
         )
-        self.kernel = load_step_kernel(self.model, options, (), "float64")
+        self.kernel = load_step_kernel(self.model, options, (), way.dtype)
         self.arrays = {
-            name: tiles(num_envs, buffer.size, "float64")
+            name: tiles(num_envs, buffer.size, way.dtype)
             for name, buffer in self.kernel.buffers.items()
             if buffer.kind == "tiles"
         }
         self.tables: dict[str, Array] = {}
         if scene.terrain is not None:
-            self.tables[HEIGHTS] = scene.terrain.heights
+            self.tables[HEIGHTS] = scene.terrain.heights.astype(way.dtype)
             write_rows(self.arrays[FRAME], np.array([*scene.terrain.origin, scene.terrain.cell]))
         self.starts = self._starts()
         joints = len(self.model.joint_links)
-        self.targets = [np.ascontiguousarray(np.broadcast_to(row, (num_envs, joints))) for row in scene.drive]
+        rows = (np.broadcast_to(row, (num_envs, joints)) for row in scene.drive)
+        self.targets = [np.ascontiguousarray(row, way.dtype) for row in rows]
 
     def run(self, n: int, tolerance: float | None = None) -> Array:
         """Run through the scene; returns positions of the first robot at the end of every hold, (n_holds, nq).
@@ -93,7 +92,8 @@ class Ours:
         rows = {"q": q, "v": v, "diverged": np.zeros((self.num_envs, 1))}
         if model.contact_names:
             depth = Placement(model, model.contact_names, scene.terrain).depth(q)
-            rows["load"] = scene.robot.material.stiffness * depth
+            loads = scene.robot.material.stiffness * depth
+            rows |= {name: loads for name in ("load", "whole_load") if name in self.arrays}
         for name in ("anchor", "pressed"):
             if name in self.arrays:
                 rows[name] = np.zeros((self.num_envs, self.arrays[name].shape[1]))

@@ -1,6 +1,7 @@
 """The picture of the accuracy benchmark: one panel for each scene, error against time. Needs matplotlib.
 
-Lines are ours in blue and green, MuJoCo's in orange and red, Drake's in yellow; the palette is that of Okabe and Ito.
+Lines are ours in blue and green, dotted in single precision, MuJoCo's in orange and red, Drake's in yellow; the palette
+is that of Okabe and Ito.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ce_gym.bench.accuracy.curves import MARGIN, Curve, Measured
+from ce_gym.bench.accuracy.scenarios import SINGLE
 from ce_gym.bench.paper.plots import BLUE, GREEN, GREY, ORANGE, RED, SKY, STYLE, plt
 
 if TYPE_CHECKING:
@@ -73,9 +75,10 @@ def draw(measured: list[Measured], out: Path) -> Path:
 def _look(curve: Curve, exact: str) -> tuple[str, dict[str, Any]]:
     """Return label and style of a curve."""
     if curve.code == "ce_gym":
-        label, color, line = OURS[curve.method] if curve.level == exact else APPROXIMATE
-        dashed = curve.level != exact
-        return label, {"color": color, "marker": line[0], "linestyle": "--" if dashed else "-", "zorder": 5}
+        method = curve.method.removesuffix(f", {SINGLE}")
+        label, color, line = OURS[method] if curve.level == exact else APPROXIMATE
+        style = "--" if curve.level != exact else "-" if method == curve.method else ":"
+        return label, {"color": color, "marker": line[0], "linestyle": style, "zorder": 5}
     if curve.code == "Drake":
         marker = DRAKE_MARKERS[curve.method]
         return f"Drake, {curve.method}", {"color": DRAKE, "marker": marker, "linestyle": ":", "markerfacecolor": "none"}

@@ -50,12 +50,17 @@ class Requirement:
     Attributes:
         claim: What is required, with the figure required.
         measured: The figure.
-        met: Whether it is enough.
+        met: Whether it is enough; None if there was nothing to judge.
     """
 
     claim: str
     measured: str
-    met: bool
+    met: bool | None
+
+    @property
+    def verdict(self) -> str:
+        """Return one word."""
+        return "none" if self.met is None else "met" if self.met else "MISSED"
 
 
 @dataclass
@@ -74,9 +79,7 @@ class Report:
         parts = ["\n".join(f"{key:>10}: {value}" for key, value in self.machine.items())]
         parts += [table.as_text() for table in self.tables]
         if self.requirements:
-            parts.append(
-                "\n".join(f"{'met   ' if r.met else 'MISSED'}  {r.claim}: {r.measured}" for r in self.requirements)
-            )
+            parts.append("\n".join(f"{r.verdict:6}  {r.claim}: {r.measured}" for r in self.requirements))
         parts += self.remarks
         return "\n\n".join(parts)
 

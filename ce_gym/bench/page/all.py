@@ -156,4 +156,6 @@ def _one(part: Part, command: Sequence[str], out: Path) -> str:
 
 def _bars(requirements: list[Requirement]) -> str:
     """Return how many bars were met."""
-    return f"{sum(bar.met for bar in requirements)} of {len(requirements)} met" if requirements else "none asked for"
+    judged = [bar.met for bar in requirements if bar.met is not None]
+    nothing = f", {len(requirements) - len(judged)} with nothing to judge" if len(judged) < len(requirements) else ""
+    return f"{sum(judged)} of {len(judged)} met{nothing}" if requirements else "none asked for"

@@ -47,7 +47,10 @@ class Chapter:
     def as_markdown(self) -> str:
         """Return the chapter in Markdown."""
         found = self.found
-        bars = [f"- {'met' if bar.met else '**missed**'}: {bar.claim}: {bar.measured}" for bar in found.requirements]
+        bars = [
+            f"- {'**missed**' if bar.met is False else bar.verdict}: {bar.claim}: {bar.measured}"
+            for bar in found.requirements
+        ]
         parts = [f"## {found.name}", f"`python -m ce_gym.bench {self.command}`", self.said, "\n".join(bars)]
         parts += [f"![]({picture})" for picture in self.pictures]
         parts += [table.as_markdown() for table in found.tables] + found.remarks
@@ -59,7 +62,7 @@ class Chapter:
         bars = "".join(
             f'<li><b class="{word}">{word}</b> {escape(bar.claim)}: {escape(bar.measured)}</li>'
             for bar in found.requirements
-            for word in ("met" if bar.met else "missed",)
+            for word in (bar.verdict.lower(),)
         )
         parts = [f'<h2 id="{escape(found.name)}">{escape(found.name)}</h2>']
         parts += [f"<p><code>python -m ce_gym.bench {escape(self.command)}</code></p>"]

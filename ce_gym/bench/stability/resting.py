@@ -16,7 +16,7 @@ import numpy as np
 from ce_gym.bench.accuracy.curves import INTEGRATORS
 from ce_gym.bench.accuracy.ours import Ours
 from ce_gym.bench.accuracy.peers import Peer, families
-from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Array, Scene
+from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Array, Scene, Way
 from ce_gym.bench.measure.report import Cell, Table
 from ce_gym.model.mechanism import ELASTIC
 from ce_gym.viewer.console import shown
@@ -75,7 +75,7 @@ def rest(path: Array) -> Rest:
 def cells(scene: Scene, steps: tuple[int, ...]) -> Iterator[tuple[str, int, Rest]]:
     """Yield what became of each way of ours and of MuJoCo's at each step to a hold."""
     for method in METHODS:
-        ours = Ours(scene, method, scene.exact, "tangent", 1)
+        ours = Ours(scene, Way(method, scene.exact), 1)
         for n in steps:
             yield f"ce_gym, {method}", n, rest(ours.run(n, TOLERANCE if method == "adaptive" else None))
     for family, integrator in itertools.product(families(scene), INTEGRATORS):

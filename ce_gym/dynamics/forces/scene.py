@@ -15,6 +15,8 @@ from ce_gym.model.mechanism import Mechanism
 
 Control = Literal["position", "torque", "motor_position", "motor_torque"]
 Ground = Literal["flat", "field"]
+TWO_LOADS = ("extrapolated", "adaptive")
+"""Methods that remember what contacts carried in whole steps apart from what they did in halves, see `methods.py`."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ class State:
         q: Positions, shape (nq,).
         v: Velocities, shape (nv,).
         load: Normal force of each contact over the last step [N], shape (n_contacts,).
+        whole_load: The same of the step in a whole, of `TWO_LOADS`, shape (n_contacts,); empty for others.
         anchor: Horizontal deflections of the contacts' bristles, world axes [m], shape (2 n_contacts,); empty without.
         dependent: Where the dependent coordinates that no formula gives will be, roughly, shape (n_guess,).
         pressed: Force between each pair of capsules over the last step [N], shape (n_pairs,).
@@ -114,6 +117,7 @@ class State:
     q: SX
     v: SX
     load: SX
+    whole_load: SX
     anchor: SX
     dependent: SX
     pressed: SX
@@ -147,6 +151,7 @@ def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
     """Return the sizes of the parts of a state that are there."""
     layout, n = mechanism.robot.layout, len(options.contacts)
     sizes = {"q": layout.nq, "v": layout.nv, "load": n}
+    sizes["whole_load"] = n if options.method in TWO_LOADS else 0
     sizes |= {"anchor": 2 * n if options.material.bristle > 0 else 0, "dependent": len(reference_guess(mechanism))}
     sizes["pressed"] = len(colliding(mechanism.robot, options.self_collisions))
     loaded = loaded_motors(mechanism.robot, options.motors)

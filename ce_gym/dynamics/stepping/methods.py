@@ -15,9 +15,11 @@ from ce_gym.dynamics.stepping.plan import Ends, Plan, Rates, Stage
 
 EULER = Plan(1, (Stage("whole"),), Ends({"whole": 1.0}, {"whole": 1.0}))
 
+# Friction goes by the load of the step before, which is off in proportion to that step's length. Extrapolation removes
+# this only where the whole and the halves are off in proportion to their own lengths, so each goes by its own.
 EXTRAPOLATED = Plan(
     2,
-    (Stage("coarse"), Stage("half", length=1 / 2), Stage("fine", start="half", length=1 / 2)),
+    (Stage("coarse", load="whole_load"), Stage("half", length=1 / 2), Stage("fine", start="half", length=1 / 2)),
     Ends({"fine": 2.0, "coarse": -1.0}, means={"half": 1 / 2, "fine": 1 / 2}, error=("fine", "coarse")),
 )
 

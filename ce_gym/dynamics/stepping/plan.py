@@ -22,6 +22,8 @@ MOVED = "moved"
 """Name of the output that says how far a step moves its fastest joint, at the speed of its end [rad or m]."""
 OFF = "off"
 """Name of the output that estimates the errors of a step in its positions [rad or m], shape (nv,)."""
+LOAD = "load"
+"""Part of a state that says what contacts carried, unless a stage has another."""
 AFTER = "after"
 """Name of the step as a whole, where outputs are evaluated at its end and not combined from stages."""
 
@@ -67,12 +69,15 @@ class Stage:
         start: Name of the stage at whose end it starts, "" for the state before the step; or `Rates` of earlier stages.
         length: As a fraction of the step.
         iterations: How many iterations may follow the first; fewer if the forces of the scene never need as many.
+        load: Part of the state before the step that says what contacts carried, for one that starts there; what they
+            carry at its end is that part of the state after the step.
     """
 
     name: str
     start: str | Rates = ""
     length: float = 1.0
     iterations: int = 8
+    load: str = LOAD
 
 
 @dataclass(frozen=True)
@@ -130,7 +135,8 @@ def combined(plan: Plan, ends: Mapping[str, State], layout: Layout) -> State:
     if layout.floating:
         world = [w * (quaternion_to_rotation(ends[s].q[3:7]) @ ends[s].v[3:6]) for s, w in weights.items()]
         v[3:6] = quaternion_to_rotation(q[3:7]).T @ sum(world, SX(0))
-    return replace(last, q=q, v=v)
+    loads = {stage.load: ends[stage.name].load for stage in plan.stages if stage.load != LOAD}
+    return replace(last, q=q, v=v, **loads)
 
 
 def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:

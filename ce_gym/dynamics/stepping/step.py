@@ -224,6 +224,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         q=q,
         v=v,
         load=stacked([where(c.law.near, ca.fmax(c.normal_after(gain), 0)) for _, c, gain in contacts]),
+        whole_load=state.whole_load,
         anchor=stacked(anchors) if state.anchor.numel() else state.anchor,
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
         pressed=stacked([where(p.law.near, ca.fmax(p.normal_after(p.gain(motion)), 0)) for p in solved.pairs]),

@@ -47,7 +47,7 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
         if isinstance(stage.start, Rates):
             start = _moved(stage.start, before, list(parts.values()), dt, layout)
         else:
-            start = parts[stage.start].state if stage.start else before
+            start = parts[stage.start].state if stage.start else replace(before, load=getattr(before, stage.load))
         if parts and stage.start and not scene.looked_up.numel():  # the ground is known as it is around the start
             scene = looked_up_from(scene, parts[plan.stages[0].name].solved.kinematics)
         length = stage.length * dt if stage.length else 0.0  # a number also where dt is a symbol, see `solve`

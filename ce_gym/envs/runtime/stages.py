@@ -204,7 +204,8 @@ class Stages:
             fresh["delay"] = ca.floor(sampler.uniform(low, high + 1))
             fresh["target"] = SX(p.actions.rest)
         if "load" in fresh:
-            fresh["load"] = resting_load(self.model.mechanism, p.options, fresh, ground)
+            resting = resting_load(self.model.mechanism, p.options, fresh, ground)
+            fresh |= {name: resting for name in ("load", "whole_load") if name in fresh}
         fresh |= self.commands.new(sampler, fresh.get("grown"))
         fresh |= self.commands.steered(fresh, {name: fresh[name] for name in ("command", "heading") if name in fresh})
         chosen = self.state["chosen"] > 0.5

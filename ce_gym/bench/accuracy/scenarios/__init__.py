@@ -8,7 +8,7 @@ from ce_gym.bench.accuracy.scenarios.blocks import BLOCK_FRICTION, GRAVITY, bloc
 from ce_gym.bench.accuracy.scenarios.feet import biped, drop, stairs, trot
 from ce_gym.bench.accuracy.scenarios.flight import belt_leg, elastic_leg, four_bar, humanoid, stiff_leg, tello, tumble
 from ce_gym.bench.accuracy.scenarios.links import shanks
-from ce_gym.bench.accuracy.scenarios.scene import HOLD, Array, Scene
+from ce_gym.bench.accuracy.scenarios.scene import HOLD, SINGLE, Array, Scene, Way
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "humanoid": humanoid,
@@ -31,4 +31,4 @@ SCENES: dict[str, Callable[[], Scene]] = {
 }
 """All scenes, made when called for."""
 
-__all__ = ["BLOCK_FRICTION", "GRAVITY", "HOLD", "SCENES", "Array", "Scene"]
+__all__ = ["BLOCK_FRICTION", "GRAVITY", "HOLD", "SCENES", "SINGLE", "Array", "Scene", "Way"]

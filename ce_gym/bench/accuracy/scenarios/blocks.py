@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ce_gym.bench.accuracy.scenarios.scene import HOLD, ROUGH, SLIP_SPEED, Array, Scene, diagonal
+from ce_gym.bench.accuracy.scenarios.scene import HOLD, ROUGH, SLIP_SPEED, Array, Scene, Way, diagonal
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Pose, Robot
 
 BLOCK_HALF = (0.15, 0.1, 0.05)
@@ -41,7 +41,7 @@ def stick() -> Scene:
     """Return the block that holds against its push: as smooth as a scene without contact, so explicit methods serve."""
     push = 0.8 * BLOCK_FRICTION * np.ones(25)
     scene = block("stick", "Block that sticks, 0.8 of the cone", push)
-    return replace(scene, ours=(*ROUGH, ("rk4", "exact", "tangent")))
+    return replace(scene, ours=(*ROUGH, Way("rk4")))
 
 
 def blocks() -> dict[str, Callable[[], Scene]]:

@@ -79,7 +79,7 @@ def four_bar() -> Scene:
 def tello() -> Scene:
     """Return Tello's legs, floating without gravity: differentials, cranks and rods."""
     robot = unbounded(replace(load_robot("tello"), contacts=(), gravity=(0.0, 0.0, 0.0)))
-    ours: tuple[Way, ...] = (*SMOOTH, ("euler", "coupled", "tangent"))
+    ours = (*SMOOTH, Way("euler", "coupled"))
     return replace(driven("tello", "Floating Tello, rods and differentials", robot, 0.5, 0.1, ours), levels=LOOPED)
 
 
@@ -122,7 +122,6 @@ def elastic_leg() -> Scene:
     """Return the leg with belts whose gears and belts all stretch, by torques of the motors."""
     robot = unbounded(load_robot("mit_humanoid_leg"))
     robot = replace(robot, elastic=tuple(Elasticity(name, *figures) for name, figures in STRETCHING.items()))
-    ours: tuple[Way, ...] = tuple((method, "elastic", friction) for method, _, friction in SMOOTH)
-    rigid: Way = ("euler", "exact", "tangent")
-    scene = driven("elastic", "Leg whose gears and belts stretch", robot, 0.5, 3.0, (*ours, rigid))
+    ours = tuple(replace(way, level="elastic") for way in SMOOTH)
+    scene = driven("elastic", "Leg whose gears and belts stretch", robot, 0.5, 3.0, (*ours, Way("euler")))
     return replace(scene, exact="elastic", levels=("armature", "exact", "elastic"))

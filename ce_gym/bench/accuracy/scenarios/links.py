@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ce_gym.bench.accuracy.scenarios.scene import HOLD, SMOOTH, Scene, unbounded
+from ce_gym.bench.accuracy.scenarios.scene import HOLD, METHODS_IN_CONTACT, SMOOTH, Scene, Way, unbounded
 from ce_gym.dynamics.model import Model
 from ce_gym.model import load_robot
 from ce_gym.model.checks.collisions import capsules_of
@@ -33,5 +33,7 @@ def shanks() -> Scene:
         elif name.endswith("_hip_link"):
             targets[:, i] += CROSS if right == front else -CROSS
             start[7 + i] = targets[0, i]
+    coarse = tuple(Way(method, dtype="float32") for method in METHODS_IN_CONTACT)
+    ours = (*SMOOTH, Way("adaptive"), *coarse)
     title, still = "Legs pressed on each other", np.zeros(model.nv)
-    return Scene("shanks", title, robot, start, still, targets, "position", ours=SMOOTH, touching=PAIRS, spread=0.003)
+    return Scene("shanks", title, robot, start, still, targets, "position", ours=ours, touching=PAIRS, spread=0.003)

@@ -20,14 +20,39 @@ from ce_gym.sim.terrain import Terrain
 
 Array = NDArray[np.float64]
 
-Way = tuple[str, str, str]
-"""Method, transmission level and friction of one of our curves."""
-
 HOLD = 0.02
 """How long a target, torque or push is held, and the time between two recorded positions [s]."""
 
 SLIP_SPEED = 1e-3
 """Slip speed of the contacts of every scene [m/s]."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """How one of our curves is computed.
+
+    Attributes:
+        method: Name of a time-stepping method.
+        level: Transmission level.
+        friction: "tangent" or "secant".
+        dtype: Precision of state and arithmetic.
+    """
+
+    method: str
+    level: str = "exact"
+    friction: str = "tangent"
+    dtype: str = "float64"
+
+    @property
+    def name(self) -> str:
+        """Method, and what is not the default."""
+        friction = [] if self.friction == "tangent" else [self.friction]
+        return ", ".join([self.method, *friction, *([SINGLE] if self.dtype == "float32" else [])])
+
+
+METHODS_IN_CONTACT = ("euler", "extrapolated", "adaptive")
+SINGLE = "single precision"
+"""What the name of such a way ends with."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +68,7 @@ class Scene:
         drive: Joint targets [rad] or torques [N m] of every hold, shape (n_holds, n_joints).
         control: What `drive` is.
         push: Acceleration of the base in place of a horizontal force, world axes [m/s^2], shape (n_holds, 3), or None.
-        ours: Methods of ours, with their transmission level and friction.
+        ours: Our curves.
         levels: Transmission levels of the peers.
         exact: Transmission level that leaves nothing out of what the scene is.
         terrain: The ground, alike along y; the plane z = 0 if None.
@@ -84,20 +109,10 @@ class Scene:
         return len(self.drive)
 
 
-SMOOTH: tuple[Way, ...] = (
-    ("euler", "exact", "tangent"),
-    ("extrapolated", "exact", "tangent"),
-    ("rk4", "exact", "tangent"),
-)
-ROUGH: tuple[Way, ...] = (
-    ("euler", "exact", "tangent"),
-    ("extrapolated", "exact", "tangent"),
-    ("euler", "exact", "secant"),
-    ("extrapolated", "exact", "secant"),
-    ("adaptive", "exact", "tangent"),
-    ("adaptive", "exact", "secant"),
-)
-APPROXIMATE: Way = ("euler", "armature", "tangent")
+SMOOTH = (Way("euler"), Way("extrapolated"), Way("rk4"))
+IN_CONTACT = tuple(Way(method, friction=how) for how in ("tangent", "secant") for method in METHODS_IN_CONTACT)
+ROUGH = (*IN_CONTACT, *(replace(way, dtype="float32") for way in IN_CONTACT))
+APPROXIMATE = Way("euler", "armature")
 
 
 def unbounded(robot: Robot) -> Robot:
