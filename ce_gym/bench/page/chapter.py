@@ -17,7 +17,8 @@ h3{font-size:1em;margin:1.5em 0 .4em}p,li,code{overflow-wrap:anywhere}code{backg
 dl{display:grid;grid-template-columns:max-content 1fr;gap:.1em 1em;font-size:14px}dd{margin:0}dt{color:#57636e}
 ul{list-style:none;padding:0}li{margin:.25em 0}b.met{color:#1a7f37}b.missed{color:#b42318}
 div{overflow-x:auto}table{border-collapse:collapse;font-size:14px;font-variant-numeric:tabular-nums}
-td,th{text-align:left;padding:.2em .9em .2em 0;vertical-align:top}td.n,th.n{text-align:right;white-space:nowrap}
+td,th{text-align:left;padding:.2em .9em .2em 0;vertical-align:top}td.n,th.n{text-align:right}td.n{white-space:nowrap}
+td:first-child{min-width:7em}th{vertical-align:bottom}
 tr{border-bottom:1px solid #e3e7eb}th{border-bottom:2px solid #c9d1d9}img{max-width:100%}a{color:#1769aa}
 @media(max-width:600px){body{font-size:15px}table,dl{font-size:12px}td,th{padding-right:.6em}}"""
 
@@ -102,4 +103,4 @@ def _row(tag: str, cells: Sequence[Cell], numbers: Sequence[bool], links: Sequen
 
 
 def _is_number(cell: Cell) -> bool:
-    return cell is None or isinstance(cell, int | float)
+    return cell is None or (isinstance(cell, int | float) and not isinstance(cell, bool))
