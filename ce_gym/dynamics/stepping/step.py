@@ -65,11 +65,8 @@ class Solved:
         meshes: Of the transmissions that stretch, one or none.
         carried: What friction under load went by, as `State.carried` is.
         inertia: Of clusters, without what acts on their coordinates, shape (d, d) each.
-<<<<<<< HEAD
-        near: Whether something that is seldom near is, 1 or 0; None if all acts always.
-=======
         resistances: Of stretches, see `stretch_resistances`.
->>>>>>> hD
+        near: Whether something that is seldom near is, 1 or 0; None if all acts always.
     """
 
     kinematics: Kinematics
