@@ -91,7 +91,7 @@ def iteration_function(
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
     told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
     left = {f"{name}_next": stepped.iterate[of] for name, of in rows.items()} | {"unconverged": stepped.unconverged}
-    left |= {NEAR: stepped.solved.near} if chooses else {}
+    left |= {} if stepped.solved.near is None else {NEAR: stepped.solved.near}
     return traced("iteration", given.inputs() | parts, given.guarded(stepped) | left | told)
 
 
