@@ -7,7 +7,8 @@ import argparse
 import numpy as np
 import pytest
 
-from ce_gym.bench.speed import pressed, surroundings
+from ce_gym.bench.measure.timing import Timing
+from ce_gym.bench.speed import drives, pressed, released, surroundings
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
 
@@ -41,6 +42,27 @@ def test_report():
     assert all(row[2] > 0 and row[3] > 0 for row in table.rows)
 
 
+def test_elastic_drives_beside_exact_ones():
+    """Standing, under random targets and walking, the fastest load of each side in every round."""
+    parser = argparse.ArgumentParser()
+    surroundings.add_arguments(parser)
+    report = surroundings.run(parser.parse_args(["--num-envs", "8", "--rounds", "2", "--parts", "drives"]))
+    (table,) = report.tables
+    assert [row[0].split(", ")[1] for row in table.rows[:4]] == [
+        "standing",
+        "random targets",
+        "random targets",
+        "walking",
+    ]
+    assert len(report.requirements) == 8
+    assert all(row[2] > 0 and 0.3 < row[3] < 30 for row in table.rows)
+
+
+def test_the_fastest_load_of_each_round_counts():
+    timings = {"with 0": Timing((3.0, 1.0)), "with 1": Timing((2.0, 5.0)), "without 0": Timing((1.0, 1.0))}
+    assert drives.fastest(timings) == {"with": Timing((2.0, 1.0)), "without": Timing((1.0, 1.0))}
+
+
 def test_links_pressed_on_each_other_are_less_than_a_millimetre_in_each_other():
     """As deep as their force over the stiffness, by the poses; two pairs of a robot whose gains press hardest."""
     parser = argparse.ArgumentParser()
@@ -65,3 +87,27 @@ def test_targets_are_as_deep_as_asked(model: Model):
     assert 0.01 <= pressed.depth(model, q, pair) < 0.013
     with pytest.raises(ValueError, match="do not meet"):
         pressed.folded(model, pair, 1.0)
+
+
+def test_energy_before_robots_are_let_go_is_what_the_simulator_counts(model: Model):
+    """After a step so short that nothing has moved; springs of links in each other are most of it."""
+    pairs = surroundings.neighbours(model)
+    q, v = released.folded_states(model, pairs)
+    q, v = q[:12], v[:12]  # each pair, each depth
+    sim = Simulator(
+        model, 12, dt=1e-7, control="torque", contacts=(), self_collisions=pairs, outputs=("energy",),
+        parameters=("gravity",),
+    )  # fmt: skip
+    sim.set_parameter("gravity", 0.0)
+    sim.set_state(q, v)
+    sim.step(np.zeros(12))
+    found = released.energy(model, q, v, pairs)
+    assert found == pytest.approx(sim.energy, rel=2e-4)
+    assert (found[2::3] > 3 * model.energy(q, v)[0][2::3]).all()  # those that are 2 cm deep
+
+
+def test_robots_let_go_gain_nothing(model: Model):
+    report = released.let_go(model, surroundings.neighbours(model), steps=40)
+    (table,) = report.tables
+    assert [row[0] for row in table.rows] == ["the start", "the first step"]
+    assert all(requirement.met for requirement in report.requirements)

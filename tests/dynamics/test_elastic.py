@@ -12,10 +12,11 @@ import pytest
 from elastic_robots import KINDS, LINK, RATIO, ROTOR, differential, elastic, turntable, untied
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.drives.mesh import mesh_energy
+from ce_gym.dynamics.drives.stretch import mesh_energy
 from ce_gym.dynamics.forces.scene import StepOptions, make_scene
+from ce_gym.dynamics.stepping.plan import MOVED
 from ce_gym.dynamics.stepping.trace import step_function
-from ce_gym.model import Robot
+from ce_gym.model import Robot, load_robot
 from ce_gym.model.mechanism import LEVELS
 
 State = tuple[np.ndarray, np.ndarray]
@@ -129,6 +130,39 @@ def test_a_stiff_light_drive_is_stable_and_takes_energy_from_nowhere(mesh: str, 
         assert np.diff(energies).max() < 1e-13 * energies[0]
         gap = MESHES[mesh].get("backlash", 0.0) / 2
         assert np.abs(q[len(model.joint_links) :]).max() < gap + 1e-3
+
+
+def thrown(stiffness: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Energies (steps, robots) of Mini Cheetahs that fly, their rotors from flank to flank, and whether any failed."""
+    robot = replace(load_robot("mini_cheetah"), gravity=(0.0, 0.0, 0.0))
+    model, n, rng = Model(elastic(robot, stiffness, backlash=0.03), "elastic"), 8, np.random.default_rng(0)
+    step = step_function(model.mechanism, StepOptions(dt, control="torque"), ("energy",)).map(n)
+    q, v = np.tile(model.standing_q[:, None], (1, n)), rng.normal(0, 1, (model.nv, n))
+    v[18:] *= 20
+    q[19:] = rng.uniform(-0.015, 0.015, (12, n))
+    energies, diverged = [], np.zeros((1, n))
+    for _ in range(100):
+        found = step(q=q, v=v, diverged=diverged, target=np.zeros((12, n)))
+        q, v, diverged, energy = (found[k].full() for k in ("q_next", "v_next", "diverged_next", "energy"))
+        energies.append(energy[0])
+    return np.array(energies), diverged
+
+
+@pytest.mark.parametrize("stiffness", [28.0, 3e4, 3e6])
+def test_twelve_drives_take_energy_from_nowhere(stiffness: float):
+    """Whose flanks are settled together: what a motor could do is the most by which one may be wrong."""
+    energies, diverged = thrown(stiffness, 0.005)
+    assert not diverged.any()
+    assert (energies.max(axis=0) <= 1.001 * energies[0]).all()
+
+
+def test_stretches_do_not_make_a_step_in_parts():
+    """A rotor that flies to its other flank moves no body: further than a step may turn a joint is not too far."""
+    model = Model(turntable(40.0, backlash=1.0), "elastic")
+    step = step_function(model.mechanism, StepOptions(0.005), (MOVED,))
+    moved = [float(step(q=[0.0, -0.4], v=v, diverged=0.0, target=[0.0])[MOVED]) for v in ([0.0, 150.0], [150.0, 0.0])]
+    assert moved[0] < 1e-3
+    assert moved[1] == pytest.approx(0.75)
 
 
 @lru_cache

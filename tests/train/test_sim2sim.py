@@ -71,23 +71,53 @@ def test_robots_with_loops_start_closed_and_stand_as_ours_do(name):
     np.testing.assert_allclose(twin.state()[0][0], sim.q[0], atol=0.02)
 
 
+def ball(stiffness, damping, mass):
+    inertia = Inertial(mass, (0.0, 0.0, 0.0), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)))
+    body = Body("ball", "link", None, Placement(), Joint("free"), inertia)
+    material = ContactMaterial(stiffness, damping)
+    return Robot("ball", (body,), contacts=(ContactSphere("ball", "ball", (0.0, 0.0, 0.0), 0.1),), material=material)
+
+
+def depths_of(robot, speed, steps):
+    """How deep a ball that lands at a speed [m/s] is after every step of 1 ms [m]."""
+    twin, depths = MujocoTwin(robot, "exact", 1), []
+    touching = [[0.0, 0.0, 0.1 - 1e-9, 1.0, 0.0, 0.0, 0.0]]  # MuJoCo's contacts are those of the start of a step
+    twin.start(np.array(touching), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -speed]]))
+    for _ in range(steps):
+        twin.step(np.zeros((1, 0)), 0.001)
+        depths.append(0.1 - twin.state()[0][0, 2])
+    return depths
+
+
 @pytest.mark.parametrize(("stiffness", "damping"), [(2e4, 200.0), (5e4, 500.0)])
 def test_the_ground_gives_way_as_ours_does(stiffness, damping):
     """A ball of 2 kg that lands at 0.5 m/s: how deep it goes, by the closed form of a spring and a damper."""
-    inertia = Inertial(2.0, (0.0, 0.0, 0.0), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)))
-    body = Body("ball", "link", None, Placement(), Joint("free"), inertia)
-    material = ContactMaterial(stiffness, damping)
-    robot = Robot("ball", (body,), contacts=(ContactSphere("ball", "ball", (0.0, 0.0, 0.0), 0.1),), material=material)
-    twin = MujocoTwin(robot, "exact", 1)
-    twin.start(np.array([[0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -0.5]]))
-    depths = []
-    for _ in range(20):
-        twin.step(np.zeros((1, 0)), 0.001)
-        depths.append(0.1 - twin.state()[0][0, 2])
+    depths = depths_of(ball(stiffness, damping, 2.0), 0.5, 20)
     decay, speed = damping / 4.0, np.sqrt(stiffness / 2.0 - (damping / 4.0) ** 2)
     deepest = np.arctan2(speed, decay) / speed
     expected = 0.5 / speed * np.exp(-decay * deepest) * np.sin(speed * deepest)
-    assert max(depths) == pytest.approx(expected, rel=0.15)  # its impedance alone is 5 to 10 %, its step 1 ms
+    assert max(depths) == pytest.approx(expected, rel=0.15)  # a step is 1 ms
+
+
+@pytest.mark.parametrize("mass", [2.0, 20.0])
+def test_the_ground_carries_a_weight_as_ours_does(mass):
+    """A ball at rest has sunk by its weight over the stiffness, however heavy it is."""
+    depths = depths_of(ball(2e4, 200.0, mass), 0.0, 1500)
+    assert depths[-1] == pytest.approx(mass * 9.81 / 2e4, rel=1e-3)
+
+
+def test_a_step_on_the_ground_is_one_of_ours():
+    """Once both are in the ground, MuJoCo's step on it is ours to rounding, as long as the ground pushes."""
+    robot = ball(5e4, 500.0, 2.0)
+    ours, twin = ce_gym.Simulator(ce_gym.Model(robot), 1, dt=0.001), MujocoTwin(robot, "exact", 1)
+    q, v = np.array([[0.0, 0.0, 0.0995, 1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -0.2]])
+    ours.set_state(q, v)
+    twin.start(q, v)
+    for _ in range(4):
+        ours.step(np.zeros((1, 0)))
+        twin.step(np.zeros((1, 0)), 0.001)
+        np.testing.assert_allclose(twin.state()[1], ours.v, atol=1e-9)
+    assert ours.v[0, 5] > -0.1
 
 
 @pytest.mark.parametrize("level", ["armature", "exact"])

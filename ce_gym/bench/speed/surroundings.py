@@ -1,6 +1,9 @@
 """What scenes cost: spheres that are seldom near, links that push each other apart, height and range scans, in turn.
 
-Besides, how deep links are in each other that are pressed on each other, see `pressed.py`.
+        "--parts",
+        nargs="+",
+        default=("spheres", "pairs", *SCANS),
+        choices=("spheres", "pairs", *SCANS, "drives", *UNTIMED),
 
 Sub-steps are compared with those on the feet alone, by the same targets; links stand apart, move about, or are pressed
 on each other in most robots. Environment steps are compared with those of the same task that does not look.
@@ -10,9 +13,9 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, TypeAlias
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,7 +23,9 @@ from numpy.typing import NDArray
 
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved, ratio
+from ce_gym.bench.speed.drives import Case, drives, fastest
 from ce_gym.bench.speed.pressed import pressed_together, with_parents
+from ce_gym.bench.speed.released import let_go
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.self_contact import distance
 from ce_gym.envs.task.tasks import VELOCITY
@@ -39,14 +44,12 @@ FURTHER = 2.0
 """How many times as far from standing targets are as where links begin to touch: the ground holds feet back."""
 JITTER = 0.2
 """Of targets that move about, either way [rad]."""
-MOST = {"spheres": 1.1, "pairs": 1.5, "height_scan": 1.25}
+MOST = {"spheres": 1.1, "pairs": 1.5, "height_scan": 1.25, "drives": 1.4}
 """How many times as long a step may take; a scan that is 20 % of a step makes it 1.25 times as long as without."""
 SCANS: Mapping[str, dict[str, Any]] = {
     "height_scan": {},
     "range_scan": {"position": [0.2, 0.0, 0.05], "rays": [3, 7], "reach": 1.0, "steps": 16},
 }
-
-Case: TypeAlias = tuple[str, dict[str, Competitor]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,8 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="mini_cheetah", help="name or path of a robot with feet")
     parser.add_argument("--env", default="ce_gym/MiniCheetahVelocity-v0", help="id of an environment of it")
     parser.add_argument(
-        "--parts", nargs="+", default=("spheres", "pairs", *SCANS), choices=("spheres", "pairs", *SCANS, "depth")
+        "--parts",
+        nargs="+",
+        default=("spheres", "pairs", *SCANS),
+        choices=("spheres", "pairs", *SCANS, "drives", *UNTIMED),
     )
+    parser.add_argument("--policy", default="mini_cheetah_velocity", help="that walks in it on elastic drives")
     parser.add_argument("--num-envs", type=int, default=512, help="robots in a batch")
     parser.add_argument("--rounds", type=int, default=100, help="how often each is timed")
 
@@ -63,21 +70,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
     report, model, n = Report("surroundings"), Model(arguments.robot), arguments.num_envs
-    if "depth" in arguments.parts:
-        pressed = pressed_together(model, with_parents(model, neighbours(model)[:2]))
-        report.tables += pressed.tables
-        report.requirements += pressed.requirements
-    if not set(arguments.parts) - {"depth"}:
+    for part in [part for part in arguments.parts if part in UNTIMED]:
+        found = UNTIMED[part](model)
+        report.tables += found.tables
+        report.requirements += found.requirements
+    if not set(arguments.parts) - set(UNTIMED):
         return report
     rows: list[tuple[Cell, ...]] = []
     for dtype in DTYPES:
         cases = (spheres(model, n, dtype) if "spheres" in arguments.parts else {}) | (
             pairs(model, n, dtype) if "pairs" in arguments.parts else {}
         )
+        if "drives" in arguments.parts:
+            cases |= drives(model, arguments.env, arguments.policy, n, dtype)
         for scan in [part for part in arguments.parts if part in SCANS]:
             cases[f"{scan}, rough ground"] = (scan, looking(arguments.env, scan, n, dtype))
         for name, (part, sides) in cases.items():
-            timings = interleaved(sides, arguments.rounds, time.thread_time)
+            timings = fastest(interleaved(sides, arguments.rounds, time.thread_time))
             compared = ratio(timings["with"], timings["without"])
             rows.append((name, dtype, 1e6 * timings["without"].best, compared.of_best, compared.median))
             if part in MOST:
@@ -171,6 +180,13 @@ def folded_targets(model: Model, pair: Sequence[str]) -> NDArray:
         slope = np.array([(apart(joints + step) - here) / 1e-4 for step in 1e-4 * np.eye(len(joints))])
         joints = joints - 0.02 * slope / np.abs(slope).max()
     raise ValueError(f"{model.robot.name}: {pair[0]} and {pair[1]} do not meet; expected links that can")
+
+
+UNTIMED: Mapping[str, Callable[[Model], Report]] = {
+    "depth": lambda model: pressed_together(model, with_parents(model, neighbours(model)[:2])),
+    "energy": lambda model: let_go(model, neighbours(model)),
+}
+"""Parts in which nothing is timed."""
 
 
 def _beside(model: Model, num_envs: int, dtype: str, **scene: Any) -> dict[str, Simulator]:

@@ -11,7 +11,7 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.drives.mesh import mesh_energy
+from ce_gym.dynamics.drives.stretch import mesh_energy
 from ce_gym.dynamics.electric.cogging import cogging_energy
 from ce_gym.dynamics.forces.actuation import actuated_clusters, seen_joints
 from ce_gym.dynamics.forces.motor_control import motor_springs

@@ -20,7 +20,8 @@ import numpy as np
 from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.drives.load import carried_after, carried_now, supply_after, windings_after
-from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretching
+from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretch_resistances
+from ce_gym.dynamics.drives.stretch import stretching
 from ce_gym.dynamics.forces.actuation import Before, limit_count
 from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground, where
 from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
@@ -64,6 +65,7 @@ class Solved:
         meshes: Of the transmissions that stretch, one or none.
         carried: What friction under load went by, as `State.carried` is.
         inertia: Of clusters, without what acts on their coordinates, shape (d, d) each.
+        resistances: Of stretches, see `stretch_resistances`.
         near: Whether something that is seldom near is, 1 or 0; None if all acts always.
     """
 
@@ -77,6 +79,7 @@ class Solved:
     meshes: list[MeshForce]
     carried: SX
     inertia: dict[int, SX]
+    resistances: dict[int, SX]
     near: SX | None
 
 
@@ -103,7 +106,9 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
         vdot, a = settled(mechanism, kinematics, articulation, momentum, acting.pairs, forces)
     else:
         vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
-    return acting.solved(vdot, a, articulation.inertia)
+    of_clusters = articulation.D, articulation.inertia
+    resistances = stretch_resistances(mechanism, kinematics, *of_clusters, acting.unmeshed.slope)
+    return acting.solved(vdot, a, articulation.inertia, resistances)
 
 
 @dataclass
@@ -117,6 +122,7 @@ class Acting:
         motors: What the motors deliver to the joints.
         friction: Dry friction of the joints, one or none.
         meshes: Of the transmissions that stretch, one or none.
+        unmeshed: Those on joints but for meshes.
         joints: Those and what the joints do by themselves.
         couples: What steadies the bodies of ball joints, body axes [N m], shape (3,) each, by name.
         gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
@@ -130,23 +136,32 @@ class Acting:
     motors: SaturatedForce
     friction: list[SaturatedForce]
     meshes: list[MeshForce]
+    unmeshed: JointForce
     joints: JointTerms
     couples: dict[str, SX]
     gravity: dict[str, SX]
     carried: SX
     near: SX | None
 
-    def solved(self, vdot: SX, a: dict[str, SX], inertia: dict[int, SX] | None = None) -> Solved:
+    def solved(
+        self,
+        vdot: SX,
+        a: dict[str, SX],
+        inertia: dict[int, SX] | None = None,
+        resistances: dict[int, SX] | None = None,
+    ) -> Solved:
         """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each.
 
         Args:
             vdot: The acceleration.
             a: Of the bodies.
             inertia: Of clusters; if it is not known, what motors carry stays what it was.
+            resistances: Of stretches, see `stretch_resistances`; if they are not known, the iterate of meshes stays.
         """
         motion = Motion(vdot[vdot.numel() - self.motors.tau.numel() :], a, self.gravity)
         laws = self.contacts, self.pairs, self.motors, self.friction, self.meshes
-        return Solved(self.kinematics, vdot, motion, *laws, self.carried, inertia or {}, self.near)
+        found = inertia or {}, resistances or {}
+        return Solved(self.kinematics, vdot, motion, *laws, self.carried, *found, self.near)
 
 
 def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Acting:
@@ -171,12 +186,13 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     meshes = [Meshes(scene, y, yd, dt).linearise(of_meshes)] if stretching(mechanism) else []
 
     of_balls = ball_forces(mechanism.robot, state.q, state.v, dt)
-    more = [*friction, *meshes, *yielding_forces(mechanism, kinematics, dt)]
-    of_joints = sum(more, motors + passive_forces(mechanism.robot, y, yd, dt))
-    joints = on_coordinates(mechanism, of_balls, of_joints)
+    more = [*friction, *yielding_forces(mechanism, kinematics, dt)]
+    unmeshed = sum(more, motors + passive_forces(mechanism.robot, y, yd, dt))
+    joints = on_coordinates(mechanism, of_balls, sum(meshes, unmeshed))
     couples = {} if is_moment(dt) else steadying_couples(mechanism, kinematics, dt)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    return Acting(kinematics, contacts, pairs, motors, friction, meshes, joints, couples, gravity, carried, near)
+    laws = contacts, pairs, motors, friction, meshes
+    return Acting(kinematics, *laws, unmeshed, joints, couples, gravity, carried, near)
 
 
 @dataclass
@@ -250,11 +266,14 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         ]
     )
     of_friction = stacked([force.next_iterate(motion) for force in solved.friction])
-    of_meshes = stacked([force.next_iterate(motion) for force in solved.meshes])
     sound = ca.logic_and(unconverged, ca.logic_not(motors.check(motion)))  # rotors that stop within a step carry a blow
     of_carried = ca.if_else(sound, after.carried, solved.carried)
-    end = iterate.numel() - of_meshes.numel() - of_carried.numel()
+    last = iterate.numel() - of_carried.numel()
+    end = last - mesh_count(scene.mechanism)
     of_friction = ca.if_else(unconverged, of_friction, iterate[end - of_friction.numel() : end])
+    of_meshes = iterate[end:last]
+    if of_meshes.numel() and solved.resistances:
+        of_meshes = ca.if_else(unconverged, solved.meshes[0].next_iterate(motion, solved.resistances), of_meshes)
     return Stepped(
         state=after,
         before=state,

@@ -10,6 +10,7 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
+from ce_gym.dynamics.drives.stretch import stretching
 from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, seen_joints
 from ce_gym.dynamics.forces.motors import supply_of
 from ce_gym.dynamics.forces.parameters import parameter_defaults
@@ -120,7 +121,7 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
     for name, size in outputs.items():
         if name == MOVED:
             given["dt"] = SX.sym("dt")
-            results[name] = furthest(after.v, layout.base_nv, given["dt"])
+            results[name] = furthest(mechanism, after.v, given["dt"])
             continue
         if name in ("error", OFF):
             results[name] = error_estimate(plan, ends) if name == "error" else position_errors(plan, ends, layout)
@@ -205,7 +206,7 @@ class Given:
         robot, yd = self.scene.mechanism.robot, stepped.state.v[layout.joints_v :]
         kinematics = stepped.solved.kinematics
         if name == MOVED:
-            return furthest(stepped.state.v, layout.base_nv, self.dt)
+            return furthest(self.mechanism, stepped.state.v, self.dt)
         if name == "motor_speed":
             return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
         if name == "motor_torque":
@@ -241,9 +242,14 @@ def weighted(weights: Mapping[str, float], values: Mapping[str, SX]) -> SX:
     return sum((weight * values[name] for name, weight in weights.items()), SX(0))
 
 
-def furthest(v: SX, base: int, dt: SX | float) -> SX:
-    """Return how far the fastest joint moves in a step at velocities (nv,), the first `base` left out [rad or m]."""
-    return dt * ca.norm_inf(ca.vertcat(v[base:], 0))
+def furthest(mechanism: Mechanism, v: SX, dt: SX | float) -> SX:
+    """Return how far the fastest joint moves in a step at velocities (nv,) [rad or m].
+
+    Stretches of transmissions, the last ones, do not count: they move no body, so that nothing turns further than a
+    step can follow, and the equations of motion do not change with them.
+    """
+    joints = v[mechanism.robot.layout.base_nv : v.numel() - len(stretching(mechanism))]
+    return dt * ca.norm_inf(ca.vertcat(joints, 0))
 
 
 def loops_close(mechanism: Mechanism, before: Kinematics, after: State) -> SX:
