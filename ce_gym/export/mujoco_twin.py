@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 LEVELS = ("armature", "exact")
 
 STICKING = 100.0
-"""Damping of friction that sticks, over that of the normal [-]: feet carry some tens of newtons at a creep of 1 mm/s."""
+"""Damping of friction that sticks, over that of the normal [-]: feet carry tens of newtons at a creep of 1 mm/s."""
 
 TIMESTEP, LOOPS_TIMESTEP = 0.001, 0.00025
 """MuJoCo's step [s], and the one for closed loops. Contacts as quick as ours are want 1 ms. At that step equalities
