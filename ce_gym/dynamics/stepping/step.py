@@ -144,11 +144,7 @@ class Acting:
     near: SX | None
 
     def solved(
-        self,
-        vdot: SX,
-        a: dict[str, SX],
-        inertia: dict[int, SX] | None = None,
-        resistances: dict[int, SX] | None = None,
+        self, vdot: SX, a: dict[str, SX], inertia: dict[int, SX] | None = None, resistances: dict[int, SX] | None = None
     ) -> Solved:
         """Return it with the acceleration (nv,) that comes of it, and that of each body minus gravity, (6,) each.
 
