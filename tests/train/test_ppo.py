@@ -112,7 +112,8 @@ def test_resume_goes_on_counting(trained, tmp_path):
     curve = read_curve(tmp_path / "curve.csv")
     assert curve[: len(before)] == before
     assert curve[-1]["steps"] == again.record["steps"]
-    assert np.all(np.diff([row["seconds"] for row in curve]) > 0)
+    assert np.all(np.diff([row["seconds"] for row in curve]) >= 0)  # to hundredths of a second
+    assert curve[-1]["seconds"] > before[-1]["seconds"]
     assert 36_000 <= again.model.num_timesteps < 37_000
     assert again.record["resumed_from"] == str(trained.policy)
     assert evaluate(again.model, ID, episodes=16)["forward_error"] < 0.2
