@@ -1,4 +1,4 @@
-"""What is left of a function where an input is zero: choices that follow from it are made, nothing is reckoned anew.
+"""What is left of a function where a value is zero: choices that follow from it are made, nothing is reckoned anew.
 
 The operations that are left are those of the whole function, fused as there, and so are the bits of their results.
 """

@@ -20,7 +20,8 @@ from ce_gym.compile.lowering.vector import Value
 
 Nodes: TypeAlias = set[int]
 MADE_AGAIN = 32
-"""What the choice takes and only what it asks for needs, too, is made again for that if it is as few operations."""
+"""Values of the first part that only the whole function goes on with are made again there instead of kept, if so many
+operations are enough: tiles that choose nothing then do not store them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +91,8 @@ def parted(graph: Graph, outputs: Sequence[Nodes], changing: Nodes, choice: int 
         again = _made_again(graph, first, kept)
         kept |= (_read(graph, _operations(graph) - first) & first) - again
         stages.insert(0, _stages(graph, first - again, changing))
-    versions = [graph, left][-len(stages) :]
-    keeps = [_read(g, last | written) & before for g, (before, last) in zip(versions, stages, strict=True)]
+    graphs = [graph, left][-len(stages) :]
+    keeps = [_read(g, last | written) & before for g, (before, last) in zip(graphs, stages, strict=True)]
     places = {k: i for i, k in enumerate(sorted(kept.union(*keeps)))}
 
     def part(g: Graph, nodes: Nodes, leaves: frozenset[int], keeps: Nodes) -> Part:
@@ -103,7 +104,7 @@ def parted(graph: Graph, outputs: Sequence[Nodes], changing: Nodes, choice: int 
         part(graph, first, says, kept),
         tuple(
             (part(g, before, none, keep), part(g, last, rest, set()))
-            for g, (before, last), keep in zip(versions, stages, keeps, strict=True)
+            for g, (before, last), keep in zip(graphs, stages, keeps, strict=True)
         ),
     )
 
