@@ -29,6 +29,7 @@ from ce_gym.dynamics.algebra.spatial import (
     SX,
     Transform,
     cross,
+    eliminated_in_order,
     mirrored,
     solve_positive_definite,
     symmetric_blocks,
@@ -132,13 +133,37 @@ def inward_inertia_pass(
         articulation.inertia[k], articulation.handle_body[k] = condensed.D, handle.name if handle else None
         if cluster.output_body is None:
             continue
-        solved = solve_positive_definite(D, ca.horzcat(U.T, u))  # D^-1 [U^T, u]
-        Ia = mirrored(condensed.inertia - U @ solved[:, :6])
-        pa = condensed.force + U @ solved[:, 6]
+        yields, yielding_to = _given_way(D, U, u, stretches(mechanism, cluster))
+        Ia = mirrored(condensed.inertia - yields)
+        pa = condensed.force + yielding_to
         X = kinematics.bodies[handle.name].X if handle else Transform.identity()
         IA[cluster.output_body] += X.inertia_to_parent(Ia)
         pA[cluster.output_body] += X.force_to_parent(pa)
     return articulation
+
+
+def stretches(mechanism: Mechanism, cluster: Cluster) -> bool:
+    """Whether a transmission of a cluster stretches. The last of its coordinates are stretches then."""
+    return any(mechanism.robot.body(name).kind == "stretch" for name in cluster.independent)
+
+
+def solve_cluster(D: SX, b: SX, last_first: bool) -> SX:
+    """Solve `D x = b` for right-hand sides (d, m) of a cluster with inertia (d, d); see `_given_way`."""
+    return solve_positive_definite(D[::-1, ::-1], b[::-1, :])[::-1, :] if last_first else solve_positive_definite(D, b)
+
+
+def _given_way(D: SX, U: SX, u: SX, last_first: bool) -> tuple[SX, SX]:
+    """Return `U D^-1 U^T` and `U D^-1 u`, by which a cluster is felt less, as it gives way.
+
+    Stretches are eliminated first. A rotor's column of U is its momentum along one axis, and what it leaves of a
+    joint's column costs next to nothing, while a joint's column fills what is eliminated after it.
+    """
+    b = ca.horzcat(U.T, u)
+    if not last_first:
+        solved = solve_positive_definite(D, b)
+        return U @ solved[:, :6], U @ solved[:, 6]
+    _, left, scaled = eliminated_in_order(D[::-1, ::-1], b[::-1, :])
+    return left[:, :6].T @ scaled[:, :6], left[:, :6].T @ scaled[:, 6]
 
 
 def _add_transverse_inertias(
@@ -190,7 +215,8 @@ def outward_acceleration_pass(
         a_output = a[cluster.output_body] if cluster.output_body is not None else ca.vertcat(SX(3, 1), -gravity)
         handle = articulation.handle_body[k]
         a_handle = kinematics.bodies[handle].X.motion(a_output) if handle else a_output
-        ydd = solve_positive_definite(articulation.D[k], articulation.u[k] - articulation.U[k].T @ a_handle)
+        left = articulation.u[k] - articulation.U[k].T @ a_handle
+        ydd = solve_cluster(articulation.D[k], left, stretches(mechanism, cluster))
         vdot[rows] = ydd
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         qdd = coordinates.G @ ydd + coordinates.g
