@@ -119,19 +119,6 @@ def solve_positive_definite(A: SX, b: SX) -> SX:
         b: Right-hand sides, shape (n, m).
     """
     n = A.shape[0]
-    L, left, scaled = eliminated_in_order(A, b)
-    x = [scaled[i, :] for i in range(n)]
-    for i in reversed(range(n)):
-        x[i] = x[i] - sum(L[k, i] * x[k] for k in range(i + 1, n))
-    return ca.vertcat(*x)
-
-
-def eliminated_in_order(A: SX, b: SX) -> tuple[SX, SX, SX]:
-    """Factorise `A = L diag(pivots) L^T` and return `L`, `L^-1 b` and that over the pivots; arguments as above.
-
-    With them `b^T A^-1 b` is the second transposed times the third, without going back, and as sparse as `L^-1 b` is.
-    """
-    n = A.shape[0]
     L, scaled, inverse_pivot = SX.eye(n), SX(n, n), []  # scaled = L diag(pivots)
     for j in range(n):
         for i in range(j, n):
@@ -142,4 +129,7 @@ def eliminated_in_order(A: SX, b: SX) -> tuple[SX, SX, SX]:
     x = [b[i, :] for i in range(n)]
     for i in range(n):
         x[i] = x[i] - sum(L[i, k] * x[k] for k in range(i))
-    return L, ca.vertcat(*x), ca.vertcat(*[x[i] * inverse_pivot[i] for i in range(n)])
+    x = [x[i] * inverse_pivot[i] for i in range(n)]
+    for i in reversed(range(n)):
+        x[i] = x[i] - sum(L[k, i] * x[k] for k in range(i + 1, n))
+    return ca.vertcat(*x)

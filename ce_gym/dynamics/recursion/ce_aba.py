@@ -29,7 +29,6 @@ from ce_gym.dynamics.algebra.spatial import (
     SX,
     Transform,
     cross,
-    eliminated_in_order,
     mirrored,
     solve_positive_definite,
     symmetric_blocks,
@@ -39,6 +38,7 @@ from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, solve_turning
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
 from ce_gym.dynamics.recursion.rotors import transverse_inertia
+from ce_gym.dynamics.recursion.stretched import Stretched, stretches
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, snapped
 
@@ -80,6 +80,7 @@ class Articulation:
         u: Generalised force left after all biases, shape (d,).
         handle_body: The body whose frame is the handle; None if the handle is the output body's frame.
         base: Articulated inertia of a floating base and the force left on it; None for a fixed base.
+        stretched: How clusters whose transmissions stretch are eliminated, with that `u`; if it is another, nothing.
     """
 
     U: dict[int, SX] = field(default_factory=dict)
@@ -88,6 +89,7 @@ class Articulation:
     u: dict[int, SX] = field(default_factory=dict)
     handle_body: dict[int, str | None] = field(default_factory=dict)
     base: tuple[SX, SX] | None = None
+    stretched: dict[int, Stretched] = field(default_factory=dict)
 
 
 def inward_inertia_pass(
@@ -126,44 +128,30 @@ def inward_inertia_pass(
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
         D = mirrored(condensed.D + joints.slope[rows, rows])
         U, u = condensed.U, joints.tau[rows] - condensed.bias - transverse_bias
+        more, drag = SX(*D.shape), SX(len(rows), 1)
         if turning is not None and cluster.output_body is not None:
             more, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
             D, u = mirrored(D + more), u + drag
+        if stretches(mechanism, cluster):
+            felt, biased = mirrored(condensed.D + more), ca.horzcat(U.T, drag - condensed.bias - transverse_bias)
+            D = mirrored(felt + joints.slope[rows, rows])
+            articulation.stretched[k] = Stretched.of(felt, joints.slope[rows, rows], biased, joints.tau[rows])
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
         articulation.inertia[k], articulation.handle_body[k] = condensed.D, handle.name if handle else None
         if cluster.output_body is None:
             continue
-        yields, yielding_to = _given_way(D, U, u, stretches(mechanism, cluster))
-        Ia = mirrored(condensed.inertia - yields)
-        pa = condensed.force + yielding_to
+        yields, through = articulation.stretched[k].yields if k in articulation.stretched else _yields(D, U, u)
+        Ia, pa = mirrored(condensed.inertia - yields), condensed.force + through
         X = kinematics.bodies[handle.name].X if handle else Transform.identity()
         IA[cluster.output_body] += X.inertia_to_parent(Ia)
         pA[cluster.output_body] += X.force_to_parent(pa)
     return articulation
 
 
-def stretches(mechanism: Mechanism, cluster: Cluster) -> bool:
-    """Whether a transmission of a cluster stretches. The last of its coordinates are stretches then."""
-    return any(mechanism.robot.body(name).kind == "stretch" for name in cluster.independent)
-
-
-def solve_cluster(D: SX, b: SX, last_first: bool) -> SX:
-    """Solve `D x = b` for right-hand sides (d, m) of a cluster with inertia (d, d); see `_given_way`."""
-    return solve_positive_definite(D[::-1, ::-1], b[::-1, :])[::-1, :] if last_first else solve_positive_definite(D, b)
-
-
-def _given_way(D: SX, U: SX, u: SX, last_first: bool) -> tuple[SX, SX]:
-    """Return `U D^-1 U^T` and `U D^-1 u`, by which a cluster is felt less, as it gives way.
-
-    Stretches are eliminated first. A rotor's column of U is its momentum along one axis, and what it leaves of a
-    joint's column costs next to nothing, while a joint's column fills what is eliminated after it.
-    """
-    b = ca.horzcat(U.T, u)
-    if not last_first:
-        solved = solve_positive_definite(D, b)
-        return U @ solved[:, :6], U @ solved[:, 6]
-    _, left, scaled = eliminated_in_order(D[::-1, ::-1], b[::-1, :])
-    return left[:, :6].T @ scaled[:, :6], left[:, :6].T @ scaled[:, 6]
+def _yields(D: SX, U: SX, u: SX) -> tuple[SX, SX]:
+    """Return `U D^-1 U^T` and `U D^-1 u`."""
+    solved = solve_positive_definite(D, ca.horzcat(U.T, u))
+    return U @ solved[:, :6], U @ solved[:, 6]
 
 
 def _add_transverse_inertias(
@@ -215,8 +203,10 @@ def outward_acceleration_pass(
         a_output = a[cluster.output_body] if cluster.output_body is not None else ca.vertcat(SX(3, 1), -gravity)
         handle = articulation.handle_body[k]
         a_handle = kinematics.bodies[handle].X.motion(a_output) if handle else a_output
-        left = articulation.u[k] - articulation.U[k].T @ a_handle
-        ydd = solve_cluster(articulation.D[k], left, stretches(mechanism, cluster))
+        if k in articulation.stretched:
+            ydd = articulation.stretched[k].acceleration(a_handle)
+        else:
+            ydd = solve_positive_definite(articulation.D[k], articulation.u[k] - articulation.U[k].T @ a_handle)
         vdot[rows] = ydd
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         qdd = coordinates.G @ ydd + coordinates.g
