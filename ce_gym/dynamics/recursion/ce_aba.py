@@ -140,18 +140,16 @@ def inward_inertia_pass(
         articulation.inertia[k], articulation.handle_body[k] = condensed.D, handle.name if handle else None
         if cluster.output_body is None:
             continue
-        yields, through = articulation.stretched[k].yields if k in articulation.stretched else _yields(D, U, u)
-        Ia, pa = mirrored(condensed.inertia - yields), condensed.force + through
+        if k in articulation.stretched:
+            Ia, pa = articulation.stretched[k].felt(condensed.inertia, condensed.force)
+        else:
+            solved = solve_positive_definite(D, ca.horzcat(U.T, u))  # D^-1 [U^T, u]
+            Ia = mirrored(condensed.inertia - U @ solved[:, :6])
+            pa = condensed.force + U @ solved[:, 6]
         X = kinematics.bodies[handle.name].X if handle else Transform.identity()
         IA[cluster.output_body] += X.inertia_to_parent(Ia)
         pA[cluster.output_body] += X.force_to_parent(pa)
     return articulation
-
-
-def _yields(D: SX, U: SX, u: SX) -> tuple[SX, SX]:
-    """Return `U D^-1 U^T` and `U D^-1 u`."""
-    solved = solve_positive_definite(D, ca.horzcat(U.T, u))
-    return U @ solved[:, :6], U @ solved[:, 6]
 
 
 def _add_transverse_inertias(

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.spatial import SX, mirrored
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.mechanism import Mechanism
 
@@ -60,11 +60,12 @@ class Stretched:
         scaled = [row * inverse for row, inverse in zip(left, inverse_pivot, strict=True)]
         return Stretched(L, ca.vertcat(*left), ca.vertcat(*scaled))
 
-    @property
-    def yields(self) -> tuple[SX, SX]:
-        """`U D^-1 U^T` and `U D^-1 u`: by how much less a cluster is felt since it gives way, and what it lets through."""
-        U = self.left[:, :6].T
-        return U @ self.scaled[:, :6], U @ self.scaled[:, 6]
+    def felt(self, inertia: SX, force: SX) -> tuple[SX, SX]:
+        """Return `inertia - U D^-1 U^T`, its upper triangle mirrored, and `force + U D^-1 u`, (6, 6) and (6,)."""
+        for j in range(self.L.shape[0]):
+            U, scaled = self.left[j, :6].T, self.scaled[j, :]
+            inertia, force = inertia - U @ scaled[:6], force + U @ scaled[6]
+        return mirrored(inertia), force
 
     def acceleration(self, a: SX) -> SX:
         """Return `D^-1 (u - U^T a)`, shape (d,), of a cluster whose handle accelerates by `a`, shape (6,)."""
