@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import os
 
 import numpy as np
 import pytest
 
+from ce_gym.bench.measure import processes
 from ce_gym.bench.measure.timing import Timing
-from ce_gym.bench.speed import drives, pressed, released, surroundings
+from ce_gym.bench.speed import pressed, released, surroundings
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
 
@@ -43,7 +45,7 @@ def test_report():
 
 
 def test_elastic_drives_beside_exact_ones():
-    """Standing, under random targets and walking, the fastest load of each side in every round."""
+    """Standing, under random targets and walking."""
     parser = argparse.ArgumentParser()
     surroundings.add_arguments(parser)
     report = surroundings.run(parser.parse_args(["--num-envs", "8", "--rounds", "2", "--parts", "drives"]))
@@ -58,9 +60,19 @@ def test_elastic_drives_beside_exact_ones():
     assert all(row[2] > 0 and 0.3 < row[3] < 30 for row in table.rows)
 
 
-def test_the_fastest_load_of_each_round_counts():
-    timings = {"with 0": Timing((3.0, 1.0)), "with 1": Timing((2.0, 5.0)), "without 0": Timing((1.0, 1.0))}
-    assert drives.fastest(timings) == {"with": Timing((2.0, 1.0)), "without": Timing((1.0, 1.0))}
+def test_the_fastest_process_of_each_round_counts():
+    one, other = ({"case": {"with": Timing(seconds)}} for seconds in ((3.0, 1.0), (2.0, 5.0)))
+    assert processes.fastest([one, other]) == {"case": {"with": Timing((2.0, 1.0))}}
+
+
+def test_several_processes_measure_one_after_the_other():
+    own = {"case": {"process": Timing((float(os.getpid()),))}}
+    assert processes.in_processes(_measured, 1) == own
+    assert processes.in_processes(_measured, 2) != own
+
+
+def _measured() -> processes.Timings:
+    return {"case": {"process": Timing((float(os.getpid()),))}}
 
 
 def test_links_pressed_on_each_other_are_less_than_a_millimetre_in_each_other():

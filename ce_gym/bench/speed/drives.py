@@ -2,19 +2,17 @@
 
 What they cost is a longer sub-step, and further iterations of it in which flanks of transmissions meet and let go. Both
 levels have the same targets, and each run begins in the same state, so that all rounds do the same work. Walking is by
-a policy: environment steps, of which sub-steps are the most. Kernels are loaded several times, for where code lands in
-memory makes some loads slower (docs/numerics.md); the fastest load counts.
+a policy: environment steps, of which sub-steps are the most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import gymnasium
 import numpy as np
 
-from ce_gym.bench.measure.timing import Competitor, Timing
+from ce_gym.bench.measure.timing import Competitor
 from ce_gym.dynamics.model import Model
 from ce_gym.model.mechanism import ELASTIC
 from ce_gym.policies import load_policy
@@ -26,7 +24,7 @@ SPREADS = (0.0, 0.3, 1.0)
 """Of targets, either way from standing [rad]."""
 WALKED = 50
 """Environment steps of a run."""
-LOADS = 3
+LEVELS = {"without": "exact", "with": ELASTIC}
 
 Case: TypeAlias = tuple[str, dict[str, Competitor]]
 
@@ -36,24 +34,10 @@ def drives(model: Model, env: str, policy: str, num_envs: int, dtype: str) -> di
     cases: dict[str, Case] = {}
     for spread in SPREADS:
         name = f"random targets, {spread:g} rad either way" if spread else "standing"
-        sides = _loads(lambda level, s=spread: _held(Model(model.robot, level), s, num_envs, dtype))
+        sides = {side: _held(Model(model.robot, level), spread, num_envs, dtype) for side, level in LEVELS.items()}
         cases[f"elastic drives, {name}"] = ("drives", sides)
-    walking = _loads(lambda level: _walking(env, policy, level, num_envs, dtype))
+    walking = {side: _walking(env, policy, level, num_envs, dtype) for side, level in LEVELS.items()}
     return cases | {"elastic drives, walking, environment steps": ("drives", walking)}
-
-
-def fastest(timings: Mapping[str, Timing]) -> dict[str, Timing]:
-    """Return timings of sides, round by round of that load which was the fastest then."""
-    rounds: dict[str, list[tuple[float, ...]]] = {}
-    for name, timing in timings.items():
-        rounds.setdefault(name.split()[0], []).append(timing.seconds)
-    return {side: Timing(tuple(map(min, zip(*seconds, strict=True)))) for side, seconds in rounds.items()}
-
-
-def _loads(make: Callable[[str], Competitor]) -> dict[str, Competitor]:
-    """Return both sides, several times."""
-    levels = {"without": "exact", "with": ELASTIC}
-    return {f"{side} {i}": make(level) for i in range(LOADS) for side, level in levels.items()}
 
 
 def _held(model: Model, spread: float, num_envs: int, dtype: str) -> Competitor:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,9 +22,10 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.bench.measure.processes import Timings, in_processes
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved, ratio
-from ce_gym.bench.speed.drives import Case, drives, fastest
+from ce_gym.bench.speed.drives import Case, drives
 from ce_gym.bench.speed.pressed import pressed_together, with_parents
 from ce_gym.bench.speed.released import let_go
 from ce_gym.dynamics.model import Model
@@ -65,11 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--policy", default="mini_cheetah_velocity", help="that walks in it on elastic drives")
     parser.add_argument("--num-envs", type=int, default=512, help="robots in a batch")
     parser.add_argument("--rounds", type=int, default=100, help="how often each is timed")
+    parser.add_argument("--processes", type=int, default=1, help="in how many processes; the fastest counts")
 
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
-    report, model, n = Report("surroundings"), Model(arguments.robot), arguments.num_envs
+    report, model = Report("surroundings"), Model(arguments.robot)
     for part in [part for part in arguments.parts if part in UNTIMED]:
         found = UNTIMED[part](model)
         report.tables += found.tables
@@ -78,16 +81,8 @@ def run(arguments: argparse.Namespace) -> Report:
         return report
     rows: list[tuple[Cell, ...]] = []
     for dtype in DTYPES:
-        cases = (spheres(model, n, dtype) if "spheres" in arguments.parts else {}) | (
-            pairs(model, n, dtype) if "pairs" in arguments.parts else {}
-        )
-        if "drives" in arguments.parts:
-            cases |= drives(model, arguments.env, arguments.policy, n, dtype)
-        for scan in [part for part in arguments.parts if part in SCANS]:
-            cases[f"{scan}, rough ground"] = (scan, looking(arguments.env, scan, n, dtype))
-        for name, (part, sides) in cases.items():
-            timings = fastest(interleaved(sides, arguments.rounds, time.thread_time))
-            compared = ratio(timings["with"], timings["without"])
+        for case, timings in in_processes(partial(timed, arguments, dtype), arguments.processes).items():
+            (part, name), compared = case.split(": ", 1), ratio(timings["with"], timings["without"])
             rows.append((name, dtype, 1e6 * timings["without"].best, compared.of_best, compared.median))
             if part in MOST:
                 claim = f"{name}, {dtype}: at most {MOST[part]} times as long"
@@ -95,6 +90,21 @@ def run(arguments: argparse.Namespace) -> Report:
     columns = ("scene", "precision", "step without [us]", "times that, least", "median")
     report.tables.append(Table(f"Steps of {model.robot.name} with more in their scene", columns, tuple(rows)))
     return report
+
+
+def timed(arguments: argparse.Namespace, dtype: str) -> Timings:
+    """Time all cases in one precision; each is called by its part and its name."""
+    model, n, cases = Model(arguments.robot), arguments.num_envs, dict[str, Case]()
+    if "spheres" in arguments.parts:
+        cases |= spheres(model, n, dtype)
+    if "pairs" in arguments.parts:
+        cases |= pairs(model, n, dtype)
+    if "drives" in arguments.parts:
+        cases |= drives(model, arguments.env, arguments.policy, n, dtype)
+    for scan in [part for part in arguments.parts if part in SCANS]:
+        cases[f"{scan}, rough ground"] = (scan, looking(arguments.env, scan, n, dtype))
+    clock = time.thread_time
+    return {f"{part}: {name}": interleaved(sides, arguments.rounds, clock) for name, (part, sides) in cases.items()}
 
 
 def spheres(model: Model, num_envs: int, dtype: str) -> dict[str, Case]:

@@ -80,17 +80,22 @@ class Mesh:
             return tau, ca.if_else(self.ahead, self.slope, 0) + ca.if_else(self.behind, self.slope, 0)
         return tau, ca.if_else(ca.logic_or(self.ahead, self.behind), self.slope, 0)
 
+    def beyond(self, motion: Motion) -> tuple[SX, SX]:
+        """Return by how much a step ends beyond where the side ahead acts, and short of the other's [N m]."""
+        after = self.pull + self.slope * motion.ydd[self.row]
+        return after - self.high, self.low - after
+
     def wrong(self, motion: Motion, again: SX) -> SX:
         """Return 1 if a side acts that should not or the other way round, and it matters; else 0."""
-        after, most = self.pull + self.slope * motion.ydd[self.row], ca.if_else(again > 0, self.harmless, 0)
-        over, under = after - self.high, self.low - after
+        (over, under), most = self.beyond(motion), ca.if_else(again > 0, self.harmless, 0)
         one = ca.if_else(self.ahead, -over, over) > most
         return ca.logic_or(one, ca.if_else(self.behind, -under, under) > most)
 
     def let_go(self, motion: Motion, resistance: SX) -> SX:
         """Return the acceleration that the stretch would have without the mesh, or as it is where sides overlap."""
-        ydd, (tau, slope) = motion.ydd[self.row], self.force
-        return ydd if self.overlaps else ydd + (slope * ydd - tau) / resistance
+        ydd, (over, under) = motion.ydd[self.row], self.beyond(motion)
+        pushes = ca.if_else(self.ahead, over, 0) - ca.if_else(self.behind, under, 0)
+        return ydd if self.overlaps else ydd + pushes / resistance
 
 
 @dataclass

@@ -212,7 +212,7 @@ def settled(
     """
     n, near = len(pairs), pairs[0].law.near
     left = {k: _apart(u, forces) for k, u in articulation.u.items()}
-    found, acting = SX(n, n + 1), replace(articulation, u={})
+    found, acting = SX(n, n + 1), replace(articulation, u={}, stretched={})
     for k, (Y, u) in left.items():
         if Y.nnz():
             own = u - articulation.U[k].T @ _carried(mechanism, kinematics, articulation, k)

@@ -38,6 +38,7 @@ from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, solve_turning
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
 from ce_gym.dynamics.recursion.rotors import transverse_inertia
+from ce_gym.dynamics.recursion.stretched import Stretched, stretches
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, snapped
 
@@ -79,6 +80,7 @@ class Articulation:
         u: Generalised force left after all biases, shape (d,).
         handle_body: The body whose frame is the handle; None if the handle is the output body's frame.
         base: Articulated inertia of a floating base and the force left on it; None for a fixed base.
+        stretched: How clusters whose transmissions stretch are eliminated, with that `u`; if it is another, nothing.
     """
 
     U: dict[int, SX] = field(default_factory=dict)
@@ -87,6 +89,7 @@ class Articulation:
     u: dict[int, SX] = field(default_factory=dict)
     handle_body: dict[int, str | None] = field(default_factory=dict)
     base: tuple[SX, SX] | None = None
+    stretched: dict[int, Stretched] = field(default_factory=dict)
 
 
 def inward_inertia_pass(
@@ -125,16 +128,24 @@ def inward_inertia_pass(
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
         D = mirrored(condensed.D + joints.slope[rows, rows])
         U, u = condensed.U, joints.tau[rows] - condensed.bias - transverse_bias
+        more, drag = SX(*D.shape), SX(len(rows), 1)
         if turning is not None and cluster.output_body is not None:
             more, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
             D, u = mirrored(D + more), u + drag
+        if stretches(mechanism, cluster):
+            felt, biased = mirrored(condensed.D + more), ca.horzcat(U.T, drag - condensed.bias - transverse_bias)
+            D = mirrored(felt + joints.slope[rows, rows])
+            articulation.stretched[k] = Stretched.of(felt, joints.slope[rows, rows], biased, joints.tau[rows])
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
         articulation.inertia[k], articulation.handle_body[k] = condensed.D, handle.name if handle else None
         if cluster.output_body is None:
             continue
-        solved = solve_positive_definite(D, ca.horzcat(U.T, u))  # D^-1 [U^T, u]
-        Ia = mirrored(condensed.inertia - U @ solved[:, :6])
-        pa = condensed.force + U @ solved[:, 6]
+        if k in articulation.stretched:
+            Ia, pa = articulation.stretched[k].felt(condensed.inertia, condensed.force)
+        else:
+            solved = solve_positive_definite(D, ca.horzcat(U.T, u))  # D^-1 [U^T, u]
+            Ia = mirrored(condensed.inertia - U @ solved[:, :6])
+            pa = condensed.force + U @ solved[:, 6]
         X = kinematics.bodies[handle.name].X if handle else Transform.identity()
         IA[cluster.output_body] += X.inertia_to_parent(Ia)
         pA[cluster.output_body] += X.force_to_parent(pa)
@@ -190,7 +201,10 @@ def outward_acceleration_pass(
         a_output = a[cluster.output_body] if cluster.output_body is not None else ca.vertcat(SX(3, 1), -gravity)
         handle = articulation.handle_body[k]
         a_handle = kinematics.bodies[handle].X.motion(a_output) if handle else a_output
-        ydd = solve_positive_definite(articulation.D[k], articulation.u[k] - articulation.U[k].T @ a_handle)
+        if k in articulation.stretched:
+            ydd = articulation.stretched[k].acceleration(a_handle)
+        else:
+            ydd = solve_positive_definite(articulation.D[k], articulation.u[k] - articulation.U[k].T @ a_handle)
         vdot[rows] = ydd
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         qdd = coordinates.G @ ydd + coordinates.g

@@ -1,0 +1,80 @@
+"""Clusters whose transmissions stretch: their stretches are eliminated before their joints.
+
+A rotor behind a transmission that stretches is a coordinate of its own, of which little is felt: its column of `U` is
+a momentum along one axis. With `D = L diag(pivots) L^T` from the last coordinate to the first, stretches behind joints,
+
+    L left = [U^T, u],   U D^-1 U^T = left^T diag(pivots)^-1 left,   L^T ydd = diag(pivots)^-1 (left_u - left_U a),
+
+a stretch leaves one number at one place of a joint's column, while a joint's column would fill that of the stretch. The
+outward pass needs no more of a joint than where nothing stretches.
+
+What acts on coordinates is added to what elimination leaves of it, and both to the articulated inertia last. It is
+known before the bodies beyond are; summed first it is one number to be kept until then, instead of one for each term.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX, mirrored
+from ce_gym.model.clusters import Cluster
+from ce_gym.model.mechanism import Mechanism
+
+
+@dataclass
+class Stretched:
+    """A cluster whose stretches are eliminated first. Rows are in that order, the last coordinate first.
+
+    Attributes:
+        L: Lower triangle with ones, shape (d, d).
+        left: What is left of `[U^T, u]`, shape (d, 7).
+        scaled: The same over the pivots, shape (d, 7).
+    """
+
+    L: SX
+    left: SX
+    scaled: SX
+
+    @staticmethod
+    def of(inertia: SX, slope: SX, biased: SX, tau: SX) -> Stretched:
+        """Eliminate the coordinates of a cluster.
+
+        Args:
+            inertia: Articulated, shape (d, d).
+            slope: What is added to it by what acts on coordinates, shape (d, d).
+            biased: `[U^T, u]` without what acts on coordinates, shape (d, 7).
+            tau: That, shape (d,).
+        """
+        n, given = tau.numel(), ca.horzcat(SX(tau.numel(), 6), tau)[::-1, :]
+        inertia, slope, biased = inertia[::-1, ::-1], slope[::-1, ::-1], biased[::-1, :]
+        L, pivoted, inverse_pivot, left = SX.eye(n), SX(n, n), [], []  # pivoted = L diag(pivots)
+        for j in range(n):
+            for i in range(j, n):
+                pivoted[i, j] = inertia[i, j] + (slope[i, j] - sum(pivoted[i, k] * L[j, k] for k in range(j)))
+            inverse_pivot.append(1 / pivoted[j, j])
+            for i in range(j + 1, n):
+                L[i, j] = pivoted[i, j] * inverse_pivot[j]
+            left.append(biased[j, :] + (given[j, :] - sum(L[j, k] * left[k] for k in range(j))))
+        scaled = [row * inverse for row, inverse in zip(left, inverse_pivot, strict=True)]
+        return Stretched(L, ca.vertcat(*left), ca.vertcat(*scaled))
+
+    def felt(self, inertia: SX, force: SX) -> tuple[SX, SX]:
+        """Return `inertia - U D^-1 U^T`, its upper triangle mirrored, and `force + U D^-1 u`, (6, 6) and (6,)."""
+        for j in range(self.L.shape[0]):
+            U, scaled = self.left[j, :6].T, self.scaled[j, :]
+            inertia, force = inertia - U @ scaled[:6], force + U @ scaled[6]
+        return mirrored(inertia), force
+
+    def acceleration(self, a: SX) -> SX:
+        """Return `D^-1 (u - U^T a)`, shape (d,), of a cluster whose handle accelerates by `a`, shape (6,)."""
+        n, ydd = self.L.shape[0], self.scaled[:, 6] - self.scaled[:, :6] @ a
+        for i in reversed(range(n)):
+            ydd[i] -= sum(self.L[k, i] * ydd[k] for k in range(i + 1, n))
+        return ydd[::-1]
+
+
+def stretches(mechanism: Mechanism, cluster: Cluster) -> bool:
+    """Whether a transmission of a cluster stretches; stretches are the last of its coordinates."""
+    return any(mechanism.robot.body(name).kind == "stretch" for name in cluster.independent)
