@@ -15,7 +15,7 @@ pure couple). With `thd = G_r yd`, `a_c = X_c a + S_c ydd + z_c` it adds
     u -= G_r^T (J g_r + h^T z_c) + S_c^T f               p += X_c^T f,   f = h g_r + v_c x* h thd
 
 where S_c and z_c vanish if c is the output body. A rotor that is not symmetric adds a little more to its carrier and to
-u, see rotors.py.
+u, see rotors.py. A cluster whose transmissions stretch is eliminated in another order, see stretched.py.
 """
 
 from __future__ import annotations
