@@ -30,7 +30,7 @@ LARGEST_ANGLE = 12.6
 """Of a joint [rad], two turns: what is larger is in degrees."""
 
 ROUNDS, GAIN = 4, 1e-4
-"""How often initial states are searched anew at most where transmissions stretch, and the gain that is worth another."""
+"""How often initial states are begun anew at most where transmissions stretch, and the gain that is worth it again."""
 UNFIT = 2.0
 """What is left of a measurement is so many times its noise where figures do not fit."""
 
