@@ -21,7 +21,7 @@ from ce_gym.identify.held import held_model
 from ce_gym.identify.log import Log, LogError
 from ce_gym.identify.separable import correlation_time, covariance_of, held_of, hold, known_badly, lines_of
 from ce_gym.identify.shots import Settings, Shots
-from ce_gym.identify.windows import PARTS, Windows, cut, first_states, noise_of_encoders, with_stretches
+from ce_gym.identify.windows import PARTS, Windows, cut, guesses, noise_of_encoders
 from ce_gym.model import Robot, RobotError, load_robot
 from ce_gym.model.errors import unknown
 
@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 LARGEST_ANGLE = 12.6
 """Of a joint [rad], two turns: what is larger is in degrees."""
 
+ROUNDS, GAIN = 4, 1e-4
+"""How often initial states are begun anew at most where transmissions stretch, and the gain that is worth it again."""
 UNFIT = 2.0
 """What is left of a measurement is so many times its noise where figures do not fit."""
 
@@ -122,9 +124,14 @@ def _search(shots: Shots, windows: Windows) -> tuple[Problem, Array]:
     """
     x = np.array([figure.start / figure.scale for figure in shots.figures])
     parts, start = windows.parts(), np.array([figure.start for figure in shots.figures])
-    states = with_stretches(shots, parts, first_states(shots, parts), start)
-    short = Problem(shots, parts, states, noise_of_encoders(shots.log))
+    short = Problem(shots, parts, guesses(shots, parts, start), noise_of_encoders(shots.log))
     x = solve(short, x, 1e-3)
+    for _ in range(ROUNDS if shots.encoders.joints < shots.model.nq else 0):
+        short.weigh(x)
+        values = short.values(x)
+        if short.begin_anew(x, guesses(shots, parts, values)) < GAIN:
+            break
+        x = solve(short, x, 1e-4)
     short.weigh(x)
     problem = Problem(shots, windows, short.states[::PARTS], short.noise)
     while True:
@@ -144,7 +151,7 @@ def _held_out(
     """Return curves, and errors with the figures before and after; initial states are fitted in either case."""
     read, errors = [], []
     for values in both:
-        states = with_stretches(shots, windows.parts(), first_states(shots, windows.parts()), values)
+        states = guesses(shots, windows.parts(), values)
         for pieces in (windows.parts(), windows):
             problem = Problem(shots, pieces, states, noise)
             problem.improve_states(values / problem.scale, 4)

@@ -20,7 +20,8 @@ LARGEST_STEPS = 0.01, 0.3
 """Of initial positions and velocities that data hardly tell, as of a joint that sticks."""
 DAMPINGS = 0.0, 0.03, 1.0, 30.0
 """Of Levenberg and Marquardt's steps, relative to the diagonal: where joints stick and slip, full steps often fail."""
-
+ANEW = 20
+"""Most steps of initial states that begin anew."""
 SETTLED = 1e-5
 """Steps of initial states that help less than that, relative to the sum of squares, are the last."""
 
@@ -31,7 +32,7 @@ class Problem:
     Args:
         shots: Simulates windows.
         windows: Which.
-        states: First guess of initial states, shape (W, nq + nv).
+        states: First guesses of initial states, shape (G, W, nq + nv) or (W, nq + nv) for one.
         noise: Standard deviation of each measured quantity, shape (n_measured,).
 
     Attributes:
@@ -40,8 +41,9 @@ class Problem:
     """
 
     def __init__(self, shots: Shots, windows: Windows, states: Array, noise: Array) -> None:
-        self.shots, self.windows, self.states, self.noise = shots, windows, states.copy(), noise.copy()
-        self.guess, self.free = states.copy(), np.arange(len(shots.figures))
+        self.shots, self.windows, self.noise = shots, windows, noise.copy()
+        self.guesses = states.copy().reshape(-1, *states.shape[-2:])
+        self.states, self.free = self.guesses[0].copy(), np.arange(len(shots.figures))
         self.scale = np.array([figure.scale for figure in shots.figures])
         self.measured = shots.log.values[windows.rows]
         self.residual = np.zeros_like(self.measured)
@@ -93,11 +95,11 @@ class Problem:
         return self._known[1:]
 
     def improve_states(self, x: Array, steps: int) -> None:
-        """Make steps of Levenberg and Marquardt's while they help, or go back to the guess, each limb and window."""
+        """Make steps of Levenberg and Marquardt's while they help, or go back to a guess, each limb and window."""
         least = np.repeat(1 / np.square(LARGEST_STEPS), (self.shots.model.nq, self.shots.model.nv))
         for _ in range(steps):
             base, by_state = self._differences.by_states(self.values(x), self.states)
-            new = np.stack([self.states, self.guess, *[self.states] * len(DAMPINGS), *self._going_on()])
+            new = np.stack([self.states, *[self.states] * len(DAMPINGS), *self.guesses, *self._going_on()])
             for c in self.limbs.numbers:
                 rows, r = self.limbs.states[c], self._weighed(self.measured - base, c)
                 J = by_state[c] / self._noise_of(c)
@@ -105,9 +107,26 @@ class Problem:
                 normal = JT @ J + np.diag(least[rows])
                 for k, damping in enumerate(DAMPINGS):
                     damped = normal * (1 + damping * np.eye(len(rows)))
-                    new[2 + k][:, rows] += np.linalg.solve(damped, JT @ r)[..., 0]
+                    new[1 + k][:, rows] += np.linalg.solve(damped, JT @ r)[..., 0]
             if self._choose(x, new) < SETTLED:
                 break
+
+    def begin_anew(self, x: Array, guesses: Array) -> float:
+        """Search initial states again from guesses (G, W, nq + nv), and keep those that fit better than the present.
+
+        States that were found while figures were far off can be between other flanks than the robot was.
+
+        Returns:
+            By how much the sum of squares has become less, relative to itself.
+        """
+        new = [self.states]
+        for guess in guesses:
+            again = Problem(self.shots, self.windows, guess, self.noise)
+            again.free = self.free
+            again.improve_states(x, ANEW)
+            new.append(again.states)
+        self.forget()
+        return self._choose(x, np.stack(new))
 
     def _going_on(self) -> list[Array]:
         """Return states as the window before ends, and with its stretches alone: flanks that rattle are no cubics."""

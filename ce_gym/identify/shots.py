@@ -189,6 +189,12 @@ class Shots:
             shown[..., column] += values[:, figure, None, None]
         return shown, np.hstack([sim.q, sim.v]).reshape(C, W, -1)
 
+    def zeros(self, values: Array) -> Array:
+        """Return what encoders read too much at figures (P,), shape (n_measured,)."""
+        found = np.zeros(self.encoders.size)
+        found[self._zeros[:, 1]] = values[self._zeros[:, 0]]
+        return found
+
     def _default(self, name: str) -> Array:
         return parameter_defaults(self.model.robot, self.model.robot.material, (name,))[name]
 

@@ -13,6 +13,8 @@ from ce_gym.identify.shots import Shots
 Array = NDArray[np.float64]
 SETTLING = 0.03
 """How long transmissions are given until they stretch as their load has them [s]."""
+SPANS = 0.02, 0.01, 0.005
+"""Half of what a first guess looks at [s]: a smooth motion is known best from long ones, one that rattles by short."""
 PARTS = 5
 """Windows of the first search are so many times shorter."""
 
@@ -61,19 +63,38 @@ def cut(log: Log, window: float, longest_delay: float, held_out: float) -> tuple
     return Windows(starts[:-kept], length), Windows(starts[-kept:], length)
 
 
-def first_states(shots: Shots, windows: Windows) -> Array:
+def first_states(shots: Shots, windows: Windows, span: float = SPANS[0], zeros: Array | float = 0.0) -> Array:
     """Return a first guess of states, shape (W, nq + nv): cubics through the angles about the start of each window.
 
     Near an end of the log they go through what there is on the other side.
+
+    Args:
+        shots: What is simulated.
+        windows: Which.
+        span: How long before and after the start they look [s].
+        zeros: What encoders read too much, shape (n_measured,).
     """
     log, last = shots.log, len(shots.log.values) - 1
-    n = min(max(3, round(0.02 / log.dt)), last // 2)
+    n = min(max(3, round(span / log.dt)), last // 2)
     rows = np.clip(windows.first, n, last - n)[:, None] + np.arange(-n, n + 1)
     powers = ((rows - windows.first[:, None]) * log.dt)[..., None] ** np.arange(4)
-    fit = np.linalg.pinv(powers) @ log.values[rows]
+    fit = np.linalg.pinv(powers) @ (log.values[rows] - zeros)
     q = shots.encoders.positions(fit[:, 0])
     ahead = shots.encoders.positions(fit[:, 0] + 1e-3 * fit[:, 1])
     return np.hstack([q, (ahead - q) / 1e-3])
+
+
+def guesses(shots: Shots, windows: Windows, values: Array) -> Array:
+    """Return first guesses of states at figures (P,), shape (G, W, nq + nv): several where transmissions stretch.
+
+    What rattles on its flanks turns back within milliseconds: a cubic over 40 ms has its mean and not its speed, and
+    a search from there ends between other flanks. With 5 ms rows all spans are three rows, and one guess is enough.
+    """
+    rattles = shots.encoders.joints < shots.model.nq
+    spans = SPANS if rattles and SPANS[1] > 3 * shots.log.dt else SPANS[:1]
+    zeros = shots.zeros(values)
+    each = [first_states(shots, windows, span, zeros) for span in spans]
+    return np.stack([with_stretches(shots, windows, states, values) for states in each])
 
 
 def with_stretches(shots: Shots, windows: Windows, states: Array, values: Array) -> Array:
