@@ -1,7 +1,7 @@
 """The benchmarks of speed, accuracy and stability, one after the other, as one page with their CSV and JSON.
 
 Each runs in a process of its own, so that none finds memory or kernels of another; what a machine lacks, and what needs
-files of others that were not given, is named as skipped. `--quick` takes less than ten minutes, everything up to two hours.
+files of others that were not given, is named as skipped. `--quick` takes under ten minutes, everything up to two hours.
 """
 
 from __future__ import annotations
