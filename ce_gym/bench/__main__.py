@@ -9,30 +9,41 @@ from __future__ import annotations
 
 import ast
 import importlib
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
-from ce_gym.bench.page.depends import ROOT, benchmark_file
 from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
     "speed", "beside", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy",
     "adaptive", "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness", "growth",
-    "surroundings", "servo", "identification", "all", "stale",
+    "surroundings", "servo", "identification", "all",
 )  # fmt: skip
+
+
+HERE = Path(__file__).parent
+
+
+def benchmark_file(name: str) -> Path:
+    """Return the file of a benchmark."""
+    candidates = (HERE / f"{name}.py", HERE / name / "benchmark.py", *HERE.glob(f"*/{name}.py"))
+    return next(path for path in candidates if path.exists())
 
 
 def summary(name: str) -> str:
     """Return the first docstring line of a benchmark, without importing it."""
-    source = (ROOT / benchmark_file(name)).read_text(encoding="utf-8")
+    source = benchmark_file(name).read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
 
 
 def load(name: str) -> ModuleType:
     """Import a benchmark."""
-    return importlib.import_module(benchmark_file(name).removesuffix(".py").replace("/", "."))
+    return importlib.import_module(
+        ".".join(("ce_gym.bench", *benchmark_file(name).relative_to(HERE).with_suffix("").parts))
+    )
 
 
 def listing() -> str:
@@ -66,10 +77,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         missing = f"{name} needs {error.name}, which is not installed"
         print(f'ce_gym.bench: {missing}: pip install "ce_gym[bench]"', file=sys.stderr)
         return 2
+    report.command = f"python -m ce_gym.bench {shlex.join([name, *_without_json(rest)])}"
     print(report.as_text())
     if arguments.json:
         arguments.json.write_text(report.as_json(), encoding="utf-8")
     return int(report.failed)
+
+
+def _without_json(arguments: Sequence[str]) -> list[str]:
+    """Return arguments without the name of the report's file."""
+    kept = list(arguments)
+    if "--json" in kept:
+        place = kept.index("--json")
+        del kept[place : place + 2]
+    return kept
 
 
 if __name__ == "__main__":

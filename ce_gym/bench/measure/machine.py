@@ -5,6 +5,8 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import platform
+import subprocess
+from pathlib import Path
 
 from ce_gym.compile.system import processor, usable_cores
 
@@ -22,6 +24,15 @@ def describe() -> dict[str, str]:
         "python": platform.python_version(),
         **versions,
     }
+
+
+def commit() -> str:
+    """Return the commit of the source, with "-dirty" if files differ from it; empty outside of a repository."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    except FileNotFoundError:  # git is not installed
+        return ""
 
 
 def _version(package: str) -> str:

@@ -73,6 +73,7 @@ class Report:
     remarks: list[str] = field(default_factory=list)
     failed: bool = False
     machine: dict[str, str] = field(default_factory=machine.describe)
+    command: str = ""
 
     def as_text(self) -> str:
         """Return everything as plain text."""
@@ -87,12 +88,23 @@ class Report:
         """Return everything as JSON."""
         content = {
             "name": self.name,
+            "command": self.command,
+            "commit": machine.commit(),
             "machine": self.machine,
             "tables": [{"title": t.title, "columns": t.columns, "rows": t.rows} for t in self.tables],
             "requirements": [vars(r) for r in self.requirements],
             "remarks": self.remarks,
         }
         return json.dumps(content, indent=2, default=lambda scalar: scalar.item()) + "\n"  # of numpy
+
+
+def read_report(file: Path) -> Report:
+    """Return the report that a JSON file holds."""
+    content = json.loads(file.read_text(encoding="utf-8"))
+    tables = [Table(t["title"], tuple(t["columns"]), tuple(map(tuple, t["rows"]))) for t in content["tables"]]
+    requirements = [Requirement(**requirement) for requirement in content["requirements"]]
+    remarks, command = content["remarks"], content["command"]
+    return Report(content["name"], tables, requirements, remarks, machine=content["machine"], command=command)
 
 
 def cell_text(cell: Cell) -> str:
