@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from bootstrap import Array, difference, interquartile_mean, interval, of_one
 from console import Table, markdown
-from study import Row, Study
+from study_file import Row, Study
 
 LEAST, GAP = 5, 0.05
 """Seeds of every arm below which there is no answer, and the share of the first arm's figure that is a gap."""

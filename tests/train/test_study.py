@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from bootstrap import interquartile_mean
 from point_mass import ID
-from study import main, read_rows, read_study
+from study import main
+from study_file import read_rows, read_study
 from study_tables import answer, loss, losses, points, samples
 
 import ce_gym

@@ -12,18 +12,18 @@ import csv
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ce_gym.bench.accuracy.benchmark import as_markdown
 from ce_gym.bench.accuracy.curves import (
     MARGIN,
     NUM_ENVS,
     OUR_STEPS,
     Curve,
+    Delivered,
     Measured,
     Point,
     Side,
@@ -50,46 +50,6 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Delivered:
-    """One tolerance on one scene.
-
-    Attributes:
-        scene: Its name.
-        asked: The tolerance [rad or m].
-        error: What was delivered.
-        seconds: Time for one robot and simulated second [s].
-        fixed: The same of the extrapolated method at the best fixed step for that error; None if none reaches it.
-        best: The same of the best method.
-        taken: Steps of a robot, mean.
-        refused: Attempts that were refused.
-        missed: Steps that missed the tolerance at the shortest length.
-        counts: Whether the tolerance decided anything: most steps were shorter than the longest, and the error is not
-            below what references are known to.
-    """
-
-    scene: str
-    asked: float
-    error: float
-    seconds: float
-    fixed: float | None
-    best: float | None
-    taken: float
-    refused: float
-    missed: float
-    counts: bool
-
-    @property
-    def ratio(self) -> float:
-        """Error delivered over error asked."""
-        return self.error / self.asked
-
-    @property
-    def slower(self) -> float | None:
-        """Time over that of the extrapolated method at its best fixed step."""
-        return self.seconds / self.fixed if self.fixed else None
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     parser.add_argument("--out", type=Path, default=Path("adaptive"), help="folder for picture, CSV and table")
@@ -112,7 +72,7 @@ def run(arguments: argparse.Namespace) -> Report:
         found += measure(SCENES[name](), tolerances, steps, rounds)
         write_csv(out / "adaptive.csv", found)
     table = Table("Adaptive steps, one robot and one simulated second", COLUMNS, tuple(map(row, found)))
-    (out / "adaptive.md").write_text(as_markdown(table), encoding="utf-8")
+    (out / "adaptive.md").write_text(table.as_markdown() + "\n", encoding="utf-8")
     picture = accuracy_plots.draw_adaptive(found, out)
     report = Report("adaptive", [table], requirements(found))
     report.remarks.append(

@@ -15,7 +15,7 @@ from ce_gym.bench.accuracy import drake_peer
 from ce_gym.bench.accuracy.coulomb import PUSHES, distance_table
 from ce_gym.bench.accuracy.curves import OUR_STEPS, PEER_STEPS, Comparison, Measured, comparisons, measure
 from ce_gym.bench.accuracy.scenarios import SCENES
-from ce_gym.bench.measure.report import Cell, Report, Requirement, Table, cell_text
+from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.viewer.console import shown
 
 REQUIRED = 20.0
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> Report:
     tables = [table for peer, scenes in beside.items() if scenes for table in peer_tables(scenes, peer)]
     if any(m.scene.name in PUSHES for m in measured):
         tables.append(distance_table())
-    (out / "accuracy.md").write_text("\n".join(as_markdown(table) for table in tables), encoding="utf-8")
+    (out / "accuracy.md").write_text("\n\n".join(table.as_markdown() for table in tables) + "\n", encoding="utf-8")
     picture = accuracy_plots.draw(measured, out)
     report = Report("accuracy", tables, [requirement(m, peer) for peer, scenes in beside.items() for m in scenes])
     report.remarks.append(
@@ -132,10 +132,3 @@ def write_csv(path: Path, measured: list[Measured]) -> None:
                 for p in curve.points:
                     figures = [f"{x:.6g}" for x in (p.dt, p.seconds, p.truth, p.own)]
                     writer.writerow([m.scene.name, curve.code, curve.level, curve.method, *figures])
-
-
-def as_markdown(table: Table) -> str:
-    """Return a table as Markdown."""
-    lines = [f"**{table.title}**", "", f"| {' | '.join(table.columns)} |", "|" + "---|" * len(table.columns)]
-    lines += [f"| {' | '.join(cell_text(cell) for cell in row)} |" for row in table.rows]
-    return "\n".join([*lines, ""])

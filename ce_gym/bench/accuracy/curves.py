@@ -323,3 +323,43 @@ def _fastest(measured: Measured, curves: Sequence[Curve], error: float) -> tuple
         return None, ""
     best = min(reached, key=lambda c: reached[c])
     return reached[best], best.label.split(" ", 1)[1]
+
+
+@dataclass(frozen=True)
+class Delivered:
+    """One tolerance on one scene.
+
+    Attributes:
+        scene: Its name.
+        asked: The tolerance [rad or m].
+        error: What was delivered.
+        seconds: Time for one robot and simulated second [s].
+        fixed: The same of the extrapolated method at the best fixed step for that error; None if none reaches it.
+        best: The same of the best method.
+        taken: Steps of a robot, mean.
+        refused: Attempts that were refused.
+        missed: Steps that missed the tolerance at the shortest length.
+        counts: Whether the tolerance decided anything: most steps were shorter than the longest, and the error is not
+            below what references are known to.
+    """
+
+    scene: str
+    asked: float
+    error: float
+    seconds: float
+    fixed: float | None
+    best: float | None
+    taken: float
+    refused: float
+    missed: float
+    counts: bool
+
+    @property
+    def ratio(self) -> float:
+        """Error delivered over error asked."""
+        return self.error / self.asked
+
+    @property
+    def slower(self) -> float | None:
+        """Time over that of the extrapolated method at its best fixed step."""
+        return self.seconds / self.fixed if self.fixed else None

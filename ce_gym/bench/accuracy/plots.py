@@ -9,14 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ce_gym.bench.accuracy.curves import MARGIN, Curve, Measured
+from ce_gym.bench.accuracy.curves import MARGIN, Curve, Delivered, Measured
 from ce_gym.bench.accuracy.scenarios import SINGLE
 from ce_gym.bench.paper.plots import BLUE, GREEN, GREY, ORANGE, RED, SKY, STYLE, plt
-
-if TYPE_CHECKING:
-    from ce_gym.bench.accuracy.adaptive import Delivered
 
 COLUMNS = 4
 OURS = {

@@ -16,16 +16,9 @@ import numpy as np
 
 from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, Step
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.model import Model
+from ce_gym.envs.runtime.spec import TaskSpec
 from ce_gym.envs.runtime.stages import OUTCOME, Probe, Stages
-from ce_gym.envs.task.actions import ActionMap
-from ce_gym.envs.task.curriculum import Curriculum
-from ce_gym.envs.task.ground import Ground
-from ce_gym.envs.task.randomisation import Randomised
-from ce_gym.envs.task.tasks import Task
-from ce_gym.envs.terms.registry import Term, terms_of
-from ce_gym.sim.kernels import select_contacts, select_pairs
+from ce_gym.envs.terms.registry import Term
 from ce_gym.sim.schema import Row, checked_tolerance, physics_rows, state_buffers
 from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
@@ -40,72 +33,8 @@ HOST_ROWS = (
 has been seeded; whether an episode has ended and the next one has not begun."""
 
 
-class TaskProgram:
-    """Traces one task on one robot.
-
-    Args:
-        model: The robot at a transmission level.
-        task: The task.
-        contact_forces: Whether to compute contact forces for recording.
-
-    Attributes:
-        curriculum: What robots carry over from one episode to the next.
-        actions: What an action asks for.
-        contacts: Names of the spheres that take part in the physics.
-        randomised: Figures that are drawn for each episode.
-        ground: How the task sees a field; None on flat ground.
-        options: The scene of the sub-steps.
-        reward_terms, termination_terms, metric_terms, observation_terms, critic_terms: Terms by name.
-
-    Raises:
-        ValueError: If the robot lacks what the task needs, or the task names something that does not exist.
-    """
-
-    def __init__(self, model: Model, task: Task, contact_forces: bool = False) -> None:
-        self.model, self.task, self.contact_forces = model, task, contact_forces
-        robot = model.robot
-        if not robot.floating:
-            raise ValueError(f"{robot.name} has a fixed base; a task needs a robot with a floating base")
-        self.curriculum = Curriculum(task)
-        self.reward_terms = terms_of("reward", task.rewards)
-        self.termination_terms = terms_of("termination", task.terminations)
-        self.metric_terms = terms_of("metric", task.metrics) | terms_of("metric", self.curriculum.metrics)
-        self.observation_terms = terms_of("observation", task.observations)
-        self.critic_terms = terms_of("observation", task.critic)
-        for name in task.noise:
-            if name not in self.observation_terms:
-                raise ValueError(f"noise={name!r}; expected an observation among {', '.join(self.observation_terms)}")
-        self.contacts = select_contacts(robot, task.contacts)
-        if task.latency[1] > task.n_substeps:
-            raise ValueError(
-                f"latency={task.latency}; expected at most the {task.n_substeps} sub-steps of a control step"
-            )
-        self.ground = Ground(self.model.mechanism, self.contacts) if self.curriculum.on_field else None
-        self.randomised = Randomised(robot, task.randomise)
-        self.actions = ActionMap(self.model.mechanism, task)
-        self.options = StepOptions(
-            control=self.actions.control,
-            contacts=self.contacts,
-            material=robot.material,
-            friction=task.friction,
-            method=task.method,
-            motors=task.motors,
-            control_period=task.control_period,
-            ground="field" if self.ground and self.contacts else "flat",
-            parameters=self.randomised.parameters,
-            self_collisions=select_pairs(self.model.mechanism, task.self_collisions),
-            seldom=tuple(name for name in select_contacts(robot, task.seldom) if name in self.contacts),
-        )
-
-    @property
-    def n_actions(self) -> int:
-        """Length of an action."""
-        return len(self.actions.moved)
-
-    @property
-    def control_dt(self) -> float:
-        """Length of a control step [s]."""
-        return self.task.dt * self.task.n_substeps
+class TaskProgram(TaskSpec):
+    """Traces one task on one robot as the programs of an environment."""
 
     @cached_property
     def _rows(self) -> dict[str, Row]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -19,6 +18,7 @@ from ce_gym.compile import Call, Grid
 from ce_gym.dynamics.algebra.integration import turned_by
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
+from ce_gym.envs.runtime.spec import TaskSpec
 from ce_gym.envs.task.commands import Commands
 from ce_gym.envs.task.ground import SEEN, resting_load, starting_place
 from ce_gym.envs.task.sampling import Sampler
@@ -26,9 +26,6 @@ from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.registry import Term
 from ce_gym.sim.schema import Row
 from ce_gym.sim.substeps import FRAME
-
-if TYPE_CHECKING:
-    from ce_gym.envs.runtime.program import TaskProgram
 
 OBSERVATION_BOUND = 100.0
 """Observations are clipped here; blocks are of order one, so only a robot about to fail comes near it."""
@@ -59,24 +56,24 @@ class Stages:
     """Traces the stages of a task on a robot.
 
     Args:
-        program: The task on the robot.
+        spec: The task on the robot.
         schema: The state.
         looked: See `Probe`.
     """
 
     def __init__(
-        self, program: TaskProgram, schema: Mapping[str, Row], looked: Mapping[str, int] = MappingProxyType({})
+        self, spec: TaskSpec, schema: Mapping[str, Row], looked: Mapping[str, int] = MappingProxyType({})
     ) -> None:
-        self.program, self.task, self.model = program, program.task, program.model
+        self.spec, self.task, self.model = spec, spec.task, spec.model
         self.schema = {row.name: row for row in schema.values() if not row.dtype and row.name != FRAME}
-        self.commands = Commands(self.task, program.curriculum)
+        self.commands = Commands(self.task, spec.curriculum)
         self.state = {name: SX.sym(name, row.size) for name, row in self.schema.items()}
-        seen = {SEEN: program.ground.size} if program.ground else {}
+        seen = {SEEN: spec.ground.size} if spec.ground else {}
         self.seen_ground = {name: SX.sym(name, size) for name, size in (seen | dict(looked)).items()}
 
     def probe(self) -> Probe:
         """Trace every term once."""
-        p, sampler = self.program, Sampler()
+        p, sampler = self.spec, Sampler()
         s = self._context(self.state | self.seen_ground | {"previous_action": self.state["action"]})
         for term in (*p.reward_terms.values(), *p.termination_terms.values(), *p.metric_terms.values()):
             term.number(s)
@@ -124,20 +121,20 @@ class Stages:
     def look(self) -> ca.Function:
         """Trace one observation of the policy, neither noisy nor clipped, and `failed`; of what they look at."""
         s = self._context(self.state | {"previous_action": self.state["action"]})
-        seen = {name: term(s) for name, term in self.program.observation_terms.items()}
+        seen = {name: term(s) for name, term in self.spec.observation_terms.items()}
         seen["failed"] = self._failed(s)
         return traced("look", _used(self.state, seen), seen)
 
     def values(self, terms: Mapping[str, Term]) -> ca.Function:
         """Trace terms alone, one after the other; of the state and the action before."""
-        state = self.state | {"previous_action": SX.sym("previous_action", self.program.n_actions)}
+        state = self.state | {"previous_action": SX.sym("previous_action", self.spec.n_actions)}
         s = self._context(state)
         values = {"values": ca.vertcat(SX(0, 1), *[term(s) for term in terms.values()])}
         return traced("terms", _used(state, values), values)
 
     def assess(self) -> tuple[Call, int]:
         """Trace what follows the sub-steps; return the call and how many random numbers it takes."""
-        p, task, state, sampler = self.program, self.task, self.state, Sampler()
+        p, task, state, sampler = self.spec, self.task, self.state, Sampler()
         clipped = SX.sym("clipped", p.n_actions)
         values = state | self.seen_ground | {"action": clipped, "previous_action": state["action"]}
         s = self._context(values)
@@ -180,7 +177,7 @@ class Stages:
 
         On a field the robots have been placed: their state has where they stand, all but the height of the ground.
         """
-        p, sampler = self.program, Sampler()
+        p, sampler = self.spec, Sampler()
         ours = {name for name, row in self.schema.items() if row.writer in ("physics", "task", "term", "drift")}
         ours -= {"chosen", "retries"}  # the latter counts on, so that who looks after a reset sees it too
         state = {name: x for name, x in self.state.items() if name in ours}
@@ -219,8 +216,8 @@ class Stages:
 
     def place(self) -> tuple[Call, int]:
         """Trace how those who are `chosen` take a pose on a tile of the field as if the ground were at 0."""
-        state, sampler, curriculum = self.state, Sampler(), self.program.curriculum
-        level = curriculum.level(state, sampler, self.program.control_dt)
+        state, sampler, curriculum = self.state, Sampler(), self.spec.curriculum
+        level = curriculum.level(state, sampler, self.spec.control_dt)
         place = starting_place(curriculum, level, sampler)
         fresh = {"q": self._starting_pose(sampler), "level": level, **self._drifting(sampler)}
         fresh["q"][:2] = place
@@ -230,7 +227,7 @@ class Stages:
 
     def _context(self, values: Mapping[str, SX]) -> TermContext:
         values = dict(values) | ({"scaled_parameters": 2 * values["draw"] - 1} if "draw" in values else {})
-        p = self.program
+        p = self.spec
         return TermContext(self.model.mechanism, values, p.control_dt, self.task.gait_period, p.contacts)
 
     @property
@@ -242,7 +239,7 @@ class Stages:
         return {name: sampler.symmetric(self.schema[name].size, 1.0) for name in self._drifts}
 
     def _failed(self, s: TermContext) -> SX:
-        return sum([term.number(s) for term in self.program.termination_terms.values()], SX(0)) > 0
+        return sum([term.number(s) for term in self.spec.termination_terms.values()], SX(0)) > 0
 
     def _summed(self, term: Term, s: TermContext, row: int) -> SX:
         """Sum of a metric so far; of one that counts at the end of an episode a number whose mean is its value."""
@@ -284,7 +281,7 @@ class Stages:
 
     def _every(self, period: float, clock: SX) -> SX:
         """1 once in a period [s], else 0."""
-        return ca.fmod(clock, max(round(period / self.program.control_dt), 1)) < 0.5
+        return ca.fmod(clock, max(round(period / self.spec.control_dt), 1)) < 0.5
 
     def _pushed(self, v: SX, clock: SX, sampler: Sampler) -> SX:
         """Change the horizontal velocity of the base, in its frame, once in a push period."""
@@ -306,7 +303,7 @@ class Stages:
 
     def _blocks(self, s: TermContext, sampler: Sampler) -> tuple[dict[str, SX], dict[str, SX]]:
         """Return the policy's blocks, with errors of sensors but without noise, and the critic's, without either."""
-        own, critic = self.program.observation_terms, self.program.critic_terms
+        own, critic = self.spec.observation_terms, self.spec.critic_terms
         s.unit = sampler.unit
         sensed = {name: term(s) for name, term in own.items()}
         s.unit = None
