@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -174,11 +173,6 @@ class BaseEnv(EzPickle):
     def policy_spec(self) -> dict[str, Any]:
         """Return what is needed to run a policy of this environment elsewhere; see `ce_gym.envs.policy_spec`."""
         return policy_spec(self.batch.program, self.task)
-
-    def contract(self) -> dict[str, Any]:
-        """The former name of `policy_spec`."""
-        warnings.warn("contract() is called policy_spec() now", DeprecationWarning, stacklevel=2)
-        return self.policy_spec()
 
     @cached_property
     def symmetry(self) -> Symmetry | None:

@@ -191,7 +191,7 @@ class DifferentiableEnv:
 
 def _roughness(stages: Stages, term: Term) -> str:
     """Return what is not smooth in how a term depends on the motion; "" if nothing is."""
-    state = stages.state | stages.seen_ground | {"previous_action": SX.sym("previous", stages.program.n_actions)}
+    state = stages.state | stages.seen_ground | {"previous_action": SX.sym("previous", stages.spec.n_actions)}
     context = stages._context(state)
     value = ca.vec(term(context))
     moving = [state[name] for name in ("q", "v", "load", "torque", "action", "previous_action") if name in state]

@@ -215,10 +215,6 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         return place.rows(mask, "bool")
 
 
-make_vector_env = LeggedVectorEnv
-"""The name of the entry point in specs that were stored before."""
-
-
 def _autoreset_mode(mode: str | AutoresetMode | None, place: Device) -> AutoresetMode:
     """Return an autoreset mode given as itself, by name ("SAME_STEP") or by value ("SameStep").
 

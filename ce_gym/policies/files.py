@@ -38,20 +38,7 @@ REQUIRED: dict[str, type] = {
 }  # fmt: skip
 """What a record must say."""
 
-OLD_KEYS: Mapping[Any, Any] = {"contract": "policy_spec"}
-"""Former keys of records, and what they are called now."""
-
 KINDS = {str: "text", dict: "a JSON object", int: "a whole number"}
-
-
-class Record(dict[str, Any]):
-    """What training wrote, by key; former keys still work, with a warning."""
-
-    def __missing__(self, key: str) -> Any:
-        if key not in OLD_KEYS:
-            raise KeyError(key)
-        warnings.warn(f"record[{key!r}] is called record[{OLD_KEYS[key]!r}] now", DeprecationWarning, stacklevel=2)
-        return self[OLD_KEYS[key]]
 
 
 def load_policy(path: str | Path, transmission: str | None = None) -> Policy:
@@ -178,7 +165,7 @@ def _read_onnx(file: Path) -> Policy:
 def _checked(record: Any, file: Path) -> dict[str, Any]:
     """Return a record if it has what is needed to run its policy."""
     if isinstance(record, dict):
-        record = Record({str(OLD_KEYS.get(key, key)): value for key, value in record.items()})
+        record = {str(key): value for key, value in record.items()}
     for key, kind in REQUIRED.items():
         if not isinstance(record, dict) or key not in record:
             raise PolicyError(f"{file}: {key}: missing; expected a record written by this version of train/ppo.py")

@@ -128,7 +128,7 @@ def test_divergence_is_a_truncation_even_if_the_robot_has_fallen():
 def test_reward_terms_add_up_and_weights_are_arguments():
     weights = {"torques": 0.0, "alive": 20.0}  # never negative, so that nothing is clipped
     envs = gymnasium.make_vec(
-        VELOCITY, 8, robot=TRIPOD, max_episode_steps=20, autoreset_mode="SameStep", reward_weights=weights
+        VELOCITY, 8, robot=TRIPOD, max_episode_steps=20, autoreset_mode="SameStep", rewards=weights
     )
     envs.reset(seed=0)
     total = np.zeros(8)

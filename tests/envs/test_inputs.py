@@ -19,7 +19,7 @@ VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
         ({"task": "fly"}, "task='fly'; expected one of velocity"),
         ({"robot": "mini_cheeta"}, "mini_cheetah"),
         ({"robot": "mit_humanoid_leg"}, "fixed base"),
-        ({"reward_weights": {"style": 1.0}}, "no reward term 'style'; expected one of"),
+        ({"rewards": {"style": 1.0}}, "no reward term 'style'; expected one of"),
         ({"dtype": "half"}, "dtype='half'"),
         ({"num_threads": 0}, "num_threads=0; expected a whole number"),
         ({"command_range": [[1, 0], [0, 0], [0, 0]]}, "low <= high"),

@@ -26,8 +26,8 @@ def edited(tmp_path, **changes):
         ({"tasks": {"velocitty": {"dt": 0.01}}}, r"robot\.yaml: tasks is 'velocitty': .*did you mean 'velocity'"),
         ({"tasks": {"velocity": {"dt": -1}}}, r"robot\.yaml: tasks\.velocity: dt=-1"),
         ({"tasks": {"velocity": {"dtt": 1}}}, r"robot\.yaml: tasks\.velocity: .*'dtt'"),
-        ({"tasks": {"velocity": {"reward_weights": {"pose": "x"}}}}, r"robot\.yaml: tasks\.velocity: reward_weights"),
-        ({"tasks": {"velocity": {"reward_weights": 3}}}, r"robot\.yaml: tasks\.velocity: "),
+        ({"tasks": {"velocity": {"rewards": {"pose": "x"}}}}, r"robot\.yaml: tasks\.velocity: rewards"),
+        ({"tasks": {"velocity": {"rewards": 3}}}, r"robot\.yaml: tasks\.velocity: "),
         ({"gains": None}, r"robot\.yaml: gains\.kp is missing: expected gains"),
     ],
 )
@@ -41,7 +41,7 @@ def test_tasks_in_a_file(tmp_path, changes, message):
 @pytest.mark.filterwarnings("ignore::ce_gym.InertiaWarning")
 def test_mappings_in_a_file(tmp_path):
     own = {
-        "reward_weights": {"swerve": -0.2, "track_linear_velocity": {"weight": 2.0, "width": 0.1}},
+        "rewards": {"swerve": -0.2, "track_linear_velocity": {"weight": 2.0, "width": 0.1}},
         "terminations": {"tilt": {"angle": 1.0}, "torso_contact": None},
         "randomise": {"friction": [0.5, 1.0]},
         "self_collisions": [["HR_knee_link", "FR_knee_link"]],

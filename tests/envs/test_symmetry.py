@@ -93,7 +93,7 @@ def test_a_task_that_prefers_one_side_is_no_symmetry():
         return s.base_linear_velocity[1]
 
     ce_gym.reward(to_the_left)
-    assert left_right(make_program("mini_cheetah", "velocity", reward_weights={"to_the_left": 5.0})) is None
+    assert left_right(make_program("mini_cheetah", "velocity", rewards={"to_the_left": 5.0})) is None
 
 
 def test_motors_without_joints_of_their_own_are_not_reflected():

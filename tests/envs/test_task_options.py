@@ -27,7 +27,7 @@ def test_a_term_of_ones_own():
     def twice_the_height(s):
         return 2 * s.base_height
 
-    envs = make(reward_weights={"twice_the_height": 3.0})
+    envs = make(rewards={"twice_the_height": 3.0})
     _, _, _, _, infos = envs.step(zeros(envs))
     expected = 3.0 * 2 * envs.state()["q"][:, 2] * envs.dt
     np.testing.assert_allclose(infos["reward_terms"]["twice_the_height"], expected, rtol=1e-12)
@@ -37,7 +37,7 @@ def test_a_term_of_ones_own():
 
     other.__name__ = "twice_the_height"
     ce_gym.reward(other)  # another function under the same name is another program
-    changed = make(reward_weights={"twice_the_height": 3.0})
+    changed = make(rewards={"twice_the_height": 3.0})
     _, _, _, _, infos = changed.step(zeros(changed))
     np.testing.assert_allclose(infos["reward_terms"]["twice_the_height"], -expected / 2, rtol=1e-12)
     with pytest.raises(ValueError, match="the package has one of this name"):
@@ -165,9 +165,9 @@ def test_headings_are_turned_to():
         ({"command_range": ((0, 1),)}, "command_range=.*; expected three pairs"),
         ({"push_period": -1}, "push_period=-1; expected 0 or more"),
         ({"heading": 1}, "heading=1; expected true or false"),
-        ({"reward_weights": {"torques": "much"}}, r"reward_weights\['torques'\]='much'; expected a finite number"),
-        ({"reward_weights": ["torques"]}, r"reward_weights=\['torques'\]; expected weights, or mappings"),
-        ({"reward_weights": {"torques": float("nan")}}, r"reward_weights\['torques'\]=nan; expected a finite number"),
+        ({"rewards": {"torques": "much"}}, r"rewards\['torques'\]='much'; expected a finite number"),
+        ({"rewards": ["torques"]}, r"rewards=\['torques'\]; expected weights, or mappings"),
+        ({"rewards": {"torques": float("nan")}}, r"rewards\['torques'\]=nan; expected a finite number"),
         ({"observations": ["smell"]}, "no observation term 'smell'; expected one of"),
         ({"observations": []}, r"observations=\[\]; expected at least one name"),
         ({"terminations": ["boredom"]}, "no termination term 'boredom'"),

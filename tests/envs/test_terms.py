@@ -143,7 +143,7 @@ def test_parameters_of_the_package_s_terms():
     ("options", "message"),
     [
         ({"rewards": {"torques": 1e308}}, r"rewards\['torques'\]=1e\+308; expected a weight from -1e\+09 to 1e\+09"),
-        ({"reward_weights": {"torques": -1e200}}, r"reward_weights\['torques'\]=-1e\+200; expected a weight"),
+        ({"rewards": {"torques": -1e200}}, r"rewards\['torques'\]=-1e\+200; expected a weight"),
         ({"rewards": {"survive": {}}}, r"rewards\['survive'\]=\{\}; expected a `weight`"),
         ({"rewards": {"torques": {"width": 1.0}}}, "reward term 'torques': parameter 'width'; expected none"),
         ({"rewards": {"track_linear_velocity": {"width": "wide"}}}, "width='wide'; expected a finite number"),

@@ -150,7 +150,7 @@ def test_episodes_begin_on_the_ground_in_the_middle_of_a_tile(kind: str, dtype: 
 
 def test_heights_are_above_the_ground():
     weights = {"base_height": -10.0, "alive": 20.0}
-    envs = make(64, terrain={"kind": "slope", "curriculum": False}, reward_weights=weights)
+    envs = make(64, terrain={"kind": "slope", "curriculum": False}, rewards=weights)
     *_, infos = envs.step(zeros(envs))
     q, under = envs.state()["q"], ground_under(envs)
     assert np.abs(under).max() > 0.5

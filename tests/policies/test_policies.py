@@ -57,18 +57,6 @@ def test_activations_take_any_number(activation: str) -> None:
     assert np.isfinite(out).all()
 
 
-def test_a_record_with_a_former_key_is_read(tmp_path: Path) -> None:
-    former = {"contract" if key == "policy_spec" else key: value for key, value in record().items()}
-    write_npz(stander(), former | {"contract": {"robot": "any"}}, tmp_path / "policy.npz")
-    found = load_policy(tmp_path / "policy.npz").record
-    assert found["policy_spec"] == {"robot": "any"}
-    assert "contract" not in found
-    with pytest.warns(DeprecationWarning, match="policy_spec"):
-        assert found["contract"] == {"robot": "any"}
-    with pytest.raises(KeyError):
-        found["nothing"]
-
-
 def test_both_files_hold_the_same_policy(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     layers = (rng.standard_normal((8, 48)), rng.standard_normal(8)), (rng.standard_normal((12, 8)), np.zeros(12))

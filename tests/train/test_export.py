@@ -91,8 +91,6 @@ def test_the_specification_rebuilds_observations():
         obs, *_ = envs.step(action)
     state = {**envs.state(), "action": action}
     np.testing.assert_array_equal(envs.look(state)[0], obs)
-    with pytest.warns(DeprecationWarning, match="policy_spec"):
-        assert envs.contract() == envs.policy_spec()
     start, found = 0, 0
     for block in envs.policy_spec()["observation"]["blocks"]:
         rows = slice(start, start + block["size"])

@@ -74,7 +74,6 @@ def make_program(
     transmission: str = "exact",
     contact_forces: bool = False,
     rewards: Mapping[str, Any] | None = None,
-    reward_weights: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> TaskProgram:
     """Put a task on a robot.
@@ -86,7 +85,6 @@ def make_program(
         contact_forces: Whether contact forces are computed, for recording.
         rewards: What replaces or adds to the rewards of the task, by the name of the term: a weight, 0 to remove it, or
             a mapping of `weight` and parameters, such as `{"weight": 1.5, "width": 0.25}`.
-        reward_weights: The same, as it used to be called.
         **changes: Attributes of `Task` that replace those of the task, such as command_range, contacts, actions,
             noise, history, latency, randomise, push_period or episode_length.
 
@@ -103,8 +101,7 @@ def make_program(
     check("transmission", transmission, transmission in levels, f"one of {', '.join(levels)}")
     model = Model(robot, transmission)
     figures = own_task(model.robot, task)
-    for name, given in (("reward_weights", reward_weights), ("rewards", rewards)):
-        figures = replace(figures, rewards=merged_rewards(name, figures.rewards, {} if given is None else given))
+    figures = replace(figures, rewards=merged_rewards(figures.rewards, {} if rewards is None else rewards))
     figures = changed_task(figures, changes)
     if figures.actions.endswith("_pd") and not model.robot.gains.kp:
         file, expected = model.robot.source or model.robot.name, f"gains, because actions={figures.actions!r} need them"
@@ -129,7 +126,7 @@ def own_task(robot: Robot, task: str) -> Task:
     if not isinstance(wanted, str):  # tasks ask for knees, too, but not every robot has some
         own.setdefault("contacts", tuple(group for group in wanted if group in groups))
     try:
-        weights = merged_rewards("reward_weights", KNOWN[task].rewards, dict(own.pop("reward_weights", ())))
+        weights = merged_rewards(KNOWN[task].rewards, dict(own.pop("rewards", ())))
         return changed_task(replace(KNOWN[task], rewards=weights), own)
     except (ValueError, TypeError) as error:
         raise RobotError(f"{file}: tasks.{task}: {error}") from None

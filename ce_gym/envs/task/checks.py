@@ -80,24 +80,23 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
     return figure
 
 
-def merged_rewards(name: str, old: Mapping[str, Any], given: Any) -> dict[str, Any]:
+def merged_rewards(old: Mapping[str, Any], given: Any) -> dict[str, Any]:
     """Return reward terms of a task with some replaced or added, those of weight 0 left out.
 
     Args:
-        name: Of the argument.
         old: What the task has, a weight or a mapping of `weight` and parameters by the name of the term.
         given: What a user gave, likewise; parameters alone leave the weight as it was.
 
     Raises:
         ValueError: If it is nothing of the kind.
     """
-    check(name, given, isinstance(given, Mapping), "weights, or mappings of weight and parameters, by name")
+    check("rewards", given, isinstance(given, Mapping), "weights, or mappings of weight and parameters, by name")
     rewards = dict(old)
     for term, value in given.items():
         before = old.get(term, {})
         before = dict(before) if isinstance(before, Mapping) else {"weight": before}
         new = before | (dict(value) if isinstance(value, Mapping) else {"weight": value})
-        place = f"{name}[{term!r}]"
+        place = f"rewards[{term!r}]"
         check(place, value, "weight" in new, "a `weight`, for the task has none")
         new["weight"] = number(place, new["weight"])
         check(place, value, abs(new["weight"]) <= HEAVIEST, f"a weight from -{HEAVIEST:g} to {HEAVIEST:g}")

@@ -5,7 +5,6 @@ A term is a free function of a `TermContext`. What is here is traced when it is 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 
@@ -375,10 +374,3 @@ class TermContext:
     def commanded_to_move(self) -> SX:
         """1 if the command asks for motion, else 0."""
         return ca.sumsqr(self.command) > 0.01
-
-
-def __getattr__(name: str) -> type:
-    if name == "Snapshot":
-        warnings.warn("Snapshot is called TermContext now", DeprecationWarning, stacklevel=2)
-        return TermContext
-    raise AttributeError(name)
