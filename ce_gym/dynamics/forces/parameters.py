@@ -22,7 +22,7 @@ PARAMETERS = {
     "friction": "Coulomb coefficient of the contacts [-], 1",
     "slip_speed": "speed at which the damping of friction alone carries its full force [m/s], 1",
     "stiffness": "normal stiffness of the contacts [N/m], 1",
-    "damping": "normal damping of the contacts [N s/m], 1",
+    "damping": "normal damping of the contacts under Kelvin and Voigt's law [N s/m], 1",
     "kp": "position gains of the joints [N m/rad or N/m], n_joints",
     "kd": "velocity gains of the joints [N m s/rad or N s/m], n_joints",
     "motor_strength": "factor on motor torques and their limits [-], 1",
