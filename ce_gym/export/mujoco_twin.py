@@ -126,14 +126,19 @@ def lay_ground(model: mujoco.MjModel, robot: Robot) -> None:
     a0 + A f = (v+ - v) / h, with R = 1 / (h (c + h k)), b = 1 / h and K = k R it is f = -k (r + h v+) - c v+: a spring
     and a damper at the end of the step h, as ours are, whatever they carry. R is said by an impedance d, as
     (1 - d) / d times the mobility that MuJoCo gives the body (`invweight0`); negative solref are d K and d b. A
-    material without damping of its own is damped critically.
+    material without damping of its own is damped critically. The dissipation of Hunt and Crossley's law becomes the
+    damping that it has where all contacts carry the robot together.
     """
     model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, STICKING
     material, h = robot.material, model.opt.timestep
+    weight = robot.total_mass * math.hypot(*robot.gravity)
     for contact in robot.contacts:
         geom = model.geom(contact.name)
         mobility = float(model.body_invweight0[int(geom.bodyid[0]), 0])
-        damping = material.damping or 2.0 * math.sqrt(material.stiffness / mobility)
+        if material.dissipation is None:
+            damping = material.damping or 2.0 * math.sqrt(material.stiffness / mobility)
+        else:
+            damping = material.dissipation * weight / len(robot.contacts)
         R = 1.0 / (h * (damping + h * material.stiffness))
         d = mobility / (mobility + R)
         geom.solimp[:2] = d  # at every depth
