@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def ball(damping: float, stiffness: float, dissipation: float) -> Robot:
 def test_a_ball_leaves_the_ground(damping: float, approach: float, stiffness: float, h: float):
     model, results = Model(ball(damping, stiffness, h)), []
     for method in ("extrapolated", "adaptive"):
-        options = {"tolerance": 1e-9} if method == "adaptive" else {}
+        options: dict[str, Any] = {"tolerance": 1e-9} if method == "adaptive" else {}
         sim = ce_gym.Simulator(model, dt=1e-5, control="torque", method=method, outputs=("energy",), **options)
         sim.set_state([0, 0, 0.0801, 1, 0, 0, 0], [0, 0, 0, 0, 0, -approach])
         before = 0.35 * approach**2
