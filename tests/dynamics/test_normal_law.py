@@ -22,7 +22,7 @@ INERTIA = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
 def leaving(approach: float, h: float) -> float:
     """Speed of a mass that meets `k d (1 + h ddot)`: its equation of motion, integrated over the depth by hand."""
     balance = lambda u: h * (approach + u) - np.log((1 + h * approach) / (1 - h * u))  # noqa: E731
-    return brentq(balance, 1e-9, min(approach, (1 - 1e-12) / h))
+    return float(brentq(balance, 1e-9, min(approach, (1 - 1e-12) / h)))  # type: ignore[arg-type]
 
 
 def ball(damping: float, stiffness: float, dissipation: float) -> Robot:
