@@ -101,11 +101,13 @@ def flailing(robot: Robot) -> int:
     return int(simulator.diverged.sum())
 
 
-def test_stops_of_cranks_hold_where_stops_of_feet_do_not():
-    """They grow stiff towards the dead centre of a loop, past which a foot on the spring of its own stop is thrown."""
+def test_stops_keep_loops_from_their_dead_centres():
+    """Stops of feet or of cranks: without either, feet are thrown past the end of their rods' reach."""
     robot, unlimited = load_robot("tello"), (-np.inf, np.inf)
     bodies = tuple(
-        replace(body, joint=replace(body.joint, position=unlimited)) if "crank" in body.name else body
+        replace(body, joint=replace(body.joint, position=unlimited))
+        if "crank" in body.name or "foot" in body.name
+        else body
         for body in robot.bodies
     )
     assert flailing(robot) == 0 < flailing(replace(robot, bodies=bodies))
