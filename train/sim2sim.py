@@ -209,11 +209,12 @@ def compare(
         envs.close()
     for level, (name, _) in TWINS.items():
         envs, obs, given = _environment(record, record["transmission"], episodes, seconds, every, seed)
+        native: Any = envs.envs.unwrapped
         try:
-            if level == "exact" and (reason := _without_ratios(envs.envs.unwrapped.model.robot)):
+            if level == "exact" and (reason := _without_ratios(native.model.robot)):
                 print(f"{name}: not judged: {reason}", file=sys.stderr)
                 continue
-            results[name] = play(policy, MujocoWorld(envs.envs.unwrapped, obs, level), obs, given)
+            results[name] = play(policy, MujocoWorld(native, obs, level), obs, given)
         except RobotError as error:  # of loops MJCF can say `exact`, but no armature that varies with the pose
             if level == "exact":
                 raise
