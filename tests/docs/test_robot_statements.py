@@ -135,7 +135,7 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         "how_it_works.md",
         lambda: (
             f"makes {sum(not is_axisymmetric(rotor) for rotor in robot(JVRC).rotors())} of the "
-            f"{sum(1 for _ in robot(JVRC).rotors())} lopsided: its exact forward dynamics takes {instructions(JVRC)} instr"
+            f"{sum(1 for _ in robot(JVRC).rotors())} lopsided: its exact forward dynamics takes {instructions(JVRC)} "
         ),
     ),
     ("environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
@@ -170,8 +170,8 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         lambda: (
             "the Berkeley Humanoid "
             f"{min(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g} to "
-            f"{max(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g}, {the(gains('berkeley_humanoid', 'ffe'))} and "
-            f"{the(gains('berkeley_humanoid', 'faa'))} at the feet"
+            f"{max(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g}, "
+            f"{the(gains('berkeley_humanoid', 'ffe'))} and {the(gains('berkeley_humanoid', 'faa'))} at the feet"
         ),
     ),
     (
