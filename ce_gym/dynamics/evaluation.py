@@ -18,6 +18,7 @@ from ce_gym.dynamics.constraints.closure import closures, reference_guess
 from ce_gym.dynamics.constraints.continuation import follow
 from ce_gym.dynamics.derivatives import gradient_function, jacobian_function, product_function
 from ce_gym.dynamics.functions import FUNCTIONS
+from ce_gym.model.errors import check_names, listed_names
 from ce_gym.model.mechanism import Mechanism
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ class Evaluator:
         """
         if name not in self._functions:
             if name not in FUNCTIONS:
-                raise KeyError(f"no function {name!r}; expected one of {', '.join(FUNCTIONS)}")
+                raise KeyError(f"no function {name!r}; expected one of {listed_names(name, FUNCTIONS)}")
             self._functions[name] = FUNCTIONS[name](self.mechanism)
         return self._functions[name]
 
@@ -139,6 +140,7 @@ class Evaluator:
             >>> derivatives.jacobian(model.standing_q, np.zeros(18), np.ones(18))["vdot", "rotor_inertia"].shape
             (18, 1)
         """
+        check_names("wrt", wrt, wrt, "an input among")
         key = name, tuple(wrt)
         if key not in self._derivatives:
             self._derivatives[key] = Derivatives(self, *key)

@@ -17,6 +17,7 @@ from ce_gym.dynamics.evaluation import Evaluator
 from ce_gym.dynamics.standing import check_standing
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
+from ce_gym.model.errors import check_names
 from ce_gym.model.frames import added
 from ce_gym.model.mechanism import build_mechanism
 
@@ -129,9 +130,7 @@ class Model(Evaluator):
         """
         if wrenches is None:
             return self._evaluate("forward_dynamics", q, v, tau)[0][..., 0]
-        for name in wrenches:
-            if name not in self.body_names:
-                raise ValueError(f"wrench on {name!r}: expected the name of a body of {self.robot.name}")
+        check_names("wrenches", wrenches, self.body_names, f"the name of a body of {self.robot.name}:")
         each = [np.asarray(wrenches.get(name, np.zeros(6)), dtype=float) for name in self.body_names]
         stacked = np.concatenate(np.broadcast_arrays(*each), axis=-1)
         return self._evaluate("forward_dynamics_with_wrenches", q, v, tau, stacked)[0][..., 0]
@@ -237,10 +236,9 @@ class Model(Evaluator):
         Raises:
             ValueError: If a body does not exist.
         """
-        chosen = [motor.rotor for motor in self.robot.motors] if actuated is None else list(actuated)
-        for name in chosen:
-            if name not in self.spanning_names:
-                raise ValueError(f"actuated {name!r}: expected the name of a body with a joint of {self.robot.name}")
+        chosen = [motor.rotor for motor in self.robot.motors] if actuated is None else actuated
+        expected = f"the name of a body with a joint of {self.robot.name}:"
+        check_names("actuated", chosen, self.spanning_names, expected)
         G = self._evaluate("spanning_jacobian", q)[0]
         return G[..., [row for name in chosen for row in self.robot.spanning_rows[name][1]], :]
 

@@ -65,8 +65,12 @@ class MujocoTwin:
         self._coordinates = None if loops else Coordinates.of(self.model, robot)
         self._tree = Model(robot, level) if loops else None
         self._batch = Batch(self.model, num_envs)
+        first = {self.model.joint(i).name: i for i in range(self.model.njnt)}
+        addresses = {name: (int(self.model.jnt_qposadr[i]), int(self.model.jnt_dofadr[i])) for name, i in first.items()}
+        rows = robot.spanning_rows  # rotors that are armature here have rows, and no joint
+        self._joints = [(addresses[name], rows[name]) for name in robot.joints if name in addresses]
         names = [*robot.balls, *robot.independent]
-        at = [(int(self.model.joint(name).qposadr[0]), int(self.model.joint(name).dofadr[0])) for name in names]
+        at = [addresses[name] for name in names]
         sizes = [(len(rows), len(speeds)) for rows, speeds in (robot.rows[name] for name in names)]
         placed = list(zip(at, sizes, strict=True))
         self._positions = [*range(7), *(p + i for (p, _), (n, _) in placed for i in range(n))]
@@ -95,9 +99,9 @@ class MujocoTwin:
         qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
         qpos[:7], qvel[:3], qvel[3:6] = q[:7], rotation_matrix(q[3:7]) @ v[3:6], v[:3]
         span = self._tree.spanning(q, v)
-        for name, position, speed in zip(self._tree.spanning_names, span[0][7:], span[1][6:], strict=True):
-            joint = self.model.joint(name)
-            qpos[joint.qposadr], qvel[joint.dofadr] = position, speed
+        for (position, speed), (rows, speeds) in self._joints:
+            qpos[position : position + len(rows)] = span[0][rows]
+            qvel[speed : speed + len(speeds)] = span[1][speeds]
         return qpos, qvel
 
     def step(self, target: Array, duration: float) -> None:

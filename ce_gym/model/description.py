@@ -15,10 +15,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from ce_gym.model.constraints import Constraint
+from ce_gym.model.constraints import Constraint, LinearConstraint
 from ce_gym.model.coordinates import Layout, placed, sizes
 from ce_gym.model.drives import Battery, Elasticity, Motor
+from ce_gym.model.errors import listed_names
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
+
+UNKNOWN_RATIO = 1e6
+"""Gear ratio in place of one that is not known: the rotor's own inertia is then 1e-12 of the reflected one."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,11 @@ class Inertial:
     mass: float
     com: Vec3
     inertia: Mat3
+
+    @property
+    def trace(self) -> float:
+        """Sum of the three moments of inertia [kg m^2]."""
+        return sum(self.inertia[i][i] for i in range(3))
 
 
 @dataclass(frozen=True)
@@ -270,11 +279,19 @@ class Robot:
         for body in self.bodies:
             if body.name == name:
                 return body
-        raise KeyError(f"{self.name} has no body {name!r}; it has {', '.join(b.name for b in self.bodies)}")
+        raise KeyError(f"{self.name} has no body {name!r}; it has {listed_names(name, [b.name for b in self.bodies])}")
 
     def rotors(self) -> Iterator[Body]:
         """Iterate over the bodies that spin inside transmissions."""
         return (body for body in self.bodies if body.kind == "rotor")
+
+    @property
+    def unknown_ratios(self) -> tuple[str, ...]:
+        """The rotors whose gear ratio the robot's file does not say, such as armature in MJCF: see `UNKNOWN_RATIO`."""
+        ties = [tie for tie in self.constraints if isinstance(tie, LinearConstraint)]
+        steep = [tie for tie in ties if max(abs(x) for _, x in tie.coefficients) >= UNKNOWN_RATIO / 100]
+        tied = {name for tie in steep for name in tie.bodies}
+        return tuple(body.name for body in self.rotors() if body.name in tied and body.inertial.trace < 1e-9)
 
     @property
     def commanded(self) -> tuple[str, ...]:

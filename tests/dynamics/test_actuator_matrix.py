@@ -161,6 +161,6 @@ def test_motors_of_the_legs_determine_their_joints():
 
 def test_unknown_actuators_are_named(two_motors: Robot):
     model = Model(two_motors)
-    with pytest.raises(ValueError, match="actuated 'link9': expected the name of a body with a joint of"):
+    with pytest.raises(ValueError, match="actuated='link9'; expected the name of a body with a joint of"):
         model.actuator_matrix(model.standing_q, ["link9"])
     assert model.actuator_matrix(model.standing_q, []).shape == (0, 1)

@@ -15,6 +15,7 @@ from ce_gym.dynamics.forces.contact import Compliance
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
 from ce_gym.model.drives import ELASTIC_FACTORS, Battery, Elasticity, Motor
+from ce_gym.model.errors import check_names
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 PARAMETERS = {
@@ -74,11 +75,19 @@ class Figures:
     backlash: SX
 
 
-def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str, ...]) -> dict[str, NDArray]:
+def parameter_defaults(
+    robot: Robot, material: ContactMaterial, names: Sequence[str], argument: str = "parameters"
+) -> dict[str, NDArray]:
     """Return the value that leaves the robot as it is, for each declared parameter, shape (size,).
 
+    Args:
+        robot: The robot.
+        material: Of its contacts.
+        names: The declared parameters.
+        argument: What an error calls them.
+
     Raises:
-        ValueError: If a name is not a parameter of the robot.
+        ValueError: If a name is not a parameter of the robot, or is listed twice.
     """
     gains = {"kp": dict(robot.gains.kp), "kd": dict(robot.gains.kd)}
     plain = {
@@ -112,10 +121,7 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
     plain |= {f"link_inertia:{link}": np.ones(1) for link in links}
     plain |= {f"rotor_inertia:{rotor.name}": np.ones(1) for rotor in robot.rotors()}
     plain |= {f"{kind}:{elastic.rotor}": np.ones(1) for kind in ELASTIC_FACTORS for elastic in robot.elastic}
-    for name in names:
-        if name not in plain:
-            expected = f"one of {', '.join(PARAMETERS)}, BODY being a link, ROTOR a rotor"
-            raise ValueError(f"parameters={name!r}; expected {expected}")
+    check_names(argument, names, plain, "one of", listed=f"{', '.join(PARAMETERS)}, BODY being a link, ROTOR a rotor")
     if "ratio" in names:
         check_ratios(robot)
     return {name: plain[name] for name in names}

@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Iterable
 from dataclasses import fields
-from fnmatch import fnmatch
+from fnmatch import fnmatchcase
 from functools import cache
 
 import numpy as np
@@ -29,7 +29,7 @@ from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import DriveFriction
-from ce_gym.model.errors import InertiaWarning, bad, unknown
+from ce_gym.model.errors import InertiaWarning, bad, listed_names, unknown
 
 MOST_BODIES = 500
 """Most bodies of a robot: what is done with them takes more than in proportion, and none has as many."""
@@ -84,11 +84,12 @@ def _check_names(robot: Robot, file: str) -> None:
 def _check_inertia(robot: Robot, file: str) -> None:
     """Warn of figures that no rigid body can have, unless they are kept knowingly."""
     impossible = [body.name for body in robot.bodies if violates_triangle_inequality(body)]
+    _check_unique(file, "kept_inertia", robot.kept_inertia)
     for pattern in robot.kept_inertia:
-        if not any(fnmatch(name, pattern) for name in impossible):
-            expected = f"one of {', '.join(impossible)}" if impossible else "nothing: no inertia is impossible"
+        if not any(fnmatchcase(name, pattern) for name in impossible):
+            expected = f"one of {listed_names(pattern, impossible)}" if impossible else "none: no inertia is impossible"
             raise bad(file, "kept_inertia", pattern, expected)
-    unknowing = [name for name in impossible if not any(fnmatch(name, pattern) for pattern in robot.kept_inertia)]
+    unknowing = [name for name in impossible if not any(fnmatchcase(name, pattern) for pattern in robot.kept_inertia)]
     if unknowing:
         _warn_of_inertia(robot.name, tuple(unknowing))
 
@@ -193,6 +194,7 @@ def _check_capsules(robot: Robot, file: str) -> None:
         check_finite(file, key, (*capsule.start, *capsule.end))
         if not 0.0 < capsule.radius < math.inf:
             raise bad(file, f"{key} radius", capsule.radius, "more than 0 [m]")
+    _check_unique(file, "self_collisions", [" and ".join(sorted(pair)) for pair in robot.self_collisions])
     for pair in robot.self_collisions:
         for name in pair:
             if name not in links:
