@@ -59,6 +59,87 @@ def test_only_what_mujoco_lets_touch_the_ground_is_a_contact(write, mask, rest, 
     assert {sphere.name for sphere in robot.contacts if sphere.body == "leg"} == touching
 
 
+FOOTED = """<mujoco><option><flag override="{override}"/></option>
+<default><default class="rubber"><geom friction="1.3" priority="1"/></default></default>
+<worldbody><geom name="floor" type="plane" size="0 0 1" {floor}/>{world}<body name="trunk" pos="0 0 0.39"><freejoint/>
+<geom name="hull" type="box" size=".1 .1 .05" {hull}/><body name="leg"><joint axis="0 1 0"/>
+<geom name="foot" type="sphere" pos="0 0 -.37" size=".03" mass=".1" {foot}/></body></body></worldbody>
+<contact>{contact}</contact></mujoco>"""
+SECOND_FLOOR = '<body name="tiles"><geom type="plane" size="0 0 1" {}/></body>'
+
+
+def footed(floor="", foot="", hull="", world="", contact="", override="disable") -> str:
+    return FOOTED.format(floor=floor, foot=foot, hull=hull, world=world, contact=contact, override=override)
+
+
+def mujocos_friction(text: str) -> float:
+    """Return the largest sliding friction of MuJoCo's own contacts of the foot, 0 if they are frictionless."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    foot = model.geom("foot").id
+    touching = [contact for contact in data.contact if foot in contact.geom]
+    assert touching
+    return max(float(contact.friction[0]) if contact.dim > 1 else 0.0 for contact in touching)
+
+
+@pytest.mark.parametrize(
+    "figures",
+    [
+        {},
+        {"foot": 'friction="0.6"'},
+        {"foot": 'friction="1.6"'},
+        {"foot": 'friction="0.6" priority="1"'},
+        {"foot": 'friction="0.6" priority="-1"'},
+        {"foot": 'class="rubber"', "floor": 'friction="2"'},
+        {"foot": 'class="rubber" friction="0.2"', "floor": 'friction="2" priority="1"'},
+        {"foot": 'friction="0.6"', "floor": 'friction="0.3" priority="2"'},
+        {"foot": 'friction="0.6"', "floor": 'friction="0.3"', "hull": 'friction="3" priority="5"'},
+        {"foot": 'condim="1"', "floor": 'condim="1"'},
+        {"foot": 'condim="1"', "floor": 'condim="4"'},
+        {"foot": 'condim="1" priority="1"', "floor": 'condim="6"'},
+        {"foot": 'friction="0"', "floor": 'friction="0"'},
+        {"contact": '<pair geom1="foot" geom2="floor" friction="0.25 0.25 0 0 0"/>', "foot": 'priority="1"'},
+        {"contact": '<pair geom1="floor" geom2="foot" condim="1"/>', "foot": 'contype="0" conaffinity="0"'},
+        {"contact": '<pair geom1="floor" geom2="foot"/>', "foot": 'friction="0.6"', "floor": 'friction="0.3"'},
+        {"contact": '<pair geom1="foot" geom2="floor"/><exclude body1="leg" body2="world"/>', "foot": 'friction="2"'},
+        {"world": SECOND_FLOOR.format('friction="2"'), "contact": '<exclude body1="tiles" body2="leg"/>'},
+        {"world": SECOND_FLOOR.format('friction="0.3"'), "floor": 'friction="0.4"', "foot": 'friction="0.5"'},
+        {"world": SECOND_FLOOR.format('priority="1" friction="1.3"'), "foot": 'friction="0.5"'},
+        {"world": SECOND_FLOOR.format('contype="2" conaffinity="2" friction="3"'), "foot": 'friction="0.5"'},
+        {"override": "enable", "foot": 'friction="0.6" priority="1"'},
+    ],
+    ids=lambda figures: " ".join(figures),
+)
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_feet_have_the_friction_of_mujocos_contacts(write, figures):
+    text = footed(**figures)
+    assert load_robot(write(text)).material.friction == pytest.approx(mujocos_friction(text), abs=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_feet_have_the_friction_of_mujocos_contacts_whatever_the_figures(write):
+    rng = np.random.default_rng(0)
+
+    def figures() -> str:
+        friction, priority, condim = rng.uniform(0.1, 2), rng.integers(-1, 2), rng.choice((1, 3, 4, 6))
+        return f'friction="{friction}" priority="{priority}" condim="{condim}" solmix="{rng.uniform(0, 1)}"'
+
+    for _ in range(30):
+        text = footed(floor=figures(), foot=figures(), hull=figures())
+        assert load_robot(write(text)).material.friction == pytest.approx(mujocos_friction(text), abs=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_without_ground_in_the_file_feet_have_their_own_friction(write):
+    world = '<geom name="floor" type="plane" size="0 0 1" />'
+    for own, friction in (("", 1.0), ('friction="0.6"', 0.6), ('friction="0.6" condim="1"', 0.6)):
+        robot = load_robot(write(footed(foot=own).replace(world, "")))
+        assert robot.material.friction == friction
+
+
 @pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
 def test_what_touches_the_ground_is_no_rotor(write):
     """A wheel that is coupled to another is tied and symmetric as rotors are, but it is outside."""
@@ -147,7 +228,31 @@ def test_physics_that_the_file_switches_off(write):
         (mjcf(CHAIN + '<geom name="g" type="box" size="1 1 1"/>'), "obstacle g"),
         (mjcf(CHAIN.replace('name="a"', 'name="a" armature="1"')), "the gear ratio behind the armature of arm"),
         (mjcf(CHAIN.replace('name="a"', 'name="a" range="1 2"')), "beyond its limits, of arm"),
-        (f"<mujoco>{GEOMS.replace(ROUGH, ROUGH.replace('0.6', '0.9'))}</mujoco>", "than 0.9"),
+        (
+            f"<mujoco>{GEOMS}</mujoco>".replace('name="shin"', 'name="shin" condim="6"'),
+            "torsional and rolling friction",
+        ),
+        (f"<mujoco>{GEOMS}</mujoco>".replace('name="shin"', 'name="shin" margin="0.01"'), "margin and gap of contacts"),
+        (f"<mujoco>{GEOMS}</mujoco>".replace('name="shin"', 'name="shin" solref=".01 1"'), "compliance of contacts"),
+        (
+            f'<mujoco>{GEOMS}<contact><pair geom1="floor" geom2="shin" friction=".5 .4 0 0 0"/></contact></mujoco>',
+            "smaller one of two sliding frictions",
+        ),
+        (
+            f'<mujoco>{GEOMS}<contact><pair geom1="hull" geom2="shin"/></contact></mujoco>'.replace(
+                'name="hull"', 'name="hull" contype="0"'
+            )
+            .replace(
+                '<body name="leg"',
+                "<body><joint/><geom size='.1' mass='1' contype='0' conaffinity='0'/><body name=\"leg\"",
+            )
+            .replace("</body></body></worldbody>", "</body></body></body></worldbody>"),
+            "contact between bodies of the robot",
+        ),
+        (
+            f"<mujoco>{GEOMS.replace(ROUGH, ROUGH.replace('0.6', '0.9'))}</mujoco>",
+            "friction other than 0.6: 0.9 of hull_corner1 and 7 more",
+        ),
     ],
     ids=lambda value: value[:40] if not value.startswith("<") else "",
 )
