@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.dynamics.model import Model
+from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mujoco_batch import Batch
-from ce_gym.export.mujoco_coordinates import Coordinates
+from ce_gym.export.mujoco_coordinates import Coordinates, rotor_scale
 from ce_gym.export.mujoco_model import STIFF, Settings, compiled
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Robot
 from ce_gym.model.frames import rotation_matrix
+from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
 
@@ -64,6 +66,8 @@ class MujocoTwin:
         lay_ground(self.model, robot)
         self._coordinates = None if loops else Coordinates.of(self.model, robot)
         self._tree = Model(robot, level) if loops else None
+        ties = joint_ties(build_mechanism(robot)) if loops else {}
+        self._scales = {name: rotor_scale(self.model, robot, name, tie) for name, tie in ties.items()}
         self._batch = Batch(self.model, num_envs)
         names = [*robot.balls, *robot.independent]
         at = [(int(self.model.joint(name).qposadr[0]), int(self.model.joint(name).dofadr[0])) for name in names]
@@ -95,9 +99,12 @@ class MujocoTwin:
         qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
         qpos[:7], qvel[:3], qvel[3:6] = q[:7], rotation_matrix(q[3:7]) @ v[3:6], v[:3]
         span = self._tree.spanning(q, v)
+        joints = [self.model.joint(j) for j in range(self.model.njnt)]
+        written = {joint.name: joint for joint in joints}
         for name, position, speed in zip(self._tree.spanning_names, span[0][7:], span[1][6:], strict=True):
-            joint = self.model.joint(name)
-            qpos[joint.qposadr], qvel[joint.dofadr] = position, speed
+            if joint := written.get(name):  # rotors that the level leaves out have none
+                scale = self._scales.get(name, 1.0)
+                qpos[joint.qposadr], qvel[joint.dofadr] = position / scale, speed / scale
         return qpos, qvel
 
     def step(self, target: Array, duration: float) -> None:
