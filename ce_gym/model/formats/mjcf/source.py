@@ -19,6 +19,7 @@ from ce_gym.model.checks.body import LARGEST_FIGURE
 from ce_gym.model.checks.robot import MOST_BODIES
 from ce_gym.model.errors import RobotError, bad, printable
 from ce_gym.model.formats.mjcf.limits import check_file
+from ce_gym.model.formats.mjcf.scenes import scene_hint
 from ce_gym.model.formats.placement import exact_right_angles, vec3
 from ce_gym.model.formats.text_file import one_line
 from ce_gym.model.frames import Placement, rotation_matrix
@@ -108,7 +109,8 @@ def read_mjcf(path: Path) -> MjcfSource:
             model = mujoco.MjModel.from_xml_path(str(path))
             source = MjcfSource(str(path), mujoco, model, mujoco.MjData(model))
     except Exception as error:  # MuJoCo raises ValueError, FatalError, MemoryError and others
-        raise RobotError(f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})") from None
+        told = f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})"
+        raise RobotError(told + scene_hint(path)) from None
     _check_figures(str(path), model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, source.data, 0)
