@@ -11,9 +11,9 @@ import pytest
 from mjcf_files import ANKLE, CHAIN, GEOMS, RODS, ROUGH, mjcf
 
 from ce_gym.dynamics import Model
-from ce_gym.model import LossyImportWarning, load_robot
+from ce_gym.model import LossyImportWarning, RobotError, load_robot
 
-pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco")
 
 
 def test_contacts_actuators_pose_and_looks(write):
@@ -74,8 +74,6 @@ def footed(floor="", foot="", hull="", world="", contact="", override="disable")
 
 def mujocos_friction(text: str) -> float:
     """Return the largest sliding friction of MuJoCo's own contacts of the foot, 0 if they are frictionless."""
-    import mujoco
-
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -207,9 +205,96 @@ def test_physics_that_the_file_switches_off(write):
     assert robot.contacts == ()
 
 
+@pytest.mark.filterwarnings("error::ce_gym.LossyImportWarning")
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<motor joint="hip" ctrlrange="-3 3" gear="2"/>',
+        '<position joint="hip" kp="9" ctrlrange="-1 2" forcerange="-5 5"/>',
+        '<position joint="hip" kp="9" inheritrange="1"/>',
+        '<position joint="hip" kp="9" gear="2" ctrlrange="-2 4"/>',
+    ],
+)
+def test_what_is_represented_is_not_said(write, actuator):
+    load_robot(write(hopper(actuator)))
+
+
+@pytest.mark.parametrize("flag", ["frictionloss", "limit", "spring", "damper", "constraint"])
+def test_figures_that_a_flag_switches_off_are_zero(write, flag):
+    world = CHAIN.replace('name="a"', 'name="a" frictionloss="1" range="-1 1" stiffness="2" damping="3"')
+    fields = ("friction", "position", "stiffness", "damping")
+    off = {"frictionloss": {0}, "limit": {1}, "spring": {2}, "damper": {3}, "constraint": {0, 1}}[flag]
+    try:
+        robot = load_robot(write(mjcf(world, extra=f'<option><flag {flag}="disable"/></option>')))
+    except RobotError:
+        pytest.skip("this MuJoCo has no such flag")
+    joint = robot.body("arm").joint
+    values = [(1.0, 0.0), ((-1.0, 1.0), (-np.inf, np.inf)), (2.0, 0.0), (3.0, 0.0)]
+    assert [getattr(joint, field) for field in fields] == [pair[i in off] for i, pair in enumerate(values)]
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_an_equality_that_a_flag_switches_off_is_none(write):
+    equality = '<joint joint1="f" joint2="a" polycoef="0 1 0 0 0"/>'
+    off = '<option><flag equality="disable"/></option>'
+    assert len(load_robot(write(mjcf(CHAIN, equality))).independent) == 4
+    robot = load_robot(write(mjcf(CHAIN, equality, extra=off)))
+    assert (len(robot.independent), robot.constraints) == (5, ())
+
+
+HIP = 'name="hip" axis="0 1 0" range="-1 2"'
+LATER = '<?xml version="1.0"?>'  # marks what only later versions of MuJoCo have
+
+
+def hopper(actuator="", option="", **changes) -> str:
+    """The hopper with more attributes of its joints and geoms."""
+    text = GEOMS.replace("<freejoint/>", f'<joint name="base" type="free" {changes.get("base", "")}/>')
+    text = text.replace(HIP, f"{HIP} {changes.get('hip', '')}").replace(
+        'name="shin"', f'name="shin" {changes.get("shin", "")}'
+    )
+    start = f'<compiler angle="radian"/>{option}'
+    return f"<mujoco>{start}{text}<actuator>{actuator}</actuator>{changes.get('rest', '')}</mujoco>"
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [
+        (hopper(base='damping="1"'), "damping of the free joint base"),
+        (hopper(hip='margin="0.1"'), "margin of the limit of joint hip"),
+        (hopper(hip='solreflimit="0.01 1"'), "compliance (solreflimit, solimplimit) of the limit of joint hip"),
+        (
+            hopper(hip='frictionloss="1" solreffriction=".01 1"'),
+            "compliance (solreffriction, solimpfriction) of the dry",
+        ),
+        (LATER + hopper(hip='stiffness="1" springyield="0.2"'), "yielding (springyield) of the spring of joint hip"),
+        (hopper(hip='actuatorfrcrange="-3 2"'), "the nearer one of the two limits actuatorfrcrange of joint hip"),
+        (LATER + hopper(shin='adhesion="1"'), "adhesion of geom shin"),
+        (LATER + hopper(shin='surfacevel="1 0 0"'), "moving surface (surfacevel) of geom shin"),
+        (
+            hopper('<motor name="m" joint="hip" forcerange="-3 2"/>'),
+            "the nearer one of the two limits forcerange of actuator m",
+        ),
+        (
+            hopper('<motor name="m" joint="hip" ctrlrange="0 2"/>'),
+            "the nearer one of the two limits ctrlrange of actuator m",
+        ),
+        (hopper('<position name="m" joint="hip" kp="9" ctrlrange="0 2"/>'), "ctrlrange of actuator m, narrower"),
+        (
+            hopper('<position name="m" joint="hip" kp="9" gear="2" ctrlrange="-1 2"/>'),
+            "ctrlrange of actuator m, narrower",
+        ),
+        (LATER + hopper('<motor name="m" joint="hip" delay=".01" nsample="5"/>'), "delay of actuator m"),
+        (
+            hopper('<general name="m" joint="hip" biastype="affine" biasprm="1 -2 0" gainprm="2"/>'),
+            "constant force (first",
+        ),
+        (
+            hopper('<motor name="m" joint="hip"/>', '<option actuatorgroupdisable="0"/>'),
+            "actuatorgroupdisable of actuator m",
+        ),
+        (hopper('<motor joint="hip"/>', '<option><flag actuation="disable"/></option>'), '<flag actuation="disable"/>'),
+        (hopper(rest='<keyframe><key qvel="1 0 0 0 0 0 0"/></keyframe>'), "the velocity (qvel) of the reference pose"),
+        (hopper(option='<option viscosity="1"/>'), "viscosity of the medium"),
         (mjcf(CHAIN.replace('name="a"', 'name="a" stiffness="3 1"')), "nonlinear part of the spring of joint a"),
         (
             f"<mujoco>{GEOMS}</mujoco>".replace("<freejoint/>", '<joint name="f" type="free" frictionloss="3"/>'),
@@ -257,6 +342,11 @@ def test_physics_that_the_file_switches_off(write):
     ids=lambda value: value[:40] if not value.startswith("<") else "",
 )
 def test_what_cannot_be_represented_is_said_once(write, text, what):
+    try:
+        mujoco.MjModel.from_xml_string(text)
+    except ValueError:
+        assert text.startswith(LATER)
+        pytest.skip("this MuJoCo has no such attribute")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         robot = load_robot(write(text))

@@ -81,7 +81,12 @@ def read_bodies(
     tree.bodies.sort(key=lambda body: body.joint.type != "free")
     free = [body.name for body in tree.bodies if body.joint.type == "free"]
     if len(free) > 1:
-        raise bad(source.file, "bodies that move freely", tuple(free), "one robot, so at most one free joint")
+        raise bad(
+            source.file,
+            "bodies that move freely",
+            tuple(free),
+            "one robot, so at most one free joint; take the others out",
+        )
     return tree
 
 

@@ -164,7 +164,7 @@ def _report_between(source: MjcfSource, tree: MjcfTree, geoms: list[int]) -> Non
     for i, a in enumerate(geoms):
         for b in geoms[:i]:
             first, second = str(_carrier(source, tree, a)), str(_carrier(source, tree, b))
-            apart = first != second and first != parents[second] and second != parents[first]
-            if apart and can_touch(source, a, b):
+            jointed = source.enabled("FILTERPARENT") and (first == parents[second] or second == parents[first])
+            if first != second and not jointed and can_touch(source, a, b):
                 source.leave_out("contact between bodies of the robot")
                 return

@@ -33,6 +33,7 @@ from ce_gym.model.formats.mjcf.contacts import read_contacts
 from ce_gym.model.formats.mjcf.equalities import choose_independent, locked_joints, read_constraints
 from ce_gym.model.formats.mjcf.rotors import add_rotors
 from ce_gym.model.formats.mjcf.source import MjcfSource, quaternion, read_mjcf, rotation, summary
+from ce_gym.model.formats.mjcf.unmodelled import report_unmodelled
 from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink
@@ -96,13 +97,13 @@ def read_robot(
     tree.bodies[:] = with_rotors(tree.bodies, constraints, [b for b in tree.moved_by.values() if b not in links])
     ties = add_rotors(source, tree, _ratios(gears, tree, driven), driven)
     pose, assembly = _pose(source, tree, independent, lowest)
-    _report_world(source)
+    report_unmodelled(source)
     robot = Robot(
         name=_name(source, path),
         bodies=tuple(tree.bodies),
         constraints=(*constraints, *ties),
         independent=independent,
-        contacts=contacts if source.enabled("CONTACT") else (),
+        contacts=contacts if source.enabled("CONTACT") and source.enabled("CONSTRAINT") else (),
         material=material,
         pose=pose,
         assembly=assembly,
@@ -177,18 +178,3 @@ def _pose(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...], lowe
             angles[body] = allowed
     dependent = tuple((body, angle) for body, angle in angles.items() if body not in independent)
     return Pose(height, tuple((body, angles.get(body, 0.0)) for body in independent), tuple(balls)), dependent
-
-
-def _report_world(source: MjcfSource) -> None:
-    """Note what acts on the whole robot."""
-    model = source.model
-    for what, value in (("wind", model.opt.wind), ("density", model.opt.density), ("viscosity", model.opt.viscosity)):
-        if np.any(value):
-            source.leave_out("{} of the medium", what)
-    for count, what in ((model.nflex, "deformable bodies"), (model.nplugin, "plugins")):
-        if count:
-            source.leave_out(what)
-    for t in range(model.ntendon):
-        acts = [getattr(model, f"tendon_{key}")[t] for key in ("stiffness", "damping", "frictionloss", "limited")]
-        if any(map(np.any, acts)):
-            source.leave_out("spring, damper, friction or limit of tendon {}", source.name("tendon", t))

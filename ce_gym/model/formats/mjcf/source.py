@@ -107,6 +107,7 @@ def read_mjcf(path: Path) -> MjcfSource:
     try:
         with _without_log(mujoco):
             model = mujoco.MjModel.from_xml_path(str(path))
+            _switch_off(mujoco, model)
             source = MjcfSource(str(path), mujoco, model, mujoco.MjData(model))
     except Exception as error:  # MuJoCo raises ValueError, FatalError, MemoryError and others
         told = f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})"
@@ -118,6 +119,21 @@ def read_mjcf(path: Path) -> MjcfSource:
         _move_within_limits(source)
     source.forward()
     return source
+
+
+def _switch_off(mujoco: Any, model: Any) -> None:
+    """Set to zero what the <flag> of a file disables; gravity, contacts and actuators apart, see `enabled`."""
+    for features, figures in (
+        (("CONSTRAINT", "FRICTIONLOSS"), ("dof_frictionloss", "tendon_frictionloss")),
+        (("CONSTRAINT", "LIMIT"), ("jnt_limited", "tendon_limited")),
+        (("CONSTRAINT", "EQUALITY"), ("eq_active0",)),
+        (("PASSIVE", "SPRING"), ("jnt_stiffness", "tendon_stiffness")),  # PASSIVE: before MuJoCo 3.4
+        (("PASSIVE", "DAMPER"), ("dof_damping", "tendon_damping")),
+    ):
+        bits = [int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{feature}", 0)) for feature in features]
+        if any(model.opt.disableflags & bit for bit in bits):
+            for figure in figures:
+                getattr(model, figure)[:] = 0
 
 
 def _move_within_limits(source: MjcfSource) -> None:

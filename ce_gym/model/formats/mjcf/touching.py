@@ -81,13 +81,13 @@ def touch_of(source: MjcfSource, a: int, b: int | None) -> Touch:
         dimension = max([DEFAULT_DIMENSION] * (b is None) + [int(model.geom_condim[g]) for g in deciding])
         friction = [max(float(model.geom_friction[g][0]) for g in deciding)] * 2
         solvers = [(*model.geom_solref[g], *model.geom_solimp[g]) for g in deciding]
-        solver = next((one for one in solvers if not _is_default(one)), _DEFAULT_SOLVER)
+        solver = next((one for one in solvers if not is_default_solver(one)), _DEFAULT_SOLVER)
         margins = [float(x) for g in both for x in (model.geom_margin[g], model.geom_gap[g])]
     if model.opt.enableflags & int(source.mujoco.mjtEnableBit.mjENBL_OVERRIDE):
         friction = [float(x) for x in model.opt.o_friction]
         solver, margins = (*model.opt.o_solref, *model.opt.o_solimp), [float(model.opt.o_margin)]
     other = ["torsional and rolling friction"] if dimension > 3 else []
-    if not _is_default(solver) or any(slip_solver):
+    if not is_default_solver(solver) or any(slip_solver):
         other.append("the compliance of contacts (solref, solimp)")
     if any(margins):
         other.append("margin and gap of contacts")
@@ -97,7 +97,8 @@ def touch_of(source: MjcfSource, a: int, b: int | None) -> Touch:
     return Touch(sliding, tuple(other))
 
 
-def _is_default(solver: tuple[float, ...]) -> bool:
+def is_default_solver(solver: tuple[float, ...]) -> bool:
+    """Whether solref and solimp, one after the other, are MuJoCo's default."""
     return np.allclose(solver, _DEFAULT_SOLVER)
 
 
