@@ -38,17 +38,18 @@ def test_a_scene_that_attaches_its_robot_is_the_robot(tmp_path):
 
 
 @pytest.mark.parametrize("scene", ["scene.xml", "flat scene.xml"])
-@pytest.mark.parametrize("text", [NEEDY, "<mujocoinclude><body/></mujocoinclude>"])
+@pytest.mark.parametrize("text", [NEEDY, f"<mujocoinclude><worldbody>{TRUNK}</worldbody></mujocoinclude>"])
 def test_a_robot_that_needs_its_scene_says_which(tmp_path, scene, text):
     (tmp_path / "robot.xml").write_text(text)
     (tmp_path / "other.xml").write_text("<mujoco/>")
     (tmp_path / scene).write_text(SCENE.format(""))
-    with pytest.raises(RobotError, match=rf"MuJoCo refuses .*; {re.escape(scene)} includes it: read that file"):
+    with pytest.raises(RobotError, match=rf"MuJoCo refuses .*; it is a part of {re.escape(scene)}: read that$"):
         load_robot(tmp_path / "robot.xml")
 
 
 def test_a_robot_that_cannot_be_read_for_other_reasons_has_no_hint(tmp_path):
-    (tmp_path / "robot.xml").write_text(NEEDY)
+    (tmp_path / "robot.xml").write_text(NEEDY.replace("shin", "missing", 1))
+    (tmp_path / "scene.xml").write_text(SCENE.format(""))
     with pytest.raises(RobotError, match=r"refuses the file: expected valid MJCF \([^)]*\)$"):
         load_robot(tmp_path / "robot.xml")
 
@@ -58,7 +59,7 @@ def test_a_scene_without_its_robot_says_where_it_may_be(tmp_path):
     (tmp_path / "scene.xml").write_text(f"<mujoco><worldbody>{FLOOR}</worldbody></mujoco>")
     with pytest.raises(RobotError, match=r"bodies that move is \(\): .* a scene for the robot in robot.xml"):
         load_robot(tmp_path / "scene.xml")
-    (tmp_path / "robot.xml").unlink()
+    (tmp_path / "robot.xml").write_text("<mujoco><default><joint/></default></mujoco>")
     with pytest.raises(RobotError, match=r"has a body with a joint$"):
         load_robot(tmp_path / "scene.xml")
 

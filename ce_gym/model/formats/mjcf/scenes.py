@@ -3,31 +3,44 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ce_gym.model.errors import RobotError
 from ce_gym.model.formats.text_file import read_text
 
-MOST_SEARCHED = 50
-"""How many files beside one are searched for what it lacks."""
+MOST_SEARCHED, MOST_NAMED = 50, 3
+"""How many files beside one are searched for what it lacks, and how many of them a message names."""
 
 
-def scene_hint(path: Path) -> str:
-    """Return which files beside an MJCF file include it, as the end of a message that it cannot stand alone."""
-    named = rf"<(?:include|model)\b[^>]*\bfile\s*=\s*[\"'](?:[^\"']*/)?{re.escape(path.name)}[\"']"
-    names = [other.name for other, text in _beside(path) if re.search(named, text)]
-    return f"; {_listed(names)} includes it: read that file" if names else ""
+def scene_hint(path: Path, is_readable: Callable[[Path], bool]) -> str:
+    """Return which files beside an MJCF file include it, as the end of a message that it cannot stand alone.
+
+    Args:
+        path: The file.
+        is_readable: Whether MuJoCo reads a file.
+    """
+    scenes = [other for other, text in _beside(path) if _includes(text, path)]
+    names = [other.name for other in scenes[:MOST_NAMED] if is_readable(other)]
+    return f"; it is a part of {', '.join(names)}: read that" if names else ""
 
 
 def robot_hint(path: Path) -> str:
     """Return which files beside a scene have robots, as the end of a message that the scene has none."""
-    names = [other.name for other, text in _beside(path) if re.search(r"<(freejoint|joint)\b", text)]
-    return f"; this may be a scene for the robot in {_listed(names)}: read that, or <include> it here" if names else ""
+    own = read_text(path, "an MJCF file")
+    names = [
+        other.name
+        for other, text in _beside(path)
+        if re.search(r"<(freejoint|joint)\b", text.partition("<worldbody")[2]) and not _includes(own, other)
+    ]
+    listed = ", ".join(names[:MOST_NAMED])
+    return f"; this may be a scene for the robot in {listed}: read that, or <include> it here" if names else ""
 
 
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:3])
+def _includes(text: str, part: Path) -> bool:
+    """Whether a text of MJCF includes or attaches a file of some name."""
+    name = rf"[\"'](?:[^\"']*/)?{re.escape(part.name)}[\"']"
+    return re.search(rf"<(?:include|model)\b[^>]*\bfile\s*=\s*{name}", text) is not None
 
 
 def _beside(path: Path) -> Iterator[tuple[Path, str]]:

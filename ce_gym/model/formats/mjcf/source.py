@@ -105,13 +105,11 @@ def read_mjcf(path: Path) -> MjcfSource:
     except ImportError:
         raise RobotError(f"{path}: MJCF is read by MuJoCo: expected the package; pip install 'ce_gym[mjcf]'") from None
     try:
-        with _without_log(mujoco):
-            model = mujoco.MjModel.from_xml_path(str(path))
-            _switch_off(mujoco, model)
-            source = MjcfSource(str(path), mujoco, model, mujoco.MjData(model))
+        model = _compiled(mujoco, path)
+        source = MjcfSource(str(path), mujoco, model, mujoco.MjData(model))
     except Exception as error:  # MuJoCo raises ValueError, FatalError, MemoryError and others
         told = f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})"
-        raise RobotError(told + scene_hint(path)) from None
+        raise RobotError(told + scene_hint(path, lambda other: _is_readable(mujoco, other))) from None
     _check_figures(str(path), model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, source.data, 0)
@@ -119,6 +117,22 @@ def read_mjcf(path: Path) -> MjcfSource:
         _move_within_limits(source)
     source.forward()
     return source
+
+
+def _compiled(mujoco: Any, path: Path) -> Any:
+    with _without_log(mujoco):
+        model = mujoco.MjModel.from_xml_path(str(path))
+    _switch_off(mujoco, model)
+    return model
+
+
+def _is_readable(mujoco: Any, path: Path) -> bool:
+    try:
+        check_file(path)
+        _compiled(mujoco, path)
+    except Exception:  # as above
+        return False
+    return True
 
 
 def _switch_off(mujoco: Any, model: Any) -> None:
