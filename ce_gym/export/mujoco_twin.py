@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.dynamics.model import Model
+from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mujoco_batch import Batch
-from ce_gym.export.mujoco_coordinates import Coordinates
+from ce_gym.export.mujoco_coordinates import Coordinates, rotor_scale
 from ce_gym.export.mujoco_model import STIFF, Settings, compiled
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Robot
 from ce_gym.model.frames import rotation_matrix
+from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
 
@@ -64,11 +66,14 @@ class MujocoTwin:
         lay_ground(self.model, robot)
         self._coordinates = None if loops else Coordinates.of(self.model, robot)
         self._tree = Model(robot, level) if loops else None
+        ties = joint_ties(build_mechanism(robot)) if loops else {}
+        scales = {name: rotor_scale(self.model, robot, name, tie) for name, tie in ties.items()}
         self._batch = Batch(self.model, num_envs)
         first = {self.model.joint(i).name: i for i in range(self.model.njnt)}
         addresses = {name: (int(self.model.jnt_qposadr[i]), int(self.model.jnt_dofadr[i])) for name, i in first.items()}
         rows = robot.spanning_rows  # rotors that are armature here have rows, and no joint
-        self._joints = [(addresses[name], rows[name]) for name in robot.joints if name in addresses]
+        known = [name for name in robot.joints if name in addresses]
+        self._joints = [(addresses[name], rows[name], scales.get(name, 1.0)) for name in known]
         names = [*robot.balls, *robot.independent]
         at = [addresses[name] for name in names]
         sizes = [(len(rows), len(speeds)) for rows, speeds in (robot.rows[name] for name in names)]
@@ -99,9 +104,9 @@ class MujocoTwin:
         qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
         qpos[:7], qvel[:3], qvel[3:6] = q[:7], rotation_matrix(q[3:7]) @ v[3:6], v[:3]
         span = self._tree.spanning(q, v)
-        for (position, speed), (rows, speeds) in self._joints:
-            qpos[position : position + len(rows)] = span[0][rows]
-            qvel[speed : speed + len(speeds)] = span[1][speeds]
+        for (position, speed), (rows, speeds), scale in self._joints:
+            qpos[position : position + len(rows)] = span[0][rows] / scale
+            qvel[speed : speed + len(speeds)] = span[1][speeds] / scale
         return qpos, qvel
 
     def step(self, target: Array, duration: float) -> None:

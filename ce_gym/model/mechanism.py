@@ -159,7 +159,7 @@ def build_mechanism(
     inertias = {name: spatial_inertia(robot.body(name)) for name in kept}
     for rotor in merged.values():
         if rotor.parent is not None and (locked_rotors or exact):
-            inertias[rotor.parent] = inertias[rotor.parent] + _seen_from_parent(rotor)
+            inertias[rotor.parent] = inertias[rotor.parent] + seen_from_parent(rotor)
     bodies = {b.name: _moving_body(b, inertias[b.name]) for b in robot.bodies if b.name in kept}
     spins = tuple(
         tuple(_spin(robot.body(name), merged[name]) for name in cluster.bodies if name in merged)
@@ -244,8 +244,8 @@ def snapped(x: Array) -> Array:
     return np.where(np.abs(x - nearest) < 1e-12, nearest, x)
 
 
-def _seen_from_parent(body: Body) -> Array:
-    """Spatial inertia of a body at joint coordinate zero, about its parent's origin, in its parent's axes."""
+def seen_from_parent(body: Body) -> Array:
+    """Return the spatial inertia of a body at joint coordinate zero about its parent's origin, in the parent's axes."""
     rotation, position = np.array(body.placement.rotation), np.array(body.placement.position)
     to_body = np.block([[rotation.T, np.zeros((3, 3))], [-rotation.T @ skew(position), rotation.T]])
     inertia = to_body.T @ spatial_inertia(body) @ to_body
