@@ -64,9 +64,9 @@ def test_inverse_dynamics_undoes_forward_dynamics(model: Model):
     assert np.linalg.eigvalsh(M).min() > 0
 
 
-@pytest.mark.parametrize("level", [level for level in LEVELS if level != "armature"])
+@pytest.mark.parametrize("level", LEVELS)
 def test_power_balance(model: Model, level: str):
-    """The rate of change of energy is the power of the forces. (A diagonal that varies with the pose breaks this.)"""
+    """The rate of change of energy is the power of the forces."""
     model = Model(model.robot, level)
     q, v = (x[0] for x in states(model, 1))
     tau = np.random.default_rng(8).normal(0, 5, model.nv)
