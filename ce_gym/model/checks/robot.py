@@ -110,8 +110,8 @@ def _check_tree(robot: Robot, file: str) -> None:
             raise bad(file, "body name", body.name, "a name that no other body has")
         if body.parent is not None and body.parent not in seen:
             raise unknown(file, f"{body.kind} {body.name!r} parent", body.parent, seen, "a body listed before it")
-        if body.joint.type == "ball" and body.kind == "rotor":
-            raise bad(file, f"rotor {body.name!r} joint type", "ball", "a joint about one axis")
+        if body.joint.type in ("ball", "prismatic") and body.kind == "rotor":
+            raise bad(file, f"rotor {body.name!r} joint type", body.joint.type, "revolute, because rotors spin")
         if body.joint.type == "free" and (seen or body.parent is not None):
             raise bad(
                 file, f"{body.kind} {body.name!r} joint type", "free", "free only for the first body, on the world"
