@@ -31,6 +31,7 @@ class Model(Evaluator):
     positions]`, `v = [base angular (3) [rad/s], base linear (3) [m/s], angular velocity of each ball joint (3) [rad/s],
     joint velocities]`, both base velocities in the base frame, those of ball joints against the parent in the axes of
     the body that turns; a fixed base has only the joints. `vdot` is the time derivative of `v`, component by component.
+    Quaternions whose norm is within 1e-3 of 1 are scaled to unit length; others are refused with a ValueError.
 
     Args:
         robot: A description, the name of a robot that ships with the package, or a path to a robot file.
@@ -170,7 +171,7 @@ class Model(Evaluator):
         q_span, v_span = np.asarray(q_span, dtype=float), np.asarray(v_span, dtype=float)
         span = self.robot.spanning_rows
         q = q_span[..., [row for name in self.robot.rows for row in span[name][0]]]
-        v = v_span[..., [row for name in self.robot.rows for row in span[name][1]]]
+        q, v = self.unit(q), v_span[..., [row for name in self.robot.rows for row in span[name][1]]]
         expected, angles = self.spanning(q, v), [rows[0] for rows, _ in span.values() if len(rows) == 1]
         turned = np.exp(1j * (expected[0] - q_span)[..., angles]) - 1  # whole turns do not matter
         for name, error in (("q_span", turned), ("v_span", expected[1] - v_span)):

@@ -15,8 +15,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
 from ce_gym.model.constraints import Constraint, LinearConstraint
-from ce_gym.model.coordinates import Layout, placed, sizes
+from ce_gym.model.coordinates import Layout, placed, sizes, unit_quaternions
 from ce_gym.model.drives import Battery, Elasticity, Motor
 from ce_gym.model.errors import listed_names
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
@@ -206,7 +208,7 @@ class Pose:
     Attributes:
         height: Height of the base origin above flat ground [m]; ignored by a fixed base.
         joints: Pairs (body, angle) for independent joints; those not named are zero [rad or m].
-        balls: Pairs (body, unit quaternion wxyz) for ball joints; those not named are not turned.
+        balls: Pairs (body, quaternion wxyz of norm 1 within 1e-3) for ball joints; those not named are not turned.
     """
 
     height: float = 0.0
@@ -344,9 +346,16 @@ class Robot:
     def standing_q(self) -> tuple[float, ...]:
         """Positions of the standing pose, upright at the origin, shape (nq,)."""
         base = [0.0, 0.0, self.pose.height, 1.0, 0.0, 0.0, 0.0] if self.floating else []
-        turned, angles = dict(self.pose.balls), dict(self.pose.joints)
-        balls = [x for name in self.balls for x in turned.get(name, (1.0, 0.0, 0.0, 0.0))]
+        angles = dict(self.pose.joints)
+        balls = [x for quaternion in self.standing_balls.values() for x in quaternion]
         return (*base, *balls, *(angles.get(name, 0.0) for name in self.independent))
+
+    @property
+    def standing_balls(self) -> dict[str, tuple[float, ...]]:
+        """Unit quaternions (w, x, y, z) of the ball joints in the standing pose, by name of the body."""
+        turned = dict(self.pose.balls)
+        rows = {name: np.array(turned.get(name, (1.0, 0.0, 0.0, 0.0)), float) for name in self.balls}
+        return {name: tuple(unit_quaternions(row, (0,), f"pose.balls.{name}").tolist()) for name, row in rows.items()}
 
     @property
     def joints(self) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from ce_gym.model.checks.constraint import check_constraint
 from ce_gym.model.checks.supply import check_supply
 from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.coordinates import UNIT_TOLERANCE
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import DriveFriction
 from ce_gym.model.errors import InertiaWarning, bad, listed_names, unknown
@@ -275,8 +276,9 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
     for name, quaternion in robot.pose.balls:
         if name not in robot.balls:
             raise unknown(file, "pose.balls", name, robot.balls, "the name of a body on a ball joint")
-        if not math.isclose(math.hypot(*quaternion), 1.0, rel_tol=RELATIVE_TOLERANCE):
-            raise bad(file, f"pose.balls.{name}", quaternion, "a quaternion (w, x, y, z) of length 1")
+        if len(quaternion) != 4 or not abs(math.hypot(*quaternion) - 1.0) <= UNIT_TOLERANCE:
+            expected = f"a quaternion (w, x, y, z) of norm 1 within {UNIT_TOLERANCE:g}: divide it by its norm"
+            raise bad(file, f"pose.balls.{name}", quaternion, expected)
     _check_within_limits(robot, file)
     _check_assembly(robot, file)
     for key, pairs in (("gains.kp", robot.gains.kp), ("gains.kd", robot.gains.kd)):
