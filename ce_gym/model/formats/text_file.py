@@ -23,13 +23,29 @@ def read_text(path: Path, kind: str, largest: int = LARGEST_FILE) -> str:
     Raises:
         RobotError: It is missing, not a regular file (a folder, a device, a pipe), too large, or not UTF-8.
     """
+    data = read_bytes(path, kind, largest)
     try:
-        data = _read(path, kind, largest)
         return data.decode("utf-8").replace("\r\n", "\n")
+    except ValueError as error:
+        raise _unreadable(path, kind, error) from None
+
+
+def read_bytes(path: Path, kind: str, largest: int = LARGEST_FILE) -> bytes:
+    """Return the content of a file; see `read_text`.
+
+    Raises:
+        RobotError: It is missing, not a regular file, or too large.
+    """
+    try:
+        return _read(path, kind, largest)
     except RobotError:
         raise
     except (OSError, ValueError) as error:
-        raise RobotError(f"{path}: cannot be read: expected {kind} ({one_line(error)})") from None
+        raise _unreadable(path, kind, error) from None
+
+
+def _unreadable(path: Path, kind: str, error: Exception) -> RobotError:
+    return RobotError(f"{path}: cannot be read: expected {kind} ({one_line(error)})")
 
 
 def _read(path: Path, kind: str, largest: int) -> bytes:

@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from ce_gym.model.description import Inertial, Joint, Shape
 from ce_gym.model.errors import bad
-from ce_gym.model.formats.placement import rotation_from_rpy, symmetric, transform_inertial, vec3
-from ce_gym.model.frames import Placement, Vec3
+from ce_gym.model.formats.placement import exact_right_angles, rotation_from_rpy, symmetric, transform_inertial, vec3
+from ce_gym.model.frames import Placement, Vec3, rotation_matrix
 
 Color = tuple[float, float, float, float]
 
@@ -67,7 +69,11 @@ def name_of(file: str, element: Element, attribute: str = "name", where: str = "
 
 def placement(file: str, where: str, parent: Element) -> Placement:
     """Return the pose in the <origin> of `parent`; the identity if there is none."""
-    origin = parent.find("origin")
+    return pose_of(file, where, parent.find("origin"))
+
+
+def pose_of(file: str, where: str, origin: Element | None) -> Placement:
+    """Return the pose that the attributes `xyz` and `rpy` of an element say; the identity without one."""
     if origin is None:
         return Placement()
     xyz = numbers(file, where, origin, "xyz", 3) if origin.get("xyz") else (0.0, 0.0, 0.0)
@@ -105,6 +111,7 @@ def joint(file: str, where: str, element: Element, joint_type: str) -> Joint:
         velocity=number(file, where, limit, "velocity", _NO_LIMIT),
         damping=number(file, where, dynamics, "damping", 0.0),
         friction=number(file, where, dynamics, "friction", 0.0),
+        stiffness=number(file, where, dynamics, "stiffness", 0.0),  # RaiSim's word for a spring at 0
     )
 
 
@@ -122,6 +129,17 @@ def axis(file: str, where: str, parent: Element) -> Vec3:
     if element is None:
         return (1.0, 0.0, 0.0)  # the format's default
     return unit_axis(file, f"{where} <axis xyz>", numbers(file, where, element, "xyz", 3))
+
+
+def moved(file: str, where: str, element: Element, coordinate: float) -> Placement:
+    """Return the pose of a joint's child in the joint's frame, at a coordinate [rad or m]."""
+    if coordinate == 0.0:
+        return Placement()
+    along = np.array(axis(file, where, element))
+    if element.get("type") == "prismatic":
+        return Placement(vec3(coordinate * along))
+    half = 0.5 * coordinate
+    return Placement(rotation=exact_right_angles(rotation_matrix(np.array([np.cos(half), *np.sin(half) * along]))))
 
 
 def shape(file: str, where: str, visual: Element, colors: dict[str, Color]) -> Shape | None:

@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from ce_gym.model.errors import RobotError, bad, unknown
-from ce_gym.model.formats.text_file import one_line, read_text
+from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.urdf import elements as read
+from ce_gym.model.formats.urdf.document import parse_urdf
 
 MOST_LINKS = 1000
 """Most links of a file, those included that fixed joints weld to others."""
+MIMIC_DEFAULTS = (("multiplier", 1.0), ("offset", 0.0))
 MOVING = ("revolute", "continuous", "prismatic", "floating")
 
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A <joint>: what it is called and what it joins."""
+    """A <joint>.
+
+    Attributes:
+        name: Its name.
+        type: "revolute", "continuous", "prismatic", "floating" or "fixed".
+        parent, child: The links that it joins.
+        element: Its element.
+        offset: Coordinate at which it is fixed [rad or m], because it mimics a joint that does not move.
+    """
 
     name: str
     type: str
     parent: str
     child: str
     element: Element
+    offset: float = 0.0
 
     @property
     def where(self) -> str:
@@ -43,20 +52,22 @@ class UrdfGraph:
         joints: The joint that moves a link, by the name of that link.
         order: Names of the links, parents before children, otherwise in the order of the file.
         root: The only link that is no joint's child.
+        notes: What reading the joints left out.
     """
 
     def __init__(self, path: Path):
         self.file = str(path)
-        self.robot = _parse(path)
+        self.robot = parse_urdf(path)
         self.links = self._links()
-        self.joints = {joint.child: joint for joint in self._joints()}
+        self.notes: list[str] = []
+        self.joints = {joint.child: joint for joint in self._without_idle_mimics(self._joints())}
         self.order = self._parents_first()
         self.root = self.order[0]
 
     @property
     def is_plus(self) -> bool:
-        """Whether the file uses what URDF+ adds: <loop>, <coupling>, or `independent` on a joint."""
-        added = [self.robot.find(tag) for tag in ("loop", "coupling")]
+        """Whether the file uses what URDF+ adds: <loop>, <coupling>, or `independent` on a joint; or a <loop_joint>."""
+        added = [self.robot.find(tag) for tag in ("loop", "coupling", "loop_joint")]
         return any(element is not None for element in added) or any(
             joint.element.get("independent") is not None for joint in self.joints.values()
         )
@@ -99,6 +110,26 @@ class UrdfGraph:
             moved_by[joint.child] = joint.name
         return list(joints.values())
 
+    def _without_idle_mimics(self, joints: list[UrdfJoint]) -> list[UrdfJoint]:
+        """Return the joints; those that mimic a joint that does not move are fixed.
+
+        A <mimic> on a fixed joint means nothing: the joint does not move.
+        """
+        by_name = {joint.name: joint for joint in joints}
+        changed = True
+        while changed:  # a chain of mimics ends in a fixed joint
+            changed = False
+            for name, joint in by_name.items():
+                mimic = joint.element.find("mimic")
+                other = None if mimic is None else by_name.get(mimic.get("joint", ""))
+                if joint.type == "fixed" or mimic is None or other is None or other.type != "fixed":
+                    continue
+                ratio, offset = (read.number(self.file, joint.where, mimic, k, d) for k, d in MIMIC_DEFAULTS)
+                by_name[name] = replace(joint, type="fixed", offset=ratio * other.offset + offset)
+                self.notes.append(f"{joint.where} mimics {other.name!r}, which is fixed: it is fixed, too")
+                changed = True
+        return list(by_name.values())
+
     def _joint(self, element: Element) -> UrdfJoint:
         name = read.name_of(self.file, element)
         where = f"joint {name!r}"
@@ -128,16 +159,3 @@ class UrdfGraph:
                 chain.append(joint.parent)
             order.update(dict.fromkeys(reversed(chain)))
         return list(order)
-
-
-def _parse(path: Path) -> Element:
-    text = read_text(path, "a URDF file")
-    if "<!DOCTYPE" in text:  # it can define entities, which read other files or grow without bound
-        raise RobotError(f"{path}: there is a <!DOCTYPE>: expected a URDF without document type and entities")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise RobotError(f"{path}: malformed XML: expected a URDF file ({one_line(error)})") from None
-    if root.tag != "robot":
-        raise bad(str(path), "root element", root.tag, "<robot>")
-    return root

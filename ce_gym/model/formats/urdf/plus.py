@@ -28,6 +28,7 @@ from ce_gym.model.formats.placement import compose
 from ce_gym.model.formats.rotor_rule import with_rotors
 from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.urdf import elements as read
+from ce_gym.model.formats.urdf.drives import add_rotors
 from ce_gym.model.formats.urdf.graph import UrdfGraph
 from ce_gym.model.formats.urdf.tree import Base, Frame, UrdfTree, read_tree
 
@@ -55,8 +56,11 @@ def robot_from_graph(graph: UrdfGraph, base: Base | None = None) -> Robot:
     independent = tuple(_independent(graph, tree))
     dependent = [body.name for body in tree.bodies if body.name not in independent]
     bodies = with_rotors(tree.bodies, constraints, dependent) if graph.is_plus else tree.bodies
+    notes = list(tree.notes)
+    bodies, gears = add_rotors(bodies, tree.drives, (), notes)
+    constraints = (*constraints, *gears)
     pose = Pose(joints=with_limits((), bodies, independent))
-    robot = Robot(tree.name, bodies, constraints, independent, pose=pose, source=graph.file, notes=tree.notes)
+    robot = Robot(tree.name, bodies, constraints, independent, pose=pose, source=graph.file, notes=tuple(notes))
     check_robot(robot)
     return robot
 
@@ -106,15 +110,13 @@ def _branches(first: str | None, second: str | None, bodies: tuple[Body, ...]) -
 
 
 def _loops(graph: UrdfGraph, tree: UrdfTree) -> Iterator[LoopConstraint]:
-    for i, element in enumerate(graph.robot.findall("loop")):
+    for i, element in enumerate((*graph.robot.findall("loop"), *graph.robot.findall("loop_joint"))):
         name = element.get("name") or f"loop {i + 1}"
-        where = f"loop {name!r}"
+        where = f"{element.tag} {name!r}"
         kind = element.get("type", "")
         if kind not in _LOOP_TYPES:
             raise unknown(graph.file, f"{where} type", element.get("type"), _LOOP_TYPES, "a joint that closes a loop")
-        predecessor, successor = (
-            _end(graph.file, where, element, tag, tree.frames) for tag in ("predecessor", "successor")
-        )
+        predecessor, successor = _ends(graph, where, element, tree.frames)
         if predecessor[0] == successor[0]:
             raise bad(graph.file, where, predecessor[0] or "the world", "two links that can move against each other")
         yield LoopConstraint(
@@ -128,11 +130,35 @@ def _loops(graph: UrdfGraph, tree: UrdfTree) -> Iterator[LoopConstraint]:
         )
 
 
+def _ends(graph: UrdfGraph, where: str, element: Element, frames: dict[str, Frame]) -> tuple[Frame, Frame]:
+    """Return the bodies at both ends of a loop with the poses of the loop's joint in them.
+
+    A <loop_joint> (RigidBodyDynamics.jl, Isaac Sim) has <link1> and <link2>, which carry `xyz` and `rpy` themselves.
+    """
+    file = graph.file
+    if element.tag == "loop":
+        first, second = (_end(file, where, element, tag, frames) for tag in ("predecessor", "successor"))
+        return first, second
+    if all(joint.element.get("independent") is None for joint in graph.joints.values()):
+        expected = 'independent="false" on each joint that the loops determine, or the loop as <connect> in MJCF'
+        raise bad(file, f"<{element.tag}> {where.split(' ', 1)[1]}", "without independent joints", expected)
+    ends = [end for end in element if end.tag in ("link1", "link2")]
+    if len(ends) != 2:
+        raise bad(file, f"{where} ends", len(ends), "a <link1> and a <link2>")
+    first, second = (_frame(file, where, end, end, frames) for end in ends)
+    return first, second
+
+
 def _end(file: str, where: str, element: Element, tag: str, frames: dict[str, Frame]) -> Frame:
     """Return the body at one end of a loop or coupling, and the pose of the end's <origin> in it."""
     end = read.required(file, where, element, tag)
+    return _frame(file, where, end, end.find("origin"), frames)
+
+
+def _frame(file: str, where: str, end: Element, origin: Element | None, frames: dict[str, Frame]) -> Frame:
+    """Return the body that a link belongs to, and a pose given in the link's frame in the body's."""
     link = read.name_of(file, end, "link", where)
     if link not in frames:
-        raise unknown(file, f"{where} <{tag} link>", link, frames, "the name of a link")
+        raise unknown(file, f"{where} <{end.tag} link>", link, frames, "the name of a link")
     body, pose = frames[link]
-    return body, compose(pose, read.placement(file, where, end))
+    return body, compose(pose, read.pose_of(file, where, origin))

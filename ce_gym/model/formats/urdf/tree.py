@@ -13,20 +13,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from ce_gym.model.checks.body import check_body
 from ce_gym.model.constraints import LinearConstraint
-from ce_gym.model.description import Body, Joint, Shape
+from ce_gym.model.description import Body, Inertial, Joint, Shape
 from ce_gym.model.errors import bad, unknown
-from ce_gym.model.formats.placement import compose, merge_inertials, transform_inertial
+from ce_gym.model.formats.placement import compose, mat3, merge_inertials, transform_inertial
 from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.urdf import elements as read
+from ce_gym.model.formats.urdf.drives import Drive, drives_of
 from ce_gym.model.formats.urdf.graph import UrdfGraph, UrdfJoint
-from ce_gym.model.frames import Placement, added
+from ce_gym.model.formats.urdf.vocabulary import unread_words
+from ce_gym.model.frames import ZERO, Placement, added
 
 Base = Literal["floating", "fixed"]
 Frame = tuple[str | None, Placement]  # the body (None: the world) that carries a frame, and the frame's pose in it
 
 WORLD = "world"
+ROUNDING = 1e-12
+"""Of the largest moment of inertia in a file."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,7 @@ class UrdfTree:
         notes: What was left out.
         fixed: Links that were asked for to be kept apart, by name.
         collisions: The <collision> elements of every link that has some, in the link's frame; None for a mesh.
+        drives: Motors that the file describes.
     """
 
     name: str
@@ -50,6 +57,7 @@ class UrdfTree:
     notes: tuple[str, ...]
     fixed: Mapping[str, FixedLink]
     collisions: Mapping[str, tuple[Shape | None, ...]]
+    drives: tuple[Drive, ...]
 
 
 def read_urdf(path: Path, base: Base | None = None, apart: Collection[str] = ()) -> UrdfTree:
@@ -79,17 +87,33 @@ def read_tree(graph: UrdfGraph, base: Base | None = None, apart: Collection[str]
     return _Reader(graph, base, apart).tree()
 
 
+def _without_rounding(inertials: dict[str, Inertial | None]) -> dict[str, Inertial | None]:
+    """Return mass properties in which principal moments that are negative by rounding are zero.
+
+    Rounding is 1e-12 of the largest moment in the file: CAD programs write -5e-20 for the inertia of a small part.
+    """
+    given = {name: part for name, part in inertials.items() if part is not None}
+    largest = max((np.abs(part.inertia).max() for part in given.values()), default=0.0)
+    for name, part in given.items():
+        moments, axes = np.linalg.eigh(np.array(part.inertia))
+        if -ROUNDING * largest <= moments[0] < 0.0:
+            inertials[name] = replace(part, inertia=mat3(axes * np.fmax(moments, 0.0) @ axes.T))
+    return inertials
+
+
 class _Reader:
     """One pass over one file; holds the look-up tables the pass needs."""
 
     def __init__(self, graph: UrdfGraph, base: Base | None, apart: Collection[str]):
         self.graph, self.file, self.joints = graph, graph.file, graph.joints
         self.colors = read.colors_of(self.file, graph.robot)
-        self.inertials = {name: read.inertial(self.file, f"link {name!r}", link) for name, link in graph.links.items()}
+        self.inertials = _without_rounding(
+            {name: read.inertial(self.file, f"link {name!r}", link) for name, link in graph.links.items()}
+        )
         self.root_is_world = self._root_is_world(base)
         self.apart = [link for link in graph.order if link in apart and self._is_fixed(link)]
         self.frames = self._frames()
-        self.notes: list[str] = []
+        self.notes = [*graph.notes, *unread_words(graph.robot)]
 
     def tree(self) -> UrdfTree:
         bodies = tuple(self._body(link) for link in self.graph.order if self._moves(link))
@@ -98,7 +122,8 @@ class _Reader:
         fixed = {link: self._fixed(link) for link in self.apart}
         collisions = {link: tuple(self._shapes_of(link, "collision")) for link in self.graph.order}
         collisions = {link: shapes for link, shapes in collisions.items() if shapes}
-        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes), fixed, collisions)
+        drives = drives_of(self.graph, self.notes)
+        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes), fixed, collisions, drives)
 
     def _root_is_world(self, base: Base | None) -> bool:
         floating = [joint for joint in self.joints.values() if joint.type == "floating"]
@@ -128,7 +153,8 @@ class _Reader:
 
     def _attachment(self, joint: UrdfJoint, frames: dict[str, Frame]) -> Frame:
         carrier, pose = frames[joint.parent]
-        return carrier, compose(pose, read.placement(self.file, joint.where, joint.element))
+        pose = compose(pose, read.placement(self.file, joint.where, joint.element))
+        return carrier, compose(pose, read.moved(self.file, joint.where, joint.element, joint.offset))
 
     def _is_fixed(self, link: str) -> bool:
         return link in self.joints and self.joints[link].type == "fixed"
@@ -147,9 +173,12 @@ class _Reader:
         inertials = [
             transform_inertial(self.frames[part][1], inertial) for part in parts if (inertial := self.inertials[part])
         ]
-        if not inertials:
-            raise bad(self.file, f"link {link!r} <inertial>", None, "mass and inertia, because the link moves")
         joint = self.joints.get(link)
+        if not inertials and (joint is None or joint.type == "floating"):
+            raise bad(self.file, f"link {link!r} <inertial>", None, "mass and inertia, because the link moves")
+        if not inertials:
+            self.notes.append(f"link {link!r} moves and has no <inertial>: its mass is 0")
+            inertials = [Inertial(0.0, ZERO, mat3(np.zeros((3, 3))))]
         parent, pose, motion = None, Placement(), Joint("free")
         if joint is not None and joint.type != "floating":
             parent, pose = self._attachment(joint, self.frames)
@@ -172,7 +201,7 @@ class _Reader:
         by_name = {joint.name: joint for joint in self.joints.values()}
         for joint in self.joints.values():
             mimic = joint.element.find("mimic")
-            if mimic is None:
+            if mimic is None or joint.type == "fixed":
                 continue
             other = by_name.get(mimic.get("joint", ""))
             if other is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from ce_gym.model.errors import bad
 from ce_gym.model.formats.mjcf.robot import read_robot
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink
+from ce_gym.model.formats.urdf.drives import Drive
 from ce_gym.model.formats.urdf.tree import Base, Frame, read_urdf
 
 
@@ -24,12 +25,16 @@ class Links:
         frames: Body and pose of every frame that can be named, links merged into others included.
         fixed: Links that no joint moves but that the YAML file calls rotors, by name; no body has their mass.
         collisions: What a URDF says of how its links touch, in the frame of each; None for a mesh.
+        drives: Motors that a URDF describes.
+        driven: Joints that the YAML file has rotors for.
     """
 
     robot: Robot
     frames: dict[str, Frame]
     fixed: Mapping[str, FixedLink]
     collisions: Mapping[str, tuple[Shape | None, ...]]
+    drives: tuple[Drive, ...] = ()
+    driven: Collection[str] = ()
 
 
 def read_links(path: Path, file: Section) -> Links:
@@ -46,6 +51,7 @@ def read_links(path: Path, file: Section) -> Links:
         value = None if "urdf" not in file else "both"
         raise bad(file.file, "urdf or mjcf", value, "one of them, the file that says what the links are")
     rotors = file.section("rotors")
+    driven = {joint for _, rotor in rotors.sections() for joint in names_in(rotor, "ratios")}
     if "urdf" in file:
         if "gears" in file:
             raise bad(file.file, "gears", "given", "none: a URDF has no armature; give `rotors`")
@@ -53,10 +59,9 @@ def read_links(path: Path, file: Section) -> Links:
         tree = read_urdf(path.parent / file.text("urdf"), base, rotors.data)
         independent = _not_tied(tree.bodies, tree.constraints)
         robot = Robot(tree.name, tree.bodies, tree.constraints, independent, notes=tree.notes)
-        return Links(robot, dict(tree.frames), tree.fixed, tree.collisions)
+        return Links(robot, dict(tree.frames), tree.fixed, tree.collisions, tree.drives, driven)
     if "base" in file:
         raise bad(file.file, "base", file.get("base"), "none, because an MJCF file says itself what its base is")
-    driven = {joint for _, rotor in rotors.sections() for joint in names_in(rotor, "ratios")}
     robot, frames, fixed = read_robot(path.parent / file.text("mjcf"), file.section("gears"), driven, rotors.data)
     return Links(robot, frames, fixed, {})
 

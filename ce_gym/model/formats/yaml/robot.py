@@ -20,6 +20,7 @@ from ce_gym.model.formats.identified import with_identified
 from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
 from ce_gym.model.formats.standing import with_limits
+from ce_gym.model.formats.urdf import drives
 from ce_gym.model.formats.yaml.constraints import read_constraints
 from ce_gym.model.formats.yaml.contacts import read_capsules, read_contacts, read_pairs
 from ce_gym.model.formats.yaml.links import read_links
@@ -46,6 +47,9 @@ def robot_from_yaml(path: Path) -> Robot:
     file.texts("sources")  # for readers of the file; only its form is checked
     library, motors = read_motors(file.section("motors"))
     bodies, gears = add_rotors(file.section("rotors"), links, library)
+    notes = list(below.notes)
+    bodies, urdf_gears = drives.add_rotors(bodies, links.drives, links.driven, notes)
+    gears = (*gears, *urdf_gears)
     bodies = _with_joint_figures(file, bodies)
     ties = (*gears, *read_constraints(file, bodies, links.frames))
     independent = _independent(file, below, ties)
@@ -65,7 +69,7 @@ def robot_from_yaml(path: Path) -> Robot:
         tasks=tuple((name, frozen(task.items())) for name, task in file.section("tasks").sections()),
         kept_inertia=file.texts("kept_inertia"),
         source=str(path),
-        notes=(*below.notes, *file.texts("notes")),
+        notes=(*notes, *file.texts("notes")),
     )
     if "assembly" in file:
         robot = replace(robot, assembly=file.section("assembly").numbers())

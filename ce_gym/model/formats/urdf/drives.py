@@ -1,0 +1,159 @@
+"""Motors that a URDF describes -> rotors behind gears.
+
+- <transmission> of one joint with <mechanicalReduction> and <motorInertia>, in the transmission, its joint or its
+  actuator (ROS control), or with <drake:gear_ratio value> and <drake:rotor_inertia value> (Drake).
+- <dynamics rotor_inertia> (RaiSim): an inertia that is added at the joint, so a rotor whose ratio is not known.
+
+Each becomes a thin disc without mass about the joint's axis, mounted where the joint is; see `rotor_links.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from xml.etree.ElementTree import Element
+
+from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.description import Body, Joint
+from ce_gym.model.errors import bad
+from ce_gym.model.formats.rotor_links import UNKNOWN_RATIO, disc, without_rotors
+from ce_gym.model.formats.urdf import elements as read
+from ce_gym.model.formats.urdf.graph import UrdfGraph
+
+WORDS = {
+    "ratio": ("mechanicalReduction", "drake:gear_ratio", "gear_ratio"),
+    "inertia": ("motorInertia", "drake:rotor_inertia", "rotor_inertia"),
+}
+UNMODELLED = ("type", "joint", "actuator", "hardwareInterface", "role", "offset")
+"""Other elements of a <transmission>, which say nothing of inertia."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A motor at a joint.
+
+    Attributes:
+        where: Its element, for messages.
+        link: The link that its joint moves.
+        inertia: Of its rotor about the axis [kg m^2].
+        ratio: Turns of the rotor for one of the joint.
+    """
+
+    where: str
+    link: str
+    inertia: float
+    ratio: float
+
+
+def drives_of(graph: UrdfGraph, notes: list[str]) -> tuple[Drive, ...]:
+    """Return the motors that a file describes in full, and add a note for each that it does not.
+
+    Raises:
+        RobotError: A number is none, or negative.
+    """
+    return (*_transmissions(graph, notes), *_added_inertias(graph))
+
+
+def add_rotors(
+    bodies: tuple[Body, ...], drives: tuple[Drive, ...], known: Collection[str], notes: list[str]
+) -> tuple[tuple[Body, ...], tuple[LinearConstraint, ...]]:
+    """Return the bodies with a rotor for each drive, and the gears.
+
+    Args:
+        bodies: Links, parents before children.
+        drives: The motors.
+        known: Links whose rotors are described elsewhere, which goes before the URDF.
+        notes: Gains a note for each drive that adds no rotor.
+    """
+    moved, rotors, gears = {body.name: body for body in bodies}, list[Body](), list[LinearConstraint]()
+    for drive in drives:
+        link = moved.get(drive.link)
+        if link is None or link.joint.nv != 1:
+            notes.append(f"left out: {drive.where}: its joint does not move")
+            continue
+        if drive.link in known:
+            notes.append(f"left out: {drive.where}: the YAML file describes the rotor")
+            continue
+        name = f"{drive.link}_rotor"
+        while name in moved or name in {rotor.name for rotor in rotors}:
+            name += "_"
+        axis = link.joint.axis
+        inertia = disc(drive.inertia, axis)
+        rotors.append(Body(name, "rotor", link.parent, link.placement, Joint("revolute", axis), inertia))
+        gears.append(LinearConstraint(name, ((name, 1.0), (drive.link, -drive.ratio))))
+    return (*_with_rest(bodies, rotors, gears, notes), *rotors), tuple(gears)
+
+
+def _with_rest(
+    bodies: tuple[Body, ...], rotors: list[Body], gears: list[LinearConstraint], notes: list[str]
+) -> Iterator[Body]:
+    """Iterate over the links without the inertia at rest of the rotors that they carry.
+
+    A carrier with less inertia than its rotors keeps its own, and the ratio of its rotors counts as not known.
+    """
+    unknown = {gear.name for gear in gears if abs(gear.coefficients[1][1]) == UNKNOWN_RATIO}
+    for body in bodies:
+        carried = [rotor for rotor in rotors if rotor.parent == body.name and rotor.name not in unknown]
+        rest = without_rotors(body.inertial, carried) if carried else body.inertial
+        if rest is None:
+            names = ", ".join(rotor.name for rotor in carried)
+            notes.append(f"left out: the gear ratios of {names}: such rotors have more inertia than {body.name}")
+            for rotor in carried:
+                _forget_ratio(rotor, rotors, gears)
+        yield body if rest is None else replace(body, inertial=rest)
+
+
+def _forget_ratio(rotor: Body, rotors: list[Body], gears: list[LinearConstraint]) -> None:
+    """Keep the reflected inertia of a rotor only: a far lighter rotor behind a far higher ratio."""
+    i = next(i for i, gear in enumerate(gears) if gear.name == rotor.name)
+    (own, (link, ratio)), at = gears[i].coefficients, rotors.index(rotor)
+    gears[i] = replace(gears[i], coefficients=(own, (link, math.copysign(UNKNOWN_RATIO, ratio))))
+    share = (ratio / UNKNOWN_RATIO) ** 2
+    inertia = tuple(tuple(share * x for x in row) for row in rotor.inertial.inertia)
+    rotors[at] = replace(rotor, inertial=replace(rotor.inertial, inertia=inertia))
+
+
+def _transmissions(graph: UrdfGraph, notes: list[str]) -> Iterator[Drive]:
+    by_name: Mapping[str, str] = {joint.name: link for link, joint in graph.joints.items()}
+    for i, element in enumerate(graph.robot.findall("transmission")):
+        where = f"transmission {element.get('name') or i + 1!r}"
+        figures = {key: _figure(graph.file, where, element, words) for key, words in WORDS.items()}
+        joints = [joint.get("name", (joint.text or "").strip()) for joint in element.findall("joint")]
+        known = {tag for words in WORDS.values() for tag in words} | set(UNMODELLED)
+        unread = sorted({child.tag for part in element.iter() for child in part} - known)
+        if unread:
+            notes.append(f"left out: {where}: {', '.join(f'<{tag}>' for tag in unread)}")
+        inertia, ratio = figures["inertia"], figures["ratio"]
+        if len(joints) == 1 and joints[0] in by_name and inertia:
+            yield Drive(where, by_name[joints[0]], inertia, ratio or 1.0)
+        elif inertia:
+            notes.append(f"left out: {where}: <motorInertia>, which needs one joint of the file")
+        elif ratio not in (None, 0.0, 1.0, -1.0):
+            notes.append(f"left out: {where}: <mechanicalReduction> without an inertia of the motor's rotor")
+
+
+def _figure(file: str, where: str, transmission: Element, words: tuple[str, ...]) -> float | None:
+    """Return the number in the first element of some names, as text or as `value`; None if there is none."""
+    element = next((part for part in transmission.iter() if part.tag in words), None)
+    if element is None:
+        return None
+    text = element.get("value", element.text or "")
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    negative = value < 0.0 and words == WORDS["inertia"]
+    if not math.isfinite(value) or negative:
+        raise bad(file, f"{where} <{element.tag}>", text, "a finite number" + (" that is not negative" * negative))
+    return value
+
+
+def _added_inertias(graph: UrdfGraph) -> Iterator[Drive]:
+    for link, joint in graph.joints.items():
+        dynamics = joint.element.find("dynamics")
+        reflected = read.number(graph.file, joint.where, dynamics, "rotor_inertia", 0.0)
+        if reflected < 0.0:
+            raise bad(graph.file, f"{joint.where} <dynamics rotor_inertia>", reflected, "0 or more [kg m^2]")
+        if reflected:
+            yield Drive(f"{joint.where} <dynamics rotor_inertia>", link, reflected / UNKNOWN_RATIO**2, UNKNOWN_RATIO)

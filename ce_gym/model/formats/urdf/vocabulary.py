@@ -1,0 +1,67 @@
+"""Words of a URDF file that nothing reads, so that none is left out silently.
+
+Source: wiki.ros.org/urdf/XML. Everything under <visual> and <material> is for the eye and may say what it likes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from xml.etree.ElementTree import Element
+
+CHILDREN = {
+    "robot": {"link", "joint", "material", "transmission", "gazebo", "loop", "coupling", "loop_joint"},
+    "link": {"inertial", "visual", "collision"},
+    "inertial": {"origin", "mass", "inertia"},
+    "collision": {"origin", "geometry", "material"},
+    "geometry": {"box", "sphere", "cylinder", "capsule", "mesh"},
+    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic"},
+}
+"""Elements that are read, by the element that they stand in; the others have none."""
+ATTRIBUTES = {
+    "robot": {"name", "version"},
+    "link": {"name"},
+    "joint": {"name", "type", "independent"},
+    "collision": {"name"},
+    "origin": {"xyz", "rpy"},
+    "mass": {"value"},
+    "inertia": {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"},
+    "box": {"size"},
+    "sphere": {"radius"},
+    "cylinder": {"radius", "length"},
+    "capsule": {"radius", "length"},
+    "mesh": {"filename", "scale"},
+    "parent": {"link"},
+    "child": {"link"},
+    "axis": {"xyz"},
+    "limit": {"lower", "upper", "effort", "velocity"},
+    "dynamics": {"damping", "friction", "stiffness", "rotor_inertia"},
+    "mimic": {"joint", "multiplier", "offset"},
+}
+"""Attributes that are read."""
+READ_ELSEWHERE = ("visual", "material", "transmission", "loop", "coupling", "loop_joint")
+"""Elements whose content is not looked at here."""
+
+
+def unread_words(robot: Element) -> tuple[str, ...]:
+    """Return a note for each kind of element or attribute that nothing reads, with how often it occurs."""
+    counts = Counter(_unread("", robot))
+    return tuple(f"left out: {word}{f' ({count} times)' if count > 1 else ''}" for word, count in counts.items())
+
+
+def _unread(parent: str, element: Element) -> Iterator[str]:
+    """Iterate over the words under an element that nothing reads, as `<joint><calibration>` or `<limit jerk>`."""
+    tag = element.tag
+    if tag == "gazebo" and parent == "robot":
+        words = sorted({child.tag for child in element})
+        yield f"<gazebo>: {', '.join(words)}" if words else "<gazebo>"
+        return
+    if parent and tag not in CHILDREN.get(parent, ()):
+        yield f"<{parent}><{tag}>"
+        return
+    if tag in READ_ELSEWHERE:
+        return
+    known = ATTRIBUTES.get(tag, set())
+    yield from (f"<{tag} {name}>" for name in element.attrib if name not in known and not name.startswith("xmlns"))
+    for child in element:
+        yield from _unread(tag, child)
