@@ -140,7 +140,7 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _new(args: argparse.Namespace) -> int:
-    from ce_gym.envs.custom import id_stem, missing
+    from ce_gym.envs.custom import id_stem, missing, zero_limits
     from ce_gym.export.new_robot import write_new_robot
 
     path, robot = write_new_robot(args.file, args.out)
@@ -148,6 +148,8 @@ def _new(args: argparse.Namespace) -> int:
     print(f"{path}: {len(robot.independent)} joints, {len(robot.contacts)} contact spheres, {guesses} lines of guesses")
     for problem in missing(robot):
         print(f"  missing: {problem}")
+    for line in zero_limits(robot):
+        print(f"  {line}")
     print(
         f"Go through the file; then\n  python -m ce_gym inspect {path}\n"
         "and, to train, with a module that registers it:\n"
@@ -163,7 +165,7 @@ def _inspect(args: argparse.Namespace) -> int:
     from ce_gym.diagnostics.standing_text import standing_report
     from ce_gym.diagnostics.transmission_text import transmission_report
     from ce_gym.dynamics import Model
-    from ce_gym.envs.custom import missing
+    from ce_gym.envs.custom import missing, zero_limits
 
     if re.search(r"-v\d+$", args.name) and not args.name.endswith((".yaml", ".urdf", ".xml")):
         return _inspect_environment(args)
@@ -173,6 +175,7 @@ def _inspect(args: argparse.Namespace) -> int:
         return 0
     print(f"{model.describe()}\n", flush=True)
     problems = missing(model.robot)
+    print("".join(f"Joints have {line}\n" for line in zero_limits(model.robot)), flush=True)
     print("Environments: it has what every task needs\n" if not problems else "Environments lack:")
     print("".join(f"  {problem}\n" for problem in problems), flush=True)
     if model.robot.gains.kp and not (problems or args.no_timing):

@@ -70,6 +70,20 @@ def missing(robot: Robot) -> list[RobotError]:
     return found
 
 
+def zero_limits(robot: Robot) -> list[str]:
+    """Return a line for each limit of joints that is 0 in a robot's file, as CAD programs write it by default."""
+    joints = [robot.body(name) for name in robot.driven]
+    weak = [body.name for body in joints if body.joint.torque == 0.0]
+    slow = [body.name for body in joints if body.joint.velocity == 0.0]
+    lines = [f"no torque: the effort is 0 for {_listed(weak)}; write the motors' torques [N m] into the file"]
+    lines += [f"no speed: the velocity is 0 for {_listed(slow)}; speed limits of joints are not simulated"]
+    return [line for line, names in zip(lines, (weak, slow), strict=True) if names]
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more joints" if len(names) > 3 else "")
+
+
 def id_stem(robot: Robot, name: str | None = None) -> str:
     """Return what the ids of a robot's environments start with, such as "ce_gym/MyRobot".
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import os
+import re
 from pathlib import Path
 
 from ce_gym.export.guesses import BEND, DAMPING_TIME, FULL_TORQUE_AT, Guesses, guess
@@ -10,6 +13,8 @@ from ce_gym.model.errors import RobotError
 from ce_gym.model.load import load_robot
 
 GUESS = "# GUESS"
+PLAIN = r"[\w./-]+"
+"""Paths that YAML reads without quotes."""
 MOST_NOTES = 6
 ANY_GAIN = {"kp": 20.0, "kd": 0.5}
 """Gains of joints of which not even the torque is known [N m/rad, N m s/rad]."""
@@ -34,9 +39,22 @@ def write_new_robot(path: Path, out: Path | None = None) -> tuple[Path, Robot]:
     out = path.with_suffix(".yaml") if out is None else out
     if out.exists():
         raise RobotError(f"{out}: is there already: expected a name that is free; --out gives another")
-    robot = load_robot(path)
-    out.write_text(new_robot(robot, kind, path.name), encoding="utf-8")
-    return out, load_robot(out)
+    text = new_robot(load_robot(path), kind, _from_folder(path, out.parent))
+    out.write_text(text, encoding="utf-8")
+    try:
+        return out, load_robot(out)
+    except RobotError:  # nothing is left behind that cannot be used
+        out.unlink()
+        raise
+
+
+def _from_folder(path: Path, folder: Path) -> str:
+    """Return how a file in a folder names another file: relative to the folder, absolute on another drive."""
+    target, start = path.resolve(), folder.resolve()
+    try:
+        return Path(os.path.relpath(target, start)).as_posix()
+    except ValueError:  # Windows has a tree for each drive
+        return target.as_posix()
 
 
 def new_robot(robot: Robot, kind: str, name: str) -> str:
@@ -51,7 +69,7 @@ def new_robot(robot: Robot, kind: str, name: str) -> str:
     found = guess(robot, has_pose)
     parts = [
         f"# Made by `python -m ce_gym new`. Go through it: what is marked {GUESS[2:]} are rules of thumb.",
-        f"name: {robot.name}\n{kind}: {name}",
+        f"name: {robot.name}\n{kind}: {name if re.fullmatch(PLAIN, name) else json.dumps(name)}",
     ]
     if kind == "urdf":
         parts.append(f"base: {'floating' if robot.floating else 'fixed'}  {GUESS}, from the mass of the first link")
@@ -96,6 +114,11 @@ def _pose(found: Guesses, has_pose: bool) -> str:
     return "\n".join([*lines, *(["  joints:", *joints] if joints else [])])
 
 
+def _why(robot: Robot, joint: str) -> str:
+    """Return what a file says of a joint without a largest torque."""
+    return "the file says that its effort is 0" if robot.body(joint).joint.torque == 0.0 else "no torque limit"
+
+
 def _gains(robot: Robot, found: Guesses) -> str:
     if robot.gains.kp:
         return "# Gains are those of the MJCF file's position actuators."
@@ -104,5 +127,5 @@ def _gains(robot: Robot, found: Guesses) -> str:
     ]
     for key, column in (("kp", 1), ("kd", 2)):
         lines += [f"  {key}:", *(f"    {row[0]}: {row[column]:g}" for row in found.gains)]
-        lines += [f"    {joint}: {ANY_GAIN[key]:g}  {GUESS}: no torque limit" for joint in found.no_torque]
+        lines += [f"    {joint}: {ANY_GAIN[key]:g}  {GUESS}: {_why(robot, joint)}" for joint in found.no_torque]
     return "\n".join(lines)

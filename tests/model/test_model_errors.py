@@ -121,7 +121,7 @@ URDF_ERRORS = [
     (('<joint name="knee"', '<joint name="hip"'), ["leg.urdf", "joint name", "'hip'", "no other joint"]),
     (('type="fixed"', 'type="planar"'), ["leg.urdf", "'ankle' type", "'planar'", "revolute"]),
     (('type="fixed"', 'type="floating"'), ["leg.urdf", "'ankle' type", "'floating'", "one degree of freedom"]),
-    (('type="fixed"', 'type="revolute"'), ["leg.urdf", "'foot' <inertial>", "missing", "mass and inertia"]),
+    (('type="fixed"', 'type="revolute"'), ["leg.yaml", "'foot' mass", "0.0", "above 0"]),
     (('<mass value="2"/>', '<mass value="0"/>'), ["leg.urdf", "'thigh' mass", "0.0", "above 0"]),
     (('<mass value="2"/>', '<mass value="-2"/>'), ["leg.urdf", "'thigh' <mass value>", "-2.0", "not negative"]),
     (('<mass value="2"/>', '<mass value="1e400"/>'), ["leg.urdf", "'thigh' <mass value>", "'1e400'", "finite"]),
@@ -221,7 +221,7 @@ def test_messages_stop_inside_a_value_that_aliases_make_huge():
         (b"<sdf/>", ["r.urdf", "root element", "'sdf'", "<robot>"]),
         (b"<robot/>", ["r.urdf", "<robot>", "at least one <link>"]),
         (b'<robot name="r"><link name="world"/></robot>', ["r.urdf", "bodies", "at least one body"]),
-        (b"\xff\xfe<robot/>", ["r.urdf", "cannot be read"]),
+        (b"\xff\xfe<robot/>", ["r.urdf", "malformed XML"]),
         (b'<?xml version="1.0" encoding="no-such"?><robot/>', ["r.urdf"]),
     ],
 )

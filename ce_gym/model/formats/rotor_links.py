@@ -17,9 +17,6 @@ from ce_gym.model.description import Body, Inertial, Shape
 from ce_gym.model.formats.placement import mat3
 from ce_gym.model.frames import ZERO, Placement, Vec3
 
-UNKNOWN_RATIO = 1e6
-"""Gear ratio in place of one that is not known: the rotor's own inertia is then 1e-12 of the reflected one."""
-
 
 @dataclass(frozen=True)
 class FixedLink:

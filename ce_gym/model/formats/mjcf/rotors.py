@@ -25,7 +25,7 @@ from ce_gym.model.description import UNKNOWN_RATIO, Body, Joint
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.equalities import drives_joint, tendon_coefficients
 from ce_gym.model.formats.mjcf.source import MjcfSource
-from ce_gym.model.formats.rotor_links import UNKNOWN_RATIO, disc, without_rotors
+from ce_gym.model.formats.rotor_links import disc, without_rotors
 from ce_gym.model.frames import Placement
 
 

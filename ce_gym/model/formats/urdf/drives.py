@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from xml.etree.ElementTree import Element
 
 from ce_gym.model.constraints import LinearConstraint
-from ce_gym.model.description import Body, Joint
+from ce_gym.model.description import UNKNOWN_RATIO, Body, Joint
 from ce_gym.model.errors import bad
-from ce_gym.model.formats.rotor_links import UNKNOWN_RATIO, disc, without_rotors
+from ce_gym.model.formats.rotor_links import disc, without_rotors
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.graph import UrdfGraph
 

@@ -1,0 +1,191 @@
+"""URDF files as vendors write them: dialects for motors, namespaces, encodings, missing and rounded inertia, notes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ce_gym
+from ce_gym.envs.custom import zero_limits
+from ce_gym.export.new_robot import write_new_robot
+from ce_gym.model import RobotError, load_robot
+
+PUP = Path(__file__).parents[1] / "data" / "own_robot" / "pup.urdf"
+I = 0.02
+"""Of the arm about its axis [kg m^2]."""
+
+
+def inertial(mass: float, moment: float) -> str:
+    inertia = f'<inertia ixx="{moment}" ixy="0" ixz="0" iyy="{moment}" iyz="0" izz="{moment}"/>'
+    return f'<inertial><mass value="{mass}"/>{inertia}</inertial>'
+
+
+def arm(more: str = "", joint: str = "", root: str = "") -> str:
+    return (
+        f'<robot name="arm"{root}><link name="world"/><link name="upper">{inertial(1.5, I)}</link>'
+        f'<link name="lower">{inertial(0.7, 0.01)}</link>'
+        '<joint name="shoulder" type="revolute"><parent link="world"/><child link="upper"/><axis xyz="0 0 1"/>'
+        f'<limit lower="-1" upper="1" effort="9" velocity="3"/>{joint}</joint>'
+        '<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.3 0 0"/>'
+        f'<axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="9" velocity="3"/></joint>{more}</robot>'
+    )
+
+
+@pytest.fixture
+def load(tmp_path: Path):
+    def read(text: str, encoding: str = "utf-8", name: str = "arm.urdf") -> ce_gym.Robot:
+        file = tmp_path / name
+        file.write_bytes(text.encode(encoding))
+        return load_robot(file)
+
+    return read
+
+
+def diagonal(robot: ce_gym.Robot) -> np.ndarray:
+    model = ce_gym.Model(robot, transmission="armature")
+    return np.diag(model.mass_matrix(model.standing_q))
+
+
+TRANSMISSIONS = {
+    "actuator": "<joint name='{j}'/><actuator name='m'><mechanicalReduction>{n}</mechanicalReduction>"
+    "<motorInertia>{i}</motorInertia></actuator>",
+    "joint": "<joint name='{j}'><mechanicalReduction>{n}</mechanicalReduction></joint><motorInertia>{i}</motorInertia>",
+    "drake": "<joint name='{j}'/><actuator name='m'><drake:gear_ratio value='{n}'/>"
+    "<drake:rotor_inertia value='{i}'/></actuator>",
+}
+
+
+@pytest.mark.parametrize("kind", TRANSMISSIONS)
+@pytest.mark.parametrize(("joint", "ratio"), [("shoulder", 30.0), ("elbow", -12.5)])
+def test_transmissions_with_inertia_become_rotors(load, kind: str, joint: str, ratio: float):
+    """At `armature` the joint has ratio^2 J more; the rotor's inertia at rest was in the carrier's already."""
+    motor = TRANSMISSIONS[kind].format(j=joint, n=ratio, i=4e-5)
+    robot = load(arm(f"<transmission name='t'>{motor}</transmission>"))
+    more = diagonal(robot) - diagonal(load(arm()))
+    place = ["shoulder", "elbow"].index(joint)
+    assert more[place] == pytest.approx(ratio**2 * 4e-5 - (4e-5 if joint == "elbow" and place == 0 else 0), rel=1e-9)
+    assert len(list(robot.rotors())) == 1
+    assert not robot.notes
+
+
+def test_inertia_that_raisim_adds_at_a_joint_is_kept_at_every_level(load):
+    robot = load(arm(joint='<dynamics damping="0.1" rotor_inertia="0.05" stiffness="2.5"/>'))
+    assert (diagonal(robot) - diagonal(load(arm())))[0] == pytest.approx(0.05, rel=1e-6)
+    exact = ce_gym.Model(robot).mass_matrix(np.zeros(2))[0, 0]
+    assert exact == pytest.approx(diagonal(robot)[0], rel=1e-6)
+    assert robot.body("upper").joint.stiffness == 2.5
+
+
+def test_a_yaml_file_goes_before_the_transmissions_of_its_urdf(load, tmp_path: Path):
+    motor = TRANSMISSIONS["actuator"].format(j="shoulder", n=30, i=4e-5)
+    load(arm(f"<transmission name='t'>{motor}</transmission>"))
+    yaml = "urdf: arm.urdf\nrotors: {m: {parent: world, xyz: [0, 0, 0], axis: [0, 0, 1], mass: 0.1, inertia: [1e-4, 0, 0, 1e-4, 0, 1e-4], ratios: {upper: 10}}}\n"
+    (tmp_path / "over.yaml").write_text(yaml)
+    robot = load_robot(tmp_path / "over.yaml")
+    assert [rotor.name for rotor in robot.rotors()] == ["m"]
+    assert any("transmission 't'" in note for note in robot.notes)
+    (tmp_path / "plain.yaml").write_text("urdf: arm.urdf\n")
+    assert [rotor.name for rotor in load_robot(tmp_path / "plain.yaml").rotors()] == ["upper_rotor"]
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ("<transmission name='t'><joint name='elbow'/><mechanicalReduction>50</mechanicalReduction></transmission>",
+         "transmission 't': <mechanicalReduction>"),
+        ("<transmission name='t'><joint name='elbow'/><joint name='shoulder'/><motorInertia>1e-4</motorInertia>"
+         "</transmission>", "transmission 't': <motorInertia>"),
+        ("<gazebo reference='upper'><mu1>0.3</mu1><kp>1e5</kp></gazebo>", "<gazebo>: kp, mu1"),
+        ("<tendon name='x'/>", "<robot><tendon>"),
+    ],
+)  # fmt: skip
+def test_words_that_are_left_out_are_noted(load, more: str, said: str):
+    assert [said in note for note in load(arm(more)).notes] == [True]
+
+
+def test_attributes_that_are_left_out_are_noted_with_their_number(load):
+    text = arm().replace('velocity="3"', 'velocity="3" acceleration="40"')
+    assert load(text).notes == ("left out: <limit acceleration> (2 times)",)
+    assert load(arm(joint='<safety_controller k_velocity="1"/>')).notes == ("left out: <joint><safety_controller>",)
+
+
+@pytest.mark.parametrize("root", [' xmlns="http://www.ros.org"', ' xmlns:xacro="http://ros.org/wiki/xacro"'])
+def test_namespaces_change_nothing(load, root: str):
+    assert load(arm(root=root)).bodies == load(arm()).bodies
+
+
+@pytest.mark.parametrize("encoding", ["iso-8859-1", "utf-16", "utf-8-sig", "utf-8"])
+def test_files_are_read_in_the_encoding_that_they_declare(load, encoding: str):
+    declared = "utf-8" if encoding == "utf-8-sig" else encoding
+    text = f'<?xml version="1.0" encoding="{declared}"?>' + arm().replace("elbow", "Gelenk-Ü")
+    assert load(text, encoding).independent == ("upper", "lower")
+
+
+def test_an_undeclared_prefix_is_a_name_like_others(load):
+    assert load(arm("<vendor:extra/>")).notes == ("left out: <robot><vendor:extra>",)
+
+
+@pytest.mark.parametrize("more", ["<xacro:include filename='x'/>", "<link name='${prefix}hand'/>"])
+def test_macros_that_were_not_expanded_are_refused(load, more: str):
+    with pytest.raises(RobotError, match="expand it first: xacro"):
+        load(arm(more))
+
+
+def test_a_mimic_of_a_joint_that_does_not_move_is_fixed_at_its_offset(load):
+    hand = (
+        f"<link name='palm'>{inertial(0.2, 1e-3)}</link><joint name='wrist' type='fixed'><parent link='lower'/>"
+        f"<child link='palm'/></joint><link name='finger'>{inertial(0.1, 1e-3)}</link>"
+        "<joint name='knuckle' type='revolute'><parent link='palm'/><child link='finger'/><origin xyz='0.1 0 0'/>"
+        "<axis xyz='0 0 1'/><limit lower='0' upper='1' effort='1' velocity='1'/><mimic joint='wrist' offset='{}'/>"
+        "</joint>"
+    )
+    robot = load(arm(hand.format(0.5)))
+    assert robot.independent == ("upper", "lower")
+    assert robot.total_mass == pytest.approx(2.5)
+    welded = hand.replace("type='revolute'", "type='fixed'").replace("<mimic joint='wrist' offset='{}'/>", "")
+    welded = welded.replace("<origin xyz='0.1 0 0'/>", "<origin xyz='0.1 0 0' rpy='0 0 0.5'/>")
+    expected = load(arm(welded), name="welded.urdf").body("lower").inertial
+    np.testing.assert_allclose(robot.body("lower").inertial.inertia, expected.inertia, rtol=1e-12)
+
+
+def test_moving_links_without_inertial_have_no_mass(load):
+    text = arm().replace(f'<link name="upper">{inertial(1.5, I)}</link>', '<link name="upper"/>')
+    robot = load(text)
+    assert robot.body("upper").inertial.mass == 0.0
+    assert any("'upper'" in note for note in robot.notes)
+    assert load(arm().replace(inertial(0.7, 0.01), inertial(0.7, 0.01))).total_mass == 2.2
+
+
+def test_inertia_that_is_negative_by_rounding_is_zero(load):
+    text = arm(f"<link name='cap'>{inertial(0.0, -5.4e-20)}</link><joint name='c' type='fixed'><parent link='lower'/>"
+               "<child link='cap'/></joint>")  # fmt: skip
+    np.testing.assert_array_equal(load(text).body("lower").inertial.inertia, load(arm()).body("lower").inertial.inertia)
+    with pytest.raises(RobotError, match="positive semidefinite"):
+        load(arm().replace(inertial(1.5, I), inertial(1.5, -1e-9)))
+
+
+def test_efforts_of_zero_are_said(load):
+    robot = load(arm().replace('effort="9" velocity="3"', 'effort="0" velocity="0"'))
+    assert [line[:12] for line in zero_limits(robot)] == ["no torque: t", "no speed: th"]
+    assert zero_limits(load(arm())) == []
+
+
+def test_a_new_file_names_the_urdf_from_its_own_folder(tmp_path: Path):
+    (tmp_path / "vendor parts").mkdir()
+    (tmp_path / "mine").mkdir()
+    urdf = tmp_path / "vendor parts" / "pup.urdf"
+    urdf.write_text(PUP.read_text())
+    out, robot = write_new_robot(urdf, tmp_path / "mine" / "pup.yaml")
+    assert '"../vendor parts/pup.urdf"' in out.read_text()
+    assert load_robot(out).independent == robot.independent
+
+
+def test_a_new_file_that_cannot_be_loaded_is_not_left_behind(tmp_path: Path, monkeypatch):
+    urdf = tmp_path / "pup.urdf"
+    urdf.write_text(PUP.read_text())
+    monkeypatch.setattr("ce_gym.export.new_robot._contacts", lambda *_: "contacts: 3")
+    with pytest.raises(RobotError):
+        write_new_robot(urdf)
+    assert not urdf.with_suffix(".yaml").exists()
