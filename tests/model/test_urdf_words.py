@@ -81,7 +81,8 @@ def test_inertia_that_raisim_adds_at_a_joint_is_kept_at_every_level(load):
 def test_a_yaml_file_goes_before_the_transmissions_of_its_urdf(load, tmp_path: Path):
     motor = TRANSMISSIONS["actuator"].format(j="shoulder", n=30, i=4e-5)
     load(arm(f"<transmission name='t'>{motor}</transmission>"))
-    yaml = "urdf: arm.urdf\nrotors: {m: {parent: world, xyz: [0, 0, 0], axis: [0, 0, 1], mass: 0.1, inertia: [1e-4, 0, 0, 1e-4, 0, 1e-4], ratios: {upper: 10}}}\n"
+    rotor = "xyz: [0, 0, 0], axis: [0, 0, 1], mass: 0.1, inertia: [1e-4, 0, 0, 1e-4, 0, 1e-4], ratios: {upper: 10}"
+    yaml = f"urdf: arm.urdf\nrotors: {{m: {{parent: world, {rotor}}}}}\n"
     (tmp_path / "over.yaml").write_text(yaml)
     robot = load_robot(tmp_path / "over.yaml")
     assert [rotor.name for rotor in robot.rotors()] == ["m"]
