@@ -85,7 +85,7 @@ def read_bodies(
             source.file,
             "bodies that move freely",
             tuple(free),
-            "one robot, so at most one free joint; take the others out",
+            "one robot, so at most one free joint",
         )
     return tree
 
