@@ -19,6 +19,7 @@ from ce_gym.dynamics.forces.normal import NORMAL_LAWS
 from ce_gym.dynamics.forces.parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.forces.scene import Control, StepOptions, target_names
 from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.parameter_effects import check_effects
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import OUTPUTS
 from ce_gym.model import ContactMaterial
@@ -159,6 +160,7 @@ class Simulator:
             retry=retry,
             control_period=control_period,
         )
+        check_effects(model.mechanism, self.options)
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)

@@ -292,7 +292,7 @@ def _scale_spins(bodies: dict[str, MovingBody], robot: Robot, given: Mapping[str
             _add_moment(bodies, rotor.parent, -change, np.array(rotor.placement.rotation) @ axis)
 
 
-def _add_moment(bodies: dict[str, MovingBody], name: str, moment: SX, axis: NDArray) -> None:
+def _add_moment(bodies: dict[str, MovingBody], name: str, moment: SX | float, axis: NDArray) -> None:
     """Add a moment of inertia about an axis of a body, in place."""
     more = ca.diagcat(moment * constant(np.outer(axis, axis)), SX(3, 3))
     bodies[name] = replace(bodies[name], inertia=constant(bodies[name].inertia) + more)  # type: ignore[arg-type]
