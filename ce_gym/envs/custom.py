@@ -72,10 +72,10 @@ def missing(robot: Robot) -> list[RobotError]:
 
 def zero_limits(robot: Robot) -> list[str]:
     """Return a line for each limit of joints that is 0 in a robot's file, as CAD programs write it by default."""
-    joints = [robot.body(name) for name in robot.driven]
-    weak = [body.name for body in joints if body.joint.torque == 0.0]
+    joints = [robot.body(name) for name in robot.commanded]
+    weak = [body.name for body in joints if body.joint.torque == 0.0 and not body.joint.stiffness]
     slow = [body.name for body in joints if body.joint.velocity == 0.0]
-    lines = [f"no torque: the effort is 0 for {_listed(weak)}; write the motors' torques [N m] into the file"]
+    lines = [f"no torque: the effort is 0, or there is no actuator, for {_listed(weak)}; nothing drives them"]
     lines += [f"no speed: the velocity is 0 for {_listed(slow)}; speed limits of joints are not simulated"]
     return [line for line, names in zip(lines, (weak, slow), strict=True) if names]
 

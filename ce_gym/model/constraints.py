@@ -59,6 +59,28 @@ class LinearConstraint(Constraint):
 
 
 @dataclass(frozen=True)
+class PolynomialConstraint(Constraint):
+    """`coordinate of dependent = sum(coefficients[k] * (coordinate of argument)^k)`: a joint that follows on a cam.
+
+    Either of the two may be the independent joint.
+
+    Attributes:
+        dependent: Body whose joint coordinate is the polynomial.
+        argument: Body whose joint coordinate is its argument.
+        coefficients: By ascending power, in units of the dependent coordinate over powers of the other's.
+    """
+
+    dependent: str
+    argument: str
+    coefficients: tuple[float, ...]
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies whose joint coordinates the constraint ties together."""
+        return (self.dependent, self.argument)
+
+
+@dataclass(frozen=True)
 class LoopConstraint(Constraint):
     """A joint that closes a loop: a frame on one body and a frame on another share their origin, and perhaps an axis.
 

@@ -303,12 +303,16 @@ class Robot:
 
     @property
     def passive(self) -> tuple[str, ...]:
-        """The independent joints that springs alone move, as they have one and the largest torque of an actuator is 0.
+        """The independent joints without an actuator: their largest torque is 0, and that of another is not.
 
-        They have positions and speeds as the others have, entries in targets that nothing follows, and no gains.
+        If it is 0 for all of them, the file does not say which joints are driven (CAD exports of URDF files have
+        `effort="0"` everywhere), and joints with a spring are passive. Passive joints have positions and speeds as the
+        others have, entries in targets that nothing follows, no gains and no actions.
         """
-        sprung = {body.name for body in self.bodies if body.joint.stiffness and body.joint.torque == 0.0}
-        return tuple(name for name in self.commanded if name in sprung)
+        idle = [name for name in self.commanded if self.body(name).joint.torque == 0.0]
+        if len(idle) < len(self.commanded):
+            return tuple(idle)
+        return tuple(name for name in idle if self.body(name).joint.stiffness)
 
     @property
     def driven(self) -> tuple[str, ...]:

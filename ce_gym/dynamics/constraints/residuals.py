@@ -19,6 +19,7 @@ from ce_gym.model.constraints import (
     FunctionConstraint,
     LinearConstraint,
     LoopConstraint,
+    PolynomialConstraint,
     RodConstraint,
     constraint_function,
 )
@@ -54,6 +55,14 @@ def gap(robot: Robot, constraint: Constraint, angles: Angles) -> SX:
 
 def _linear(robot: Robot, constraint: LinearConstraint, angles: Angles) -> SX:
     return sum((a * angles[body] for body, a in constraint.coefficients), SX(-constraint.offset))
+
+
+def _polynomial(robot: Robot, constraint: PolynomialConstraint, angles: Angles) -> SX:
+    """The dependent coordinate less the polynomial, by Horner's rule."""
+    value, argument = SX(0), angles[constraint.argument]
+    for coefficient in reversed(constraint.coefficients):
+        value = value * argument + coefficient
+    return angles[constraint.dependent] - value
 
 
 def _rod(robot: Robot, rod: RodConstraint, angles: Angles) -> SX:
@@ -204,6 +213,7 @@ class Kind:
 
 KINDS: dict[type[Constraint], Kind] = {
     LinearConstraint: Kind(_linear),
+    PolynomialConstraint: Kind(_polynomial),
     LoopConstraint: Kind(_loop),
     RodConstraint: Kind(_rod, lambda rod: rod.length),
     FunctionConstraint: Kind(_function),

@@ -16,6 +16,7 @@ from ce_gym.model.constraints import (
     FunctionConstraint,
     LinearConstraint,
     LoopConstraint,
+    PolynomialConstraint,
     RodConstraint,
     constraint_function,
 )
@@ -54,6 +55,12 @@ def _check_linear(constraint: LinearConstraint, key: str, file: str) -> None:
     check_finite(file, f"{key} offset", (constraint.offset,))
 
 
+def _check_polynomial(constraint: PolynomialConstraint, key: str, file: str) -> None:
+    check_finite(file, f"{key} coefficients", constraint.coefficients)
+    if not any(constraint.coefficients[1:]):
+        raise bad(file, f"{key} coefficients", constraint.coefficients, "one of a power of at least 1 that is not 0")
+
+
 def _check_loop(constraint: LoopConstraint, key: str, file: str) -> None:
     if constraint.joint not in ("revolute", "ball"):
         raise bad(file, f"{key} joint", constraint.joint, "revolute or ball")
@@ -80,6 +87,7 @@ def _check_function(constraint: FunctionConstraint, key: str, file: str) -> None
 
 CHECKS: dict[type[Constraint], Callable[[Any, str, str], None]] = {
     LinearConstraint: _check_linear,
+    PolynomialConstraint: _check_polynomial,
     LoopConstraint: _check_loop,
     RodConstraint: _check_rod,
     FunctionConstraint: _check_function,

@@ -286,7 +286,7 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
         for joint, gain in pairs:
             check_not_negative(file, f"{key}.{joint}", gain)
             if joint in robot.passive:
-                raise bad(file, f"{key}.{joint}", gain, "none for a passive joint: it has a spring and a torque of 0")
+                raise bad(file, f"{key}.{joint}", gain, "none for a passive joint, whose largest torque is 0")
         for joint in robot.driven:
             if pairs and joint not in dict(pairs):
                 raise bad(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")

@@ -1,32 +1,55 @@
 """The actuators of a compiled MJCF file -> torque limits and gains of joints.
 
 An actuator on a joint gives `gear * (gain * control + bias)`. With an affine bias it is a position controller, whose
-gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up. Where a file has actuators,
-a joint that has a spring and none of them is passive: its torque limit is 0, and it has no gains.
+gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up. An actuator on a joint or a
+fixed tendon whose coordinate is `ratio` times that of one independent joint, by linear equalities, acts on that joint:
+its torque is `ratio` times as large, its gains `ratio^2` times. Where a file has actuators, an independent joint that
+none of them moves is passive: its torque limit is 0, and it has no gains.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
 
+from ce_gym.model.constraints import Constraint, LinearConstraint
 from ce_gym.model.description import Gains
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
-from ce_gym.model.formats.mjcf.equalities import drives_joint
+from ce_gym.model.formats.mjcf.equalities import actuated_joints
 from ce_gym.model.formats.mjcf.source import MjcfSource
 
+Ratios = dict[str, tuple[str, float]]  # for a body, the independent joint that moves it, and how far for a unit of that
 
-def read_actuators(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...]) -> Gains:
-    """Set the torque limits of the tree's joints and return the gains; what else there is is left out."""
-    model = source.model
+
+def read_actuators(
+    source: MjcfSource,
+    tree: MjcfTree,
+    independent: tuple[str, ...],
+    constraints: Iterable[Constraint],
+    driven: Collection[str] = (),
+) -> Gains:
+    """Set the torque limits of the tree's joints and return the gains; what else there is is left out.
+
+    Args:
+        source: The compiled file.
+        tree: Its bodies.
+        independent: Those of them whose joint coordinates are independent.
+        constraints: What ties the joints together.
+        driven: Bodies whose rotors the caller knows; they are not passive.
+    """
+    model, ratios = source.model, _ratios(independent, constraints)
     kp, kd = dict.fromkeys(independent, 0.0), dict.fromkeys(independent, 0.0)
     limits: dict[str, float] = {}
+    moved = set(driven)
     for a in range(model.nu):
-        body = _driven(source, tree, a, independent)
+        moved |= {tree.moved_by[j] for j in actuated_joints(source, a) if j in tree.moved_by}
+        body, ratio = _driven(source, tree, a, ratios)
         if body is None:
             continue
-        gear = abs(float(model.actuator_gear[a][0]))
+        moved.add(body)
+        gear = abs(float(model.actuator_gear[a][0]) * ratio)
         limits[body] = limits.get(body, 0.0) + gear * _largest_force(source, a)
         if model.actuator_biastype[a] == source.mujoco.mjtBias.mjBIAS_AFFINE:
             kp[body] -= gear**2 * float(model.actuator_biasprm[a][1])
@@ -34,9 +57,7 @@ def read_actuators(source: MjcfSource, tree: MjcfTree, independent: tuple[str, .
     for j, body in tree.moved_by.items():
         if model.jnt_actfrclimited[j]:
             limits[body] = min(limits.get(body, np.inf), float(np.abs(model.jnt_actfrcrange[j]).max()))
-    springs = {body.name for body in tree.bodies if body.joint.stiffness}
-    passive = springs.intersection(independent) - _moved(source, tree) if model.nu else ()
-    for name in passive:
+    for name in set(independent) - moved if model.nu else ():
         limits[name] = 0.0
         del kp[name], kd[name]
     tree.bodies[:] = [
@@ -46,17 +67,18 @@ def read_actuators(source: MjcfSource, tree: MjcfTree, independent: tuple[str, .
     return _gains(source, kp, kd)
 
 
-def _moved(source: MjcfSource, tree: MjcfTree) -> set[str]:
-    """Return the joints that an actuator of the file moves, those included whose actuator is left out."""
-    model, mujoco = source.model, source.mujoco
-    moved: set[int] = set()
-    for a, (first, _) in enumerate(model.actuator_trnid):
-        if drives_joint(source, a):
-            moved.add(int(first))
-        elif model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
-            along = range(model.tendon_adr[first], model.tendon_adr[first] + model.tendon_num[first])
-            moved |= {int(model.wrap_objid[w]) for w in along if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT}
-    return {tree.moved_by[j] for j in moved if j in tree.moved_by}
+def _ratios(independent: tuple[str, ...], constraints: Iterable[Constraint]) -> Ratios:
+    """Return how far each independent joint moves itself, and what follows it alone by linear ties of two joints."""
+    ratios: Ratios = {name: (name, 1.0) for name in independent}
+    ties = [dict(tie.coefficients) for tie in constraints if isinstance(tie, LinearConstraint)]
+    pairs = [tie for tie in ties if len(tie) == 2]
+    while ties := [tie for tie in pairs if len(tie.keys() & ratios.keys()) == 1]:
+        for tie in ties:
+            for known, unknown in (tuple(tie), tuple(tie)[::-1]):
+                if known in ratios and unknown not in ratios:
+                    joint, ratio = ratios[known]
+                    ratios[unknown] = joint, -ratio * tie[known] / tie[unknown]
+    return ratios
 
 
 def _gains(source: MjcfSource, kp: dict[str, float], kd: dict[str, float]) -> Gains:
@@ -71,24 +93,34 @@ def _gains(source: MjcfSource, kp: dict[str, float], kd: dict[str, float]) -> Ga
     return Gains(tuple(kp.items()), tuple(kd.items()))
 
 
-def _driven(source: MjcfSource, tree: MjcfTree, a: int, independent: tuple[str, ...]) -> str | None:
-    """Return the body whose joint actuator `a` drives; None, with a note, if a robot cannot have such an actuator."""
+def _driven(source: MjcfSource, tree: MjcfTree, a: int, ratios: Ratios) -> tuple[str | None, float]:
+    """Return the independent joint that actuator `a` drives, and how far the actuator moves for a unit of that.
+
+    None, with a note, if a robot cannot have such an actuator.
+    """
     model, mujoco = source.model, source.mujoco
     name = source.name("actuator", a)
-    body = tree.moved_by.get(int(model.actuator_trnid[a][0])) if drives_joint(source, a) else None
+    joints = {tree.moved_by[j]: x for j, x in actuated_joints(source, a).items() if j in tree.moved_by and x}
     biases = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
     fixed = model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
-    if body is None or not fixed or int(model.actuator_biastype[a]) not in biases:
+    if not joints or not fixed or int(model.actuator_biastype[a]) not in biases:
         source.leave_out("actuator {} (not a motor or controller of one joint)", name)
-        return None
-    if body not in independent:
+        return None, 0.0
+    if not joints.keys() <= ratios.keys():
         source.leave_out("actuator {} (its joint is not independent)", name)
-        return None
+        return None, 0.0
+    ratio: dict[str, float] = {}
+    for body, coefficient in joints.items():
+        joint, per_joint = ratios[body]
+        ratio[joint] = ratio.get(joint, 0.0) + coefficient * per_joint
+    if len(ratio) > 1:
+        source.leave_out("actuator {} (its tendon moves several independent joints)", name)
+        return None, 0.0
     if model.actuator_dyntype[a] != mujoco.mjtDyn.mjDYN_NONE:
         source.leave_out("the activation dynamics of actuator {}", name)
     if np.any(getattr(model, "actuator_damping", np.zeros(model.nu))[a]):
         source.leave_out("the damping of actuator {}", name)
-    return body
+    return next(iter(ratio.items()))
 
 
 def _largest_force(source: MjcfSource, a: int) -> float:

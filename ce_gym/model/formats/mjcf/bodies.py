@@ -36,6 +36,7 @@ class MjcfTree:
             ball joints that have become hinges.
         hinged: The bodies of the three hinges that such a ball joint has become, by joint index.
         fixed: Bodies without a joint that were asked for to be kept apart, by name.
+        ties: Names of constraints.
     """
 
     bodies: list[Body] = field(default_factory=list)
@@ -43,18 +44,28 @@ class MjcfTree:
     moved_by: dict[int, str] = field(default_factory=dict)
     hinged: dict[int, tuple[Body, Body, Body]] = field(default_factory=dict)
     fixed: dict[str, FixedLink] = field(default_factory=dict)
+    ties: set[str] = field(default_factory=set)
 
     def fresh(self, name: str) -> str:
-        """Return `name`, or `name_2` and so on if a body has it already."""
-        taken, count, new = {body.name for body in self.bodies}, 1, name
-        while new in taken:
-            count += 1
-            new = f"{name}_{count}"
+        """Return `name`, or `name_2` and so on if a body or a constraint has it already."""
+        return _fresh(name, {body.name for body in self.bodies} | self.ties)
+
+    def fresh_tie(self, name: str) -> str:
+        """Return a name that no other constraint has, and keep it."""
+        self.ties.add(new := _fresh(name, self.ties))
         return new
 
     def parent(self, body: str) -> str | None:
         """Return the parent of a body."""
         return next(b.parent for b in self.bodies if b.name == body)
+
+
+def _fresh(name: str, taken: Collection[str]) -> str:
+    count, new = 1, name
+    while new in taken:
+        count += 1
+        new = f"{name}_{count}"
+    return new
 
 
 def read_bodies(

@@ -1,188 +1,176 @@
-"""The equalities of a compiled MJCF file -> constraints, and the choice of independent joints.
+"""The equalities of a compiled MJCF file -> constraints.
 
-| equality                        | becomes                                                                |
-|---------------------------------|------------------------------------------------------------------------|
-| joint, and joint to a constant  | a linear constraint; a weld                                            |
-| fixed tendons                   | a linear constraint                                                    |
-| spatial tendon of two sites     | a rod                                                                  |
-| connect                         | a ball joint                                                           |
-| weld                            | two revolute joints with crossed axes: together they leave no freedom  |
+| in the file                                | becomes                                                                |
+|--------------------------------------------|------------------------------------------------------------------------|
+| joint to a constant                        | a weld in the tree                                                     |
+| joint, with `polycoef` up to the first power | a linear constraint                                                  |
+| joint, with higher powers                  | a polynomial constraint                                                |
+| fixed tendons                              | a linear constraint                                                    |
+| spatial tendon of two sites                | a rod                                                                  |
+| connect                                    | a ball joint                                                           |
+| weld                                       | two revolute joints with crossed axes: together they leave no freedom  |
+| weld with `torquescale` 0                  | a ball joint                                                           |
+| fixed tendon with a narrow `range`         | a linear constraint at the middle of the range                         |
 
-MuJoCo holds them softly; here they are exact.
+MuJoCo holds them softly; here they are exact. What an equality repeats of others is found in `independent.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.polynomial import Polynomial
 
-from ce_gym.model.constraints import Constraint, LinearConstraint, LoopConstraint, RodConstraint
+from ce_gym.model.constraints import Constraint, LinearConstraint, LoopConstraint, PolynomialConstraint, RodConstraint
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement
 from ce_gym.model.formats.placement import compose, transform_point, vec3
 from ce_gym.model.frames import Placement, Vec3, added
 
-RANK_TOLERANCE = 1e-8
-"""Relative size of a row or column of a constraint Jacobian that counts as zero."""
-
-CLOSING_STEPS, LARGEST_STEP = 8, 0.1
-"""How often a reference pose is moved to close its loops, and how far joints may be from there [rad or m]."""
-
 WELD_AXES: tuple[Vec3, Vec3] = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+
+NARROW = 0.01
+"""Width of the range of a tendon that couples its joints, as a share of what their own ranges let it travel."""
+UNLIMITED_TRAVEL = 2 * np.pi
+"""Travel of a joint without limits, where such a share is taken [rad or m]."""
 
 Form = tuple[dict[int, float], float]  # coefficients of joint coordinates by joint index, and a constant [rad or m]
 
 
 def locked_joints(source: MjcfSource) -> dict[int, float]:
-    """Return the coordinates [rad or m] of joints that an equality holds at a constant, by joint index."""
-    model = source.model
-    return {
-        int(model.eq_obj1id[i]): float(model.eq_data[i][0] + model.qpos0[model.jnt_qposadr[model.eq_obj1id[i]]])
-        for i in _active(source)
-        if model.eq_type[i] == source.mujoco.mjtEq.mjEQ_JOINT and model.eq_obj2id[i] < 0
-    }
+    """Return the coordinates [rad or m] of joints that equalities hold still, by joint index.
 
-
-def read_constraints(source: MjcfSource, tree: MjcfTree, locked: dict[int, float]) -> tuple[Constraint, ...]:
-    """Return the constraints; what cannot be one is left out.
-
-    An equality that has been left out is switched off in `source.data`, so that its Jacobian is that of the rest.
+    An equality of joints or fixed tendons does so if it is with a constant, or if its other joints are held already.
     """
-    found: list[Constraint] = []
+    locked: dict[int, float] = {}
+    active = [i for i in range(source.model.neq) if source.model.eq_active0[i]]
+    while True:
+        lines = [line for i in active if (line := _linear(source, i, locked)) is not None and len(line[0]) == 1]
+        if not lines:
+            return locked
+        ((joint, coefficient),) = lines[0][0].items()
+        locked[joint] = lines[0][1] / coefficient
+
+
+def read_constraints(source: MjcfSource, tree: MjcfTree, locked: Mapping[int, float]) -> dict[int, list[Constraint]]:
+    """Return the constraints that each equality becomes, by its index; what cannot be one is left out.
+
+    An equality that has been left out is switched off in `source.data`, so that its Jacobian is that of the rest. The
+    couplings by tendons come last, with indices from the number of equalities on.
+    """
+    found: dict[int, list[Constraint]] = {}
+    given = [source.given_name("equality", i) for i in range(source.model.neq)]
+    tree.ties.update(name for name in given if name)
     for i in range(source.model.neq):
-        name = source.name("equality", i)
         if not source.model.eq_active0[i]:
-            source.leave_out("equality {}, which is not active", name)
+            source.leave_out("equality {}, which is not active", given[i] or f"number {i + 1}")
             continue
-        if source.model.eq_type[i] == source.mujoco.mjtEq.mjEQ_JOINT and source.model.eq_obj2id[i] < 0:
-            continue  # a weld in the tree
-        constraints = list(_constraint(source, tree, i, locked))
-        if not constraints:
-            source.leave_out("equality {}", name)
+        line = _linear(source, i, locked)
+        if line is not None and not line[0]:
+            continue  # its joints are welds in the tree
+        name = given[i] or tree.fresh_tie(_name_by_ends(source, tree, i))
+        if constraints := list(_constraint(source, tree, i, name, line)):
+            found[i] = constraints
+        else:
+            source.leave_out(_reason(source, i), name)
             source.data.eq_active[i] = 0
-        found += constraints
-    return tuple(found)
+    for tendon in coupling_tendons(source):
+        name = tree.fresh_tie(source.name("tendon", tendon))
+        low, high = source.model.tendon_range[tendon]
+        coefficients, offset = _unlocked(tendon_coefficients(source, tendon) or {}, (low + high) / 2, locked)
+        if len(coefficients) > 1:
+            pairs = tuple((tree.moved_by[j], x) for j, x in coefficients.items())
+            found[source.model.neq + tendon] = [LinearConstraint(name, pairs, offset)]
+            source.leave_out("the play of tendon {}", f"{name} (range {low:g} to {high:g}, held at its middle)")
+    return found
 
 
-def choose_independent(source: MjcfSource, tree: MjcfTree, rotors: Collection[str]) -> tuple[str, ...]:
-    """Return the bodies whose joints are independent, in MuJoCo's order.
+def coupling_tendons(source: MjcfSource) -> list[int]:
+    """Return the fixed tendons whose limits leave their joints so little play that they couple them."""
+    model = source.model
+    return [t for t in range(model.ntendon) if model.tendon_limited[t] and _is_narrow(source, t)]
 
-    The dependent joints are found by elimination in the Jacobian of all equalities at the reference pose, as many as it
-    has rank: those of `rotors` before others, then what a joint equality names first (MuJoCo's own dependent joint),
-    then hinges that were a ball joint, then joints without a spring, and of either those without an actuator first.
+
+def _is_narrow(source: MjcfSource, tendon: int) -> bool:
+    model, coefficients = source.model, tendon_coefficients(source, tendon)
+    low, high = model.tendon_range[tendon]
+    if coefficients is None or sum(1 for x in coefficients.values() if x) < 2:
+        return False
+    travels = [np.ptp(model.jnt_range[j]) if model.jnt_limited[j] else UNLIMITED_TRAVEL for j in coefficients]
+    return high - low <= NARROW * added(abs(x) * t for x, t in zip(coefficients.values(), travels, strict=True))
+
+
+def actuated_joints(source: MjcfSource, actuator: int) -> dict[int, float]:
+    """Return how far an actuator moves for a unit of each joint, by joint index; nothing if it is on anything else."""
+    model, kinds = source.model, source.mujoco.mjtTrn
+    kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator][0])
+    if kind in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
+        return {target: 1.0}
+    if kind == int(kinds.mjTRN_TENDON):
+        return tendon_coefficients(source, target) or {}
+    return {}
+
+
+def _name_by_ends(source: MjcfSource, tree: MjcfTree, i: int) -> str:
+    """Return a name for an equality without one: those of the bodies or tendons that it ties."""
+    model, kinds, objects = source.model, source.mujoco.mjtEq, source.mujoco.mjtObj
+    ids, kind = (int(model.eq_obj1id[i]), int(model.eq_obj2id[i])), model.eq_type[i]
+    if kind == kinds.mjEQ_JOINT:
+        names = [tree.moved_by.get(j) or source.name("joint", j) for j in ids if j >= 0]
+    elif kind == kinds.mjEQ_TENDON:
+        names = [source.name("tendon", t) for t in ids if t >= 0]
+    elif _holds_bodies(source, i):
+        sites = model.eq_objtype[i] == objects.mjOBJ_SITE
+        names = [source.name("body", model.site_bodyid[x] if sites else x) for x in ids]
+    else:
+        return source.name("equality", i)
+    return "_to_".join(names)
+
+
+def _holds_bodies(source: MjcfSource, i: int) -> bool:
+    kinds, kind = source.mujoco.mjtEq, int(source.model.eq_type[i])
+    return kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD))
+
+
+def _reason(source: MjcfSource, i: int) -> str:
+    """Say what an equality that is left out is, `{}` standing for its name."""
+    if _holds_bodies(source, i):
+        return "equality {} (both of its ends move together)"
+    if _forms(source, i) is not None:
+        return "equality {} (polycoef has powers above the first, and ties tendons or a joint that is held)"
+    return "equality {}"
+
+
+def _constraint(source: MjcfSource, tree: MjcfTree, i: int, name: str, line: Form | None) -> Iterator[Constraint]:
+    """Iterate over the constraints that equality `i` becomes: none if it cannot be represented.
 
     Args:
         source: The compiled file.
         tree: Its bodies.
-        rotors: Bodies that would best be dependent.
+        i: The equality.
+        name: Its name.
+        line: What it is as a linear equation of joints, if it is one.
     """
     model, kinds = source.model, source.mujoco.mjtEq
-    driven = {int(model.actuator_trnid[a][0]) for a in range(model.nu) if drives_joint(source, a)}
-    named = {int(model.eq_obj1id[i]) for i in _active(source) if model.eq_type[i] == kinds.mjEQ_JOINT}
-    jacobian, joints = _equality_jacobian(source), _scalar_joints(source, tree)
-    order = [
-        (body not in rotors, j not in named, j not in tree.hinged, model.jnt_stiffness[j] > 0.0, j in driven)
-        for j, body, _ in joints
-    ]
-    moved = [jacobian[:, dofs] @ axis for _, _, (dofs, axis) in joints]
-    columns = np.array(moved).reshape(len(joints), len(jacobian)).T
-    dependent: set[int] = set()
-    for group in sorted(set(order)):
-        while (pivot := _largest(columns, [i for i, key in enumerate(order) if key == group])) is not None:
-            dependent.add(pivot)
-            unit = columns[:, pivot] / np.linalg.norm(columns[:, pivot])
-            columns = columns - np.outer(unit, unit @ columns)
-            columns[:, pivot] = 0.0
-    return tuple(body for i, (_, body, _) in enumerate(joints) if i not in dependent)
-
-
-def _scalar_joints(source: MjcfSource, tree: MjcfTree) -> list[tuple[int, str, tuple[slice, NDArray[np.float64]]]]:
-    """Return joint index and body of each joint with one coordinate, and how MuJoCo's velocities follow from its own.
-
-    The last is the rows of its joint and the entries there, at the reference pose.
-    """
-    model, kinds, found = source.model, source.mujoco.mjtJoint, []
-    for j in sorted({*tree.moved_by, *tree.hinged}):
-        first = int(model.jnt_dofadr[j])
-        if j in tree.hinged:
-            found += [(j, b.name, (slice(first, first + 3), np.array(b.joint.axis))) for b in tree.hinged[j]]
-        elif model.jnt_type[j] != kinds.mjJNT_FREE and model.jnt_type[j] != kinds.mjJNT_BALL:
-            found.append((j, tree.moved_by[j], (slice(first, first + 1), np.ones(1))))
-    return found
-
-
-def _largest(columns: NDArray[np.float64], among: list[int]) -> int | None:
-    """Return the index of the longest of some columns; None if all of them are zero."""
-    lengths = np.linalg.norm(columns[:, among], axis=0)
-    return among[int(np.argmax(lengths))] if lengths.size and lengths.max() > RANK_TOLERANCE else None
-
-
-def _equality_jacobian(source: MjcfSource) -> NDArray[np.float64]:
-    """Return the Jacobian of the active equalities at the reference pose, rows of length 1, shape (n, nv).
-
-    A pose that was rounded is closed first: a gap makes joints that equalities do not move look as if they did.
-    """
-    start = source.data.qpos.copy()
-    rows, gap = _equality_rows(source)
-    for _ in range(CLOSING_STEPS):
-        step = -np.linalg.lstsq(rows, gap, rcond=1e-6)[0] if len(rows) else np.zeros(0)
-        if not 0.0 < np.abs(step).max(initial=0.0) < LARGEST_STEP:
-            break
-        source.mujoco.mj_integratePos(source.model, source.data.qpos, step, 1.0)
-        rows, gap = _equality_rows(source)
-    source.data.qpos[:] = start
-    source.forward()
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > RANK_TOLERANCE)
-
-
-def _equality_rows(source: MjcfSource) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the Jacobian (n, nv) and the residuals (n,) of the active equalities at `source.data.qpos`."""
-    mujoco, model, data = source.mujoco, source.model, source.data
-    sparse = model.opt.jacobian
-    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    source.forward()
-    model.opt.jacobian = sparse
-    chosen = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-    return data.efc_J.reshape(-1, model.nv)[: data.nefc][chosen], data.efc_pos[chosen].copy()
-
-
-def drives_joint(source: MjcfSource, actuator: int) -> bool:
-    """Whether an actuator acts on a joint."""
-    kinds = source.mujoco.mjtTrn
-    return int(source.model.actuator_trntype[actuator]) in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
-
-
-def _active(source: MjcfSource) -> list[int]:
-    return [i for i in range(source.model.neq) if source.model.eq_active0[i]]
-
-
-def _constraint(source: MjcfSource, tree: MjcfTree, i: int, locked: dict[int, float]) -> Iterator[Constraint]:
-    """Iterate over the constraints that equality `i` becomes: none if it cannot be represented."""
-    model, kinds = source.model, source.mujoco.mjtEq
-    kind, name = model.eq_type[i], source.name("equality", i)
-    if kind == kinds.mjEQ_JOINT:
-        first, second = (_joint_form(source, int(j)) for j in (model.eq_obj1id[i], model.eq_obj2id[i]))
-        yield from _linear(source, tree, i, first, second, locked)
+    kind = model.eq_type[i]
+    if line is not None:
+        yield LinearConstraint(name, tuple((tree.moved_by[j], x) for j, x in line[0].items()), line[1])
+    elif kind == kinds.mjEQ_JOINT:
+        if {int(model.eq_obj1id[i]), int(model.eq_obj2id[i])} <= tree.moved_by.keys():
+            yield _polynomial(source, tree, i, name)
     elif kind == kinds.mjEQ_TENDON:
-        yield from _tendon(source, tree, i, locked)
-    elif kind == kinds.mjEQ_CONNECT:
+        yield from _rod(source, tree, i, name)
+    elif _holds_bodies(source, i):
         (first, at_first), (second, at_second) = _ends(source, tree, i)
-        if first != second:
+        if first == second:
+            return
+        if kind == kinds.mjEQ_CONNECT or model.eq_data[i][10] == 0.0:  # a weld's scale of torques
             yield LoopConstraint(name, "ball", first, second, at_first, at_second)
-    elif kind == kinds.mjEQ_WELD:
-        (first, at_first), (second, at_second) = _ends(source, tree, i)
-        if first != second and model.eq_data[i][10] > 0.0:  # its scale of torques; 0 leaves rotation free
-            for axis in WELD_AXES:
-                label = f"{name} about {'xyz'[axis.index(1.0)]}"
-                yield LoopConstraint(label, "revolute", first, second, at_first, at_second, axis)
-
-
-def _joint_form(source: MjcfSource, joint: int) -> Form:
-    """A joint's coordinate less its `ref`, which is what MuJoCo's polynomial is about."""
-    return {joint: 1.0}, -float(source.model.qpos0[source.model.jnt_qposadr[joint]])
+            return
+        for axis in WELD_AXES:
+            label = tree.fresh_tie(f"{name} about {'xyz'[axis.index(1.0)]}")
+            yield LoopConstraint(label, "revolute", first, second, at_first, at_second, axis)
 
 
 def tendon_coefficients(source: MjcfSource, tendon: int) -> dict[int, float] | None:
@@ -198,47 +186,69 @@ def tendon_coefficients(source: MjcfSource, tendon: int) -> dict[int, float] | N
     return coefficients
 
 
-def _tendon_form(source: MjcfSource, tendon: int) -> Form | None:
-    """A fixed tendon's length less its length at `ref`; None if the tendon is spatial."""
-    if tendon < 0:
-        return {}, 0.0
-    coefficients = tendon_coefficients(source, tendon)
-    return None if coefficients is None else (coefficients, -float(source.model.tendon_length0[tendon]))
+def _forms(source: MjcfSource, i: int) -> tuple[Form, Form] | None:
+    """Return the two sides of an equality of joints or fixed tendons, each less its value at `ref`; None for others.
+
+    That is what MuJoCo's polynomial is about.
+    """
+    model, kinds = source.model, source.mujoco.mjtEq
+    ids = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+    if model.eq_type[i] == kinds.mjEQ_JOINT:
+        first, second = (({j: 1.0}, -float(model.qpos0[model.jnt_qposadr[j]])) if j >= 0 else ({}, 0.0) for j in ids)
+        return first, second
+    if model.eq_type[i] == kinds.mjEQ_TENDON:
+        coefficients = [tendon_coefficients(source, t) if t >= 0 else {} for t in ids]
+        if coefficients[0] is not None and coefficients[1] is not None:
+            lengths = [-float(model.tendon_length0[t]) if t >= 0 else 0.0 for t in ids]
+            return (coefficients[0], lengths[0]), (coefficients[1], lengths[1])
+    return None
 
 
-def _tendon(source: MjcfSource, tree: MjcfTree, i: int, locked: dict[int, float]) -> Iterator[Constraint]:
+def _linear(source: MjcfSource, i: int, locked: Mapping[int, float]) -> Form | None:
+    """Return the coefficients of joints that are not locked, and the right-hand side; None if it is not linear."""
+    forms = _forms(source, i)
+    if forms is None:
+        return None
+    (first, first_constant), (second, second_constant) = forms
+    constant, ratio, *higher = (float(x) for x in source.model.eq_data[i][:5])
+    if any(higher) and second:
+        if not second.keys() <= locked.keys():
+            return None
+        at = added(x * locked[j] for j, x in second.items()) + second_constant
+        constant, ratio, second = float(Polynomial((constant, ratio, *higher))(at)), 0.0, {}
+    coefficients = dict(first)
+    for joint, value in second.items():
+        coefficients[joint] = coefficients.get(joint, 0.0) - ratio * value
+    return _unlocked(coefficients, constant + ratio * second_constant - first_constant, locked)
+
+
+def _polynomial(source: MjcfSource, tree: MjcfTree, i: int, name: str) -> PolynomialConstraint:
+    """Return `first = polynomial of second`, of joints, counted from zero instead of their `ref`."""
+    model = source.model
+    dependent, argument = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+    start, at = (float(model.qpos0[model.jnt_qposadr[j]]) for j in (dependent, argument))
+    shifted = Polynomial(model.eq_data[i][:5])(Polynomial((-at, 1.0))) + start
+    return PolynomialConstraint(
+        name, tree.moved_by[dependent], tree.moved_by[argument], tuple(map(float, shifted.coef))
+    )
+
+
+def _unlocked(coefficients: dict[int, float], offset: float, locked: Mapping[int, float]) -> Form:
+    """Return a linear form without joints that are locked or do not matter, and its right-hand side."""
+    offset -= added(value * locked[joint] for joint, value in coefficients.items() if joint in locked)
+    return {joint: x for joint, x in coefficients.items() if joint not in locked and x != 0.0}, offset
+
+
+def _rod(source: MjcfSource, tree: MjcfTree, i: int, name: str) -> Iterator[RodConstraint]:
     model, kinds = source.model, source.mujoco.mjtWrap
-    tendon, other = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
-    first, second = _tendon_form(source, tendon), _tendon_form(source, other)
-    if first is not None and second is not None:
-        yield from _linear(source, tree, i, first, second, locked)
-        return
+    tendon = int(model.eq_obj1id[i])
     wraps = range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
-    if other >= 0 or [int(model.wrap_type[w]) for w in wraps] != [int(kinds.mjWRAP_SITE)] * 2:
+    if int(model.eq_obj2id[i]) >= 0 or [int(model.wrap_type[w]) for w in wraps] != [int(kinds.mjWRAP_SITE)] * 2:
         return
     ends = [_site(source, tree, int(model.wrap_objid[w])) for w in wraps]
     (a, at_a), (b, at_b) = ((body, frame.position) for body, frame in ends)
     if a != b:
-        length = float(model.tendon_length0[tendon] + model.eq_data[i][0])
-        yield RodConstraint(source.name("equality", i), a, b, at_a, at_b, length)
-
-
-def _linear(
-    source: MjcfSource, tree: MjcfTree, i: int, first: Form, second: Form, locked: dict[int, float]
-) -> Iterator[LinearConstraint]:
-    """Iterate over `first = constant + ratio * second`, the linear part of MuJoCo's polynomial."""
-    constant, ratio, *higher = (float(x) for x in source.model.eq_data[i][:5])
-    name = source.name("equality", i)
-    if second[0] and any(higher):
-        source.leave_out("the polynomial of equality {} beyond its linear part", name)
-    coefficients = dict(first[0])
-    for joint, value in second[0].items():
-        coefficients[joint] = coefficients.get(joint, 0.0) - ratio * value
-    offset = constant + ratio * second[1] - first[1]
-    offset -= added(value * locked[joint] for joint, value in coefficients.items() if joint in locked)
-    pairs = tuple((tree.moved_by[j], x) for j, x in coefficients.items() if j not in locked and x != 0.0)
-    if len(pairs) > 1:
-        yield LinearConstraint(name, pairs, offset)
+        yield RodConstraint(name, a, b, at_a, at_b, float(model.tendon_length0[tendon] + model.eq_data[i][0]))
 
 
 def _ends(source: MjcfSource, tree: MjcfTree, i: int) -> list[tuple[str | None, Placement]]:
@@ -252,7 +262,8 @@ def _ends(source: MjcfSource, tree: MjcfTree, i: int) -> list[tuple[str | None, 
     if model.eq_type[i] == source.mujoco.mjtEq.mjEQ_CONNECT:
         points = [transform_point(frame, vec3(x)) for frame, x in ((frame_1, data[0:3]), (frame_2, data[3:6]))]
         return [(first, Placement(points[0])), (second, Placement(points[1]))]
-    return [(first, compose(frame_1, placement(data[3:6], data[6:10]))), (second, frame_2)]
+    anchored = compose(frame_2, Placement(vec3(data[0:3])))
+    return [(first, compose(frame_1, placement(data[3:6], data[6:10]))), (second, anchored)]
 
 
 def _site(source: MjcfSource, tree: MjcfTree, site: int) -> tuple[str | None, Placement]:

@@ -30,7 +30,8 @@ from ce_gym.model.formats.mjcf.actuators import read_actuators
 from ce_gym.model.formats.mjcf.balls import balls_in_loops
 from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, shapes
 from ce_gym.model.formats.mjcf.contacts import read_contacts
-from ce_gym.model.formats.mjcf.equalities import choose_independent, locked_joints, read_constraints
+from ce_gym.model.formats.mjcf.equalities import locked_joints, read_constraints
+from ce_gym.model.formats.mjcf.independent import choose_independent, equality_rows, without_repeats
 from ce_gym.model.formats.mjcf.rotors import add_rotors
 from ce_gym.model.formats.mjcf.source import MjcfSource, quaternion, read_mjcf, rotation, summary
 from ce_gym.model.formats.mjcf.unmodelled import report_unmodelled
@@ -85,12 +86,14 @@ def read_robot(
     source = read_mjcf(path)
     locked = locked_joints(source)
     tree = read_bodies(source, locked, balls_in_loops(source), apart)
-    constraints = read_constraints(source, tree, locked)
+    equalities = read_constraints(source, tree, locked)
+    poses = equality_rows(source, tree)
+    constraints = without_repeats(source, equalities, poses)
     spinning = [
         body.name for body in with_rotors(tree.bodies, constraints, tree.moved_by.values()) if body.kind == "rotor"
     ]
-    independent = choose_independent(source, tree, spinning)
-    gains = read_actuators(source, tree, independent)
+    independent = choose_independent(source, tree, spinning, poses)
+    gains = read_actuators(source, tree, independent, constraints, driven)
     contacts, material, lowest = read_contacts(source, tree)
     _add_shapes(source, tree)
     links = {*independent, *(contact.body for contact in contacts)}  # what touches the ground spins outside
@@ -110,7 +113,7 @@ def read_robot(
         gains=gains,
         gravity=vec3(source.model.opt.gravity) if source.enabled("GRAVITY") else (0.0, 0.0, 0.0),
         source=str(path),
-        notes=tuple(f"left out: {what.format(name)}" for what, name in source.left_out),
+        notes=(*(f"left out: {what.format(name)}" for what, name in source.left_out), *source.notes),
     )
     if source.left_out:
         warnings.warn(f"{path}: left out: {summary(source.left_out)}", LossyImportWarning, stacklevel=4)

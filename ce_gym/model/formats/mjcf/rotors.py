@@ -23,7 +23,7 @@ import numpy as np
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import UNKNOWN_RATIO, Body, Joint
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
-from ce_gym.model.formats.mjcf.equalities import drives_joint, tendon_coefficients
+from ce_gym.model.formats.mjcf.equalities import actuated_joints, tendon_coefficients
 from ce_gym.model.formats.mjcf.source import MjcfSource
 from ce_gym.model.formats.rotor_links import disc, without_rotors
 from ce_gym.model.frames import Placement
@@ -132,8 +132,9 @@ def _known_ratios(source: MjcfSource, tree: MjcfTree) -> dict[int, float]:
     model = source.model
     gears: dict[int, list[float]] = {}
     for a in range(model.nu):
-        if drives_joint(source, a):
-            gears.setdefault(int(model.actuator_trnid[a][0]), []).append(float(model.actuator_gear[a][0]))
+        joints = actuated_joints(source, a)
+        for joint, coefficient in joints.items() if len(joints) == 1 else ():
+            gears.setdefault(joint, []).append(float(model.actuator_gear[a][0]) * coefficient)
     return {j: gear[0] for j, gear in gears.items() if len(gear) == 1 and abs(gear[0]) not in (0.0, 1.0)}
 
 
@@ -171,13 +172,10 @@ def _motor_armatures(source: MjcfSource) -> list[_Armature]:
     found = []
     for a in range(model.nu):
         inertia = float(getattr(model, "actuator_armature", np.zeros(model.nu))[a])
-        gear, target = float(model.actuator_gear[a][0]), int(model.actuator_trnid[a][0])
-        name = source.name("actuator", a)
-        joints = {target: 1.0} if drives_joint(source, a) else None
-        if model.actuator_trntype[a] == source.mujoco.mjtTrn.mjTRN_TENDON:
-            joints = tendon_coefficients(source, target)
-        if inertia and joints is None:
+        gear, name = float(model.actuator_gear[a][0]), source.name("actuator", a)
+        joints = actuated_joints(source, a)
+        if inertia and not joints:
             source.leave_out("armature of actuator {}", name)
-        elif inertia and joints:
+        elif inertia:
             found.append(_Armature(name, joints, inertia * gear**2, None if abs(gear) in (0.0, 1.0) else gear))
     return found

@@ -47,6 +47,7 @@ class MjcfSource:
         model: `MjModel`.
         data: `MjData` at the reference pose: the first keyframe, or all joints at their `ref`.
         left_out: What the robot will lack: a text that completes "... is left out", and the name to put in it.
+        notes: What else a user should know.
         moved: Whether joints were moved to within their limits, so that the height of the base means nothing.
     """
 
@@ -55,11 +56,24 @@ class MjcfSource:
     model: Any
     data: Any
     left_out: list[tuple[str, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     moved: bool = False
 
     def name(self, kind: str, index: int) -> str:
         """Return the name of element `index` of a kind, such as "body"; one like "body3" if it has none."""
-        return printable(getattr(self.model, kind)(int(index)).name) or f"{kind}{index}"
+        return self.given_name(kind, index) or self._unused(kind, f"{kind}{index}")
+
+    def given_name(self, kind: str, index: int) -> str:
+        """Return the name that the file gives to an element; "" if it gives none."""
+        return printable(getattr(self.model, kind)(int(index)).name)
+
+    def _unused(self, kind: str, name: str) -> str:
+        """Return a name, with as many underscores as it takes that no element of a kind has it."""
+        try:
+            getattr(self.model, kind)(name)
+        except KeyError:
+            return name
+        return self._unused(kind, f"{name}_")
 
     def leave_out(self, what: str, name: str = "") -> None:
         """Note what the robot will lack, `{}` in it standing for the name of an element."""

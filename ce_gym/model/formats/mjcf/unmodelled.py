@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.formats.mjcf.equalities import drives_joint
+from ce_gym.model.formats.mjcf.equalities import actuated_joints, coupling_tendons
 from ce_gym.model.formats.mjcf.source import MjcfSource
 from ce_gym.model.formats.mjcf.touching import is_default_solver, solid
 
@@ -57,7 +57,8 @@ def _report_actuators(source: MjcfSource) -> None:
         name = source.name("actuator", a)
         if model.opt.disableactuator & 1 << int(model.actuator_group[a]) and 0 <= model.actuator_group[a] < 31:
             source.leave_out("the actuatorgroupdisable of actuator {}", name)
-        if not drives_joint(source, a) or model.actuator_gaintype[a] != source.mujoco.mjtGain.mjGAIN_FIXED:
+        joints = actuated_joints(source, a)
+        if len(joints) != 1 or model.actuator_gaintype[a] != source.mujoco.mjtGain.mjGAIN_FIXED:
             continue  # left out as a whole
         if np.any(_new(source, "actuator_delay", model.nu)[a]):
             source.leave_out("delay of actuator {}", name)
@@ -68,7 +69,7 @@ def _report_actuators(source: MjcfSource) -> None:
         if model.actuator_biastype[a] != affine and clamped[a]:
             if _is_lopsided(model.actuator_ctrlrange[a]):
                 source.leave_out("the nearer one of the two limits ctrlrange of actuator {}", name)
-        elif clamped[a] and _narrows(source, a):
+        elif clamped[a] and _narrows(source, a, *joints):
             source.leave_out("ctrlrange of actuator {}, narrower than the range of its joint", name)
     for j in range(model.njnt):
         if model.jnt_actfrclimited[j] and _is_lopsided(model.jnt_actfrcrange[j]):
@@ -79,9 +80,9 @@ def _is_lopsided(limits: NDArray[np.float64]) -> bool:
     return not np.isclose(-limits[0], limits[1], rtol=1e-6)
 
 
-def _narrows(source: MjcfSource, a: int) -> bool:
+def _narrows(source: MjcfSource, a: int, joint: int) -> bool:
     """Whether a position actuator's targets are limited to less than the range of its joint."""
-    model, joint, gear = source.model, int(source.model.actuator_trnid[a][0]), float(source.model.actuator_gear[a][0])
+    model, gear = source.model, float(source.model.actuator_gear[a][0])
     stiffness = -float(model.actuator_biasprm[a][1])
     if gear == 0.0 or stiffness == 0.0:
         return False
@@ -103,7 +104,8 @@ def _report_world(source: MjcfSource) -> None:
     for count, what in ((model.nflex, "deformable bodies"), (model.nplugin, "plugins")):
         if count:
             source.leave_out(what)
+    couplings = coupling_tendons(source)
     for t in range(model.ntendon):
-        acts = [getattr(model, f"tendon_{key}")[t] for key in ("stiffness", "damping", "frictionloss", "limited")]
-        if any(map(np.any, acts)):
-            source.leave_out("spring, damper, friction or limit of tendon {}", source.name("tendon", t))
+        for key in ("stiffness", "damping", "frictionloss", "limited"):
+            if np.any(getattr(model, f"tendon_{key}")[t]) and not (key == "limited" and t in couplings):
+                source.leave_out(f"{'range' if key == 'limited' else key} of tendon {{}}", source.name("tendon", t))

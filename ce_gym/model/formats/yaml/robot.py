@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from ce_gym.model.assets import assets_folder
@@ -31,7 +32,7 @@ _JOINT_FIGURES = {"joint_friction": "friction", "joint_stiffness": "stiffness", 
 _KEYS = (
     *("name", "urdf", "mjcf", "base", "sources", "notes", "kept_inertia", "gravity", "gears"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
-    *("capsules", "self_collisions", "elastic", "battery"),
+    *("capsules", "self_collisions", "elastic", "battery", "passive"),
     *_JOINT_FIGURES,
 )
 
@@ -53,6 +54,7 @@ def robot_from_yaml(path: Path) -> Robot:
     bodies = _with_joint_figures(file, bodies)
     ties = (*gears, *read_constraints(file, bodies, links.frames))
     independent = _independent(file, below, ties)
+    bodies = _without_actuators(file, bodies, independent)
     robot = replace(
         below,
         name=file.text("name", below.name),
@@ -112,6 +114,21 @@ def _with_joint_figures(file: Section, bodies: tuple[Body, ...]) -> tuple[Body, 
             for body in bodies
         )
     return bodies
+
+
+def _without_actuators(file: Section, bodies: tuple[Body, ...], independent: tuple[str, ...]) -> tuple[Body, ...]:
+    """Return bodies with joints of no torque where a pattern of the list `passive` fits: no actuator moves these."""
+    passive: set[str] = set()
+    for pattern in file.texts("passive"):
+        matches = {name for name in independent if fnmatchcase(name, pattern)}
+        if not matches:
+            raise unknown(file.file, "passive", pattern, independent, "the name of an independent joint, or a pattern")
+        passive |= matches
+    if passive and passive == set(independent):
+        raise bad(file.file, "passive", tuple(passive), "at least one independent joint that is not passive")
+    return tuple(
+        replace(body, joint=replace(body.joint, torque=0.0)) if body.name in passive else body for body in bodies
+    )
 
 
 def _independent(file: Section, below: Robot, ties: tuple[Constraint, ...]) -> tuple[str, ...]:
