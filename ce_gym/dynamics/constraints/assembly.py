@@ -25,8 +25,15 @@ Array = NDArray[np.float64]
 CLOSED = 1e-10
 """Largest residual of a constraint that is met at the reference pose."""
 SINGULAR = 1e-7
-"""Smallest singular value, relative to the largest, of independent rows."""
-_SAMPLES, _SPREAD = 6, 0.3
+"""Smallest singular value, relative to the largest, of loops that are not singular."""
+REDUNDANT = 1e-6
+"""Smallest singular value of rows, each with a largest entry of 1, that do not repeat each other: files are rounded."""
+NEARLY_CLOSED = 1e-6
+"""Largest residual of rounded rows in configurations that meet all others."""
+SAMPLES, SPREADS = 6, (0.3, 0.1, 0.03)
+"""Configurations around the reference pose that are tried, and how far from it, in units of the coordinates."""
+FARTHEST = 0.5
+"""How far a configuration may move when it is closed: beyond, it is on another branch, which may be singular."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +136,12 @@ class Assembler:
         linear = (self.A @ q - self.b) / scale
         return np.concatenate([linear, phi[:, 0]]), np.vstack([self.A / scale[:, None], K]) * self.unit
 
-    def _close(self, q: Array, free: list[int]) -> tuple[Array, float]:
-        """Move the coordinates `free` until the constraints are met, by a damped Gauss-Newton iteration."""
+    def _close(self, q: Array, free: list[int], smallest: float = 1e-10) -> tuple[Array, float]:
+        """Move the coordinates `free` until the constraints are met, by a damped Gauss-Newton iteration.
+
+        Directions whose singular value is below `smallest`, relative to the largest, are left alone: along them the
+        iteration would wander far for the sake of a rounding error.
+        """
         q = q.copy()
         for _ in range(200):
             phi, K = self._all(q)
@@ -138,7 +149,7 @@ class Assembler:
                 return q, np.inf
             if np.abs(phi).max() < 1e-15:
                 break
-            step = -np.linalg.lstsq(K[:, free], phi, rcond=1e-10)[0]
+            step = -np.linalg.lstsq(K[:, free], phi, rcond=smallest)[0]
             q[free] += self.unit[free] * step * min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
         return q, float(np.abs(self._all(q)[0]).max())
 
@@ -148,17 +159,24 @@ class Assembler:
 
     def _independent_rows(self, q: Array) -> tuple[int, ...]:
         """Find rows that are not implied by others, in configurations around the reference pose that meet them all."""
-        rng = np.random.default_rng(0)
-        spread = self.unit * rng.uniform(-_SPREAD, _SPREAD, (_SAMPLES, self.n))
-        moved = [self._close(q + sample, list(range(self.n))) for sample in spread]
-        Ks = [self._all(valid)[1] for valid, gap in moved if gap < CLOSED]
+        Ks = next((Ks for spread in SPREADS if (Ks := self._jacobians_around(q, spread))), [])
         if not Ks:
             raise self._error("does not close at the standing pose, nor near it: expected `pose` and `assembly` near")
         first, kept = len(self.A), list(range(len(self.A)))
         for row in range(first, first + self.n_rows):
-            if max(_smallest(K[[*kept, row]]) for K in Ks) > SINGULAR:
+            if max(_smallest(K[[*kept, row]]) for K in Ks) > REDUNDANT:
                 kept.append(row)
         return tuple(row - first for row in kept[first:])
+
+    def _jacobians_around(self, q: Array, spread: float) -> list[Array]:
+        """Return the Jacobian of all rows in configurations near `q` that are closed, on the same branch."""
+        samples = self.unit * np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, self.n))
+        found = []
+        for start in q + samples:
+            closed, gap = self._close(start, list(range(self.n)), REDUNDANT)
+            if gap < NEARLY_CLOSED and np.abs((closed - start) / self.unit).max() < FARTHEST:
+                found.append(self._all(closed)[1])
+        return found
 
     def _condition(self, q: Array, rows: tuple[int, ...]) -> float:
         """Condition number of the dependent columns, each row scaled to its largest entry."""

@@ -25,7 +25,7 @@ VANISHING = 1e-9
 """Size of a row that counts as zero where all rows of its kind are as small."""
 CLOSING_STEPS, LARGEST_STEP = 8, 0.1
 """How often a pose is moved to close its loops, and how far joints may be from there [rad or m]."""
-POSES, SPREAD = 4, 0.2
+POSES, SPREAD = 4, 0.05
 """How many poses are tried around the reference pose, and how far from it [rad or m]."""
 OPEN = 1e-4
 """Residual beyond which a pose does not count as closed [m or rad]."""
