@@ -36,7 +36,7 @@ from ce_gym.dynamics.forces.motors import (
     supply_of,
 )
 from ce_gym.dynamics.forces.parameters import rubbing_as_declared
-from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
+from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation, Stick
 from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.drives import Motor
@@ -237,7 +237,7 @@ def deliver(
     speed, tau, slope = W @ yd[rows], SX(asked.tau), asked.slope
     turning = SX(len(motors), yd.numel())
     turning[:, rows] = W
-    free, own, sticks, windings = SX.eye(len(motors)), SX(len(motors), len(motors)), [], []
+    free, own, windings = SX.eye(len(motors)), SX(len(motors), len(motors)), []
     for i, (motor, place) in enumerate(zip(motors, cluster.places, strict=True)):
         if (limits := model.limits(before.supply.now(place, motor), speed[i], strength, dt)) is not None:
             (high, forwards), (low, backwards) = limits
@@ -263,14 +263,13 @@ def deliver(
             friction = ca.if_else(known, friction, HOLD)
         if rubs(friction):
             last = iterate.numel() - 1  # before it, the frictions of all motors, as many as there are before those
-            one = dry_friction(friction, speed[i], turning[i, :], dt, iterate, (last + yd.numel()) // 2 + place)
-            force.limited[(last + yd.numel()) // 2 + place] = one
+            at, way = (last + yd.numel()) // 2 + place, turning[i, :]
+            one, rests, stops = dry_friction(friction, speed[i], way, dt, iterate, at, len(rows) == 1)
+            force.limited[at] = one
             tau[i] += one.given
-            own[i, i] += ca.if_else(one.free, dt * friction / STICK_SPEED, 0)
-            sticks.append(ca.logic_and(one.free, friction > 0) if isinstance(friction, SX) else one.free)
-    if len(sticks) == len(motors) == len(rows):
-        all_stick = SX(ca.sum1(ca.vertcat(*sticks)) > len(sticks) - 0.5)
-        force.held |= dict.fromkeys(rows, all_stick)
+            own[i, i] += ca.if_else(one.free, dt * stops, 0)
+            sticks = ca.logic_and(one.free, friction > 0) if isinstance(friction, SX) else one.free
+            force.frictions.append(Stick(way, sticks, rests))
     answer = free @ slope @ free
     for i, (place, given, at_limit) in enumerate(windings):
         force.windings[place] = JointForce(given, answer[i, :] @ turning + at_limit * turning[i, :])

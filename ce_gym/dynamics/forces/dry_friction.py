@@ -8,19 +8,28 @@ one degree of freedom is one, `sum |W_i| f_i`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.law import JointForce
+from ce_gym.dynamics.forces.law import JointForce, is_moment
 from ce_gym.dynamics.forces.parameters import rubbing_as_declared
-from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation
+from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation, Stick
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.mechanism import Mechanism
 
 STICK_SPEED = 1e-4
-"""Speed at which dry friction that sticks carries its full torque [rad/s or m/s]."""
+"""Speed at which dry friction that stops a joint or rotor carries its full torque; one that is slower, and sticks, is
+at rest [rad/s or m/s]."""
+STICK_ACCELERATION, STICK_ACCELERATION_ALONE = 2e-3, 1e-5
+"""That speed at rest is this times the step, in a cluster with several degrees of freedom and with one [rad/s^2].
+
+Breakaway is late by it times the inertia. The damping of a rotor that sticks must leave digits for the other motions of
+its cluster, which single precision has few of; a cluster with one degree of freedom has no others.
+"""
+INDEPENDENT = 1e-6
+"""Least determinant of directions for them to be independent."""
 STICK_ITERATIONS = 8
 """How many iterations of a step joints may ask for after the first until which of them stick is settled.
 
@@ -87,9 +96,6 @@ def friction_count(mechanism: Mechanism, declared: tuple[str, ...] = ()) -> int:
 class JointFriction:
     """What the dry friction of all joints does over one step: a `ForceLaw`.
 
-    An independent joint that friction holds does not move at all: by its own, or by any in a cluster with one degree of
-    freedom. Where friction of dependent joints holds several, they creep by less than `STICK_SPEED`.
-
     Attributes:
         mechanism: The robot.
         kinematics: Of it.
@@ -112,17 +118,17 @@ class JointFriction:
         n, last = self.yd.numel(), iterate[-1] > STICK_ITERATIONS - 0.5
         force = SaturatedForce(SX(n, 1), SX(n, n), iterate.numel(), count=iterate[-1] + 1)
         for cluster in rubbing_clusters(self.mechanism):
-            for name, (friction, own) in self._torques(cluster).items():
+            for friction, own in self._torques(cluster).values():
                 way, place = SX(1, n), len(force.limited)
                 way[cluster.rows] = own
-                one = dry_friction(friction, way @ self.yd, way, self.dt, iterate, place)
+                alone = len(cluster.rows) == 1
+                one, rests, damping = dry_friction(friction, way @ self.yd, way, self.dt, iterate, place, alone)
                 force.limited[place] = one
                 acts = one.free if not cluster.declared else ca.logic_and(one.free, friction > 0)
                 sticks = ca.logic_and(acts, ca.logic_not(last))
                 force.tau += way.T @ ca.if_else(last, ca.fmax(-friction, ca.fmin(friction, one.expected)), one.given)
-                force.slope += way.T @ ca.if_else(sticks, self.dt * friction / STICK_SPEED, 0) @ way
-                if name in self.mechanism.robot.independent:
-                    force.held[self.mechanism.robot.independent.index(name)] = sticks
+                force.slope += way.T @ ca.if_else(sticks, self.dt * damping, 0) @ way
+                force.frictions.append(Stick(way, sticks, rests))
         return force
 
     def _torques(self, cluster: Rubbing) -> dict[str, tuple[SX, SX]]:
@@ -137,11 +143,14 @@ class JointFriction:
         return {name: (lengths[name] * f, ways[name] / lengths[name]) for name, f in cluster.friction.items()}
 
 
-def dry_friction(friction: SX | float, speed: SX, turning: SX, dt: float, iterate: SX, place: int) -> Saturation:
+def dry_friction(
+    friction: SX | float, speed: SX, turning: SX, dt: float, iterate: SX, place: int, alone: bool
+) -> tuple[Saturation, SX, SX]:
     """Return the dry friction of a joint or a rotor: what would stop it, up to what friction has.
 
     It sticks by a damping so large that it is at rest at the end of the step but for `STICK_SPEED`; where that
-    would take more than it has it slips, and is a constant torque against the motion at the end of the step.
+    would take more than it has it slips, and is a constant torque against the motion at the end of the step. At rest
+    the damping is larger still, and what is left of the speed is taken away, see `stand_still`.
 
     Args:
         friction: What it has [N m or N].
@@ -150,7 +159,63 @@ def dry_friction(friction: SX | float, speed: SX, turning: SX, dt: float, iterat
         dt: Length of the step [s].
         iterate: From the iteration before, shape (limit_count,).
         place: Of this torque in it.
+        alone: Whether its cluster has one degree of freedom.
+
+    Returns:
+        The torque; whether the joint or rotor is at rest at the start of the step, 1 or 0; the damping [N m s/rad].
     """
-    sticking, still = friction / STICK_SPEED, SX(1, turning.numel())
+    rests, still = ca.fabs(speed) <= STICK_SPEED, SX(1, turning.numel())
+    slowest = ca.fmin(STICK_SPEED, dt * (STICK_ACCELERATION_ALONE if alone else STICK_ACCELERATION))
+    damping = SX(friction) / (STICK_SPEED if is_moment(dt) else ca.if_else(rests, slowest, STICK_SPEED))
     ends = JointForce(SX(friction), still), JointForce(SX(-friction), still)
-    return Saturation.about(iterate, place, JointForce(-sticking * speed, dt * sticking * turning), *ends)
+    one = Saturation.about(iterate, place, JointForce(-damping * speed, dt * damping * turning), *ends)
+    if is_moment(dt):
+        return one, rests, damping
+    expected = ca.if_else(iterate[-1] > 0, one.expected, ca.if_else(rests, 0, one.expected))
+    return replace(one, expected=expected), rests, damping
+
+
+def stand_still(
+    mechanism: Mechanism, kinematics: Kinematics, frictions: list[Stick], before: SX, q: SX, v: SX, dt: float
+) -> None:
+    """Let stand what dry friction holds, in positions and velocities (nq,) and (nv,) after a step; changed in place.
+
+    Joints of a cluster do not move if friction sticks along as many independent directions as the cluster has degrees
+    of freedom, nor does a joint that is independent and sticks by itself. A rotor that sticks behind a transmission
+    that stretches does not turn: the stretch takes up what its joints move.
+
+    Args:
+        mechanism: The robot.
+        kinematics: At the start of the step.
+        frictions: What dry friction there is.
+        before: Positions at the start of the step.
+        q: After it.
+        v: Velocities after it.
+        dt: Length of the step [s].
+    """
+    layout, stretches = mechanism.robot.layout, len(mechanism.robot.independent) - len(mechanism.robot.commanded)
+    first_q, first_v = layout.joints_q, layout.joints_v
+    for rows in kinematics.rows:
+        rows = [row - first_v for row in rows if row >= first_v]
+        own = [one for one in frictions if ca.sparsify(one.turning[rows]).nnz()] if rows else []
+        whole = SX(0)
+        if len(own) >= len(rows) > 0:
+            ways = [ca.if_else(one.sticks, one.turning[rows] / ca.norm_2(one.turning[rows]), 0) for one in own]
+            whole = ca.det(sum((way.T @ way for way in ways), SX(len(rows), len(rows)))) > INDEPENDENT
+        for one in own:
+            columns = ca.sparsify(one.turning[rows]).sparsity().get_col()
+            held = [rows[columns[0]]] if len(columns) == 1 else []
+            for row in held:
+                q[first_q + row] = ca.if_else(one.sticks, before[first_q + row], q[first_q + row])
+                v[first_v + row] = ca.if_else(ca.logic_and(one.sticks, one.rests), 0, v[first_v + row])
+            stretch = [rows[j] for j in columns if rows[j] >= len(mechanism.robot.commanded)]
+            if stretches and len(stretch) == 1 and len(columns) > 1:
+                row = stretch[0]
+                others = one.turning @ v[first_v:] - one.turning[row] * v[first_v + row]
+                takes = ca.logic_and(one.sticks, one.rests)
+                v[first_v + row] = ca.if_else(takes, -others / one.turning[row], v[first_v + row])
+                q[first_q + row] = ca.if_else(takes, before[first_q + row] + dt * v[first_v + row], q[first_q + row])
+        rest = ca.logic_and(whole, sum((one.sticks * ca.logic_not(one.rests) for one in own), SX(0)) < 0.5)
+        for row in rows if len(own) >= len(rows) else ():
+            q[first_q + row] = ca.if_else(whole, before[first_q + row], q[first_q + row])
+            v[first_v + row] = ca.if_else(rest, 0, v[first_v + row])

@@ -82,13 +82,28 @@ class Saturation:
 
 
 @dataclass
+class Stick:
+    """Dry friction of one joint or rotor over one step.
+
+    Attributes:
+        turning: Speed of the joint or rotor for unit velocities of all independent joints, shape (1, nj).
+        sticks: 1 if it sticks, else 0.
+        rests: 1 if it was at rest at the start of the step, else 0.
+    """
+
+    turning: SX
+    sticks: SX
+    rests: SX
+
+
+@dataclass
 class SaturatedForce(JointForce):
     """A force on joints that is made of torques kept within limits: a `LinearForce`.
 
     Attributes:
         size: Of its iterate: the expected torques, and last `count`.
         limited: The torques that are kept within limits, at their places in the iterate.
-        held: Rows of `y` that dry friction holds, each with 1 if it does, else 0.
+        frictions: What dry friction there is.
         windings: Torques of motors, by their places, before what they lose.
         on_line: On which torque-speed line each is, likewise: 1 forwards, -1 backwards, 0 where it is on none.
         sampled: What a sampled controller holds after the step, as `State.held` is.
@@ -97,7 +112,7 @@ class SaturatedForce(JointForce):
 
     size: int
     limited: dict[int, Saturation] = field(default_factory=dict)
-    held: dict[int, SX] = field(default_factory=dict)
+    frictions: list[Stick] = field(default_factory=list)
     windings: dict[int, JointForce] = field(default_factory=dict)
     on_line: dict[int, SX] = field(default_factory=dict)
     sampled: SX = field(default_factory=lambda: SX(0, 1))

@@ -24,7 +24,7 @@ from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh
 from ce_gym.dynamics.drives.stretch import stretching
 from ce_gym.dynamics.forces.actuation import Before, limit_count
 from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground, where
-from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
+from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count, stand_still
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.law import JointForce, Motion, is_moment
 from ce_gym.dynamics.forces.motor_control import Motors
@@ -227,9 +227,8 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
     yd = state.v[scene.mechanism.robot.layout.joints_v :]
     q, v = advance(state.q, state.v, solved.vdot, dt, scene.mechanism.robot.layout)
     saturated = [motors, *solved.friction]
-    for row, held in [pair for force in saturated for pair in force.held.items()]:  # such a joint does not move at all
-        place = q.numel() - motors.tau.numel() + row
-        q[place] = ca.if_else(held, state.q[place], q[place])
+    frictions = [one for force in saturated for one in force.frictions]
+    stand_still(scene.mechanism, kinematics, frictions, state.q, q, v, dt)
     contacts = [(kinematics.bodies[c.body].R, c, c.gain(motion)) for c in solved.contacts]
     anchors = [where(c.law.near, (R @ c.anchor_after(gain))[:2]) for R, c, gain in contacts]
     after = State(
