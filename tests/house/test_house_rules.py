@@ -38,7 +38,7 @@ LAYERS = {
     " contact_shapes urdf mjcf yaml",
     "compile": "system arrays program layout lowering private_files cache critical threads kernel machine_code sources"
     " loading cuda",
-    "dynamics": "algebra constraints standing recursion electric forces drives self_contact functions derivatives"
+    "dynamics": "algebra constraints standing recursion hulls electric forces drives self_contact functions derivatives"
     " stepping evaluation model",
     "sim": "arguments tiles devices terrain placement substeps kernel_key kernels derivative_kernels schema batch"
     " pieces simulator derivatives",
