@@ -190,8 +190,8 @@ def _between(points: Array, faces: list[list[int]], spacing: float, tolerance: f
 def _grid(n: int, m: int) -> Array:
     """Return places (u, v) on a square: evenly on its sides, and inside as many as a grid of n by m cells has.
 
-    Those inside are a lattice that no line along or across the square passes through twice, mirrored to all quarters. So
-    the edge of a ridge or of a stair is found more exactly than the points are apart.
+    Those inside are a lattice in one quarter, mirrored to the others, in which no two points have the same `u` or the
+    same `v`. So the edge of a ridge or of a stair is found more exactly than the points are apart.
     """
     along, across = np.arange(n + 1) / n, np.arange(m + 1) / m
     sides = [(u, v) for u in along for v in (0.0, 1.0)] + [(u, v) for u in (0.0, 1.0) for v in across]
@@ -201,21 +201,25 @@ def _grid(n: int, m: int) -> Array:
     return np.concatenate([sides, *inside])
 
 
-def pressed(hull: Hull, z: SX, under: SX, corners: SX) -> list[tuple[SX, SX, SX]]:
+def pressed(hull: Hull, up: SX, z: SX, under: SX, corners: SX) -> list[tuple[SX, SX, SX]]:
     """Return where each region of a hull touches the ground: point (3,) in the body frame [m], depth [m], normal (3,).
+
+    Of a rounded hull it is what is straight below its points that touches: on ground that leans by an angle `b` against
+    the line between them, that is `radius (1 / cos b - 1)` short of where a sphere would.
 
     Args:
         hull: The hull.
+        up: The world's upward direction in the body frame, shape (3,).
         z: Heights of its points [m], shape (n,).
         under: Height [m] and slopes of the ground under each of them, shape (3, n).
         corners: Height of the ground under the contacts of the scene [m], shape (n_contacts,).
     """
     depths, normals = [], []
     for i, weights in enumerate(hull.weights):
-        up = 1 / ca.sqrt(1 + ca.sumsqr(under[1:, i]))
+        cosine = 1 / ca.sqrt(1 + ca.sumsqr(under[1:, i]))
         rise = under[0, i] - sum((weight * corners[corner] for corner, weight in weights), SX(0))
-        depths.append(ca.fmin(hull.radius - up * (z[i] - under[0, i]), STEEPNESS * (rise - RISE)))
-        normals.append(up * ca.vertcat(-under[1:, i], 1))
+        depths.append(ca.fmin(cosine * (hull.radius - z[i] + under[0, i]), STEEPNESS * (rise - RISE)))
+        normals.append(cosine * ca.vertcat(-under[1:, i], 1))
     found = []
     for _, members in hull.regions:
         deepest = depths[members[0]]
@@ -231,7 +235,7 @@ def pressed(hull: Hull, z: SX, under: SX, corners: SX) -> list[tuple[SX, SX, SX]
         push = weighted([normals[i] for i in members], cubes)
         length = ca.norm_2(push)
         depth = unit * length / (scale * scale * root)
-        found.append((point, depth + ca.fmin(deepest - LEAST_DEPTH, 0), push / length))
+        found.append((point - hull.radius * up, depth + ca.fmin(deepest - LEAST_DEPTH, 0), push / length))
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 import casadi as ca
@@ -192,7 +192,7 @@ def contact_centres(scene: Scene) -> list[tuple[ContactSphere, SX]]:
     """Return all that may touch the ground, and where its centre is in its body [m], shape (3,)."""
     spheres = contact_spheres(scene.mechanism, scene.options)
     centres = [constant(np.array(sphere.position)) for sphere in spheres] + ca.horzsplit(scene.spots)
-    poles = [spheres[i] for i in poles_of(scene.options.hulls)]
+    poles = [replace(spheres[i], radius=0.0) for i in poles_of(scene.options.hulls)]
     return list(zip([*spheres, *poles], centres, strict=True))
 
 

@@ -104,11 +104,12 @@ def hulls_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
     for hull in options.hulls:
         own = slice(first, first + len(hull.points))
         first = own.stop
-        for spot, depth, normal in pressed(hull, points[2, own], under[:, own], ground[0, :]):
-            place = kinematics.bodies[hull.body].point_position(spot)
+        body = kinematics.bodies[hull.body]
+        for spot, depth, normal in pressed(hull, body.R[2, :].T, points[2, own], under[:, own], ground[0, :]):
+            place = body.point_position(spot)
             spots.append(spot)
             places.append(place[:2])
-            planes.append(ca.vertcat(place[2] + (depth - hull.radius) / normal[2], -normal[:2] / normal[2]))
+            planes.append(ca.vertcat(place[2] + depth / normal[2], -normal[:2] / normal[2]))
     given |= {"contact_places": ca.vec(at), "contact_ground": ca.vec(ground), "hull_ground": ca.vec(under)}
     results = {"places": ca.horzcat(*places), "ground_next": ca.horzcat(*planes), "spots": ca.horzcat(*spots)}
     return traced("hulls", given, {name: ca.vec(value) for name, value in results.items()})
