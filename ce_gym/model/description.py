@@ -152,6 +152,7 @@ class ContactSphere:
         group: Free label, such as "foot", "knee" or "torso", by which tasks choose contacts.
         rim: Radius of the circle on which the sphere's centre moves [m]; 0 for a sphere that is fixed.
         axis: Of that circle in the body frame, a unit vector.
+        shape: Name of the convex shape of which it is a corner; "" for a sphere or a point of its own.
     """
 
     name: str
@@ -161,6 +162,7 @@ class ContactSphere:
     group: str = "foot"
     rim: float = 0.0
     axis: Vec3 = (0.0, 0.0, 1.0)
+    shape: str = ""
 
 
 @dataclass(frozen=True)

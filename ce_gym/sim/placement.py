@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.dynamics.forces.ground import above, lift, reach
+from ce_gym.dynamics.hulls import Hull
 from ce_gym.dynamics.model import Model
 from ce_gym.sim.terrain import Terrain
 
@@ -20,10 +21,13 @@ class Placement:
         model: The robot.
         contacts: Names of the spheres.
         terrain: The ground; the plane z = 0 if None.
+        hulls: Convex shapes on a field whose corners some of the spheres are.
     """
 
-    def __init__(self, model: Model, contacts: Sequence[str], terrain: Terrain | None) -> None:
-        self._model, self._terrain = model, terrain
+    def __init__(
+        self, model: Model, contacts: Sequence[str], terrain: Terrain | None, hulls: Sequence[Hull] = ()
+    ) -> None:
+        self._model, self._terrain, self._hulls = model, terrain, hulls
         self._chosen = [model.contact_names.index(name) for name in contacts]
         spheres = [model.robot.contacts[i] for i in self._chosen]
         self._carriers = [model.body_names.index(sphere.body) for sphere in spheres]
@@ -42,7 +46,14 @@ class Placement:
             return 0.0
         over, level = self._over_ground(q), self._reach(q)
         allowed = np.minimum(over[0], level) + (self._reach(q, *over[2:]) - level)
-        return float(lift(allowed, *over).max())
+        return max(float(lift(allowed, *over).max()), *(self._lift_of(hull, q) for hull in self._hulls), -np.inf)
+
+    def _lift_of(self, hull: Hull, q: ArrayLike) -> float:
+        """Return the same for the points of a hull."""
+        at, turned = self._model.body_poses(q)
+        body = self._model.body_names.index(hull.body)
+        x, y, z = at[body][:, None] + turned[body] @ np.array(hull.points).T
+        return float(lift(np.minimum(z, hull.radius), z, *np.moveaxis(self._terrain.at(x, y), -1, 0)).max())  # type: ignore[union-attr]
 
     def _reach(self, q: ArrayLike, slope_x: ArrayLike = 0.0, slope_y: ArrayLike = 0.0) -> NDArray:
         """Return how far each contact reaches from its centre towards ground of these slopes [m]."""

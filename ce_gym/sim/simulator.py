@@ -33,6 +33,7 @@ from ce_gym.sim.pieces import piece_length, run_substeps
 from ce_gym.sim.placement import Placement
 from ce_gym.sim.schema import Row, Steps, checked_tolerance, physics_rows
 from ce_gym.sim.terrain import Terrain
+from ce_gym.sim.terrain.hulls import hulls_on
 
 FAILURES = Row("failures", 0, "host", dtype="int64")
 """How often a robot has diverged and been set anew, and how often it has been stepped again."""
@@ -144,7 +145,8 @@ class Simulator:
         self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
         self.dtype, self.num_threads = dtype, num_threads
         self.contact_names = select_contacts(model.robot, contacts)
-        self._placement = Placement(model, self.contact_names, terrain)
+        hulls = hulls_on(model.robot, self.contact_names, terrain)
+        self._placement = Placement(model, self.contact_names, terrain, hulls)
         self.options = StepOptions(
             control=control,  # type: ignore[arg-type]
             contacts=self.contact_names,
@@ -159,6 +161,7 @@ class Simulator:
             seldom=tuple(name for name in select_contacts(model.robot, seldom, "seldom") if name in self.contact_names),
             retry=retry,
             control_period=control_period,
+            hulls=hulls,
         )
         check_effects(model.mechanism, self.options)
         self.target_names = target_names(model.mechanism, self.options.control)
@@ -375,7 +378,9 @@ class Simulator:
         if "stiffness" in self._columns:
             rows = to_numpy(self._batch.rows("parameters"))
             stiffness = rows[:, self._columns["stiffness"]]
-        return stiffness * self._placement.depth(q)
+        load = stiffness * self._placement.depth(q)
+        between = len(self.options.touches) - len(self.contact_names)
+        return np.concatenate([load, np.zeros((*load.shape[:-1], between))], axis=-1)
 
     def _read(self, name: str) -> Array:
         if name not in self._arrays:

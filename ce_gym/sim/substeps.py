@@ -14,7 +14,13 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.choice import chooses
 from ce_gym.dynamics.stepping.control import beginning_function as beginning_of_interval
 from ce_gym.dynamics.stepping.control import control_function, control_sizes
-from ce_gym.dynamics.stepping.ground_lookup import places_function, planes_function, touching_function
+from ce_gym.dynamics.stepping.ground_lookup import (
+    hull_places_function,
+    hulls_function,
+    places_function,
+    planes_function,
+    touching_function,
+)
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import beginning_function, judging_function, mending_function
 from ce_gym.dynamics.stepping.plan import LOAD, MOVED, OFF, Plan, Rates, Stage
@@ -55,7 +61,7 @@ def substeps(
     kept = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
     if len(kept) < len(outputs):
         return substeps(mechanism, options, tuple(kept))
-    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground")}
+    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground", "samples")}
     sizes |= {"retries": 1, **kept} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= control_sizes(mechanism.robot.layout) if plan.controlled else {}
     fractions = {TRIED: 1.0} | ({_own(plan, stage): stage.length for stage in plan.stages} if staged else {})
@@ -169,17 +175,26 @@ def _zeros(iteration: ca.Function, name: str) -> ca.Function:
 def look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> Parts:
     """Find the ground under the contacts; `at` is what the names of the state's buffers begin with."""
     places, touching = places_function(mechanism, options), touching_function(mechanism, options)
-    n = len(options.contacts)
-    buffers = [Buffer(HEIGHTS, 0, "table"), Buffer("places", 2 * n, "scratch"), Buffer("ground", 3 * n, "scratch")]
-    state = tuple(f"{at}{name}" for name in places.name_in())
-    under = Call(places, state, ("places",)), Lookup(HEIGHTS, FRAME, "places", "ground")
-    if touching is None:
-        return buffers, under
-    m, planes = touching.numel_out(0) // 2, planes_function(mechanism, options)
-    buffers += [Buffer("touching", 2 * m, "scratch"), Buffer("found", 3 * m, "scratch")]
-    beside = (
-        Call(touching, (*state[: touching.n_in() - 2], "places", "ground"), ("touching",)),
-        Lookup(HEIGHTS, FRAME, "touching", "found"),
-        Call(planes, tuple(planes.name_in()), ("ground",)),
-    )
-    return buffers, (*under, *beside)
+    n, state = len(options.contacts), tuple(f"{at}{name}" for name in places.name_in())
+    centres, ground = ("contact_places", "contact_ground") if options.hulls else ("places", "ground")
+    buffers = [Buffer(HEIGHTS, 0, "table"), Buffer(centres, 2 * n, "scratch"), Buffer(ground, 3 * n, "scratch")]
+    steps: tuple[Call | Lookup, ...] = (Call(places, state, (centres,)), Lookup(HEIGHTS, FRAME, centres, ground))
+    if touching is not None:
+        m, planes = touching.numel_out(0) // 2, planes_function(mechanism, options)
+        buffers += [Buffer("touching", 2 * m, "scratch"), Buffer("found", 3 * m, "scratch")]
+        steps += (
+            Call(touching, (*state[: touching.n_in() - 2], centres, ground), ("touching",)),
+            Lookup(HEIGHTS, FRAME, "touching", "found"),
+            Call(planes, (centres, ground, "touching", "found"), (ground,)),
+        )
+    if options.hulls:
+        points, hulls = hull_places_function(mechanism, options), hulls_function(mechanism, options)
+        m, results = points.numel_out(0) // 2, ("places", "ground", "samples")
+        buffers += [Buffer("hull_places", 2 * m, "scratch"), Buffer("hull_ground", 3 * m, "scratch")]
+        buffers += [Buffer(name, hulls.numel_out(i), "scratch") for i, name in enumerate(results)]
+        steps += (
+            Call(points, state, ("hull_places",)),
+            Lookup(HEIGHTS, FRAME, "hull_places", "hull_ground"),
+            Call(hulls, (*state, "contact_places", "contact_ground", "hull_ground"), results),
+        )
+    return buffers, steps

@@ -88,7 +88,9 @@ class Touch:
     anchor: SX
 
 
-def touch_ground(body: BodyState, sphere: ContactSphere, height: SX, normal: SX, load: SX, anchor: SX) -> Touch:
+def touch_ground(
+    body: BodyState, sphere: ContactSphere, centre: SX, height: SX, normal: SX, load: SX, anchor: SX
+) -> Touch:
     """Place a sphere against the plane that the ground is nearby.
 
     The deepest point of one that rolls is where it is at the start, as a sphere's is: another point of the body at each
@@ -97,13 +99,14 @@ def touch_ground(body: BodyState, sphere: ContactSphere, height: SX, normal: SX,
     Args:
         body: Kinematics of the body that carries it.
         sphere: The sphere, or the rim around which one moves.
+        centre: Where its centre is in the body [m], shape (3,).
         height: Of the ground under the centre [m].
         normal: Unit normal of the ground there, world axes, shape (3,).
         load: Its normal force over the last step [N].
         anchor: Horizontal deflection of its bristle, world axes [m], shape (2,), or (0,) for none.
     """
     n = body.R.T @ normal
-    centre, axis = constant(np.array(sphere.position)), constant(np.array(sphere.axis))
+    axis = constant(np.array(sphere.axis))
     cosine = ca.dot(axis, n)
     depth = sphere.radius + sphere.rim * sine(cosine) - normal[2] * (body.point_position(centre)[2] - height)
     point = centre - above_deepest(sphere.radius, sphere.rim, n, axis, cosine)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
+
+import casadi as ca
+import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import reference_guess
 from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors, supply_size
 from ce_gym.dynamics.forces.normal import HuntCrossley, normal_law
 from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
+from ce_gym.dynamics.hulls import Hull, poles_of
+from ce_gym.dynamics.recursion.kinematics import Kinematics, constant
 from ce_gym.model.checks.collisions import colliding
-from ce_gym.model.description import ContactMaterial
+from ce_gym.model.description import ContactMaterial, ContactSphere
 from ce_gym.model.mechanism import Mechanism
 
 Control = Literal["position", "torque", "motor_position", "motor_torque"]
@@ -40,6 +45,7 @@ class StepOptions:
         seldom: Contacts that are looked at only where they are near, see `stepping/choice.py`.
         control_period: Of position control: it looks at joints or motors every so often and holds its torques in
             between [s]; 0 for controllers that never stop, see `forces/motor_control.py`.
+        hulls: Convex shapes with further contacts between their corners, on a field.
         retry: How often a kernel may halve a step for a robot that fails in it, see `stepping/parts.py`.
     """
 
@@ -57,6 +63,12 @@ class StepOptions:
     seldom: tuple[str, ...] = ()
     control_period: float = 0.0
     retry: int = 6
+    hulls: tuple[Hull, ...] = ()
+
+    @property
+    def touches(self) -> tuple[str, ...]:
+        """Names of the contacts, and of the corner that stands for each region of a hull: all that may touch."""
+        return (*self.contacts, *(self.contacts[i] for i in poles_of(self.hulls)))
 
     @property
     def sampled(self) -> bool:
@@ -72,9 +84,10 @@ class Scene:
         mechanism: The robot at a transmission level.
         options: What the scene consists of.
         figures: Contact, gains and motor strength.
-        ground: Height [m] and slopes dz/dx, dz/dy of the ground under each contact, shape (3, n_contacts); not used on
-            flat ground.
-        looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_contacts);
+        ground: Height [m] and slopes dz/dx, dz/dy of the ground under each of the options' `touches`, shape
+            (3, n_touches); not used on flat ground.
+        samples: Where on their bodies the regions of hulls touch the ground [m], shape (3, n_regions).
+        looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_touches);
             empty if that is where they are.
         choosing: Whether what is seldom near is left out where it is not; else all acts always.
     """
@@ -83,6 +96,7 @@ class Scene:
     options: StepOptions
     figures: Figures
     ground: SX
+    samples: SX = field(default_factory=lambda: SX(3, 0))
     looked_up: SX = field(default_factory=SX)
     choosing: bool = False
 
@@ -107,9 +121,9 @@ class State:
     Attributes:
         q: Positions, shape (nq,).
         v: Velocities, shape (nv,).
-        load: Normal force of each contact over the last step [N], shape (n_contacts,).
-        whole_load: The same of the step in a whole, of `TWO_LOADS`, shape (n_contacts,); empty for others.
-        anchor: Horizontal deflections of the contacts' bristles, world axes [m], shape (2 n_contacts,); empty without.
+        load: Normal force of each of the options' `touches` over the last step [N], shape (n_touches,).
+        whole_load: The same of the step in a whole, of `TWO_LOADS`, shape (n_touches,); empty for others.
+        anchor: Horizontal deflections of the contacts' bristles, world axes [m], shape (2 n_touches,); empty without.
         dependent: Where the dependent coordinates that no formula gives will be, roughly, shape (n_guess,).
         pressed: Force between each pair of capsules over the last step [N], shape (n_pairs,).
         carried: Over the last step, of parts or stages the last, the torque of each motor whose friction depends
@@ -157,7 +171,7 @@ def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:
 
 def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
     """Return the sizes of the parts of a state that are there."""
-    layout, n = mechanism.robot.layout, len(options.contacts)
+    layout, n = mechanism.robot.layout, len(options.touches)
     sizes = {"q": layout.nq, "v": layout.nv, "load": n}
     sizes["whole_load"] = n if options.method in TWO_LOADS else 0
     sizes |= {"anchor": 2 * n if options.material.bristle > 0 else 0, "dependent": len(reference_guess(mechanism))}
@@ -174,3 +188,23 @@ def symbolic_state(mechanism: Mechanism, options: StepOptions) -> State:
     """Return a state of fresh symbols."""
     sizes = state_sizes(mechanism, options)
     return State(**{f.name: SX.sym(f.name, sizes.get(f.name, 0)) for f in fields(State)})
+
+
+def contact_spheres(mechanism: Mechanism, options: StepOptions) -> list[ContactSphere]:
+    """Return the contact spheres of a scene."""
+    spheres = {contact.name: contact for contact in mechanism.robot.contacts}
+    return [spheres[name] for name in options.contacts]
+
+
+def contact_centres(scene: Scene) -> list[tuple[ContactSphere, SX]]:
+    """Return all that may touch the ground, and where its centre is in its body [m], shape (3,)."""
+    spheres = contact_spheres(scene.mechanism, scene.options)
+    centres = [constant(np.array(sphere.position)) for sphere in spheres] + ca.horzsplit(scene.samples)
+    poles = [replace(spheres[i], radius=0.0) for i in poles_of(scene.options.hulls)]
+    return list(zip([*spheres, *poles], centres, strict=True))
+
+
+def contact_places(scene: Scene, kinematics: Kinematics) -> SX:
+    """Return x and y of the centre of all that may touch the ground [m], shape (2, n_touches)."""
+    places = [kinematics.bodies[s.body].point_position(centre)[:2] for s, centre in contact_centres(scene)]
+    return ca.horzcat(SX(2, 0), *places)

@@ -5,6 +5,8 @@ and where a sphere on the plane found there would touch it. The plane at the sec
 meets, but for errors of second order in how much the ground turns over a radius. With the first alone forces would not
 be normal to the path on which a sphere can roll, and energy would grow. Spheres without radius need no second look. One
 that moves around a rim is looked up likewise, beside the centre of the rim.
+
+Shapes with contacts between their corners, see `ce_gym.dynamics.hulls`, are looked up at all of their points.
 """
 
 from __future__ import annotations
@@ -15,9 +17,9 @@ import numpy as np
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.ground import above_deepest
-from ce_gym.dynamics.forces.scene import StepOptions, symbolic_state
+from ce_gym.dynamics.forces.scene import StepOptions, contact_spheres, symbolic_state
+from ce_gym.dynamics.hulls import pressed
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
-from ce_gym.dynamics.stepping.step import contact_places, contact_spheres
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -29,7 +31,8 @@ def places_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
         (2 n_contacts,).
     """
     given, kinematics = _posed(mechanism, options)
-    return traced("places", given, {"places": ca.vec(contact_places(mechanism, options, kinematics))})
+    centres = [(sphere.body, np.array(sphere.position)) for sphere in contact_spheres(mechanism, options)]
+    return traced("places", given, {"places": ca.vec(_in_world(kinematics, centres)[:2, :])})
 
 
 def touching_function(mechanism: Mechanism, options: StepOptions) -> ca.Function | None:
@@ -77,6 +80,48 @@ def planes_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
     planes[0, round_ones] += ca.sum1(found[1:, :] * (places[:, round_ones] - touching))
     given = {"places": places, "ground": ground, "touching": touching, "found": found}
     return traced("planes", {name: ca.vec(value) for name, value in given.items()}, {"ground_next": ca.vec(planes)})
+
+
+def hull_places_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+    """Trace where the points of hulls are: as `places_function`, -> `hull_places`, shape (2 n_points,)."""
+    given, kinematics = _posed(mechanism, options)
+    return traced("hull_places", given, {"hull_places": ca.vec(_hull_points(options, kinematics)[:2, :])})
+
+
+def hulls_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+    """Trace where hulls touch the ground, and put that behind the contacts.
+
+    Returns:
+        Function (q, contact_places, contact_ground, hull_ground), or with `dependent` as for `places_function`, ->
+        (places, ground, samples): x and y of the contacts and of the regions of hulls [m], shape (2 n_touches,), the
+        ground of each, shape (3 n_touches,), and where on their bodies regions touch it [m], shape (3 n_regions,).
+    """
+    given, kinematics = _posed(mechanism, options)
+    points, n = _hull_points(options, kinematics), len(options.contacts)
+    at, ground = SX.sym("contact_places", 2, n), SX.sym("contact_ground", 3, n)
+    under, samples = SX.sym("hull_ground", 3, points.shape[1]), []
+    places, planes, first = [at], [ground], 0
+    for hull in options.hulls:
+        own = slice(first, first + len(hull.points))
+        first = own.stop
+        body = kinematics.bodies[hull.body]
+        for spot, depth, normal in pressed(hull, body.R[2, :].T, points[2, own], under[:, own], ground[0, :]):
+            place = body.point_position(spot)
+            samples.append(spot)
+            places.append(place[:2])
+            planes.append(ca.vertcat(place[2] + depth / normal[2], -normal[:2] / normal[2]))
+    given |= {"contact_places": ca.vec(at), "contact_ground": ca.vec(ground), "hull_ground": ca.vec(under)}
+    results = {"places": ca.horzcat(*places), "ground_next": ca.horzcat(*planes), "samples": ca.horzcat(*samples)}
+    return traced("hulls", given, {name: ca.vec(value) for name, value in results.items()})
+
+
+def _hull_points(options: StepOptions, kinematics: Kinematics) -> SX:
+    return _in_world(kinematics, [(hull.body, np.array(point)) for hull in options.hulls for point in hull.points])
+
+
+def _in_world(kinematics: Kinematics, points: list[tuple[str, np.ndarray]]) -> SX:
+    """Return where points of bodies are [m], shape (3, n)."""
+    return ca.horzcat(SX(3, 0), *[kinematics.bodies[body].point_position(constant(at)) for body, at in points])
 
 
 def _posed(mechanism: Mechanism, options: StepOptions) -> tuple[dict[str, SX], Kinematics]:

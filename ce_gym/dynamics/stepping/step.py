@@ -31,8 +31,9 @@ from ce_gym.dynamics.forces.motor_control import Motors
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.passive import ball_forces, passive_forces, yielding_forces
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
-from ce_gym.dynamics.forces.scene import Scene, State, StepOptions, state_sizes
+from ce_gym.dynamics.forces.scene import Scene, State, StepOptions, contact_centres, contact_places, state_sizes
 from ce_gym.dynamics.forces.self_collision import Frictionless, LinearPair, Pair, meeting, pressed_on, settled
+from ce_gym.dynamics.hulls import with_hulls
 from ce_gym.dynamics.recursion.ce_aba import (
     BodyTerms,
     JointTerms,
@@ -46,7 +47,6 @@ from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_v
 from ce_gym.dynamics.stepping.choice import anything_near
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.model.checks.collisions import colliding
-from ce_gym.model.description import ContactSphere
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -244,6 +244,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         supply=supply_after(scene, kinematics, motors, motion, state.supply, yd, dt),
         held=motors.sampled,
     )
+    forces = [where(c.law.near, R @ c.force_after(gain)) for R, c, gain in contacts]
     touches = [*solved.contacts, *solved.pairs]
     unconverged = ca.sum1(stacked([c.check(motion) for c in touches])) > 0
     for force in (*saturated, *solved.meshes):
@@ -274,7 +275,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
         before=state,
         solved=solved,
         torque=(motors.tau - motors.slope @ motion.ydd)[: len(scene.mechanism.robot.commanded)],
-        contact_forces=ca.horzcat(SX(3, 0), *[where(c.law.near, R @ c.force_after(gain)) for R, c, gain in contacts]),
+        contact_forces=with_hulls(ca.horzcat(SX(3, 0), *forces), scene.options.hulls),
         unconverged=unconverged,
         iterate=ca.vertcat(of_contacts, motors.next_iterate(motion), of_friction, of_meshes, of_carried),
         error=SX(0),
@@ -298,14 +299,14 @@ def first_iterate(scene: Scene) -> SX:
 
 def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
     """Return how many numbers an iteration leaves for the next."""
-    touches = len(options.contacts) + len(colliding(mechanism.robot, options.self_collisions))
+    touches = len(options.touches) + len(colliding(mechanism.robot, options.self_collisions))
     of_joints = limit_count(mechanism, options) + friction_count(mechanism, options.parameters) + mesh_count(mechanism)
     return Contact.size * touches + of_joints + state_sizes(mechanism, options).get("carried", 0)
 
 
 def rows_of_near(mechanism: Mechanism, options: StepOptions) -> list[int]:
     """Return which rows of an iterate belong to what acts only where it is near."""
-    acts = [name in options.seldom for name in options.contacts]
+    acts = [name in options.seldom for name in options.touches]
     acts += [True] * len(colliding(mechanism.robot, options.self_collisions))
     return [Contact.size * i + j for i, seldom in enumerate(acts) if seldom for j in range(Contact.size)]
 
@@ -314,17 +315,16 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> l
     """Place every contact sphere of the scene against the ground."""
     contacts, options = [], scene.options
     normal, friction = normal_law(options.normal_law, options.material), FRICTION[options.friction]
-    for i, sphere in enumerate(contact_spheres(scene.mechanism, options)):
+    for i, (sphere, centre) in enumerate(contact_centres(scene)):
         body = kinematics.bodies[sphere.body]
         height, up = SX(0), constant(np.array([0.0, 0.0, 1.0]))
         if options.ground == "field":
             height, slope = scene.ground[0, i], scene.ground[1:, i]
             if scene.looked_up.numel():
-                centre = body.point_position(constant(np.array(sphere.position)))
-                height += ca.dot(slope, centre[:2] - scene.looked_up[:, i])
+                height += ca.dot(slope, body.point_position(centre)[:2] - scene.looked_up[:, i])
             up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
-        touch = touch_ground(body, sphere, height, up, state.load[i], anchor)
+        touch = touch_ground(body, sphere, centre, height, up, state.load[i], anchor)
         contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt))
     return contacts
 
@@ -341,7 +341,7 @@ def meeting_pairs(scene: Scene, kinematics: Kinematics, state: State, dt: float)
 
 def only_near(scene: Scene, contacts: list[Contact], pairs: list[Pair], dt: float) -> SX:
     """Let what is seldom near act only where it is; return whether something is, 1 or 0."""
-    named = zip(scene.options.contacts, contacts, strict=True)
+    named = zip(scene.options.touches, contacts, strict=True)
     seldom = [*[contact for name, contact in named if name in scene.options.seldom], *pairs]
     near = anything_near([law.touch for law in seldom], dt)
     for law in seldom:
@@ -349,24 +349,9 @@ def only_near(scene: Scene, contacts: list[Contact], pairs: list[Pair], dt: floa
     return near
 
 
-def contact_spheres(mechanism: Mechanism, options: StepOptions) -> list[ContactSphere]:
-    """Return the contact spheres of a scene."""
-    spheres = {contact.name: contact for contact in mechanism.robot.contacts}
-    return [spheres[name] for name in options.contacts]
-
-
-def contact_places(mechanism: Mechanism, options: StepOptions, kinematics: Kinematics) -> SX:
-    """Return x and y of the centre of every contact sphere of a scene [m], shape (2, n_contacts)."""
-    places = [
-        kinematics.bodies[sphere.body].point_position(constant(np.array(sphere.position)))[:2]
-        for sphere in contact_spheres(mechanism, options)
-    ]
-    return ca.horzcat(SX(2, 0), *places)
-
-
 def looked_up_from(scene: Scene, kinematics: Kinematics) -> Scene:
     """Return a scene whose ground is known around the contacts as they are, for use when they have moved on."""
-    return replace(scene, looked_up=contact_places(scene.mechanism, scene.options, kinematics))
+    return replace(scene, looked_up=contact_places(scene, kinematics))
 
 
 def on_coordinates(mechanism: Mechanism, of_balls: JointForce, force: JointForce) -> JointTerms:

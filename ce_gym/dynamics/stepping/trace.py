@@ -50,7 +50,8 @@ def step_function(
 
     Returns:
         Function (*state, diverged, *given) -> (*state, diverged, *outputs): `state` are the parts of `State` that the
-        scene has; `given` is `target` if there are joints, `parameters` if any are declared, `ground` on a field, and
+        scene has; `given` is `target` if there are joints, `parameters` if any are declared, `ground` on a field and
+        `samples` on one with hulls, and
         `dt` if the options leave it open.
     """
     given, plan = Given(mechanism, options, follows), METHODS[options.method]
@@ -158,7 +159,7 @@ class Given:
     """Symbols of one robot before a step, and what becomes of them."""
 
     def __init__(self, mechanism: Mechanism, options: StepOptions, follows: bool = False) -> None:
-        robot, n = mechanism.robot, len(options.contacts)
+        robot, n = mechanism.robot, len(options.touches)
         self.mechanism = mechanism
         self.state, self.diverged = symbolic_state(mechanism, options), SX.sym("diverged")
         self.target = SX.sym("target", len(target_names(mechanism, options.control)))
@@ -166,7 +167,8 @@ class Given:
         self.parameters = SX.sym("parameters", sum(len(default) for default in defaults.values()))
         self.ground = SX.sym("ground", 3, n if options.ground == "field" else 0)
         self.dt: float = SX.sym("dt") if options.dt is None else options.dt  # type: ignore[assignment]  # used as one
-        self.scene = make_scene(mechanism, options, self.parameters, self.ground)
+        self.samples = SX.sym("samples", 3, n - len(options.contacts))
+        self.scene = replace(make_scene(mechanism, options, self.parameters, self.ground), samples=self.samples)
         self.places = SX.sym("places", 2, n if follows and options.ground == "field" else 0)
         if self.places.numel():
             self.scene = replace(self.scene, looked_up=self.places)
@@ -174,7 +176,7 @@ class Given:
     def inputs(self) -> dict[str, SX]:
         """Return the symbols by name, without empty ones."""
         given = {"target": self.target, "parameters": self.parameters, "ground": ca.vec(self.ground)}
-        given |= {"places": ca.vec(self.places)}
+        given |= {"samples": ca.vec(self.samples), "places": ca.vec(self.places)}
         given = {name: value for name, value in given.items() if value.numel()}
         given |= {"dt": self.dt} if isinstance(self.dt, SX) else {}
         return dict(self.state.items()) | {"diverged": self.diverged} | given

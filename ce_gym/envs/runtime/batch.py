@@ -17,7 +17,6 @@ import numpy as np
 from ce_gym.compile import Program, source_fingerprint
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.stages import OUTCOME
-from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device
 from ce_gym.sim.kernel_key import laws_key, model_key
@@ -80,8 +79,7 @@ class TaskBatch(Batch):
         num_threads: int = 1,
         max_episode_steps: float = math.inf,
     ) -> None:
-        ground = field_of(program.task.terrain)
-        super().__init__(program.schema.values(), num_envs, dtype, device, ground, num_threads)
+        super().__init__(program.schema.values(), num_envs, dtype, device, program.field, num_threads)
         self.program, self.fused = program, device.fuses
         key = kernel_key(program)
         kind = "fused step" if self.fused else "environment"
@@ -185,4 +183,4 @@ def kernel_key(program: TaskProgram) -> str:
     """Return a text that names everything that the kernels of a task on a robot depend on."""
     traced = f"{source_fingerprint(*SOURCES)} {model_key(program.model)}"
     laws = laws_key(program.model.mechanism, program.options)
-    return f"{traced} {program.task!r} {program.contact_forces} {program.probe.added} {laws}"
+    return f"{traced} {program.task!r} {program.contact_forces} {program.probe.added} {program.options.hulls} {laws}"

@@ -9,9 +9,11 @@ from ce_gym.envs.task.curriculum import Curriculum
 from ce_gym.envs.task.ground import Ground
 from ce_gym.envs.task.randomisation import Randomised
 from ce_gym.envs.task.tasks import Task
+from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.envs.terms.registry import terms_of
 from ce_gym.model.errors import check_names
 from ce_gym.sim.kernels import select_contacts, select_pairs
+from ce_gym.sim.terrain.hulls import hulls_on
 
 
 class TaskSpec:
@@ -52,7 +54,9 @@ class TaskSpec:
             raise ValueError(
                 f"latency={task.latency}; expected at most the {task.n_substeps} sub-steps of a control step"
             )
-        self.ground = Ground(self.model.mechanism, self.contacts) if self.curriculum.on_field else None
+        self.field = field_of(task.terrain)
+        hulls = hulls_on(robot, self.contacts, self.field)
+        self.ground = Ground(self.model.mechanism, self.contacts, hulls) if self.curriculum.on_field else None
         self.randomised = Randomised(robot, task.randomise)
         self.actions = ActionMap(self.model.mechanism, task)
         self.options = StepOptions(
@@ -67,6 +71,7 @@ class TaskSpec:
             parameters=self.randomised.parameters,
             self_collisions=select_pairs(self.model.mechanism, task.self_collisions),
             seldom=tuple(name for name in select_contacts(robot, task.seldom, "seldom") if name in self.contacts),
+            hulls=hulls,
         )
 
     @property

@@ -18,6 +18,7 @@ from ce_gym.compile import Call, Grid
 from ce_gym.dynamics.algebra.integration import turned_by
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
+from ce_gym.dynamics.hulls import with_hulls
 from ce_gym.envs.runtime.spec import TaskSpec
 from ce_gym.envs.task.commands import Commands
 from ce_gym.envs.task.ground import SEEN, resting_load, starting_place
@@ -228,6 +229,7 @@ class Stages:
     def _context(self, values: Mapping[str, SX]) -> TermContext:
         values = dict(values) | ({"scaled_parameters": 2 * values["draw"] - 1} if "draw" in values else {})
         p = self.spec
+        values |= {"load": with_hulls(values["load"], p.options.hulls)} if "load" in values else {}
         return TermContext(self.model.mechanism, values, p.control_dt, self.task.gait_period, p.contacts)
 
     @property

@@ -230,7 +230,9 @@ def _reflected(
     if "air_time" in state and len(feet):
         result["air_time"] = state["air_time"][:, _nearest(centres)]
     if "load" in state:
-        result["load"] = state["load"][:, _nearest(np.array([points[name] for name in program.contacts]))]
+        at, n = np.array([points[name] for name in program.options.touches]), len(program.contacts)
+        regions = n + _nearest(at[n:]) if len(at) > n else []
+        result["load"] = state["load"][:, [*_nearest(at[:n]), *regions]]
     return result
 
 

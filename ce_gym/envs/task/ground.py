@@ -17,6 +17,7 @@ from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.ground import above, lift, reach
 from ce_gym.dynamics.forces.parameters import figures
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.hulls import Hull
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.envs.task.curriculum import Curriculum
 from ce_gym.envs.task.sampling import Sampler
@@ -34,11 +35,12 @@ class Ground:
     Args:
         mechanism: The robot.
         contacts: Names of the spheres that take part in the physics.
+        hulls: Convex shapes whose corners some of these are.
     """
 
-    def __init__(self, mechanism: Mechanism, contacts: tuple[str, ...]) -> None:
-        self.mechanism, self.contacts = mechanism, contacts
-        self.size = 3 * (1 + len(mechanism.robot.contacts))
+    def __init__(self, mechanism: Mechanism, contacts: tuple[str, ...], hulls: tuple[Hull, ...]) -> None:
+        self.mechanism, self.contacts, self.hulls = mechanism, contacts, hulls
+        self.size = 3 * (1 + len(mechanism.robot.contacts) + sum(len(hull.points) for hull in hulls))
 
     def look(self, dependent: int) -> tuple[list[Buffer], tuple[Step, ...]]:
         """Return how to look at the ground, and the buffers for it but table and frame.
@@ -48,7 +50,7 @@ class Ground:
         """
         q = SX.sym("q", self.mechanism.robot.layout.nq)
         given = {"q": q} | ({"dependent": SX.sym("dependent", dependent)} if dependent else {})
-        at = ca.horzcat(q[:2], sphere_centres(self.mechanism, given)[:2, :])
+        at = ca.horzcat(q[:2], sphere_centres(self.mechanism, given)[:2, :], self._between(given)[:2, :])
         places = traced("seen_places", given, {"seen_places": ca.vec(at)})
         buffers = [Buffer("seen_places", 2 * self.size // 3, "scratch"), Buffer(SEEN, self.size, "scratch")]
         call = Call(places, tuple(given), ("seen_places",))
@@ -73,7 +75,18 @@ class Ground:
             level = reach(spheres[i].radius, spheres[i].rim, axes[:, i])
             more = reach(spheres[i].radius, spheres[i].rim, axes[:, i], *slopes) - level
             needed.append(lift(ca.fmin(z[i], level) + more, z[i], height, *slopes))
+        radii = [hull.radius for hull in self.hulls for _ in hull.points]
+        of_hulls = zip(radii, ca.horzsplit(self._between(state)), ca.horzsplit(under[:, len(spheres) :]), strict=True)
+        for radius, point, plane in of_hulls:
+            height, *slopes = ca.vertsplit(plane)
+            needed.append(lift(ca.fmin(point[2], radius), point[2], height, *slopes))
         return ca.mmax(ca.vertcat(*needed)) if needed else seen[0]
+
+    def _between(self, state: Mapping[str, SX]) -> SX:
+        """Return where the points of hulls are [m], shape (3, n_points)."""
+        bodies = _at_rest(self.mechanism, state).bodies if self.hulls else {}
+        points = [bodies[hull.body].point_position(SX(ca.DM(point))) for hull in self.hulls for point in hull.points]
+        return ca.horzcat(SX(3, 0), *points)
 
 
 def sphere_centres(mechanism: Mechanism, state: Mapping[str, SX]) -> SX:
@@ -95,7 +108,7 @@ def _at_rest(mechanism: Mechanism, state: Mapping[str, SX]) -> Kinematics:
 
 
 def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str, SX], seen: SX | None) -> SX:
-    """Return the springs' forces on the contacts [N], shape (n_contacts,): what friction has to go by at first.
+    """Return the springs' forces on the contacts [N], shape (n_touches,): what friction has to go by at first.
 
     Args:
         mechanism: The robot.
@@ -111,7 +124,7 @@ def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str,
             height, *slopes = ca.vertsplit(SX(3, 1) if seen is None else seen[3 * i + 3 : 3 * i + 6])
             depth = reach(sphere.radius, sphere.rim, axes[:, i], *slopes) - above(centres[2, i], height, *slopes)
             load.append(stiffness * ca.fmax(depth, 0))
-    return ca.vertcat(*load)
+    return ca.vertcat(*load, SX(len(options.touches) - len(options.contacts), 1))
 
 
 def starting_place(curriculum: Curriculum, level: SX, sampler: Sampler) -> SX:

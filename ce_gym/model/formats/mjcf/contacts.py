@@ -19,6 +19,7 @@ beyond it that several limbs hang on; "limb" is the rest, which no task simulate
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,11 +44,14 @@ def read_contacts(source: MjcfSource, tree: MjcfTree) -> tuple[tuple[ContactSphe
     _report_ground(source, ground)
     _report_between(source, tree, geoms)
     spheres, heights, frictions = [], [], list[float]()
+    ball = source.mujoco.mjtGeom.mjGEOM_SPHERE
     for geom, friction in _frictions(source, geoms, ground):
         for name, centre, radius in _spheres(source, geom):
             body, frame = tree.frames[source.model.geom_bodyid[geom]]
             point = np.array(source.model.geom_pos[geom]) + rotation(source.model.geom_quat[geom]) @ centre
-            spheres.append(ContactSphere(name, str(body), transform_point(frame, vec3(point)), radius))
+            at = transform_point(frame, vec3(point))
+            shape = "" if source.model.geom_type[geom] == ball else source.name("geom", geom)
+            spheres.append(ContactSphere(name, str(body), at, radius, shape=shape))
             world = source.data.geom_xpos[geom] + source.data.geom_xmat[geom].reshape(3, 3) @ centre
             heights.append(float(world[2]) - radius)
             frictions.append(friction)
@@ -113,10 +117,7 @@ def _grouped(spheres: list[ContactSphere], heights: list[float], tree: MjcfTree)
             return "foot"
         return "torso" if sphere.body in trunk else "limb"
 
-    return tuple(
-        ContactSphere(sphere.name, sphere.body, sphere.position, sphere.radius, group(sphere, height))
-        for sphere, height in zip(spheres, heights, strict=True)
-    )
+    return tuple(replace(sphere, group=group(sphere, height)) for sphere, height in zip(spheres, heights, strict=True))
 
 
 def _trunk(spheres: list[ContactSphere], tree: MjcfTree, base: str | None) -> set[str]:

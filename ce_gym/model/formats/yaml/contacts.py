@@ -46,7 +46,7 @@ def read_contacts(section: Section, links: Links) -> Iterator[ContactSphere]:
             axis = vec3([row[2] for row in pose.rotation])
             for suffix, centre, radius in _spheres(entry, shape):
                 at, rim = transform_point(pose, vec3(centre)), shape.size[0] - radius if _rolls(entry, kind) else 0.0
-                yield ContactSphere(f"{stem}{suffix}", body, at, radius, group, rim, axis if rim else AXIS)
+                yield ContactSphere(f"{stem}{suffix}", body, at, radius, group, rim, axis if rim else AXIS, shape=stem)
 
 
 def read_capsules(section: Section, links: Links) -> Iterator[Capsule]:
