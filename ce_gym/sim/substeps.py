@@ -61,7 +61,9 @@ def substeps(
     kept = {name: size for name in outputs if (size := function.numel_out(name) if name in asked else 1)}
     if len(kept) < len(outputs):
         return substeps(mechanism, options, tuple(kept))
-    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground", "samples")}
+    sizes = {
+        name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground", "samples")
+    }
     sizes |= {"retries": 1, **kept} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= control_sizes(mechanism.robot.layout) if plan.controlled else {}
     fractions = {TRIED: 1.0} | ({_own(plan, stage): stage.length for stage in plan.stages} if staged else {})
