@@ -159,6 +159,7 @@ def _new(args: argparse.Namespace) -> int:
 
 def _inspect(args: argparse.Namespace) -> int:
     from ce_gym.diagnostics.levels_text import levels_report
+    from ce_gym.diagnostics.standing import seconds_to_compile
     from ce_gym.diagnostics.standing_text import standing_report
     from ce_gym.diagnostics.transmission_text import transmission_report
     from ce_gym.dynamics import Model
@@ -175,6 +176,9 @@ def _inspect(args: argparse.Namespace) -> int:
     print("Environments: it has what every task needs\n" if not problems else "Environments lack:")
     print("".join(f"  {problem}\n" for problem in problems), flush=True)
     if model.robot.gains.kp and not (problems or args.no_timing):
+        if (seconds := seconds_to_compile(model)) > 5:
+            told = f"letting it stand compiles a kernel of about {seconds:.0f} s once"
+            print(f"ce_gym: {told}; --no-timing leaves that out", file=sys.stderr, flush=True)
         print(f"{standing_report(model)}\n", flush=True)
     print(transmission_report(model, states=0) if args.no_errors else transmission_report(model))
     return 0

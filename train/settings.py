@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
-from ce_gym.policies import ACTIVATIONS, checked_arguments, parse_yaml
+from ce_gym.policies import ACTIVATIONS, checked_arguments, listed_names, parse_yaml
 
 Activation = str
 """One of those with which a policy can be run without its learner."""
@@ -169,7 +169,7 @@ def make_settings(data: Mapping[str, Any], source: str, kind: type = Settings) -
     known = {field.name: str(field.type) for field in fields(kind)}
     for key in data:
         if key not in known:
-            raise SettingsError(f"{source}: {key}: unknown setting; expected one of {', '.join(known)}")
+            raise SettingsError(f"{source}: {key}: unknown setting; expected one of {listed_names(key, known)}")
     for key in known:
         if key not in data:
             raise SettingsError(f"{source}: {key}: missing; expected {known[key]}")

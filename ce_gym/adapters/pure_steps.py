@@ -38,21 +38,24 @@ class PureSteps:
     def forward(self, state: Rows, target: NDArray, record: bool = True) -> tuple[dict[str, NDArray], Any]:
         """Return the state after the steps, and what `backward` needs, if they are recorded."""
         self.derivatives.restore(state)
+        before, given = self.simulator.q, np.asarray(state["q"])
         if not record:
             self.simulator.step(target, self.n_substeps)
             return self.state(), None
         self.derivatives.take()
         self.derivatives.step(target, self.n_substeps)
         after = self.state()
-        return after, (self.derivatives.take(), state["q"], after["q"])
+        return after, (self.derivatives.take(), before, given, after["q"])
 
     def backward(self, recorded: Any, weights: Rows) -> tuple[dict[str, NDArray], NDArray]:
         """Return gradients with respect to the state and the target, given those with respect to the state after."""
-        records, before, after = recorded
+        records, before, given, after = recorded
         layout = self.simulator.model.robot.layout
         weights = {**weights, "q": to_tangent(after, weights["q"], layout)}
         found, targets, _ = self.derivatives.backward(weights, records)
         found["q"] = from_tangent(before, found["q"], layout)
+        for row, _ in layout.turns:  # steps scale quaternions to unit length first
+            found["q"][:, row : row + 4] /= np.linalg.norm(given[:, row : row + 4], axis=1, keepdims=True)
         return found, sum(targets[1:], start=targets[0])
 
 

@@ -7,6 +7,7 @@ the one that runs is imported.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import importlib
 import shlex
@@ -15,6 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
+from ce_gym.model import RobotError, load_robot
+from ce_gym.model.errors import listed_names
 from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
@@ -53,6 +56,15 @@ def listing() -> str:
     return "\n".join(["Usage: python -m ce_gym.bench NAME [--help] [--json FILE]", "", *lines])
 
 
+def _check_robots(arguments: argparse.Namespace) -> None:
+    """Check the names of robots before anything is measured."""
+    for option in ("robot", "robots"):
+        names = getattr(arguments, option, None) or ()
+        for name in [names] if isinstance(names, str) else names:
+            if isinstance(name, str):  # some benchmarks take numbers of robots
+                load_robot(name)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     print_anything()
@@ -62,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     name, *rest = argv
     if name not in BENCHMARKS:
-        print(f"ce_gym.bench: no benchmark {name!r}; expected one of {', '.join(BENCHMARKS)}", file=sys.stderr)
+        print(f"ce_gym.bench: no benchmark {name!r}; expected one of {listed_names(name, BENCHMARKS)}", file=sys.stderr)
         return 2
     parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the report to a JSON file")
@@ -70,7 +82,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         benchmark = load(name)
         benchmark.add_arguments(parser)
         arguments = parser.parse_args(rest)
+        _check_robots(arguments)
         report = benchmark.run(arguments)
+    except RobotError as error:
+        print(f"ce_gym.bench: {error}", file=sys.stderr)
+        return 2
     except ModuleNotFoundError as error:
         if str(error.name).startswith("ce_gym"):
             raise

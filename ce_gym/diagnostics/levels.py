@@ -60,6 +60,7 @@ class LevelReport:
         shared: The same of reflected inertia off the diagonal, where a rotor turns with several joints [-].
         rows: One for each simplified level.
         poses: How many poses the figures are over; 0 for a robot without rotors, which has no rows.
+        unknown: Rotors whose gear ratio the robot's file does not say; what they do to what carries them is left out.
     """
 
     robot: str
@@ -67,6 +68,7 @@ class LevelReport:
     shared: Range
     rows: tuple[LevelRow, ...]
     poses: int
+    unknown: tuple[str, ...] = ()
 
 
 def report_levels(model: Model, poses: int = 200, seed: int = 0) -> LevelReport:
@@ -89,7 +91,7 @@ def report_levels(model: Model, poses: int = 200, seed: int = 0) -> LevelReport:
     carried, shared = (_range(np.abs(x / relative).max((1, 2))) for x in off_level)
     feet = foot_rows(models["exact"], q)
     rows = tuple(level_row(models["exact"], level, M, feet) for level in LEVELS[1:])
-    return LevelReport(model.robot.name, carried, shared, rows, len(q))
+    return LevelReport(model.robot.name, carried, shared, rows, len(q), model.robot.unknown_ratios)
 
 
 def level_row(model: Model, level: str, M: Mapping[str, Array], feet: Array) -> LevelRow:

@@ -42,6 +42,9 @@ def as_text(report: LevelReport) -> str:
 
 def verdict(report: LevelReport) -> str:
     """Return whether armature is enough for the torques of this robot, by the rule of the studies."""
+    if report.unknown:
+        names = ", ".join(report.unknown[:3]) + (" and more" if len(report.unknown) > 3 else "")
+        return f"Unknown: the robot's file does not say the gear ratio of {names}."
     torque = next(row.torque for row in report.rows if row.level == "armature")
     if torque.high < LIMIT:
         return "Yes."

@@ -23,6 +23,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.normal import KelvinVoigt, normal_law
 from ce_gym.dynamics.forces.parameters import PARAMETERS
 from ce_gym.dynamics.forces.scene import StepOptions, make_scene, symbolic_state
 from ce_gym.dynamics.model import Model
@@ -232,7 +233,9 @@ def left_out(whole: SubStep) -> Iterator[tuple[str, SubStep]]:
     changes |= {"ground='field'": {"ground": "field"}}
     if options.material.dissipation is None:
         changes["dissipation of the material"] = {"material": replace(options.material, dissipation=1.0)}
-    for name in (name.replace("BODY", robot.bodies[0].name) for name in PARAMETERS if "ROTOR" not in name):
+    damped = isinstance(normal_law(options.normal_law, options.material), KelvinVoigt)
+    known = [name for name in PARAMETERS if "ROTOR" not in name and (name != "damping" or damped)]
+    for name in (name.replace("BODY", robot.bodies[0].name) for name in known):
         changes[f"parameter {name!r}"] = {"parameters": tuple(dict.fromkeys((*options.parameters, name)))}
     for name, change in changes.items():
         if any(getattr(options, key) != value for key, value in change.items()):

@@ -27,6 +27,10 @@ FACTORS = np.round(2.0 ** np.arange(0.0, 6.5, 0.5), 1)
 """Factors on gains that are tried, 1 to 64; the velocity gains go with their root."""
 FOOT, ANKLE = "foot", 0.05
 """Group of the contacts that carry, and how far from a foot's own joint others count as next to it [m]."""
+MOST_CONTACTS = 24
+"""How many contacts a robot stands with at most: the time to compile grows with their square."""
+LATERAL = 1e-3
+"""Lateral part of a joint's axis from which the joint turns about the lateral axis; below, it is rounding [-]."""
 PUSHES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
@@ -41,6 +45,10 @@ class StandingReport:
         factor: The same of all gains.
         toppling: Weight times height of the centre of mass above those joints [N m/rad].
         stiffness: Sum of the position gains of those of them that turn about the base's lateral axis [N m/rad].
+        gap: Height of the lowest contact above the ground in the standing pose [m].
+        contacts: How many contacts it stood with, see `carrying_contacts`.
+        which: Which they are, in words.
+        of_contacts: How many the robot has.
     """
 
     after: float | None
@@ -49,6 +57,10 @@ class StandingReport:
     factor: float | None
     toppling: float
     stiffness: float
+    gap: float
+    contacts: int
+    which: str
+    of_contacts: int
 
 
 def report_standing(model: Model) -> StandingReport:
@@ -63,7 +75,50 @@ def report_standing(model: Model) -> StandingReport:
     falls = fallen_after(model, np.concatenate(scales))
     alone, all_ = (_smallest(np.isinf(part)) for part in np.split(falls, 2))
     after = None if np.isinf(falls[0]) else float(falls[0])
-    return StandingReport(after, ankles, alone, all_, toppling(model, ankles), pitch_stiffness(model, ankles))
+    contacts, which = carrying_contacts(model)
+    return StandingReport(
+        after=after,
+        ankles=ankles,
+        ankle_factor=alone,
+        factor=all_,
+        toppling=toppling(model, ankles),
+        stiffness=pitch_stiffness(model, ankles),
+        gap=float(contact_heights(model).min()),
+        contacts=len(contacts),
+        which=which,
+        of_contacts=len(robot.contacts),
+    )
+
+
+def carrying_contacts(model: Model) -> tuple[tuple[str, ...], str]:
+    """Return the contacts that a robot stands with, and which they are in words: all of them up to `MOST_CONTACTS`.
+
+    Of more, those of the feet and the torso; of the feet alone if these are too many; and of those the lowest.
+    """
+    contacts = model.robot.contacts
+    if len(contacts) <= MOST_CONTACTS:
+        return model.contact_names, "all"
+    both = tuple(contact.name for contact in contacts if contact.group in (FOOT, "torso"))
+    feet = tuple(contact.name for contact in contacts if contact.group == FOOT)
+    if len(both) <= MOST_CONTACTS:
+        return both, "those of the groups foot and torso"
+    if len(feet) <= MOST_CONTACTS:
+        return feet, "those of the group foot"
+    heights = dict(zip(model.contact_names, contact_heights(model), strict=True))
+    lowest = set(sorted(feet, key=lambda name: heights[name])[:MOST_CONTACTS])
+    return tuple(name for name in feet if name in lowest), "the lowest of the group foot"
+
+
+def seconds_to_compile(model: Model) -> float:
+    """Return roughly how long the kernel of a standing robot takes to compile [s]: measured with 8 to 240 contacts."""
+    n = len(carrying_contacts(model)[0])
+    return 2.0 + 0.3 * n + 0.01 * n**2
+
+
+def contact_heights(model: Model) -> Array:
+    """Return the height of the lowest point of each contact in the standing pose, upright wheels aside [m]."""
+    centres = model.contact_points(model.standing_q, np.zeros(model.nv))[0]
+    return centres[:, 2] - np.array([contact.radius + contact.rim for contact in model.robot.contacts])
 
 
 def fallen_after(model: Model, scales: Array) -> Array:
@@ -73,7 +128,14 @@ def fallen_after(model: Model, scales: Array) -> Array:
         model: Of the robot.
         scales: Factors on the position gains, shape (n, n_joints); those on the velocity gains are their roots.
     """
-    sim = Simulator(model, len(scales) * len(PUSHES), DT, outputs=(), parameters=("kp", "kd"))
+    sim = Simulator(
+        model,
+        len(scales) * len(PUSHES),
+        DT,
+        contacts=carrying_contacts(model)[0],
+        outputs=(),
+        parameters=("kp", "kd"),
+    )
     gains = {"kp": dict(model.robot.gains.kp), "kd": dict(model.robot.gains.kd)}
     for name, factors in (("kp", scales), ("kd", np.sqrt(scales))):
         own = np.array([gains[name].get(joint, 0.0) for joint in model.robot.commanded])
@@ -125,7 +187,7 @@ def pitch_stiffness(model: Model, joints: tuple[str, ...]) -> float:
     rotations = dict(zip(model.body_names, model.body_poses(model.standing_q)[1], strict=True))
     kp = dict(model.robot.gains.kp)
     lateral = {name: float(rotations[name][1] @ np.array(model.robot.body(name).joint.axis)) for name in joints}
-    return sum(kp.get(name, 0.0) * part**2 for name, part in lateral.items())
+    return sum(kp.get(name, 0.0) * part**2 for name, part in lateral.items() if abs(part) > LATERAL)
 
 
 def _smallest(stands: NDArray[np.bool_]) -> float | None:

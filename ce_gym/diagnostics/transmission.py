@@ -41,6 +41,7 @@ class RotorFigures:
         inertia: Moment of inertia about its spin axis [kg m^2].
         ratios: Speed of the rotor for unit speed of each independent joint that turns it, by joint.
         symmetric: Whether its inertia is symmetric about its spin axis.
+        known: Whether the robot's file says the gear ratio; if not, `inertia` and `ratios` are placeholders.
     """
 
     name: str
@@ -48,6 +49,7 @@ class RotorFigures:
     inertia: float
     ratios: Mapping[str, float]
     symmetric: bool
+    known: bool = True
 
 
 @dataclass(frozen=True)
@@ -214,6 +216,7 @@ def _figures(model: Model, cluster: Cluster, spins: tuple[Spin, ...], G: dict[st
             spin.inertia,
             {joint: float(ratio) for joint, ratio in zip(cluster.independent, row, strict=True) if ratio != 0.0},
             is_axisymmetric(model.robot.body(spin.rotor)),
+            spin.rotor not in model.robot.unknown_ratios,
         )
         for spin, row in zip(spins, rows, strict=True)
     )

@@ -44,6 +44,7 @@ def as_text(report: TransmissionReport) -> str:
             ("rotor", "carried by", "ratio", "inertia [kg m^2]", "symmetric"),
             [_rotor_row(rotor) for cluster in report.clusters for rotor in cluster.rotors],
         ),
+        *_on_unknown(report),
         "",
         "Reflected inertia G_r^T J G_r [kg m^2], and its share of the joint's whole inertia",
         _reflected_table(report.clusters),
@@ -53,10 +54,21 @@ def as_text(report: TransmissionReport) -> str:
     return "\n".join([*parts, "", *_level_lines(report)])
 
 
+def _on_unknown(report: TransmissionReport) -> list[str]:
+    if all(rotor.known for cluster in report.clusters for rotor in cluster.rotors):
+        return []
+    return [
+        "  unknown: the robot's file gives the reflected inertia but no gear ratio, so `exact` equals `coupled` there;",
+        "  `gears:` in a YAML file gives the ratio.",
+    ]
+
+
 def _rotor_row(rotor: RotorFigures) -> tuple[Cell, ...]:
+    symmetric, carrier = "yes" if rotor.symmetric else "no", rotor.carrier or "world"
+    if not rotor.known:
+        return rotor.name, carrier, "unknown", "unknown", symmetric
     terms = [f"{'-' if ratio < 0 else '+'} {abs(ratio):.4g} {joint}" for joint, ratio in rotor.ratios.items()]
-    ratio = " ".join(terms).removeprefix("+ ")
-    return rotor.name, rotor.carrier or "world", ratio, rotor.inertia, "yes" if rotor.symmetric else "no"
+    return rotor.name, carrier, " ".join(terms).removeprefix("+ "), rotor.inertia, symmetric
 
 
 def _reflected_table(clusters: tuple[ClusterFigures, ...]) -> str:

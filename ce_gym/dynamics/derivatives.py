@@ -26,6 +26,7 @@ from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.parameters import parameter_defaults, with_parameters
 from ce_gym.dynamics.functions import FUNCTIONS
 from ce_gym.model.coordinates import Layout
+from ce_gym.model.errors import check_names, listed_names
 from ce_gym.model.mechanism import Mechanism
 
 PLAIN_FIGURES, BODY_FIGURES = ("gravity", "rotor_inertia", "ratio"), ("added_mass", "com_shift")
@@ -87,18 +88,14 @@ def make_quantity(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> Quan
         ValueError: If there is no such quantity, or it depends on no such thing.
     """
     if name not in FUNCTIONS:
-        raise ValueError(f"derivatives of {name!r}; expected one of {', '.join(FUNCTIONS)}")
+        raise ValueError(f"derivatives of {name!r}; expected one of {listed_names(name, FUNCTIONS)}")
     plain = FUNCTIONS[name](mechanism).name_in()
     figures = tuple(x for x in wrt if x not in plain or x == "guess")
     bodies = [body.name for body in mechanism.robot.bodies if body.kind == "link"]
     known = {*PLAIN_FIGURES, *(f"{figure}:{body}" for figure in BODY_FIGURES for body in bodies)}
-    for x in figures:
-        if x not in known:
-            inputs = [x for x in plain if x != "guess"]
-            expected = ", ".join([*inputs, *PLAIN_FIGURES, *(f"{figure}:BODY" for figure in BODY_FIGURES)])
-            raise ValueError(
-                f"derivatives of {name} with respect to {x!r}; expected some of {expected}, BODY being a link"
-            )
+    given = [x for x in plain if x != "guess"]
+    listed = ", ".join([*given, *PLAIN_FIGURES, *(f"{figure}:BODY" for figure in BODY_FIGURES)])
+    check_names(f"derivatives of {name}: wrt", wrt, [*given, *known], "some of", listed=f"{listed}, BODY being a link")
     defaults = parameter_defaults(mechanism.robot, mechanism.robot.material, figures)
     symbols = {x: SX.sym("figure", len(value)) for x, value in defaults.items()}
     named = with_parameters(mechanism, figures, ca.vertcat(*symbols.values())) if figures else mechanism

@@ -18,6 +18,8 @@ from ce_gym.dynamics.constraints.closure import closures, reference_guess
 from ce_gym.dynamics.constraints.continuation import follow
 from ce_gym.dynamics.derivatives import gradient_function, jacobian_function, product_function
 from ce_gym.dynamics.functions import FUNCTIONS
+from ce_gym.model.coordinates import unit_quaternions
+from ce_gym.model.errors import check_names, listed_names
 from ce_gym.model.mechanism import Mechanism
 
 Array = NDArray[np.float64]
@@ -64,14 +66,15 @@ class Evaluator:
                 (q, v) -> (K, k); "body_poses" q -> positions (3, n), rotations (3, 3 n); "body_velocities" (q, v) ->
                 angular (3, n), linear (3, n); "contact_points" (q, v) -> positions (3, n), velocities (3, n);
                 "contact_accelerations" (q, v, vdot) -> accelerations (3, n); "energy" (q, v) -> kinetic, potential.
-                Robots with loops that no formula closes have one input more, see `dependent_guess`.
+                Robots with loops that no formula closes have one input more, see `dependent_guess`. Quaternions in q
+                must have unit length: a traced function neither checks nor scales them.
 
         Raises:
             KeyError: If there is no such quantity.
         """
         if name not in self._functions:
             if name not in FUNCTIONS:
-                raise KeyError(f"no function {name!r}; expected one of {', '.join(FUNCTIONS)}")
+                raise KeyError(f"no function {name!r}; expected one of {listed_names(name, FUNCTIONS)}")
             self._functions[name] = FUNCTIONS[name](self.mechanism)
         return self._functions[name]
 
@@ -110,7 +113,7 @@ class Evaluator:
         q = np.asarray(q, dtype=float)
         if q.ndim == 0 or q.shape[-1] != self.nq:
             raise ValueError(f"q has shape {q.shape}; expected (..., {self.nq})")
-        flat = q.reshape(-1, self.nq)
+        flat = self.unit(q).reshape(-1, self.nq)
         if self.guess.size == 0 or len(flat) == 0:
             return np.zeros((*q.shape[:-1], len(self.guess)))
         guess, gap, nearness = follow(self.casadi_function("loops"), self.standing_q, self.guess, flat)
@@ -139,6 +142,7 @@ class Evaluator:
             >>> derivatives.jacobian(model.standing_q, np.zeros(18), np.ones(18))["vdot", "rotor_inertia"].shape
             (18, 1)
         """
+        check_names("wrt", wrt, wrt, "an input among")
         key = name, tuple(wrt)
         if key not in self._derivatives:
             self._derivatives[key] = Derivatives(self, *key)
@@ -164,6 +168,11 @@ class Evaluator:
         jacobians = self.derivatives("inverse_dynamics", inputs).jacobian(q, v, vdot)
         return jacobians["tau", "q"], jacobians["tau", "v"], jacobians["tau", "vdot"]
 
+    def unit(self, q: Array) -> Array:
+        """Return positions, shape (..., nq), with quaternions of unit length; ValueError if they are far from it."""
+        fits = q.ndim > 0 and q.shape[-1] == self.nq  # other shapes are refused where they are used
+        return unit_quaternions(q, [i for i, _ in self.robot.layout.turns]) if fits else q
+
     def _evaluate(self, name: str, *arguments: ArrayLike) -> list[Array]:
         """Evaluate a traced quantity on arrays that share leading batch dimensions; outputs (..., rows, columns)."""
         return self.evaluate(self.casadi_function(name), *arguments)
@@ -182,6 +191,7 @@ class Evaluator:
             ValueError: If a shape is wrong, or a loop does not close at `q`.
         """
         arrays = [np.asarray(a, dtype=float) for a in arguments]
+        arrays = [self.unit(a) if name == "q" else a for name, a in zip(function.name_in(), arrays, strict=False)]
         if "guess" in function.name_in():
             arrays.append(self.dependent_guess(arrays[0]))
         results = evaluate(function, arrays)

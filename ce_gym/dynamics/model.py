@@ -17,6 +17,7 @@ from ce_gym.dynamics.evaluation import Evaluator
 from ce_gym.dynamics.standing import check_standing
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
+from ce_gym.model.errors import check_names
 from ce_gym.model.frames import added
 from ce_gym.model.mechanism import build_mechanism
 
@@ -30,6 +31,7 @@ class Model(Evaluator):
     positions]`, `v = [base angular (3) [rad/s], base linear (3) [m/s], angular velocity of each ball joint (3) [rad/s],
     joint velocities]`, both base velocities in the base frame, those of ball joints against the parent in the axes of
     the body that turns; a fixed base has only the joints. `vdot` is the time derivative of `v`, component by component.
+    Quaternions whose norm is within 1e-3 of 1 are scaled to unit length; others are refused with a ValueError.
 
     Args:
         robot: A description, the name of a robot that ships with the package, or a path to a robot file.
@@ -129,9 +131,7 @@ class Model(Evaluator):
         """
         if wrenches is None:
             return self._evaluate("forward_dynamics", q, v, tau)[0][..., 0]
-        for name in wrenches:
-            if name not in self.body_names:
-                raise ValueError(f"wrench on {name!r}: expected the name of a body of {self.robot.name}")
+        check_names("wrenches", wrenches, self.body_names, f"the name of a body of {self.robot.name}:")
         each = [np.asarray(wrenches.get(name, np.zeros(6)), dtype=float) for name in self.body_names]
         stacked = np.concatenate(np.broadcast_arrays(*each), axis=-1)
         return self._evaluate("forward_dynamics_with_wrenches", q, v, tau, stacked)[0][..., 0]
@@ -171,7 +171,7 @@ class Model(Evaluator):
         q_span, v_span = np.asarray(q_span, dtype=float), np.asarray(v_span, dtype=float)
         span = self.robot.spanning_rows
         q = q_span[..., [row for name in self.robot.rows for row in span[name][0]]]
-        v = v_span[..., [row for name in self.robot.rows for row in span[name][1]]]
+        q, v = self.unit(q), v_span[..., [row for name in self.robot.rows for row in span[name][1]]]
         expected, angles = self.spanning(q, v), [rows[0] for rows, _ in span.values() if len(rows) == 1]
         turned = np.exp(1j * (expected[0] - q_span)[..., angles]) - 1  # whole turns do not matter
         for name, error in (("q_span", turned), ("v_span", expected[1] - v_span)):
@@ -237,10 +237,9 @@ class Model(Evaluator):
         Raises:
             ValueError: If a body does not exist.
         """
-        chosen = [motor.rotor for motor in self.robot.motors] if actuated is None else list(actuated)
-        for name in chosen:
-            if name not in self.spanning_names:
-                raise ValueError(f"actuated {name!r}: expected the name of a body with a joint of {self.robot.name}")
+        chosen = [motor.rotor for motor in self.robot.motors] if actuated is None else actuated
+        expected = f"the name of a body with a joint of {self.robot.name}:"
+        check_names("actuated", chosen, self.spanning_names, expected)
         G = self._evaluate("spanning_jacobian", q)[0]
         return G[..., [row for name in chosen for row in self.robot.spanning_rows[name][1]], :]
 

@@ -133,8 +133,8 @@ def _place(standing: Standing, mechanism: Mechanism, name: str) -> None:
 
 def _place_ball(standing: Standing, mechanism: Mechanism, name: str, rows: Array) -> None:
     """Place the body of a ball joint, given its rows of the identity, shape (3, nv)."""
-    quaternion = dict(mechanism.robot.pose.balls).get(name, (1.0, 0.0, 0.0, 0.0))
-    _attach(standing, mechanism.bodies[name], np.zeros(3), rotation_matrix(np.array(quaternion)))
+    quaternion = np.array(mechanism.robot.standing_balls[name])
+    _attach(standing, mechanism.bodies[name], np.zeros(3), rotation_matrix(quaternion))
     standing.J[name][:3] += rows
 
 

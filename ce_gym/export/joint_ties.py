@@ -26,6 +26,10 @@ class Tie:
         """Return the coordinate [rad or m] for given ones of the other joints."""
         return self.offset + sum(ratio * coordinates[name] for name, ratio in self.ratios.items())
 
+    def scaled(self, factor: float) -> Tie:
+        """Return the tie of a coordinate that is larger by a factor."""
+        return Tie({name: factor * ratio for name, ratio in self.ratios.items()}, factor * self.offset)
+
 
 def joint_ties(mechanism: Mechanism) -> dict[str, Tie]:
     """Return every joint coordinate as a function of the independent ones, by joint name.

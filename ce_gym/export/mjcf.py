@@ -15,18 +15,16 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.standing import standing_pose, turned
 from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf_equalities import MJCF_JOINTS, add_ties, check_expressible, held_rotors, joint_armature
+from ce_gym.export.mjcf_mechanism import SMALLEST_INERTIA, largest_ratio, mjcf_mechanism
 from ce_gym.export.mjcf_text import quaternion, text
 from ce_gym.model.description import ContactSphere, Robot, Shape
 from ce_gym.model.errors import bad
-from ce_gym.model.mechanism import ELASTIC, MovingBody, build_mechanism
+from ce_gym.model.mechanism import ELASTIC, MovingBody
 
 Array = NDArray[np.float64]
 
 SMALLEST_MASS = 1e-12
 """Mass given to a massless body [kg]; MuJoCo refuses moving bodies without mass."""
-
-SMALLEST_INERTIA = 1e-13
-"""Moment of inertia given to a body without any [kg m^2]; MuJoCo refuses moving bodies without inertia."""
 
 SMALLEST_RADIUS = 1e-6
 """Radius given to a contact point [m]; MuJoCo refuses spheres without extent."""
@@ -48,7 +46,8 @@ def to_mjcf(
     """Write a robot as MJCF.
 
     - `exact`: every rotor is a body with a hinge; gears are joint equalities, belts and differentials are fixed tendons
-      with a tendon equality (soft constraints: MuJoCo has no exact ones).
+      with a tendon equality (soft constraints: MuJoCo has no exact ones). Rotors too light for a body of MuJoCo's,
+      such as those that stand for an armature of unknown ratio, are written as at `coupled`, see mjcf_mechanism.py.
     - `coupled`: no rotors; joint armature for gears, tendon armature for what spans several joints of a chain; for
       other chains a massless body with armature, tied by a tendon.
     - `armature`: no rotor bodies; the diagonal of the reflected inertia as joint armature.
@@ -90,10 +89,12 @@ def to_mjcf(
     """
     if transmission == ELASTIC:
         raise bad(robot.source or robot.name, "transmission", transmission, "another level: MJCF has no such drives")
-    mechanism = build_mechanism(robot, transmission, eliminate=False)
+    mechanism = mjcf_mechanism(robot, transmission)
     ties = joint_ties(mechanism)
     check_expressible(mechanism, ties)
-    standing = standing_pose(mechanism).q
+    held = held_rotors(mechanism, ties)
+    standing = dict(standing_pose(mechanism).q)
+    standing |= {name: standing[name] / largest_ratio(ties[name]) for name in held}
     in_loops = [name for cluster in mechanism.tree.clusters if not cluster.linear for name in cluster.bodies]
     reference = {name: standing[name] for name in in_loops}
     solver = {key: text(value) for key, value in (("solref", solref), ("solimp", solimp)) if value is not None}
@@ -102,8 +103,7 @@ def to_mjcf(
     ET.SubElement(root, "option", timestep=text(timestep), integrator=integrator, gravity=text(robot.gravity))
     elements: dict[str | None, ET.Element] = {None: _add_world(root, robot, ground)}
     armature = joint_armature(mechanism, ties)
-    held = [moving for moving, _ in held_rotors(mechanism, ties).values()]
-    for moving in (*mechanism.bodies.values(), *held):
+    for moving in (*mechanism.bodies.values(), *(moving for moving, _ in held.values())):
         elements[moving.name] = _add_body(elements[moving.parent], moving, robot, reference, armature)
     add_ties(root, elements, mechanism, ties, reference, solver)
     _add_actuators(root, robot)
@@ -197,8 +197,8 @@ def valid_inertia(inertia: Array) -> Array:
     """Return the inertia [kg m^2] with its smaller principal moments raised until the triangle inequality holds."""
     moments, axes = np.linalg.eigh(inertia)
     if moments[0] < SMALLEST_INERTIA:
-        inertia = inertia + (SMALLEST_INERTIA - moments[0]) * np.eye(3)
-        moments = moments + (SMALLEST_INERTIA - moments[0])
+        moments = np.maximum(moments, SMALLEST_INERTIA)
+        inertia = (axes * moments) @ axes.T
     lacking = moments[2] - moments[0] - moments[1]
     if lacking <= 0.0:
         return inertia

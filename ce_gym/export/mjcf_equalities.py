@@ -23,11 +23,13 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.export.joint_ties import Tie
+from ce_gym.export.mjcf_mechanism import largest_ratio
 from ce_gym.export.mjcf_text import quaternion, text
 from ce_gym.model.constraints import Constraint, LoopConstraint, RodConstraint
 from ce_gym.model.description import Robot
@@ -86,22 +88,27 @@ def joint_armature(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, f
     armature = {name: spin.inertia for name, (_, spin) in held_rotors(mechanism, ties).items()}
     for spin in _spins(mechanism):
         ratios = ties[spin.rotor].ratios
-        if mechanism.level == "armature" or (mechanism.level == "coupled" and len(ratios) == 1):
+        if mechanism.level == "armature" or (_reflects_all(mechanism) and len(ratios) == 1):
             for joint, ratio in ratios.items():
                 armature[joint] = armature.get(joint, 0.0) + spin.inertia * ratio**2
     return armature
 
 
 def held_rotors(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, tuple[MovingBody, Spin]]:
-    """Return the left-out rotors that need a body, without mass, to carry their reflected inertia; by name."""
+    """Return the left-out rotors that need a body, without mass, to carry their reflected inertia; by name.
+
+    The coordinate of that body is the rotor's angle over its largest ratio, since MuJoCo's smallest inertia times the
+    square of a ratio is no longer small.
+    """
     held: dict[str, tuple[MovingBody, Spin]] = {}
-    for spin in _spins(mechanism) if mechanism.level == "coupled" else ():
+    for spin in _spins(mechanism) if _reflects_all(mechanism) else ():
         if len(ties[spin.rotor].ratios) > 1 and not _one_chain(mechanism, ties[spin.rotor].ratios):
             rotor = mechanism.robot.body(spin.rotor)
             rotation, position = np.array(rotor.placement.rotation), np.array(rotor.placement.position)
             axis, nothing = np.array(rotor.joint.axis), np.zeros((6, 6))
             moving = MovingBody(rotor.name, rotor.parent, rotation, position, rotor.joint, axis, nothing)
-            held[rotor.name] = moving, spin
+            inertia = spin.inertia * largest_ratio(ties[spin.rotor]) ** 2
+            held[rotor.name] = moving, replace(spin, inertia=inertia)
     return held
 
 
@@ -115,6 +122,11 @@ def _one_chain(mechanism: Mechanism, joints: Mapping[str, float]) -> bool:
             chain.add(body.name)
         chains.append(chain)
     return any(set(joints) <= chain for chain in chains)
+
+
+def _reflects_all(mechanism: Mechanism) -> bool:
+    """Whether rotors that are left out keep all of their reflected inertia, off-diagonal terms included."""
+    return mechanism.level in ("exact", "coupled")
 
 
 def _spins(mechanism: Mechanism) -> Iterator[Spin]:
@@ -144,11 +156,12 @@ def add_ties(
     held = held_rotors(mechanism, ties)
     for name in (*mechanism.bodies, *held):
         if name in ties and name not in ties[name].ratios:
-            _add_linear(tendons, equalities, name, ties[name], reference, solver)
+            tie = ties[name].scaled(1.0 / largest_ratio(ties[name])) if name in held else ties[name]
+            _add_linear(tendons, equalities, name, tie, reference, solver)
     for constraint in mechanism.robot.constraints:
         if not constraint.linear:
             EXPORTS[type(constraint)](elements, tendons, equalities, constraint, solver)
-    if mechanism.level == "coupled":
+    if _reflects_all(mechanism):
         for spin in _spins(mechanism):
             if len(ties[spin.rotor].ratios) > 1 and spin.rotor not in held:
                 tendon = _fixed_tendon(tendons, spin.rotor, ties[spin.rotor].ratios)

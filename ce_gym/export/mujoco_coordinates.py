@@ -14,7 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.export.joint_ties import joint_ties
+from ce_gym.export.joint_ties import Tie, joint_ties
+from ce_gym.export.mjcf_mechanism import largest_ratio
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.coordinates import Layout
 from ce_gym.model.description import Robot
@@ -23,6 +24,12 @@ from ce_gym.model.frames import rotation_matrix
 from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
+
+
+def rotor_scale(model: mujoco.MjModel, robot: Robot, name: str, tie: Tie) -> float:
+    """Return a rotor's angle over the coordinate that stands for it in MJCF: 1 but for those of `held_rotors`."""
+    written = [j for j in range(model.njnt) if model.joint(j).name == name and robot.body(name).kind == "rotor"]
+    return largest_ratio(tie) if any(model.dof_armature[model.jnt_dofadr[j]] for j in written) else 1.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,7 @@ class Coordinates:
         if loops:
             raise RobotError(f"{robot.name}: constraint {loops[0]!r}: expected only linear ones for this comparison")
         ties = joint_ties(build_mechanism(robot))
+        ties = {name: tie.scaled(1.0 / rotor_scale(model, robot, name, tie)) for name, tie in ties.items()}
         at = {model.joint(i).name: (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])) for i in range(model.njnt)}
         names = [name for name in at if name in ties]
         matrix = np.array([[ties[name].ratios.get(y, 0.0) for y in robot.independent] for name in names])

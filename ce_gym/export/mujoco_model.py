@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from ce_gym.export.mjcf import SMALLEST_INERTIA, mass_properties, to_mjcf
+from ce_gym.export.mjcf import mass_properties, to_mjcf
+from ce_gym.export.mjcf_mechanism import SMALLEST_INERTIA, mjcf_mechanism
 from ce_gym.export.mjcf_text import quaternion
 from ce_gym.model.description import Robot
-from ce_gym.model.mechanism import build_mechanism
 
 STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Impedance of equalities held as stiffly as MuJoCo allows, with a time constant of two steps."""
@@ -73,7 +73,7 @@ def load(
     if also:
         also(spec)
     model = spec.compile()
-    for moving in build_mechanism(robot, transmission, eliminate=False).bodies.values():
+    for moving in mjcf_mechanism(robot, transmission).bodies.values():
         _, _, inertia = mass_properties(moving.inertia)
         moments, axes = np.linalg.eigh(inertia)
         axes *= np.sign(np.linalg.det(axes))

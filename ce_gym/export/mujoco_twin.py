@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.dynamics.model import Model
+from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mujoco_batch import Batch
-from ce_gym.export.mujoco_coordinates import Coordinates
+from ce_gym.export.mujoco_coordinates import Coordinates, rotor_scale
 from ce_gym.export.mujoco_model import STIFF, Settings, compiled
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Robot
 from ce_gym.model.frames import rotation_matrix
+from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
 
@@ -64,9 +66,16 @@ class MujocoTwin:
         lay_ground(self.model, robot)
         self._coordinates = None if loops else Coordinates.of(self.model, robot)
         self._tree = Model(robot, level) if loops else None
+        ties = joint_ties(build_mechanism(robot)) if loops else {}
+        scales = {name: rotor_scale(self.model, robot, name, tie) for name, tie in ties.items()}
         self._batch = Batch(self.model, num_envs)
+        first = {self.model.joint(i).name: i for i in range(self.model.njnt)}
+        addresses = {name: (int(self.model.jnt_qposadr[i]), int(self.model.jnt_dofadr[i])) for name, i in first.items()}
+        rows = robot.spanning_rows  # rotors that are armature here have rows, and no joint
+        known = [name for name in robot.joints if name in addresses]
+        self._joints = [(addresses[name], rows[name], scales.get(name, 1.0)) for name in known]
         names = [*robot.balls, *robot.independent]
-        at = [(int(self.model.joint(name).qposadr[0]), int(self.model.joint(name).dofadr[0])) for name in names]
+        at = [addresses[name] for name in names]
         sizes = [(len(rows), len(speeds)) for rows, speeds in (robot.rows[name] for name in names)]
         placed = list(zip(at, sizes, strict=True))
         self._positions = [*range(7), *(p + i for (p, _), (n, _) in placed for i in range(n))]
@@ -95,9 +104,9 @@ class MujocoTwin:
         qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
         qpos[:7], qvel[:3], qvel[3:6] = q[:7], rotation_matrix(q[3:7]) @ v[3:6], v[:3]
         span = self._tree.spanning(q, v)
-        for name, position, speed in zip(self._tree.spanning_names, span[0][7:], span[1][6:], strict=True):
-            joint = self.model.joint(name)
-            qpos[joint.qposadr], qvel[joint.dofadr] = position, speed
+        for (position, speed), (rows, speeds), scale in self._joints:
+            qpos[position : position + len(rows)] = span[0][rows] / scale
+            qvel[speed : speed + len(speeds)] = span[1][speeds] / scale
         return qpos, qvel
 
     def step(self, target: Array, duration: float) -> None:
@@ -126,14 +135,19 @@ def lay_ground(model: mujoco.MjModel, robot: Robot) -> None:
     a0 + A f = (v+ - v) / h, with R = 1 / (h (c + h k)), b = 1 / h and K = k R it is f = -k (r + h v+) - c v+: a spring
     and a damper at the end of the step h, as ours are, whatever they carry. R is said by an impedance d, as
     (1 - d) / d times the mobility that MuJoCo gives the body (`invweight0`); negative solref are d K and d b. A
-    material without damping of its own is damped critically.
+    material without damping of its own is damped critically. The dissipation of Hunt and Crossley's law becomes the
+    damping that it has where all contacts carry the robot together.
     """
     model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, STICKING
     material, h = robot.material, model.opt.timestep
+    weight = robot.total_mass * math.hypot(*robot.gravity)
     for contact in robot.contacts:
         geom = model.geom(contact.name)
         mobility = float(model.body_invweight0[int(geom.bodyid[0]), 0])
-        damping = material.damping or 2.0 * math.sqrt(material.stiffness / mobility)
+        if material.dissipation is None:
+            damping = material.damping or 2.0 * math.sqrt(material.stiffness / mobility)
+        else:
+            damping = material.dissipation * weight / len(robot.contacts)
         R = 1.0 / (h * (damping + h * material.stiffness))
         d = mobility / (mobility + R)
         geom.solimp[:2] = d  # at every depth

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from ce_gym.identify.held import limbs_of
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import ELASTIC_FACTORS
-from ce_gym.model.errors import RobotError, unknown
+from ce_gym.model.errors import RobotError, bad, unknown
 
 KINDS = {
     "rotor_inertia": "factor on each rotor's spin inertia",
@@ -116,19 +116,24 @@ def sought(
     Raises:
         RobotError: There is no such kind, or no such figure.
     """
-    for kind in kinds:
-        if kind not in KINDS:
-            raise unknown("identify", "figure", kind, KINDS, "a kind of figure")
-    found = [figure for kind in kinds for figure in _of_kind(robot, kind, longest_delay, measured)]
-    for name in fixed:
-        if name not in [figure.name for figure in found]:
-            raise unknown(
-                "identify", "fixed figure", name, [figure.name for figure in found], "a figure that is sought"
-            )
+    by_kind = {kind: _of_kind(robot, kind, longest_delay, measured) for kind in KINDS}
+    usable = [kind for kind, figures in by_kind.items() if figures]
+    _check_listed("figure", kinds, KINDS, "a kind of figure")
+    _check_listed("figure", kinds, usable, f"a kind that {robot.name} and its log have")
+    found = [figure for kind in kinds for figure in by_kind[kind]]
+    _check_listed("fixed figure", fixed, [figure.name for figure in found], "a figure that is sought")
     left = [figure for figure in found if figure.name not in fixed]
     if not left:
-        raise RobotError(f"identify: nothing of {robot.name} is sought: expected a kind of figure that it has")
+        raise RobotError("identify: every figure is fixed: expected one that is sought")
     return left
+
+
+def _check_listed(key: str, names: Sequence[str], known: Sequence[str] | dict[str, str], what: str) -> None:
+    for i, name in enumerate(names):
+        if name not in known:
+            raise unknown("identify", key, name, known, what)
+        if name in names[:i]:
+            raise bad("identify", key, name, "each name once")
 
 
 def _of_kind(robot: Robot, kind: str, longest_delay: float, measured: Sequence[tuple[str, str]] = ()) -> list[Figure]:

@@ -11,6 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+UNIT_TOLERANCE = 1e-3
+"""By how much the norm of a quaternion that comes in may differ from 1."""
+UNIT_ROUNDING = 16
+"""Up to so many roundings a quaternion counts as of unit length, and keeps its bits."""
 SIZES: dict[str, tuple[int, int]] = {"free": (7, 6), "ball": (4, 3)}
 """Number of positions and of velocities of types of joints; all others have one of each."""
 
@@ -84,3 +91,32 @@ def placed(joints: Iterable[tuple[str, str]]) -> dict[str, tuple[range, range]]:
         rows[name] = range(first_q, first_q + nq), range(first_v, first_v + nv)
         first_q, first_v = first_q + nq, first_v + nv
     return rows
+
+
+def unit_quaternions(q: NDArray, first: Iterable[int], name: str = "q", dtype: DTypeLike = np.float64) -> NDArray:
+    """Return rows with quaternions of unit length, given rows in which they are nearly so.
+
+    Quaternions that are of unit length but for rounding keep their bits, and so do those that are not a number.
+
+    Args:
+        q: Shape (..., n).
+        first: Columns at which quaternions (w, x, y, z) begin.
+        name: Of the rows in error messages.
+        dtype: The precision that rounding is measured by.
+
+    Raises:
+        ValueError: The norm of a quaternion is not within `UNIT_TOLERANCE` of 1.
+    """
+    rounding, result = UNIT_ROUNDING * np.finfo(dtype).eps, q
+    for i in first:
+        norm = np.linalg.norm(np.asarray(q[..., i : i + 4], float), axis=-1)
+        off = np.abs(norm - 1)
+        if (wrong := off > UNIT_TOLERANCE).any():
+            place = tuple(int(j) for j in np.argwhere(wrong)[0])
+            entry = "".join(f"{j}, " for j in place) + f"{i}:{i + 4}"
+            expected = f"a quaternion (w, x, y, z) of norm 1 within {UNIT_TOLERANCE:g}"
+            raise ValueError(f"{name}[{entry}] has norm {norm[place]:.4g}; expected {expected}: divide it by its norm")
+        if (scaled := off > rounding).any():
+            result = np.array(result, float) if result is q else result
+            result[scaled, i : i + 4] /= norm[scaled, None]
+    return result

@@ -15,10 +15,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from ce_gym.model.constraints import Constraint
-from ce_gym.model.coordinates import Layout, placed, sizes
+import numpy as np
+
+from ce_gym.model.constraints import Constraint, LinearConstraint
+from ce_gym.model.coordinates import Layout, placed, sizes, unit_quaternions
 from ce_gym.model.drives import Battery, Elasticity, Motor
+from ce_gym.model.errors import listed_names
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
+
+UNKNOWN_RATIO = 1e6
+"""Gear ratio in place of one that is not known: the rotor's own inertia is then 1e-12 of the reflected one."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,11 @@ class Inertial:
     mass: float
     com: Vec3
     inertia: Mat3
+
+    @property
+    def trace(self) -> float:
+        """Sum of the three moments of inertia [kg m^2]."""
+        return sum(self.inertia[i][i] for i in range(3))
 
 
 @dataclass(frozen=True)
@@ -197,7 +208,7 @@ class Pose:
     Attributes:
         height: Height of the base origin above flat ground [m]; ignored by a fixed base.
         joints: Pairs (body, angle) for independent joints; those not named are zero [rad or m].
-        balls: Pairs (body, unit quaternion wxyz) for ball joints; those not named are not turned.
+        balls: Pairs (body, quaternion wxyz of norm 1 within 1e-3) for ball joints; those not named are not turned.
     """
 
     height: float = 0.0
@@ -270,11 +281,19 @@ class Robot:
         for body in self.bodies:
             if body.name == name:
                 return body
-        raise KeyError(f"{self.name} has no body {name!r}; it has {', '.join(b.name for b in self.bodies)}")
+        raise KeyError(f"{self.name} has no body {name!r}; it has {listed_names(name, [b.name for b in self.bodies])}")
 
     def rotors(self) -> Iterator[Body]:
         """Iterate over the bodies that spin inside transmissions."""
         return (body for body in self.bodies if body.kind == "rotor")
+
+    @property
+    def unknown_ratios(self) -> tuple[str, ...]:
+        """The rotors whose gear ratio the robot's file does not say, such as armature in MJCF: see `UNKNOWN_RATIO`."""
+        ties = [tie for tie in self.constraints if isinstance(tie, LinearConstraint)]
+        steep = [tie for tie in ties if max(abs(x) for _, x in tie.coefficients) >= UNKNOWN_RATIO / 100]
+        tied = {name for tie in steep for name in tie.bodies}
+        return tuple(body.name for body in self.rotors() if body.name in tied and body.inertial.trace < 1e-9)
 
     @property
     def commanded(self) -> tuple[str, ...]:
@@ -327,9 +346,16 @@ class Robot:
     def standing_q(self) -> tuple[float, ...]:
         """Positions of the standing pose, upright at the origin, shape (nq,)."""
         base = [0.0, 0.0, self.pose.height, 1.0, 0.0, 0.0, 0.0] if self.floating else []
-        turned, angles = dict(self.pose.balls), dict(self.pose.joints)
-        balls = [x for name in self.balls for x in turned.get(name, (1.0, 0.0, 0.0, 0.0))]
+        angles = dict(self.pose.joints)
+        balls = [x for quaternion in self.standing_balls.values() for x in quaternion]
         return (*base, *balls, *(angles.get(name, 0.0) for name in self.independent))
+
+    @property
+    def standing_balls(self) -> dict[str, tuple[float, ...]]:
+        """Unit quaternions (w, x, y, z) of the ball joints in the standing pose, by name of the body."""
+        turned = dict(self.pose.balls)
+        rows = {name: np.array(turned.get(name, (1.0, 0.0, 0.0, 0.0)), float) for name in self.balls}
+        return {name: tuple(unit_quaternions(row, (0,), f"pose.balls.{name}").tolist()) for name, row in rows.items()}
 
     @property
     def joints(self) -> tuple[str, ...]:

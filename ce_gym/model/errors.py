@@ -5,8 +5,10 @@ from __future__ import annotations
 import difflib
 import reprlib
 from collections.abc import Iterable
+from fnmatch import fnmatchcase
 
 _LONGEST_VALUE = 60
+_MOST_NAMES = 60
 _SHORT = reprlib.Repr()  # stops inside a large value; aliases can make a small YAML file a huge one
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 6
 _SHORT.maxlevel = 3
@@ -41,11 +43,53 @@ def bad(file: str, key: str, value: object, expected: str) -> RobotError:
 
 
 def unknown(file: str, key: str, value: object, known: Iterable[str], what: str) -> RobotError:
-    """Return the error for a name that does not exist, with the closest one that does."""
-    names = list(known)
-    close = difflib.get_close_matches(str(value), names, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else f" ({', '.join(names) or 'there are none'})"
-    return bad(file, key, value, f"{what}{hint}")
+    """Return the error for a name in a file that does not exist, with those that do."""
+    return bad(file, key, value, f"{what}: {listed_names(value, known)}")
+
+
+def check_names(
+    argument: str,
+    names: Iterable[object],
+    known: Iterable[str],
+    what: str,
+    patterns: bool = False,
+    listed: str | None = None,
+) -> None:
+    """Check that each of the names that an argument lists exists and is listed once.
+
+    Args:
+        argument: What lists them.
+        names: What a user listed.
+        known: The names that exist.
+        what: What they are names of, such as "a joint".
+        patterns: Whether names can be patterns, such as "*_hip", each of which must match a name.
+        listed: The names that exist, in words; all of `known` if None.
+
+    Raises:
+        ValueError: One line with the first wrong name, the names that exist, and the closest of them.
+    """
+    if isinstance(names, str):
+        raise ValueError(f"{argument}={names!r}; expected a list of names, such as [{names!r}]")
+    allowed, seen = list(known), set()
+    for name in names:
+        matches = isinstance(name, str) and (
+            any(fnmatchcase(each, name) for each in allowed) if patterns else name in allowed
+        )
+        if not matches:
+            raise ValueError(f"{argument}={name!r}; expected {what} {listed_names(name, allowed, listed)}")
+        if name in seen:
+            raise ValueError(f"{argument}={name!r} is listed twice; expected each name once")
+        seen.add(name)
+
+
+def listed_names(value: object, known: Iterable[str], listed: str | None = None) -> str:
+    """Return the names that exist as text, with the closest to `value`: `hip, knee (did you mean 'hip'?)`."""
+    names = [str(name) for name in known]
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    listed = listed or f"{', '.join(names[:_MOST_NAMES])}{more}" or "none: there are none"
+    by_lower = {name.lower(): name for name in names}
+    close = difflib.get_close_matches(str(value).strip("*?").lower(), by_lower, n=1)
+    return listed + (f" (did you mean {by_lower[close[0]]!r}?)" if close else "")
 
 
 def printable(text: str) -> str:

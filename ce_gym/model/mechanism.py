@@ -159,7 +159,7 @@ def build_mechanism(
     inertias = {name: spatial_inertia(robot.body(name)) for name in kept}
     for rotor in merged.values():
         if rotor.parent is not None and (locked_rotors or exact):
-            inertias[rotor.parent] = inertias[rotor.parent] + _seen_from_parent(rotor)
+            inertias[rotor.parent] = inertias[rotor.parent] + seen_from_parent(rotor)
     bodies = {b.name: _moving_body(b, inertias[b.name]) for b in robot.bodies if b.name in kept}
     spins = tuple(
         tuple(_spin(robot.body(name), merged[name]) for name in cluster.bodies if name in merged)
@@ -226,6 +226,29 @@ def is_axisymmetric(rotor: Body) -> bool:
     return has_principal_axis(rotor) and asymmetry <= AXISYMMETRY_TOLERANCE * float(np.abs(inertia).max())
 
 
+def spin_inertia(rotor: Body) -> float:
+    """Return the moment of inertia of a rotor about its spin axis [kg m^2]."""
+    axis = np.array(rotor.joint.axis)
+    moment = float(axis @ np.array(rotor.inertial.inertia) @ axis)
+    com_offset = math.fsum(np.cross(axis, np.array(rotor.inertial.com)) ** 2)
+    return moment + rotor.inertial.mass * com_offset
+
+
+def smallest_spin_factor(rotor: Body) -> float:
+    """Return the smallest factor on the spin inertia of a rotor with which its tensor is one of a body [-].
+
+    0 for a rotor about a principal axis. With products of inertia p between spin and transverse motion, or with the
+    centre of mass off the axis, `I + (factor - 1) J u u^T` is positive semidefinite from `1 - 1 / (J u^T I^-1 u)` on.
+    """
+    if has_principal_axis(rotor):
+        return 0.0
+    axis, inertia, J = np.array(rotor.joint.axis), np.array(rotor.inertial.inertia), spin_inertia(rotor)
+    inverse = np.linalg.pinv(inertia, rcond=AXISYMMETRY_TOLERANCE, hermitian=True)
+    if np.abs(inertia @ inverse @ axis - axis).max() > AXISYMMETRY_TOLERANCE:
+        return 1.0
+    return float(1.0 - 1.0 / (J * (axis @ inverse @ axis)))
+
+
 def skew(x: Array) -> Array:
     """Return the matrix of the cross product, `skew(x) @ y = cross(x, y)`."""
     return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
@@ -244,8 +267,8 @@ def snapped(x: Array) -> Array:
     return np.where(np.abs(x - nearest) < 1e-12, nearest, x)
 
 
-def _seen_from_parent(body: Body) -> Array:
-    """Spatial inertia of a body at joint coordinate zero, about its parent's origin, in its parent's axes."""
+def seen_from_parent(body: Body) -> Array:
+    """Return the spatial inertia of a body at joint coordinate zero about its parent's origin, in the parent's axes."""
     rotation, position = np.array(body.placement.rotation), np.array(body.placement.position)
     to_body = np.block([[rotation.T, np.zeros((3, 3))], [-rotation.T @ skew(position), rotation.T]])
     inertia = to_body.T @ spatial_inertia(body) @ to_body
@@ -277,15 +300,13 @@ def _averaged(rotor: Body) -> Body:
 def _spin(rotor: Body, merged: Body) -> Spin:
     """Return the spin of a rotor of which `merged` stays with its carrier."""
     axis = np.array(rotor.joint.axis)
-    moment = float(axis @ np.array(rotor.inertial.inertia) @ axis)
-    com_offset = math.fsum(np.cross(axis, np.array(rotor.inertial.com)) ** 2)
     moments, axes = np.linalg.eigh(np.array(rotor.inertial.inertia) - np.array(merged.inertial.inertia))
     to_carrier = np.array(rotor.placement.rotation)
     return Spin(
         rotor=rotor.name,
         carrier=rotor.parent,
         axis=snapped(to_carrier @ axis),
-        inertia=moment + rotor.inertial.mass * com_offset,
+        inertia=spin_inertia(rotor),
         transverse=float(moments[-1]),
         heavy_axis=snapped(to_carrier @ axes[:, -1]),
     )

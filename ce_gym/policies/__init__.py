@@ -1,5 +1,6 @@
 """Trained policies: found by name, read without running code that they may carry, run by numpy."""
 
+from ce_gym.model.errors import listed_names
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.arguments import add_env_arg, add_env_arguments, checked_arguments, parse_yaml
 from ce_gym.policies.environments import environment_of
@@ -23,6 +24,7 @@ __all__ = [
     "environment_of",
     "find_policy",
     "keep_map",
+    "listed_names",
     "load_policy",
     "locate_policy",
     "parse_yaml",

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ce_gym.model.errors import listed_names
+
 
 def check(argument: str, value: object, valid: Any, expected: str) -> None:
     """Raise a ValueError unless `valid`."""
@@ -18,7 +20,8 @@ def check(argument: str, value: object, valid: Any, expected: str) -> None:
 def check_choice(argument: str, value: object, choices: Iterable[object]) -> None:
     """Raise a ValueError unless a value is one of the choices."""
     known = tuple(choices)
-    check(argument, value, value in known, " or ".join(map(repr, known)))
+    close = listed_names(value, [each for each in known if isinstance(each, str)]).partition(" (")[2]
+    check(argument, value, value in known, " or ".join(map(repr, known)) + (f" ({close}" if close else ""))
 
 
 def check_whole(argument: str, value: Any, least: int, unit: str = "") -> None:

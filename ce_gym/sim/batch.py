@@ -11,6 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.model.coordinates import unit_quaternions
 from ce_gym.sim.devices import Array, Device
 from ce_gym.sim.schema import Row
 from ce_gym.sim.substeps import FRAME, HEIGHTS
@@ -78,6 +79,19 @@ class Batch:
         """
         self.place.write(self.arrays[name], values, mask)
 
+    def unit(self, name: str, values: NDArray, source: str = "") -> NDArray:
+        """Return rows of a state buffer, shape (..., size), with quaternions scaled to unit length.
+
+        Args:
+            name: Of the buffer.
+            values: To be written to it.
+            source: Where they come from, for the message.
+
+        Raises:
+            ValueError: The norm of a quaternion is not within 1e-3 of 1.
+        """
+        return unit_quaternions(values, self.schema[name].quaternions, source + name, self.dtype)
+
     def snapshot(self, file: File | None = None) -> Snapshot:
         """Return the state by name, shape (num_envs, size) or (num_envs,); write it to a file, too, if one is given."""
         state = {name: self.place.host(self.rows(name)) for name, row in self.schema.items() if row.writer != "scene"}
@@ -90,7 +104,8 @@ class Batch:
         """Continue from a snapshot, or from a file with one.
 
         Raises:
-            ValueError: If it is not one of such a batch; nothing is changed then.
+            ValueError: If it is not one of such a batch, or holds a quaternion that is not of unit length; nothing is
+                changed then.
         """
         state = snapshot if isinstance(snapshot, Mapping) else load_snapshot(snapshot)
         expected = self.snapshot()
@@ -102,8 +117,8 @@ class Batch:
             if (got.shape, got.dtype) != (rows.shape, rows.dtype):
                 wanted = f"{rows.dtype} {rows.shape}"
                 raise ValueError(f"snapshot: {name!r} is {got.dtype} {got.shape}; expected {wanted}")
-        for name in expected:
-            self.write(name, state[name])
+        for name, rows in {name: self.unit(name, np.asarray(state[name]), "snapshot: ") for name in expected}.items():
+            self.write(name, rows)
 
 
 def load_snapshot(file: File) -> Snapshot:

@@ -124,9 +124,14 @@ class StepDerivatives:
         return {name: self.simulator._batch.rows(name) for name in self._parts}
 
     def restore(self, state: Mapping[str, ArrayLike]) -> None:
-        """Set that, and clear divergence; parts that are left out stay as they are."""
-        for name, rows in {**state, "diverged": 0.0}.items():
-            self.simulator._batch.write(name, rows)
+        """Set that, and clear divergence; parts that are left out stay as they are.
+
+        Quaternions whose norm is within 1e-3 of 1 are scaled to unit length; others raise a ValueError.
+        """
+        batch = self.simulator._batch
+        for name, rows in {name: batch.unit(name, np.asarray(rows)) for name, rows in state.items()}.items():
+            batch.write(name, rows)
+        batch.write("diverged", 0.0)
 
     def take(self) -> list[Record]:
         """Hand over what has been recorded, and begin anew."""

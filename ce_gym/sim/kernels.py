@@ -11,6 +11,7 @@ from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.self_contact import apart_when_standing
 from ce_gym.model import Robot
 from ce_gym.model.checks.collisions import adjacent, capsules_of, colliding
+from ce_gym.model.errors import check_names
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.devices import Cpu, Device
 from ce_gym.sim.kernel_key import laws_key, model_key
@@ -20,21 +21,22 @@ MOST_PAIRS = 32
 """Most pairs of capsules in a scene: the system of their forces is dense."""
 
 
-def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, ...]:
+def select_contacts(robot: Robot, contacts: str | Sequence[str], argument: str = "contacts") -> tuple[str, ...]:
     """Return names of contact spheres, in the robot's order.
 
     Args:
         robot: The robot.
         contacts: "all", or names of spheres or groups of spheres, one or several.
+        argument: What an error calls them.
 
     Raises:
-        ValueError: If a name is neither a sphere's nor a group's.
+        ValueError: If a name is neither a sphere's nor a group's, or is listed twice.
     """
-    wanted = {contacts} if isinstance(contacts, str) else set(contacts)
-    known = {"all"} | {c.group for c in robot.contacts} | {c.name for c in robot.contacts}
-    for name in sorted(wanted - known):
-        expected = f"'all', groups or names among {', '.join(sorted(known - {'all'}))}"
-        raise ValueError(f"contacts={name!r}; expected {expected}")
+    names = [contacts] if isinstance(contacts, str) else list(contacts)
+    known = sorted({c.group for c in robot.contacts} | {c.name for c in robot.contacts})
+    listed = [name for name in names if name != "all"]
+    check_names(argument, listed, known, "'all', groups or names among")
+    wanted = set(names)
     return tuple(c.name for c in robot.contacts if wanted & {"all", c.group, c.name})
 
 
@@ -55,10 +57,13 @@ def select_pairs(mechanism: Mechanism, pairs: str | Sequence[Sequence[str]]) -> 
     chosen = everything if isinstance(pairs, str) else tuple(tuple(pair) for pair in pairs)
     known = [body.name for body in robot.bodies if body.kind == "link" and capsules_of(robot, body.name)]
     for pair in chosen:
-        if len(pair) != 2 or not set(pair) <= set(known):
-            raise ValueError(f"self_collisions: {pair!r}; expected two links with capsules among {', '.join(known)}")
+        if len(pair) != 2:
+            raise ValueError(f"self_collisions: {pair!r}; expected two links")
+        check_names("self_collisions", pair, known, "a link with capsules among")
         if adjacent(*map(robot.body, pair)):
             raise ValueError(f"self_collisions: {pair!r}; expected two links of which none carries the other")
+    unordered = [" and ".join(sorted(pair)) for pair in chosen]
+    check_names("self_collisions", unordered, unordered, "a pair of links among")
     if (count := len(colliding(robot, chosen))) > MOST_PAIRS:  # type: ignore[arg-type]
         raise ValueError(
             f"self_collisions: {count} pairs of capsules; expected at most {MOST_PAIRS}, name those that matter"

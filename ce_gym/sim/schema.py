@@ -45,6 +45,7 @@ class Row:
             (Python only; no reset touches it) or "scene" (constant: how it is stepped, and no part of a snapshot).
         reset: With what a robot begins, a number or shape (size,).
         dtype: Of a plain array, shape (num_envs, size), or (num_envs,) for size 0; "" for one in lanes.
+        quaternions: Places at which quaternions of unit length begin.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Row:
     writer: Writer
     reset: ArrayLike = 0.0
     dtype: str = ""
+    quaternions: tuple[int, ...] = ()
 
 
 def physics_rows(
@@ -77,7 +79,11 @@ def physics_rows(
     ):
         check("method", options.method, not (explicit and part in sizes), f"an implicit one, for {why}")
     check_control_period(options, dt)
-    rows = [Row(name, size, "physics", start.get(name, 0.0)) for name, size in sizes.items()]
+    turns = {"q": tuple(i for i, _ in model.robot.layout.turns)}
+    rows = [
+        Row(name, size, "physics", start.get(name, 0.0), quaternions=turns.get(name, ()))
+        for name, size in sizes.items()
+    ]
     rows += [Row("diverged", 1, "physics"), Row("retries", 1, "physics")]
     lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts}
     lengths |= {"motor_torque": motors, "motor_speed": motors}

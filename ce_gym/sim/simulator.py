@@ -23,6 +23,7 @@ from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import OUTPUTS
 from ce_gym.model import ContactMaterial
 from ce_gym.model.checks.collisions import colliding
+from ce_gym.model.errors import check_names, listed_names
 from ce_gym.sim.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
@@ -134,8 +135,8 @@ class Simulator:
         choices |= {"method": METHODS, "friction": FRICTION, "motors": MOTORS, "normal_law": (None, *NORMAL_LAWS)}
         for argument, known in choices.items():
             check_choice(argument, self._made_with[argument], known)
-        for name in outputs:
-            check_choice("outputs", name, OUTPUTS)
+        check_names("outputs", outputs, OUTPUTS, "one of")
+        defaults = parameter_defaults(model.robot, material or model.robot.material, parameters)
         self.tolerance = checked_tolerance(method, tolerance)
         self._device = device_named(device)
         self.device = self._device.name
@@ -154,7 +155,7 @@ class Simulator:
             ground="field" if terrain is not None and self.contact_names else "flat",
             parameters=tuple(parameters),
             self_collisions=select_pairs(model.mechanism, self_collisions),
-            seldom=tuple(name for name in select_contacts(model.robot, seldom) if name in self.contact_names),
+            seldom=tuple(name for name in select_contacts(model.robot, seldom, "seldom") if name in self.contact_names),
             retry=retry,
             control_period=control_period,
         )
@@ -166,7 +167,6 @@ class Simulator:
         rows = [*physics_rows(model, self.options, asked, dt, self.tolerance), FAILURES]
         self._batch = Batch(rows, num_envs, dtype, self._device, ground)
         self._arrays = self._batch.arrays
-        defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
         ends = np.cumsum([0, *(len(default) for default in defaults.values())])
         self._columns = {name: slice(*ends[i : i + 2]) for i, name in enumerate(defaults)}
         self.reset()
@@ -191,7 +191,8 @@ class Simulator:
             mask: Which robots, bool, shape (num_envs,); all of them if None.
 
         Raises:
-            ValueError: If a shape is wrong, a number is not finite, or a loop does not close.
+            ValueError: If a shape is wrong, a number is not finite, the norm of a quaternion is not within 1e-3 of 1,
+                or a loop does not close.
         """
         chosen, rows = self._chosen(mask), {"q": to_numpy(q), "v": to_numpy(v)}
         for name, value in rows.items():
@@ -199,6 +200,7 @@ class Simulator:
             check_shape(name, value, (size,), (self.num_envs, size))
             if not (np.abs(value) <= np.finfo(self.dtype).max).all():
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
+        rows["q"] = self._batch.unit("q", rows["q"])
         begun = ("anchor", "pressed", "carried", "winding", "supply", "held", "diverged", "step_error", "step_change")
         rows |= {name: np.zeros(self._arrays[name].shape[1]) for name in begun if name in self._arrays}
         if "step_length" in self._arrays:
@@ -265,9 +267,8 @@ class Simulator:
             ValueError: If the parameter was not declared, a shape is wrong, or a number is out of range.
         """
         if name not in self._columns:
-            declared = ", ".join(self._columns) or "none"
             expected = "one of those declared with Simulator(..., parameters=)"
-            raise ValueError(f"parameter {name!r}; expected {expected}: {declared}")
+            raise ValueError(f"parameter {name!r}; expected {expected}: {listed_names(name, self._columns)}")
         columns, chosen, new = self._columns[name], self._chosen(mask), to_numpy(value)
         size = int(columns.stop - columns.start)
         check_shape(name, new, (), (size,), (self.num_envs, size))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,10 @@ def folder(tmp_path):
         '0 0 0"/></k', '0 0 1 0 0 0"/></k'
     )
     (tmp_path / "balls.xml").write_text(ball)
+    (tmp_path / "nameless.xml").write_text(re.sub(r' name="[a-z]+"', "", MJCF))
+    twins = MJCF.replace('name="b"', 'name="leg"').replace('name="c"', 'name="locked"')
+    hold = '<equality><joint joint1="locked" polycoef="0.1 0 0 0 0"/></equality></mujoco>'
+    (tmp_path / "locked.xml").write_text(twins.replace("</mujoco>", hold))
     (tmp_path / "two.xml").write_text(
         MJCF.replace("</worldbody>", f'<body name="b"><freejoint/>{LINK}</body></worldbody>')
     )
@@ -39,10 +44,23 @@ def folder(tmp_path):
 @pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
 def test_the_table(folder, monkeypatch):
     rows = {path.name: files.row(path, folder) for path in files.files(folder)}
-    assert set(rows) == {"hopper.xml", "balls.xml", "dragged.xml", "two.xml", "pup.urdf"}, (
-        "a scene without a robot is no robot"
-    )
-    for name, joints in (("hopper.xml", 3), ("balls.xml", 2), ("dragged.xml", 3), ("pup.urdf", 8)):
+    assert set(rows) == {
+        "hopper.xml",
+        "balls.xml",
+        "nameless.xml",
+        "locked.xml",
+        "dragged.xml",
+        "two.xml",
+        "pup.urdf",
+    }, "a scene without a robot is no robot"
+    for name, joints in (
+        ("hopper.xml", 3),
+        ("nameless.xml", 3),
+        ("locked.xml", 2),
+        ("balls.xml", 2),
+        ("dragged.xml", 3),
+        ("pup.urdf", 8),
+    ):
         assert rows[name][1:3] == ("same", joints)
         assert all(isinstance(x, float) and x <= files.BAR for x in rows[name][4:7])
     assert (

@@ -10,7 +10,7 @@ import numpy as np
 
 from ce_gym.bench.stability import scenes
 from ce_gym.bench.stability.rises import SOURCES, Largest, sources
-from ce_gym.dynamics.forces.passive import limit_stiffness
+from ce_gym.dynamics.forces.passive import stop_springs
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactSphere, Joint, Placement, Robot
 from ce_gym.sim import Simulator
@@ -60,8 +60,8 @@ def test_a_stop_acts_by_the_velocity_at_the_start():
                 scenes.inertial(2.0, (0.1, 0.1, 0.1)))  # fmt: skip
     foot = ContactSphere("foot", "link", (0.0, 0.0, 1.0), 0.1)  # in the air
     model = Model(Robot("slider", (link,), (), ("link",), (foot,), gravity=(0.0, 0.0, 0.0)))
-    k, c = limit_stiffness(model.robot, "link")
-    for start, torque in ((0.05, 0.0), (-0.1, 200.0)):  # deeper; out of it, but for a force that turns it round
+    k, c = stop_springs(model.mechanism)["link"]
+    for start, torque in ((0.05, 0.0), (-0.3, 400.0)):  # deeper; out of it, but for a force that turns it round
         largest, _ = step(model, [0.101], [start], torque)
         after = float(largest.after["v"][0, 0])
         added = sources(model, largest, np.zeros(1), DT)[0, SOURCES.index("stops")]

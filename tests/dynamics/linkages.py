@@ -46,7 +46,7 @@ def spatial_four_bar() -> Robot:
     return Robot("spatial", bodies, (ball,), ("crank",), pose=pose, assembly=assembly)
 
 
-def rod_leg() -> Robot:
+def rod_leg(**changes) -> Robot:
     """A floating trunk with thigh and shank; a motor on the trunk moves the shank through a crank and a rod."""
     trunk = link("trunk", None, (0.0, 0.0, 0.0))
     bodies = (
@@ -59,4 +59,5 @@ def rod_leg() -> Robot:
     rod = RodConstraint("rod", "crank", "shank", (0.08, 0.0, 0.0), (0.05, 0.05, 0.05), 0.3)
     gear = LinearConstraint("gear", (("motor", 1.0), ("crank", -6.0)))
     pose, assembly = Pose(joints=(("thigh", 0.2), ("shank", 0.5))), (("crank", 0.9),)
-    return Robot("rod_leg", bodies, (rod, gear), ("thigh", "shank"), pose=pose, assembly=assembly)
+    arguments = {"name": "rod_leg", "bodies": bodies, "constraints": (rod, gear), "independent": ("thigh", "shank")}
+    return Robot(**(arguments | {"pose": pose, "assembly": assembly} | changes))

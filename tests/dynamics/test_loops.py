@@ -64,9 +64,9 @@ def test_inverse_dynamics_undoes_forward_dynamics(model: Model):
     assert np.linalg.eigvalsh(M).min() > 0
 
 
-@pytest.mark.parametrize("level", [level for level in LEVELS if level != "armature"])
+@pytest.mark.parametrize("level", LEVELS)
 def test_power_balance(model: Model, level: str):
-    """The rate of change of energy is the power of the forces. (A diagonal that varies with the pose breaks this.)"""
+    """The rate of change of energy is the power of the forces."""
     model = Model(model.robot, level)
     q, v = (x[0] for x in states(model, 1))
     tau = np.random.default_rng(8).normal(0, 5, model.nv)
@@ -79,6 +79,33 @@ def test_power_balance(model: Model, level: str):
     energies = [sum(model.energy(move(q, v, dt).full().ravel(), v + dt * vdot)) for dt in (h, -h)]
     power = (energies[0] - energies[1]) / (2 * h)
     assert abs(power - tau @ v) < 2e-5 * max(1.0, abs(tau @ v), np.abs(vdot).max() * np.abs(v).max())
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_velocity_terms_follow_from_the_mass_matrix(model: Model, level: str):
+    """Lagrange's equations for joints on a base at rest: `dM/dt v - d(v^T M v / 2)/dq`, by differences of `M`."""
+    model, base = Model(model.robot, level), 6 * model.robot.floating
+    q, v = (x[0] for x in states(model, 1))
+    v[:base] = 0.0
+    joints, h = range(base, model.nv), 1e-5
+    ends = [q + h * s * np.eye(model.nq)[model.nq - model.nv + i] for i in joints for s in (1, -1)]
+    M = model.mass_matrix(np.array(ends))[:, base:, base:].reshape(len(joints), 2, len(joints), len(joints))
+    slope, rates = (M[:, 0] - M[:, 1]) / (2 * h), v[base:]
+    expected = np.einsum("kij,k,j->i", slope, rates, rates) - np.einsum("kij,i,j->k", slope, rates, rates) / 2
+    terms = (model.bias_force(q, v) - model.bias_force(q, 0 * v))[base:]
+    np.testing.assert_allclose(terms, expected, rtol=1e-6, atol=1e-7 * np.abs(slope).max() * (rates @ rates))
+
+
+def test_armature_is_the_diagonal_of_coupled(model: Model):
+    """In clusters with one independent joint that is all of it, velocity terms included."""
+    q, v = states(model, 3)
+    coupled, armature, none = (Model(model.robot, level) for level in ("coupled", "armature", "none"))
+    added, diagonal = (x.mass_matrix(q) - none.mass_matrix(q) for x in (coupled, armature))
+    np.testing.assert_allclose(diagonal, added * np.eye(model.nv), atol=1e-12 * np.abs(added).max(initial=1.0))
+    if all(len(cluster.independent) < 2 for cluster in model.cluster_tree.clusters):
+        tau = np.random.default_rng(6).normal(0, 5, v.shape)
+        theirs = coupled.forward_dynamics(q, v, tau)
+        np.testing.assert_allclose(armature.forward_dynamics(q, v, tau), theirs, rtol=1e-10, atol=1e-10)
 
 
 def test_eliminated_rotors_in_clusters_with_loops(model: Model):

@@ -15,8 +15,8 @@ from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.parameters import ELASTIC_FACTORS, PARAMETERS, parameter_defaults
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
-from ce_gym.model import LinearConstraint, Robot, load_robot
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model import Body, Elasticity, Inertial, Joint, LinearConstraint, Motor, Placement, Robot, load_robot
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -180,14 +180,24 @@ def test_figures_of_one_elastic_drive(kind: str):
     assert np.abs((ours - declared(**given, parameters=1.0)["v_next"]).full()).max() > 1e-3
 
 
+TILTED = ((4e-5, 5e-6, 3e-6), (5e-6, 5e-5, -4e-6), (3e-6, -4e-6, 3e-5))
+SHAPES = {"as it is": {}, "tilted": {"inertia": TILTED}, "eccentric": {"com": (0.01, 0.012, 0.005)}}
+"""Of rotors: those about no principal axis are bodies of the recursion at the exact level."""
+
+
 @pytest.mark.parametrize("level", ["exact", "coupled", "armature"])
 @pytest.mark.parametrize("which", ["all", "one"])
-def test_rotor_inertia_is_that_of_the_spin(tripod: Robot, states, level: str, which: str):
+@pytest.mark.parametrize("shape", SHAPES)
+def test_rotor_inertia_is_that_of_the_spin(tripod: Robot, states, level: str, which: str, shape: str):
     """The factor acts on what a rotor holds against being spun up; as a load of its carrier it stays what it is."""
+    for rotor in tripod.rotors():
+        tripod = with_inertial(tripod, rotor.name, **SHAPES[shape])
     factor, other = 1.5, tripod
     for rotor in list(tripod.rotors())[1 if which == "one" else 0 :]:
         axis, tensor = np.array(rotor.joint.axis), np.array(rotor.inertial.inertia)
-        more = (factor - 1) * (axis @ tensor @ axis) * np.outer(axis, axis)
+        offset = np.linalg.norm(np.cross(axis, rotor.inertial.com))
+        spin = axis @ tensor @ axis + rotor.inertial.mass * offset**2
+        more = (factor - 1) * spin * np.outer(axis, axis)
         other = with_inertial(other, rotor.name, inertia=tuple(map(tuple, (tensor + more).tolist())))
         R = np.array(rotor.placement.rotation)
         kept = np.array(other.body(rotor.parent).inertial.inertia) - R @ more @ R.T
@@ -196,6 +206,37 @@ def test_rotor_inertia_is_that_of_the_spin(tripod: Robot, states, level: str, wh
     ours = results(tripod, states, level, {name: factor})
     assert_same(ours, results(other, states, level))
     assert_different(ours, results(tripod, states, level))
+
+
+@pytest.mark.parametrize("level", [ELASTIC, "exact", "coupled", "armature"])
+@pytest.mark.parametrize("offset", [0.0, 0.01])
+def test_a_geared_arm_with_an_unbalanced_rotor(level: str, offset: float):
+    """`vdot = tau / (I + N^2 J f)`, with J the moment about the axis, and its derivative by f."""
+    ratio, arm, spring, tau, factor = 8.0, 0.02, 5e3, 1.3, 0.4
+    turning = Joint("revolute", (0.0, 1.0, 0.0))
+    link = Inertial(1.0, (0.0, 0.0, 0.0), ((0.02, 0.0, 0.0), (0.0, arm, 0.0), (0.0, 0.0, 0.02)))
+    unbalanced = Inertial(0.05, (offset, 0.2, 0.0), TILTED)
+    bodies = (
+        Body("arm", "link", None, Placement(), turning, link),
+        Body("rotor", "rotor", None, Placement(), turning, unbalanced),
+    )
+    gear = LinearConstraint("gear", (("rotor", 1.0), ("arm", -ratio)))
+    given = {"motors": (Motor("rotor"),), "gravity": (0.0, 0.0, 0.0), "elastic": (Elasticity("rotor", spring),)}
+    robot, J = Robot("geared", bodies, (gear,), ("arm",), **given), 5e-5 + 0.05 * offset**2
+    model = Model(robot, level)
+    derivatives = model.derivatives("forward_dynamics", wrt=["rotor_inertia"])
+    slope = derivatives.jacobian(np.zeros(model.nq), np.zeros(model.nv), np.r_[tau, 0.0][: model.nv])
+    if level != ELASTIC:
+        expected = -tau * ratio**2 * J / (arm + ratio**2 * J) ** 2
+        assert slope["vdot", "rotor_inertia"].item() == pytest.approx(expected, rel=1e-9)
+    sim = Simulator(model, dt=1e-5, control="torque", parameters=("rotor_inertia",))
+    sim.set_parameter("rotor_inertia", factor)
+    sim.step([tau], 4000)
+    assert sim.v[0, 0] == pytest.approx(tau * 0.04 / (arm + ratio**2 * J * factor), rel=2e-3)
+    least = 1 - 1 / (J * np.linalg.inv(TILTED)[1, 1])
+    sim.set_parameter("rotor_inertia", least + 1e-6)
+    with pytest.raises(ValueError, match=f"rotor_inertia={least - 1e-4:g}; expected {least:g} or more, .* rotor"):
+        sim.set_parameter("rotor_inertia", least - 1e-4)
 
 
 def with_ratios(robot: Robot, factor: float) -> Robot:

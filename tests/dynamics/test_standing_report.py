@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ce_gym.__main__ import main
-from ce_gym.diagnostics.standing import fallen_after, has_fallen, joints_at_feet, report_standing
+from ce_gym.diagnostics.standing import (
+    StandingReport,
+    carrying_contacts,
+    contact_heights,
+    fallen_after,
+    has_fallen,
+    joints_at_feet,
+    pitch_stiffness,
+    report_standing,
+    seconds_to_compile,
+)
 from ce_gym.diagnostics.standing_text import as_text, standing_report
 from ce_gym.dynamics import Model
 
@@ -62,6 +73,80 @@ def test_what_would_carry_it(tmp_path: Path) -> None:
     words = as_text(report)
     assert "All position gains times 2.8 would carry it." in words
     assert "Those of foot" in words
+
+
+def boxes(feet: int, torso: int, shanks: int) -> str:
+    """Return entries of boxes, eight contacts each, foot boxes one above the other."""
+    foot = "{{body: foot, shape: box, size: [0.6, 0.4, 0.02], position: [0, 0, {z}], group: foot}}"
+    rest = "{{body: trunk, shape: box, size: [0.1, 0.1, 0.1], position: [0, 0, {z}], group: {group}}}"
+    lines = [f"  foot{i}: {foot.format(z=-0.09 + 0.02 * i)}" for i in range(feet)]
+    lines += [f"  torso{i}: {rest.format(z=0.01 * i, group='torso')}" for i in range(torso)]
+    lines += [f"  shank{i}: {rest.format(z=0.01 * i, group='shank')}" for i in range(shanks)]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("counts", "chosen", "which"),
+    [
+        ((1, 1, 1), 24, "all"),
+        ((1, 1, 28), 16, "those of the groups foot and torso"),
+        ((2, 10, 0), 16, "those of the group foot"),
+        ((6, 1, 20), 24, "the lowest of the group foot"),
+    ],
+)
+def test_of_many_contacts_those_that_carry_are_compiled(tmp_path: Path, counts: tuple, chosen: int, which: str) -> None:
+    file = Path(pole(tmp_path, 2 * TOPPLING))
+    before, after = YAML.index("  a: {body"), YAML.index("material:")
+    file.write_text(f"{YAML[:before]}{boxes(*counts)}\n{YAML[after:]}".replace("KP", f"{2 * TOPPLING}"))
+    model = Model(file)
+    assert len(model.robot.contacts) == 8 * sum(counts)
+    names, words = carrying_contacts(model)
+    assert (len(names), words) == (chosen, which)
+    if which.startswith("the lowest"):
+        lowest = {f"foot{i}" for i in range(3)}  # boxes of 8 contacts, some as low as the next box's
+        assert lowest <= {name.split("_")[0] for name in names}
+    assert seconds_to_compile(model) < 60
+    if sum(counts) == 30:
+        words = standing_report(model)
+        assert "stands 30 s" in words
+        assert "Simulated with 16 of its 240 contacts: those of the groups foot and torso." in words
+
+
+def report(**figures: Any) -> StandingReport:
+    """Return a report of a robot that falls, with some figures changed."""
+    usual = {"after": 0.3, "ankles": ("knee",), "ankle_factor": None, "factor": 4.0, "toppling": 30.0}
+    usual |= {"stiffness": 20.0, "gap": 0.0, "contacts": 8, "which": "all", "of_contacts": 8}
+    return StandingReport(**(usual | figures))
+
+
+def test_figures_that_mean_nothing_are_not_printed() -> None:
+    assert "times height above these joints is 30 N m/rad; their gains hold 20" in as_text(report())
+    assert "Those of knee alone would not carry it, not even times 64." in as_text(report())
+    below = as_text(report(toppling=-822.0))
+    assert "-822" not in below
+    assert "centre of mass is below these joints" in below
+    sideways = as_text(report(stiffness=0.0))
+    assert "None of these joints turns about the lateral axis" in sideways
+    assert "hold 0" not in sideways
+    assert "lowest contact is 0.054 m below the ground" in as_text(report(gap=-0.054))
+    assert "lowest contact is 0.120 m above the ground" in as_text(report(gap=0.12, after=None))
+    assert "lowest contact" not in as_text(report(gap=0.009))
+
+
+def test_gains_about_other_axes_do_not_hold_in_pitch(tmp_path: Path) -> None:
+    """An ankle that rolls, its axis turned by a rounded right angle: the lateral part of the axis is rounding."""
+    file = Path(pole(tmp_path, TOPPLING))
+    (tmp_path / "pole.urdf").write_text(URDF.replace('<axis xyz="0 1 0"/>', '<axis xyz="1 1e-15 0"/>'))
+    assert pitch_stiffness(Model(file), ("foot",)) == 0.0
+    (tmp_path / "pole.urdf").write_text(URDF.replace('<axis xyz="0 1 0"/>', '<axis xyz="1 1 0"/>'))
+    assert pitch_stiffness(Model(file), ("foot",)) == pytest.approx(TOPPLING / 2, rel=1e-9)
+
+
+def test_the_gap_below_a_robot_is_that_of_its_lowest_contact(tmp_path: Path) -> None:
+    """The pole's foot is 0.9 m below its base."""
+    file = Path(pole(tmp_path, TOPPLING))
+    file.write_text(file.read_text().replace("height: 0.9", "height: 0.93"))
+    assert contact_heights(Model(file)).min() == pytest.approx(0.03, abs=1e-12)
 
 
 def test_a_quadruped_stands(capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,7 +56,7 @@ def stepper(model: Model, dt: float = 0.005, **options):
 def test_step_equals_a_dense_solve(level: str, dissipation: float | None, bristle: float):
     """(M + dt J^T C J + slope - dt gyro) vdot = tau - bias + J^T (f0 - dt C drift), put together in numpy."""
     model, dt = cheetah(level), 0.004
-    material = ContactMaterial(3e4, 0.0 if dissipation else 200.0, 0.7, 0.05, bristle, dissipation)
+    material = ContactMaterial(3e4, 200.0, 0.7, 0.05, bristle, dissipation)
     rng = np.random.default_rng(5)
     q, v = model.standing_q.copy(), rng.normal(0, 0.3, model.nv)
     q[2] -= 0.003
@@ -220,7 +220,7 @@ def test_joint_stops_hold():
     for _ in range(400):
         q, v, *_ = step(q, v, np.full(12, 20.0))
     upper = np.array([model.robot.body(name).joint.position[1] for name in model.joint_links])
-    assert (q[7:] < upper + 0.1).all()
+    assert (q[7:] < upper + 0.02).all()
     assert np.isfinite(q).all()
 
 

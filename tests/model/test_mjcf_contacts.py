@@ -11,9 +11,9 @@ import pytest
 from mjcf_files import ANKLE, CHAIN, GEOMS, RODS, ROUGH, mjcf
 
 from ce_gym.dynamics import Model
-from ce_gym.model import LossyImportWarning, load_robot
+from ce_gym.model import LossyImportWarning, RobotError, load_robot
 
-pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco")
 
 
 def test_contacts_actuators_pose_and_looks(write):
@@ -57,6 +57,85 @@ def test_only_what_mujoco_lets_touch_the_ground_is_a_contact(write, mask, rest, 
     geoms = GEOMS.replace('name="shin"', f'name="shin" {mask}')
     robot = load_robot(write(f"<mujoco>{geoms}{rest}</mujoco>"))
     assert {sphere.name for sphere in robot.contacts if sphere.body == "leg"} == touching
+
+
+FOOTED = """<mujoco><option><flag override="{override}"/></option>
+<default><default class="rubber"><geom friction="1.3" priority="1"/></default></default>
+<worldbody><geom name="floor" type="plane" size="0 0 1" {floor}/>{world}<body name="trunk" pos="0 0 0.39"><freejoint/>
+<geom name="hull" type="box" size=".1 .1 .05" {hull}/><body name="leg"><joint axis="0 1 0"/>
+<geom name="foot" type="sphere" pos="0 0 -.37" size=".03" mass=".1" {foot}/></body></body></worldbody>
+<contact>{contact}</contact></mujoco>"""
+SECOND_FLOOR = '<body name="tiles"><geom type="plane" size="0 0 1" {}/></body>'
+
+
+def footed(floor="", foot="", hull="", world="", contact="", override="disable") -> str:
+    return FOOTED.format(floor=floor, foot=foot, hull=hull, world=world, contact=contact, override=override)
+
+
+def mujocos_friction(text: str) -> float:
+    """Return the largest sliding friction of MuJoCo's own contacts of the foot, 0 if they are frictionless."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    foot = model.geom("foot").id
+    touching = [contact for contact in data.contact if foot in contact.geom]
+    assert touching
+    return max(float(contact.friction[0]) if contact.dim > 1 else 0.0 for contact in touching)
+
+
+@pytest.mark.parametrize(
+    "figures",
+    [
+        {},
+        {"foot": 'friction="0.6"'},
+        {"foot": 'friction="1.6"'},
+        {"foot": 'friction="0.6" priority="1"'},
+        {"foot": 'friction="0.6" priority="-1"'},
+        {"foot": 'class="rubber"', "floor": 'friction="2"'},
+        {"foot": 'class="rubber" friction="0.2"', "floor": 'friction="2" priority="1"'},
+        {"foot": 'friction="0.6"', "floor": 'friction="0.3" priority="2"'},
+        {"foot": 'friction="0.6"', "floor": 'friction="0.3"', "hull": 'friction="3" priority="5"'},
+        {"foot": 'condim="1"', "floor": 'condim="1"'},
+        {"foot": 'condim="1"', "floor": 'condim="4"'},
+        {"foot": 'condim="1" priority="1"', "floor": 'condim="6"'},
+        {"foot": 'friction="0"', "floor": 'friction="0"'},
+        {"contact": '<pair geom1="foot" geom2="floor" friction="0.25 0.25 0 0 0"/>', "foot": 'priority="1"'},
+        {"contact": '<pair geom1="floor" geom2="foot" condim="1"/>', "foot": 'contype="0" conaffinity="0"'},
+        {"contact": '<pair geom1="floor" geom2="foot"/>', "foot": 'friction="0.6"', "floor": 'friction="0.3"'},
+        {"contact": '<pair geom1="foot" geom2="floor"/><exclude body1="leg" body2="world"/>', "foot": 'friction="2"'},
+        {"world": SECOND_FLOOR.format('friction="2"'), "contact": '<exclude body1="tiles" body2="leg"/>'},
+        {"world": SECOND_FLOOR.format('friction="0.3"'), "floor": 'friction="0.4"', "foot": 'friction="0.5"'},
+        {"world": SECOND_FLOOR.format('priority="1" friction="1.3"'), "foot": 'friction="0.5"'},
+        {"world": SECOND_FLOOR.format('contype="2" conaffinity="2" friction="3"'), "foot": 'friction="0.5"'},
+        {"override": "enable", "foot": 'friction="0.6" priority="1"'},
+    ],
+    ids=lambda figures: " ".join(figures),
+)
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_feet_have_the_friction_of_mujocos_contacts(write, figures):
+    text = footed(**figures)
+    assert load_robot(write(text)).material.friction == pytest.approx(mujocos_friction(text), abs=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_feet_have_the_friction_of_mujocos_contacts_whatever_the_figures(write):
+    rng = np.random.default_rng(0)
+
+    def figures() -> str:
+        friction, priority, condim = rng.uniform(0.1, 2), rng.integers(-1, 2), rng.choice((1, 3, 4, 6))
+        return f'friction="{friction}" priority="{priority}" condim="{condim}" solmix="{rng.uniform(0, 1)}"'
+
+    for _ in range(30):
+        text = footed(floor=figures(), foot=figures(), hull=figures())
+        assert load_robot(write(text)).material.friction == pytest.approx(mujocos_friction(text), abs=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_without_ground_in_the_file_feet_have_their_own_friction(write):
+    world = '<geom name="floor" type="plane" size="0 0 1" />'
+    for own, friction in (("", 1.0), ('friction="0.6"', 0.6), ('friction="0.6" condim="1"', 0.6)):
+        robot = load_robot(write(footed(foot=own).replace(world, "")))
+        assert robot.material.friction == friction
 
 
 @pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
@@ -126,9 +205,96 @@ def test_physics_that_the_file_switches_off(write):
     assert robot.contacts == ()
 
 
+@pytest.mark.filterwarnings("error::ce_gym.LossyImportWarning")
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<motor joint="hip" ctrlrange="-3 3" gear="2"/>',
+        '<position joint="hip" kp="9" ctrlrange="-1 2" forcerange="-5 5"/>',
+        '<position joint="hip" kp="9" inheritrange="1"/>',
+        '<position joint="hip" kp="9" gear="2" ctrlrange="-2 4"/>',
+    ],
+)
+def test_what_is_represented_is_not_said(write, actuator):
+    load_robot(write(hopper(actuator)))
+
+
+@pytest.mark.parametrize("flag", ["frictionloss", "limit", "spring", "damper", "constraint"])
+def test_figures_that_a_flag_switches_off_are_zero(write, flag):
+    world = CHAIN.replace('name="a"', 'name="a" frictionloss="1" range="-1 1" stiffness="2" damping="3"')
+    fields = ("friction", "position", "stiffness", "damping")
+    off = {"frictionloss": {0}, "limit": {1}, "spring": {2}, "damper": {3}, "constraint": {0, 1}}[flag]
+    try:
+        robot = load_robot(write(mjcf(world, extra=f'<option><flag {flag}="disable"/></option>')))
+    except RobotError:
+        pytest.skip("this MuJoCo has no such flag")
+    joint = robot.body("arm").joint
+    values = [(1.0, 0.0), ((-1.0, 1.0), (-np.inf, np.inf)), (2.0, 0.0), (3.0, 0.0)]
+    assert [getattr(joint, field) for field in fields] == [pair[i in off] for i, pair in enumerate(values)]
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_an_equality_that_a_flag_switches_off_is_none(write):
+    equality = '<joint joint1="f" joint2="a" polycoef="0 1 0 0 0"/>'
+    off = '<option><flag equality="disable"/></option>'
+    assert len(load_robot(write(mjcf(CHAIN, equality))).independent) == 4
+    robot = load_robot(write(mjcf(CHAIN, equality, extra=off)))
+    assert (len(robot.independent), robot.constraints) == (5, ())
+
+
+HIP = 'name="hip" axis="0 1 0" range="-1 2"'
+LATER = '<?xml version="1.0"?>'  # marks what only later versions of MuJoCo have
+
+
+def hopper(actuator="", option="", **changes) -> str:
+    """The hopper with more attributes of its joints and geoms."""
+    text = GEOMS.replace("<freejoint/>", f'<joint name="base" type="free" {changes.get("base", "")}/>')
+    text = text.replace(HIP, f"{HIP} {changes.get('hip', '')}").replace(
+        'name="shin"', f'name="shin" {changes.get("shin", "")}'
+    )
+    start = f'<compiler angle="radian"/>{option}'
+    return f"<mujoco>{start}{text}<actuator>{actuator}</actuator>{changes.get('rest', '')}</mujoco>"
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [
+        (hopper(base='damping="1"'), "damping of the free joint base"),
+        (hopper(hip='margin="0.1"'), "margin of the limit of joint hip"),
+        (hopper(hip='solreflimit="0.01 1"'), "compliance (solreflimit, solimplimit) of the limit of joint hip"),
+        (
+            hopper(hip='frictionloss="1" solreffriction=".01 1"'),
+            "compliance (solreffriction, solimpfriction) of the dry",
+        ),
+        (LATER + hopper(hip='stiffness="1" springyield="0.2"'), "yielding (springyield) of the spring of joint hip"),
+        (hopper(hip='actuatorfrcrange="-3 2"'), "the nearer one of the two limits actuatorfrcrange of joint hip"),
+        (LATER + hopper(shin='adhesion="1"'), "adhesion of geom shin"),
+        (LATER + hopper(shin='surfacevel="1 0 0"'), "moving surface (surfacevel) of geom shin"),
+        (
+            hopper('<motor name="m" joint="hip" forcerange="-3 2"/>'),
+            "the nearer one of the two limits forcerange of actuator m",
+        ),
+        (
+            hopper('<motor name="m" joint="hip" ctrlrange="0 2"/>'),
+            "the nearer one of the two limits ctrlrange of actuator m",
+        ),
+        (hopper('<position name="m" joint="hip" kp="9" ctrlrange="0 2"/>'), "ctrlrange of actuator m, narrower"),
+        (
+            hopper('<position name="m" joint="hip" kp="9" gear="2" ctrlrange="-1 2"/>'),
+            "ctrlrange of actuator m, narrower",
+        ),
+        (LATER + hopper('<motor name="m" joint="hip" delay=".01" nsample="5"/>'), "delay of actuator m"),
+        (
+            hopper('<general name="m" joint="hip" biastype="affine" biasprm="1 -2 0" gainprm="2"/>'),
+            "constant force (first",
+        ),
+        (
+            hopper('<motor name="m" joint="hip"/>', '<option actuatorgroupdisable="0"/>'),
+            "actuatorgroupdisable of actuator m",
+        ),
+        (hopper('<motor joint="hip"/>', '<option><flag actuation="disable"/></option>'), '<flag actuation="disable"/>'),
+        (hopper(rest='<keyframe><key qvel="1 0 0 0 0 0 0"/></keyframe>'), "the velocity (qvel) of the reference pose"),
+        (hopper(option='<option viscosity="1"/>'), "viscosity of the medium"),
         (mjcf(CHAIN.replace('name="a"', 'name="a" stiffness="3 1"')), "nonlinear part of the spring of joint a"),
         (
             f"<mujoco>{GEOMS}</mujoco>".replace("<freejoint/>", '<joint name="f" type="free" frictionloss="3"/>'),
@@ -147,11 +313,40 @@ def test_physics_that_the_file_switches_off(write):
         (mjcf(CHAIN + '<geom name="g" type="box" size="1 1 1"/>'), "obstacle g"),
         (mjcf(CHAIN.replace('name="a"', 'name="a" armature="1"')), "the gear ratio behind the armature of arm"),
         (mjcf(CHAIN.replace('name="a"', 'name="a" range="1 2"')), "beyond its limits, of arm"),
-        (f"<mujoco>{GEOMS.replace(ROUGH, ROUGH.replace('0.6', '0.9'))}</mujoco>", "than 0.9"),
+        (
+            f"<mujoco>{GEOMS}</mujoco>".replace('name="shin"', 'name="shin" condim="6"'),
+            "torsional and rolling friction",
+        ),
+        (f"<mujoco>{GEOMS}</mujoco>".replace('name="shin"', 'name="shin" margin="0.01"'), "margin and gap of contacts"),
+        (f"<mujoco>{GEOMS}</mujoco>".replace('name="shin"', 'name="shin" solref=".01 1"'), "compliance of contacts"),
+        (
+            f'<mujoco>{GEOMS}<contact><pair geom1="floor" geom2="shin" friction=".5 .4 0 0 0"/></contact></mujoco>',
+            "smaller one of two sliding frictions",
+        ),
+        (
+            f'<mujoco>{GEOMS}<contact><pair geom1="hull" geom2="shin"/></contact></mujoco>'.replace(
+                'name="hull"', 'name="hull" contype="0"'
+            )
+            .replace(
+                '<body name="leg"',
+                "<body><joint/><geom size='.1' mass='1' contype='0' conaffinity='0'/><body name=\"leg\"",
+            )
+            .replace("</body></body></worldbody>", "</body></body></body></worldbody>"),
+            "contact between bodies of the robot",
+        ),
+        (
+            f"<mujoco>{GEOMS.replace(ROUGH, ROUGH.replace('0.6', '0.9'))}</mujoco>",
+            "friction other than 0.6: 0.9 of hull_corner1 and 7 more",
+        ),
     ],
     ids=lambda value: value[:40] if not value.startswith("<") else "",
 )
 def test_what_cannot_be_represented_is_said_once(write, text, what):
+    try:
+        mujoco.MjModel.from_xml_string(text)
+    except ValueError:
+        assert text.startswith(LATER)
+        pytest.skip("this MuJoCo has no such attribute")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         robot = load_robot(write(text))

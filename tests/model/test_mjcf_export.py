@@ -97,6 +97,36 @@ def test_armature_is_the_diagonal_of_the_reflected_inertia():
     assert not any(joint.get("armature") for joint in none.iter("joint"))
 
 
+HOP = """<mujoco model="hop"><worldbody><geom type="plane" size="0 0 1"/><body name="trunk" pos="0 0 .5"><freejoint/>
+<geom type="box" size=".12 .08 .04" mass="3"/><body name="leg"><joint name="hip" axis="0 1 0" armature="{}"/>
+<geom type="capsule" size=".02" fromto="0 0 0 0 0 -.4" mass=".6"/></body></body></worldbody>
+<actuator><position joint="hip" kp="40" gear="{}"/></actuator></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+@pytest.mark.parametrize("level", LEVELS[:3])
+@pytest.mark.parametrize("gear", [1.0, -3.0, 50.0, 2e4])
+@pytest.mark.parametrize("armature", [1e-6, 1e-3, 0.02, 10.0])
+def test_armature_survives_a_round_trip(armature, gear, level, tmp_path):
+    """The file's own joint inertia, that of MuJoCo's equalities written again, and that read again."""
+    mujoco = pytest.importorskip("mujoco")
+    from ce_gym.bench.peers import mujoco as mujoco_peer
+
+    path = tmp_path / "hop.xml"
+    path.write_text(HOP.format(armature, gear))
+    compiled = mujoco.MjModel.from_xml_path(str(path))
+    data, M = mujoco.MjData(compiled), np.zeros((7, 7))
+    mujoco.mj_forward(compiled, data)
+    mujoco.mj_fullM(compiled, data, M)
+    robot = load_robot(path)
+    q = Model(robot, level).standing_q
+    path.write_text(to_mjcf(robot, level))
+    again = Model(load_robot(path), level)
+    written = mujoco_peer.mass_matrix(mujoco.MjModel.from_xml_path(str(path)), robot, q)
+    for found in (written[6, 6], again.mass_matrix(again.standing_q)[6, 6]):
+        assert found - (M[6, 6] - armature) == pytest.approx(armature, rel=1e-6, abs=1e-12)
+
+
 def test_offsets_of_constraints_are_kept():
     robot = load_robot("mit_humanoid_leg")
     shifted: tuple[Constraint, ...] = tuple(

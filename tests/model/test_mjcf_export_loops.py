@@ -9,6 +9,7 @@ import pytest
 
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.standing import standing_pose
+from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf import to_mjcf
 from ce_gym.model import (
     Body,
@@ -25,7 +26,7 @@ from ce_gym.model import (
     load_robot,
     register_constraint,
 )
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import LEVELS, build_mechanism
 
 TOLERANCE = 1e-9
 STIFF = {"solref": (0.002, 1.0), "solimp": (0.9999, 0.9999, 0.001, 0.5, 2.0)}
@@ -144,6 +145,10 @@ class Peer:
         self.joints = [self.model.joint(i).name for i in range(self.model.njnt)][1 if robot.floating else 0 :]
         spanning = [b.name for b in robot.bodies if b.joint.type != "free"]
         self.columns = [spanning.index(name) for name in self.joints]
+        self.scales = np.ones(len(self.joints))
+        for i, (name, tie) in enumerate((name, joint_ties(build_mechanism(robot))[name]) for name in self.joints):
+            if robot.body(name).kind == "rotor" and self.model.joint(name).armature:
+                self.scales[i] = max(map(abs, tie.ratios.values()))
 
     def rotation(self, q):
         matrix = np.empty(9)
@@ -151,14 +156,15 @@ class Peer:
         return matrix.reshape(3, 3)
 
     def positions(self, q_span):
-        return np.concatenate([q_span[:7], q_span[7:][self.columns]]) if self.floating else q_span[self.columns]
+        joints = q_span[7 * self.floating :][self.columns] / self.scales
+        return np.concatenate([q_span[:7], joints]) if self.floating else joints
 
     def rates(self, q, x_span, product=0.0):
         """Velocities or forces: base linear part first, in the world."""
         if not self.floating:
-            return x_span[self.columns]
+            return x_span[self.columns] / self.scales
         linear = self.rotation(q) @ (x_span[3:6] + product)
-        return np.concatenate([linear, x_span[:3], x_span[6:][self.columns]])
+        return np.concatenate([linear, x_span[:3], x_span[6:][self.columns] / self.scales])
 
     def rows(self, qpos):
         """The equalities at a configuration: violation [m or rad], and Jacobian."""
@@ -203,7 +209,7 @@ def test_mujoco_has_the_same_dynamics(name, level):
         q_span, v_span = model.spanning(q, v)
         effort = np.random.default_rng(4).normal(0, 2, len(peer.joints))
         on_joints = np.zeros(len(v_span))
-        on_joints[[*range(base), *(base + i for i in peer.columns)]] = [*tau[:base], *effort]
+        on_joints[[*range(base), *(base + i for i in peer.columns)]] = [*tau[:base], *(effort * peer.scales**2)]
         ours = model.actuator_matrix(q, peer.joints).T @ effort
         ours[:base] += tau[:base]
         vdot = model.spanning_acceleration(q, v, model.forward_dynamics(q, v, ours))
@@ -288,6 +294,45 @@ def test_mujoco_moves_as_we_do(name, level):
     assert np.abs(data.efc_pos[: data.nefc][equality]).max() < 1e-3
 
 
+def with_light_rotors(factor: float) -> Robot:
+    """The slider crank with rotors that have no mass, behind gears whose ratios are larger by a factor."""
+    robot, rotors = slider_crank(), ("motor", "wheel")
+    bodies, ties = list(robot.bodies), list(robot.constraints)
+    for i, each in enumerate(bodies):
+        if each.name in rotors:
+            inertia = tuple(tuple(x / factor**2 for x in row) for row in each.inertial.inertia)
+            bodies[i] = dataclasses.replace(each, inertial=Inertial(0.0, (0.0, 0.0, 0.0), inertia))
+    for i, tie in enumerate(ties):
+        if isinstance(tie, LinearConstraint):
+            pairs = tuple((name, x if name in rotors else factor * x) for name, x in tie.coefficients)
+            ties[i] = LinearConstraint(tie.name, pairs, factor * tie.offset)
+    return dataclasses.replace(robot, bodies=tuple(bodies), constraints=tuple(ties))
+
+
+@pytest.mark.parametrize("level", ["exact", "coupled"])
+@pytest.mark.parametrize("factor", [30.0, 100.0, 1e5, 1e7])
+def test_rotors_too_light_for_mujoco_keep_their_reflected_inertia(factor, level, tmp_path):
+    """What they couple to their carrier besides goes with 1 / ratio; the file holds it up to 1 / 1e5."""
+    pytest.importorskip("mujoco")
+    robot = with_light_rotors(factor)
+    model, peer = Model(robot, level), Peer(robot, level)
+    (tmp_path / "robot.xml").write_text(to_mjcf(robot, level, ground=False))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        again = Model(load_robot(tmp_path / "robot.xml"), level)
+    tolerance = 1e-5 if level == "exact" else 1e-9
+    for q, v, tau in zip(*states(model), strict=True):
+        vdot = model.forward_dynamics(q, v, tau)
+        assert np.abs(again.forward_dynamics(q, v, tau) - vdot).max() <= tolerance * max(1.0, np.abs(vdot).max())
+        q_span, v_span = model.spanning(q, v)
+        force = np.zeros(len(v_span))
+        force[[model.spanning_names.index(name) for name in robot.independent]] = tau
+        theirs = peer.acceleration(peer.positions(q_span), peer.rates(q, v_span), peer.rates(q, force), 2)
+        ours = peer.rates(q, model.spanning_acceleration(q, v, vdot))
+        kept = [i for i, name in enumerate(peer.joints) if robot.body(name).kind == "link"]
+        assert np.abs(theirs - ours)[kept].max() <= tolerance * max(1.0, np.abs(ours[kept]).max())
+
+
 def test_loops_are_connects_and_rods_are_spatial_tendons():
     root = ET.fromstring(to_mjcf(load_robot("four_bar"), **STIFF))
     assert [e.get("name") for e in root.findall("equality/connect")] == ["pin_1", "pin_2"]
@@ -305,7 +350,9 @@ def test_loops_are_connects_and_rods_are_spatial_tendons():
 def test_rotors_inside_loops_are_armature_of_dependent_joints():
     root = ET.fromstring(to_mjcf(slider_crank(), "coupled"))
     armature = {joint.get("name"): joint.get("armature") for joint in root.iter("joint") if joint.get("armature")}
-    assert armature == {"slider": repr(30.0**2 * 2e-3), "motor": "0.002"}, "two branches drive the motor: it stays"
+    assert armature == {"slider": repr(30.0**2 * 2e-3), "motor": repr(2e-3 * 20.0**2)}, (
+        "two branches drive the motor: it stays"
+    )
     assert "wheel" not in {element.get("name") for element in root.iter("body")}
     root = ET.fromstring(to_mjcf(load_robot("tello"), "coupled"))
     belts = root.findall("tendon/fixed")

@@ -11,11 +11,12 @@ import pytest
 
 from ce_gym.dynamics import Model
 from ce_gym.model import Robot, load_robot, robots
+from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim.simulator import Simulator
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "dynamics"))  # for dense.py and linkages.py
 from dense import Dense
-from linkages import spatial_four_bar
+from linkages import four_bar, rod_leg, spatial_four_bar
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.InertiaWarning")
 
@@ -60,6 +61,21 @@ def test_loops_stay_closed_for_a_minute(name: str):
         assert np.abs(Dense(model.robot, q_span, v_span).constraints()[0]).max() <= 1e-10
 
 
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("made", [four_bar, rod_leg])
+def test_free_linkages_keep_their_energy(made, level: str):
+    """A motor behind a loop, of one freedom and of two: without gravity and losses nothing changes the energy."""
+    model = Model(made(gravity=(0.0, 0.0, 0.0)), level)
+    v = np.random.default_rng(3).normal(0, 0.5, model.nv)
+    v[-1] = 4.0
+    sim = Simulator(model, 1, dt=1e-3, method="rk4", control="torque", outputs=())
+    sim.set_state(model.standing_q, v)
+    before = model.energy(sim.q[0], sim.v[0])[0]
+    sim.step(np.zeros(len(model.joint_links)), 200)
+    assert np.abs(sim.q[0] - model.standing_q)[-1] > 0.3
+    assert model.energy(sim.q[0], sim.v[0])[0] == pytest.approx(before, rel=1e-6)
+
+
 def test_iterations_follow_a_fast_crank():
     """At 20 rad/s the guess of one step to the next is good enough for rounding error."""
     model = Model(turning())
@@ -101,11 +117,13 @@ def flailing(robot: Robot) -> int:
     return int(simulator.diverged.sum())
 
 
-def test_stops_of_cranks_hold_where_stops_of_feet_do_not():
-    """They grow stiff towards the dead centre of a loop, past which a foot on the spring of its own stop is thrown."""
+def test_stops_keep_loops_from_their_dead_centres():
+    """Stops of feet or of cranks: without either, feet are thrown past the end of their rods' reach."""
     robot, unlimited = load_robot("tello"), (-np.inf, np.inf)
     bodies = tuple(
-        replace(body, joint=replace(body.joint, position=unlimited)) if "crank" in body.name else body
+        replace(body, joint=replace(body.joint, position=unlimited))
+        if "crank" in body.name or "foot" in body.name
+        else body
         for body in robot.bodies
     )
     assert flailing(robot) == 0 < flailing(replace(robot, bodies=bodies))

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 import mujoco
+import sim2sim
 from job import Job
 from ppo import train
 from settings import config_file, load_settings
@@ -69,6 +70,65 @@ def test_robots_with_loops_start_closed_and_stand_as_ours_do(name):
         twin.step(np.tile(model.standing_q[7:], (2, 1)), 0.02)
     sim.step(model.standing_q[7:], 80)
     np.testing.assert_allclose(twin.state()[0][0], sim.q[0], atol=0.02)
+
+
+LOOP = """<mujoco model="looped"><worldbody><body name="trunk" pos="0 0 0.6"><freejoint/>
+  <geom type="box" size="0.1 0.1 0.1" mass="4"/>
+  <body name="thigh" pos="0 0.08 0"><joint name="hip" axis="0 1 0" armature="0.02" range="-1 1"/>
+    <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.25" mass="0.8"/>
+    <body name="crank" pos="0 0.03 0"><joint name="knee" axis="0 1 0" armature="0.01" range="-1 1"/>
+      <geom type="capsule" size="0.01" fromto="0 0 0 -0.05 0 0" mass="0.05"/>
+      <body name="rod" pos="-0.05 0 0"><joint name="rod" axis="0 1 0"/>
+        <geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.24" mass="0.05"/></body></body>
+    <body name="shank" pos="0 0 -0.25"><joint name="shank" axis="0 1 0"/>
+      <geom type="capsule" size="0.015" fromto="0 0 0 0 0 -0.25" mass="0.4"/></body></body>
+  <body name="tail" pos="-0.1 0 0.02"><joint name="tail" type="ball"/>
+    <geom type="box" size="0.05 0.02 0.03" pos="-0.05 0 0" mass="0.3"/></body></body></worldbody>
+  <equality><connect body1="rod" body2="shank" anchor="0.01 0 -0.24"/></equality>
+  <actuator><position joint="hip" kp="60" kv="1.5"/><position joint="knee" kp="60" kv="1.5"/></actuator></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_a_robot_with_loops_and_armature_starts_closed(tmp_path):
+    """At `armature` rotors have no joint in MuJoCo; its equalities say whether dependent joints are in place."""
+    (tmp_path / "looped.xml").write_text(LOOP)
+    model, rng = ce_gym.Model(tmp_path / "looped.xml"), np.random.default_rng(0)
+    q, v = np.tile(model.standing_q, (3, 1)), rng.normal(size=(3, model.nv))
+    q[:, 7:11] = rng.normal(size=(3, 4))
+    q[:, 7:11] /= np.linalg.norm(q[:, 7:11], axis=1, keepdims=True)
+    q[:, 11:] += rng.uniform(-0.3, 0.3, (3, model.nq - 11))
+    twin = MujocoTwin(model.robot, "armature", 3)
+    twin.start(q, v)
+    np.testing.assert_allclose(np.hstack(twin.state()), np.hstack([q, v]), atol=1e-12)
+    nq, data = twin.model.nq, mujoco.MjData(twin.model)
+    for state in twin._batch.states:
+        data.qpos[:], data.qvel[:] = state[1 : 1 + nq], state[1 + nq : 1 + nq + twin.model.nv]
+        mujoco.mj_forward(twin.model, data)
+        held = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        assert held.sum() >= 3
+        np.testing.assert_allclose(data.efc_pos[held], 0.0, atol=1e-9)
+        np.testing.assert_allclose(data.efc_vel[held], 0.0, atol=1e-9)
+    twin.step(np.tile(model.standing_q[11:], (3, 1)), 0.01)
+    assert np.isfinite(np.hstack(twin.state())).all()
+    assert not twin.diverged.any()
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_rotors_of_unknown_ratio_are_no_bodies(tmp_path):
+    """Armature alone says no ratio; an actuator's gear and `gears:` do, however large they are."""
+    (tmp_path / "looped.xml").write_text(LOOP)
+    robot = ce_gym.load_robot(tmp_path / "looped.xml")
+    assert robot.unknown_ratios == ("thigh_rotor", "crank_rotor")
+    reason = sim2sim._without_ratios(robot)
+    assert (
+        reason
+        == "the file of looped gives no gear ratio for thigh_rotor, crank_rotor; `gears:` in a YAML file gives it"
+    )
+    (tmp_path / "looped.yaml").write_text("mjcf: looped.xml\ngears: {thigh: 9, crank: 2000}\n")
+    known = ce_gym.load_robot(tmp_path / "looped.yaml")
+    assert known.unknown_ratios == ()
+    assert not sim2sim._without_ratios(known)
+    assert not any(ce_gym.load_robot(name).unknown_ratios for name in ce_gym.robots())
 
 
 def ball(stiffness, damping, mass):

@@ -192,10 +192,115 @@ def test_what_cannot_be_read_is_drawn_by_shapes(text: str, tmp_path: Path) -> No
     assert "\n" not in str(told[0].message)
 
 
+def volume(shape: Triangles) -> float:
+    """Volume of a closed mesh [m^3], positive if its triangles face outwards."""
+    a, b, c = shape.vertices[shape.faces].swapaxes(0, 1)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+@pytest.mark.parametrize("kind", ["stl", "obj", "ply", "glb", "gltf", "GLB", "PLY"])
+@pytest.mark.parametrize("scale", ["1 1 1", "1 -1 1", "-1 -1 1", "-2 -1 -1", "0.5", "-1"])
+def test_triangles_face_outwards_whatever_the_scale(kind: str, scale: str, tmp_path: Path) -> None:
+    """A box of 0.001 m^3 at (0.3, 0.2, 0.1) that its file has behind a reflection where it can, read with a scale."""
+    trimesh = pytest.importorskip("trimesh")
+    solid, mirror = trimesh.creation.box((0.2, 0.1, 0.05)), np.diag([1.0, -1.0, 1.0, 1.0])
+    solid.apply_translation((0.3, -0.2 if "gl" in kind.lower() else 0.2, 0.1))
+    scene = trimesh.Scene()
+    scene.add_geometry(solid, transform=mirror if "gl" in kind.lower() else None)
+    file = urdf(tmp_path, f'<mesh filename="one.{kind}" scale="{scale}"/>')
+    if kind == "gltf":
+        for name, data in scene.export(file_type="gltf").items():
+            (file.parent / name.replace("model", "one")).write_bytes(data)
+    else:
+        (scene if kind.lower() == "glb" else solid).export(file.parent / f"one.{kind}", file_type=kind.lower())
+    (shape,) = drawn_meshes(load_robot(file, floating=True))["base"]
+    assert isinstance(shape, Triangles)
+    factors = np.array([float(x) for x in scale.split()]) * np.ones(3)
+    assert volume(shape) == pytest.approx(0.001 * abs(np.prod(factors)), rel=1e-5)
+    np.testing.assert_allclose(shape.vertices.mean(0), np.array([0.3, 0.2, 0.1]) * factors, atol=1e-6)
+
+
+def test_meshes_that_an_mjcf_mirrors_face_outwards(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("mujoco")
+    trimesh.creation.box((0.2, 0.1, 0.05)).export(tmp_path / "one.stl")
+    file = tmp_path / "one.xml"
+    file.write_text(
+        '<mujoco><asset><mesh name="one" file="one.stl" scale="1 -1 1"/></asset><worldbody><body name="base">'
+        '<freejoint/><geom type="mesh" mesh="one"/></body></worldbody></mujoco>'
+    )
+    (shape,) = drawn_meshes(load_robot(file))["base"]
+    assert isinstance(shape, Triangles)
+    assert volume(shape) == pytest.approx(0.001, rel=1e-5)
+
+
+NANS = stl().replace("vertex 0", "vertex nan", 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        ("bad.stl", b"", "bad.stl: mesh is not drawn"),
+        ("bad.stl", NANS.encode(), "bad.stl: mesh is not drawn"),
+        ("bad.stl", bytes(80) + b"\x09\0\0\0" + bytes(60), "bad.stl: mesh is not drawn"),
+        ("bad.obj", b"v 0 0 0\nv 1 0 0\nf 1 2 2\n", "bad.obj: mesh is not drawn"),
+        ("bad.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n", "bad.ply: mesh is not"),
+        ("bad.glb", b"glTF\2\0\0\0", "bad.glb: mesh is not drawn"),
+        ("bad.gltf", b'{"asset": {"version": "2.0"}, "accessors": [{"count": 1000000000000}]}', "more numbers than"),
+        ("bad.gltf", b'{"asset": {"version": "2.0"}, "buffers": [{"uri": "../../secret"}]}', "not in the folder"),
+        (
+            "bad.step",
+            b"ISO-10303-21;",
+            "1 meshes are of a kind that is not read, such as 'bad.step'; expected .stl, .obj",
+        ),
+        ("other.stl", b"", "1 meshes are not there, such as 'bad.stl'"),
+        ("good.stl", stl().encode(), "scale"),
+    ],
+)
+def test_a_bad_mesh_hides_only_itself(name: str, content: bytes, what: str, tmp_path: Path) -> None:
+    scale = ' scale="1 2"' if what == "scale" else ""
+    asked = "bad.stl" if name == "other.stl" else name
+    more = f'<visual><geometry><mesh filename="{asked}"{scale}/></geometry></visual>'
+    file = urdf(tmp_path, '<mesh filename="good.stl"/>', more)
+    (tmp_path / "secret").write_bytes(b"x")
+    (file.parent / name).write_bytes(content)
+    (file.parent / "good.stl").write_text(stl())
+    with pytest.warns(UserWarning, match=what) as told:
+        (shape,) = drawn_meshes(load_robot(file, floating=True))["base"]
+    assert isinstance(shape, Triangles)
+    assert len([one for one in told if one.category is UserWarning]) == 1
+    np.testing.assert_allclose(points_of(shape), MOVED, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a part.stl",
+        "a%20part.stl",
+        "100%.stl",
+        "{folder}/a part.stl",
+        "file://{folder}/a part.stl",
+        "file://{folder}/a%20part.stl",
+        "file://localhost{folder}/a%20part.stl",
+        "file:{folder}/a%20part.stl",
+        "package://my_robot/urdf/a%20part.stl",
+        "model://my_robot/urdf/a part.stl",
+    ],
+)
+def test_paths_with_spaces_and_addresses(name: str, tmp_path: Path) -> None:
+    folder = tmp_path / "my_robot" / "urdf"
+    file = urdf(tmp_path, f'<mesh filename="{name.format(folder=folder)}"/>')
+    for each in ("a part.stl", "100%.stl"):
+        (folder / each).write_text(stl())
+    assert len(drawn_meshes(load_robot(file, floating=True))["base"]) == 1
+
+
 @pytest.mark.parametrize("name", ["missing.stl", "package://other/one.stl", "http://host/one.stl", "one.urdf"])
 def test_what_is_not_there_is_drawn_by_shapes(name: str, tmp_path: Path) -> None:
     robot = load_robot(urdf(tmp_path, f'<mesh filename="{name}"/>'), floating=True)
-    with pytest.warns(UserWarning, match=r"one.urdf: 1 meshes are not there, such as .*; expected .stl, .obj, .dae"):
+    with pytest.warns(
+        UserWarning, match=r"one.urdf: 1 meshes are .*, such as .*; expected .stl, .obj, .dae, .ply, .glb, .gltf files"
+    ):
         assert drawn_meshes(robot) == {}
     (shape,) = [one for one in robot_commands(robot, "/robot") if one["type"] == "set_object"]
     assert shape["object"]["geometries"][0]["type"] == "BoxGeometry"

@@ -19,6 +19,10 @@ from numpy.typing import NDArray
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot
+from ce_gym.model.formats.mjcf.balls import balls_in_loops
+from ce_gym.model.formats.mjcf.bodies import read_bodies
+from ce_gym.model.formats.mjcf.equalities import locked_joints
+from ce_gym.model.formats.mjcf.source import read_mjcf
 from ce_gym.viewer.console import shown
 
 Array = NDArray[np.float64]
@@ -103,30 +107,29 @@ def _mujoco(path: Path, robot: Robot, q: Array, v: Array, tau: Array) -> Dynamic
     mj.dof_armature[: robot.layout.base_nv] = 0.0  # of the base, by a default meant for joints: listed as left out
     data, free, rotation = mujoco.MjData(mj), robot.layout.base_nv, np.zeros(9)
     mujoco.mju_quat2Mat(rotation, q[3:7] if free else np.array([1.0, 0.0, 0.0, 0.0]))
-    to_theirs = np.zeros((mj.nv, mj.nv))  # their velocity of ours: [linear in the world, angular in the body, joints]
+    to_theirs = np.zeros((mj.nv, len(v)))  # their velocity of ours: [linear in the world, angular in the body, joints]
     data.qpos[: robot.layout.base_nq] = q[: robot.layout.base_nq]
     if free:
         to_theirs[:3, 3:6], to_theirs[3:6, :3] = rotation.reshape(3, 3), np.eye(3)
-    for j in range(1 if free else 0, mj.njnt):
-        (rows, speeds), at, dof = robot.rows[_mujoco_name(mj, j)], mj.jnt_qposadr[j], mj.jnt_dofadr[j]
-        data.qpos[at : at + len(rows)] = q[rows.start : rows.stop]
-        to_theirs[dof + np.arange(len(speeds)), speeds] = 1.0
+    source = read_mjcf(path)
+    locked = locked_joints(source)
+    for j, position in locked.items():
+        data.qpos[mj.jnt_qposadr[j]] = position
+    for j, body in read_bodies(source, locked, balls_in_loops(source)).moved_by.items():
+        if mj.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE:
+            (rows, speeds), at, dof = robot.rows[body], mj.jnt_qposadr[j], mj.jnt_dofadr[j]
+            data.qpos[at : at + len(rows)] = q[rows.start : rows.stop]
+            to_theirs[dof + np.arange(len(speeds)), speeds] = 1.0
     data.qvel[:] = to_theirs @ v
     mujoco.mj_forward(mj, data)
     M = np.zeros((mj.nv, mj.nv))
     mujoco.mj_fullM(mj, data, M)
-    acceleration = to_theirs.T @ np.linalg.solve(M, to_theirs @ tau - data.qfrc_bias)
+    M = to_theirs.T @ M @ to_theirs
+    acceleration = np.linalg.solve(M, tau - to_theirs.T @ data.qfrc_bias)
     if free:  # ours is that of the body's own frame
         acceleration[3:6] -= np.cross(v[:3], v[3:6])
     moving = [b for b in range(1, mj.nbody) if mj.body_weldid[b] != 0]
-    return float(sum(mj.body_mass[moving])), to_theirs.T @ M @ to_theirs, acceleration
-
-
-def _mujoco_name(mj: object, joint: int) -> str:
-    """Return our name for a joint: that of the body, or the joint's own if it is not the last of the body."""
-    body = mj.jnt_bodyid[joint]  # type: ignore[attr-defined]
-    last = mj.body_jntadr[body] + mj.body_jntnum[body] - 1  # type: ignore[attr-defined]
-    return mj.body(body).name if joint == last else mj.joint(joint).name  # type: ignore[attr-defined]
+    return float(sum(mj.body_mass[moving])), M, acceleration
 
 
 def _pinocchio(path: Path, robot: Robot, q: Array, v: Array, tau: Array) -> Dynamics:

@@ -11,6 +11,7 @@ import warnings
 
 import ce_gym
 from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.model.errors import unknown
 from ce_gym.viewer.console import shown
 
 COLUMNS = ("id", "checker", "what it says")
@@ -24,12 +25,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Report:
     """Check every id that fits the pattern."""
     report = Report("ids")
-    ids = fnmatch.filter(sorted(ce_gym.environment_ids()), arguments.pattern)
+    known = sorted(ce_gym.environment_ids())
+    ids = fnmatch.filter(known, arguments.pattern)
+    if not ids:
+        raise unknown("ids", "pattern", arguments.pattern, known, "a pattern that fits an id")
     rows = tuple(row for env_id in shown(ids, "ids") for row in complaints(env_id))
     report.tables.append(Table("Complaints", COLUMNS, rows))
-    claim = f"of {len(ids)} ids, which is more than none, checked without a complaint"
+    claim = f"of {len(ids)} ids checked without a complaint"
     silent = len(ids) - len({row[0] for row in rows})
-    report.requirements.append(Requirement(claim, f"{silent}", 0 < len(ids) == silent))
+    report.requirements.append(Requirement(claim, f"{silent}", len(ids) == silent))
     report.failed = not report.requirements[0].met
     return report
 

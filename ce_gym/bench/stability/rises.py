@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.dynamics.forces.passive import limit_stiffness
+from ce_gym.dynamics.forces.passive import stop_springs
 from ce_gym.dynamics.model import Model
 
 Array = NDArray[Any]
@@ -96,15 +96,15 @@ def _stops(model: Model, before: Rows, after: Rows, dt: float) -> Array:
 
     Whether a stop acts is decided by the velocities at the start, how hard it pushes by those at the end.
     """
-    robot, total = model.robot, np.zeros(len(before["q"]))
+    robot, springs, total = model.robot, stop_springs(model.mechanism), np.zeros(len(before["q"]))
     for i, name in enumerate(robot.independent):
-        k, c = limit_stiffness(robot, name)
+        k, c = springs[name]
         at, to = (rows["q"][:, robot.layout.joints_q + i] for rows in (before, after))
         start, end = (rows["v"][:, robot.layout.joints_v + i] for rows in (before, after))
         for bound, side in zip(robot.body(name).joint.position, (1.0, -1.0), strict=True):
             depth, deeper = side * (bound - at), side * (bound - to)
             damped = c + dt * k
-            acts = (depth > dt * side * start) & (k * depth > damped * side * start)
+            acts = np.where(depth > 0, k * depth > c * side * start, depth > dt * side * start)
             push = np.where(acts, k * depth - damped * side * end, 0.0) if np.isfinite(bound) else 0.0
             total += dt * push * side * end
             total += 0.5 * k * (np.maximum(deeper, 0.0) ** 2 - np.maximum(depth, 0.0) ** 2)

@@ -97,6 +97,11 @@ class Closure:
         """Return the spanning coordinates, shape (n,)."""
         return constant_matrix(self.assembly.B) @ ca.vertcat(y, z) + ca.DM(self.assembly.q0)
 
+    def second_derivative(self, y: SX, z: SX, row: int) -> SX:
+        """Return the second derivative by `y` of one spanning coordinate, shape (d, d); `g` is its form `yd^T H yd`."""
+        yd = SX.sym("yd", y.numel())
+        return ca.substitute(ca.hessian(self.rates(y, z, yd)[1][row], yd)[0] / 2, yd, SX.zeros(*yd.shape))
+
     def _rows(self, robot: Robot, cluster: Cluster) -> SX:
         rows = nonlinear_rows(robot, cluster, self.spanning(self.y, self.z))
         return rows[list(self.assembly.rows)]

@@ -11,6 +11,7 @@ linear; closure.py does the others.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,6 +53,8 @@ class ClusterCoordinates:
         G: Constraint Jacobian, shape (n, d).
         g: Velocity-product acceleration of the constraint, shape (n,).
         loop: What closed loops add; None if all constraints are linear.
+        second_derivative: Function of a row -> second derivative of that coordinate by y, shape (d, d); None if all
+            constraints are linear.
     """
 
     index: dict[str, Any]
@@ -60,6 +63,7 @@ class ClusterCoordinates:
     G: SX
     g: SX
     loop: LoopState | None = None
+    second_derivative: Callable[[int], SX] | None = None
 
     def position(self, body: str) -> SX:
         """Return the position of the joint that moves a body, a number or a quaternion."""
@@ -92,7 +96,8 @@ def loop_coordinates(cluster: Cluster, closure: Closure, y: SX, yd: SX, guess: S
     q, qd = closure.spanning(y, z), G @ yd
     guessed = tuple(closure.assembly.unknown[j] for j in closure.guessed)
     loop = LoopState(guessed, gap, nearness)
-    return ClusterCoordinates({name: i for i, name in enumerate(cluster.bodies)}, q, qd, G, g, loop)
+    index = {name: i for i, name in enumerate(cluster.bodies)}
+    return ClusterCoordinates(index, q, qd, G, g, loop, lambda row: closure.second_derivative(y, z, row))
 
 
 def geared(coordinates: ClusterCoordinates, rotors: dict[str, str], ratio: SX | float) -> ClusterCoordinates:
@@ -104,7 +109,9 @@ def geared(coordinates: ClusterCoordinates, rotors: dict[str, str], ratio: SX | 
         if stretch in coordinates.index:
             scale[row, coordinates.index[stretch]] = 1 - ratio
     q, qd, g = scale @ coordinates.q, scale @ coordinates.qd, scale @ coordinates.g
-    return replace(coordinates, q=q, qd=qd, G=ca.sparsify(scale @ coordinates.G), g=g)
+    geared = replace(coordinates, q=q, qd=qd, G=ca.sparsify(scale @ coordinates.G), g=g)
+    second = coordinates.second_derivative
+    return geared if second is None else replace(geared, second_derivative=lambda row: scale[row, row] * second(row))
 
 
 def explicit_constraint(cluster: Cluster, y: SX) -> SX:

@@ -3,6 +3,8 @@
 With depth `d` and normal velocity `v_n`, out of the ground:
 
     lam = k d - (c + dt k) v_n   (Kelvin-Voigt)        lam = k d+ (1 - h v_n)+   (Hunt-Crossley, linearised)
+
+The dissipation `h` takes the place of the damping `c`, which has no part in the second law.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ class HuntCrossley:
             raise ValueError("normal_law='hunt_crossley'; expected a material with a dissipation")
         rate = c.stiffness * ca.fmax(0, 1 - h * v_n)
         growth = ca.if_else(v_n < 1 / h, c.stiffness * h * ca.fmax(touch.depth, 0), 0)
-        return rate * touch.depth + growth * v_n, c.damping + dt * rate + growth
+        return rate * touch.depth + growth * v_n, dt * rate + growth
 
 
 NORMAL_LAWS: dict[str, NormalLaw] = {"kelvin_voigt": KelvinVoigt(), "hunt_crossley": HuntCrossley()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,21 +13,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.dynamics.algebra.spatial import SX, skew
 from ce_gym.dynamics.forces.contact import Compliance
+from ce_gym.dynamics.recursion.kinematics import constant
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
 from ce_gym.model.drives import ELASTIC_FACTORS, Battery, Elasticity, Motor
-from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
+from ce_gym.model.errors import check_names
+from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, smallest_spin_factor, spin_inertia
 
 PARAMETERS = {
     "gravity": "acceleration of free fall in the world [m/s^2], 3",
     "friction": "Coulomb coefficient of the contacts [-], 1",
     "slip_speed": "speed at which the damping of friction alone carries its full force [m/s], 1",
     "stiffness": "normal stiffness of the contacts [N/m], 1",
-    "damping": "normal damping of the contacts [N s/m], 1",
+    "damping": "normal damping of the contacts under Kelvin and Voigt's law [N s/m], 1",
     "kp": "position gains of the joints [N m/rad or N/m], n_joints",
     "kd": "velocity gains of the joints [N m s/rad or N s/m], n_joints",
     "motor_strength": "factor on motor torques and their limits [-], 1",
-    "rotor_inertia": "factor on the spin inertia of symmetric rotors [-], 1",
+    "rotor_inertia": "factor on the spin inertia of rotors [-], 1",
     "rotor_inertia:ROTOR": "the same of one rotor [-], 1",
     "ratio": "factor on the gear ratios: how far rotors turn for a motion of the joints [-], 1",
     "drive_stiffness": "factor on the stiffness of elastic transmissions [-], 1",
@@ -74,11 +77,19 @@ class Figures:
     backlash: SX
 
 
-def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str, ...]) -> dict[str, NDArray]:
+def parameter_defaults(
+    robot: Robot, material: ContactMaterial, names: Sequence[str], argument: str = "parameters"
+) -> dict[str, NDArray]:
     """Return the value that leaves the robot as it is, for each declared parameter, shape (size,).
 
+    Args:
+        robot: The robot.
+        material: Of its contacts.
+        names: The declared parameters.
+        argument: What an error calls them.
+
     Raises:
-        ValueError: If a name is not a parameter of the robot.
+        ValueError: If a name is not a parameter of the robot, or is listed twice.
     """
     gains = {"kp": dict(robot.gains.kp), "kd": dict(robot.gains.kd)}
     plain = {
@@ -112,10 +123,7 @@ def parameter_defaults(robot: Robot, material: ContactMaterial, names: tuple[str
     plain |= {f"link_inertia:{link}": np.ones(1) for link in links}
     plain |= {f"rotor_inertia:{rotor.name}": np.ones(1) for rotor in robot.rotors()}
     plain |= {f"{kind}:{elastic.rotor}": np.ones(1) for kind in ELASTIC_FACTORS for elastic in robot.elastic}
-    for name in names:
-        if name not in plain:
-            expected = f"one of {', '.join(PARAMETERS)}, BODY being a link, ROTOR a rotor"
-            raise ValueError(f"parameters={name!r}; expected {expected}")
+    check_names(argument, names, plain, "one of", listed=f"{', '.join(PARAMETERS)}, BODY being a link, ROTOR a rotor")
     if "ratio" in names:
         check_ratios(robot)
     return {name: plain[name] for name in names}
@@ -139,8 +147,13 @@ def check_parameter(robot: Robot, name: str, values: ArrayLike) -> None:
     elif kind in ("ratio", "slip_speed", "drive_stiffness", "battery_voltage"):
         good, expected = numbers > 0, "more than 0"
     elif kind == "added_mass":
-        mass = robot.body(name.split(":")[1]).inertial.mass
+        mass = robot.body(name.partition(":")[2]).inertial.mass
         good, expected = numbers > -mass, f"more than -{mass:g} kg, what the body has"
+    elif kind == "rotor_inertia":
+        rotors = [rotor for rotor in robot.rotors() if name in (kind, f"{kind}:{rotor.name}")]
+        least, which = max(((smallest_spin_factor(rotor), rotor.name) for rotor in rotors), default=(0.0, ""))
+        if least > 0.0:
+            good, expected = numbers >= least, f"{least:.6g} or more, for a tensor of {which} that a body can have"
     if wrong := numbers[~(good & np.isfinite(numbers))].tolist():
         raise ValueError(f"{name}={wrong[0]:g}; expected {expected}")
 
@@ -170,6 +183,7 @@ def with_parameters(mechanism: Mechanism, names: tuple[str, ...], values: SX) ->
     """Return a mechanism with symbols in place of the figures that are declared parameters."""
     given = _split(mechanism.robot, mechanism.robot.material, names, values)
     bodies = {name: _with_ballast(body, mechanism.robot, given) for name, body in mechanism.bodies.items()}
+    _scale_spins(bodies, mechanism.robot, given)
     spins = tuple(tuple(_with_factor(spin, given) for spin in group) for group in mechanism.spins)
     ratio, gravity = given.get("ratio", mechanism.ratio), given.get("gravity", mechanism.gravity)
     robot = with_drives(mechanism.robot, given)
@@ -257,10 +271,31 @@ def _with_factors(elastic: Elasticity, given: Mapping[str, SX]) -> Elasticity:
 
 
 def _with_factor(spin: Spin, given: Mapping[str, SX]) -> Spin:
-    names = [name for name in ("rotor_inertia", f"rotor_inertia:{spin.rotor}") if name in given]
-    for name in names:
-        spin = replace(spin, inertia=spin.inertia * given[name])
+    for factor in _spin_factors(spin.rotor, given):
+        spin = replace(spin, inertia=spin.inertia * factor)
     return spin
+
+
+def _spin_factors(rotor: str, given: Mapping[str, SX]) -> list[SX]:
+    return [given[name] for name in ("rotor_inertia", f"rotor_inertia:{rotor}") if name in given]
+
+
+def _scale_spins(bodies: dict[str, MovingBody], robot: Robot, given: Mapping[str, SX]) -> None:
+    """Scale the spin inertia of rotors that are bodies, in place; as a load of the carrier it stays what it is."""
+    for rotor in robot.rotors():
+        factors = _spin_factors(rotor.name, given)
+        if not factors or rotor.name not in bodies:
+            continue
+        change, axis = (math.prod(factors) - 1) * spin_inertia(rotor), np.array(rotor.joint.axis)
+        _add_moment(bodies, rotor.name, change, axis)
+        if rotor.parent is not None:
+            _add_moment(bodies, rotor.parent, -change, np.array(rotor.placement.rotation) @ axis)
+
+
+def _add_moment(bodies: dict[str, MovingBody], name: str, moment: SX, axis: NDArray) -> None:
+    """Add a moment of inertia about an axis of a body, in place."""
+    more = ca.diagcat(moment * constant(np.outer(axis, axis)), SX(3, 3))
+    bodies[name] = replace(bodies[name], inertia=constant(bodies[name].inertia) + more)  # type: ignore[arg-type]
 
 
 def _with_ballast(body: MovingBody, robot: Robot, given: dict[str, SX]) -> MovingBody:
@@ -271,7 +306,7 @@ def _with_ballast(body: MovingBody, robot: Robot, given: dict[str, SX]) -> Movin
         return body
     inertial = robot.body(body.name).inertial
     mass, com = inertial.mass, SX(inertial.com)
-    inertia = SX(ca.sparsify(ca.DM(body.inertia)))
+    inertia = constant(body.inertia)
     if added is not None or shift is not None:
         before = _point_mass(mass, com)
         after = _point_mass(mass + (added if added is not None else 0), com + (shift if shift is not None else 0))

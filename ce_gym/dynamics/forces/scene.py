@@ -8,6 +8,7 @@ from typing import Literal
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import reference_guess
 from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors, supply_size
+from ce_gym.dynamics.forces.normal import HuntCrossley, normal_law
 from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactMaterial
@@ -87,7 +88,14 @@ class Scene:
 
 
 def make_scene(mechanism: Mechanism, options: StepOptions, parameters: SX, ground: SX) -> Scene:
-    """Return a scene whose declared parameters, stacked in the order of the options, are `parameters`."""
+    """Return a scene whose declared parameters, stacked in the order of the options, are `parameters`.
+
+    Raises:
+        ValueError: The damping of contacts is a parameter, under a law that has none.
+    """
+    law = normal_law(options.normal_law, options.material)
+    if "damping" in options.parameters and isinstance(law, HuntCrossley):
+        raise ValueError("parameters='damping'; expected a material without dissipation, which takes its place")
     named = with_parameters(mechanism, options.parameters, parameters)
     return Scene(named, options, figures(mechanism.robot, options.material, options.parameters, parameters), ground)
 

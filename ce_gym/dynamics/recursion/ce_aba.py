@@ -37,6 +37,7 @@ from ce_gym.dynamics.algebra.spatial import (
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, solve_turning
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
+from ce_gym.dynamics.recursion.reflected import diagonal_bias
 from ce_gym.dynamics.recursion.rotors import transverse_inertia
 from ce_gym.dynamics.recursion.stretched import Stretched, stretches
 from ce_gym.model.clusters import Cluster
@@ -318,7 +319,9 @@ class _Condenser:
         if level == "none":
             return
         if level == "armature":
+            yd = self.coordinates.qd[[self.coordinates.index[name] for name in self.cluster.independent]]
             condensed.D += ca.diag(J * ca.vec(G_r) ** 2)
+            condensed.bias += diagonal_bias(self.coordinates, yd, row, J)
             return
         momentum = J * G_r  # products in this order are shared between D, U and the biases
         condensed.D += momentum.T @ G_r

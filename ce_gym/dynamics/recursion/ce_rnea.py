@@ -14,6 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX, cross, turning_force
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.recursion.ce_aba import gravity_acceleration
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
+from ce_gym.dynamics.recursion.reflected import diagonal_bias
 from ce_gym.dynamics.recursion.rotors import transverse_inertia
 from ce_gym.model.mechanism import Mechanism
 
@@ -102,15 +103,19 @@ def inward_force_pass(
 def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qdd: SX) -> SX:
     """Torque of the reflected inertia: the whole block, or its diagonal at the armature level, shape (d,).
 
-    With closed loops `G_r` varies; the whole block then has a velocity term `G_r^T J g_r`, the diagonal does without.
+    With closed loops `G_r` varies, which adds velocity terms, see reflected.py.
     """
     G, index, cluster = coordinates.G, coordinates.index, mechanism.tree.clusters[k]
-    ydd = qdd[[index[name] for name in cluster.independent]]
+    own = [index[name] for name in cluster.independent]
     torque = SX(G.shape[1], 1)
     for spin in mechanism.spins[k]:
         row = index[spin.rotor]
         G_r = G[row, :]
-        torque += spin.inertia * (ca.vec(G_r) ** 2 * ydd if mechanism.level == "armature" else G_r.T * qdd[row])
+        if mechanism.level == "armature":
+            torque += spin.inertia * (ca.vec(G_r) ** 2 * qdd[own])
+            torque += diagonal_bias(coordinates, coordinates.qd[own], row, spin.inertia)
+        else:
+            torque += spin.inertia * (G_r.T * qdd[row])
     return torque
 
 

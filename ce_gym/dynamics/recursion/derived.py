@@ -23,7 +23,7 @@ def kinetic_and_potential(mechanism: Mechanism, q: SX, v: SX, guess: SX) -> tupl
     gravity = gravity_acceleration(mechanism)
     for name, body in mechanism.bodies.items():
         mass = body.inertia[3, 3]
-        moment = constant(np.array([body.inertia[2, 4], body.inertia[0, 5], body.inertia[1, 3]]))  # mass * com
+        moment = ca.sparsify(ca.vertcat(body.inertia[2, 4], body.inertia[0, 5], body.inertia[1, 3]))  # mass * com
         state = kinematics.bodies[name]
         potential -= ca.dot(gravity, mass * state.p + state.R @ moment)
     return ca.dot(v, momentum) / 2, potential

@@ -16,12 +16,12 @@ from ce_gym.dynamics.electric.cogging import cogging_energy
 from ce_gym.dynamics.forces.actuation import actuated_clusters, seen_joints
 from ce_gym.dynamics.forces.motor_control import motor_springs
 from ce_gym.dynamics.forces.motors import MOTORS
-from ce_gym.dynamics.forces.passive import limit_stiffness, yielding_joints
+from ce_gym.dynamics.forces.passive import stop_springs, yielding_joints
 from ce_gym.dynamics.forces.scene import Scene, State
 from ce_gym.dynamics.recursion.derived import kinetic_and_potential
 from ce_gym.dynamics.recursion.kinematics import outward_velocity_pass
 from ce_gym.dynamics.stepping.step import meeting_pairs, touching
-from ce_gym.model.description import Robot
+from ce_gym.model.mechanism import Mechanism
 
 
 def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
@@ -72,17 +72,17 @@ def spring_energy(scene: Scene, state: State) -> SX:
             angle = coordinates.position(name)
             total += joint.stiffness * (angle - joint.springref) ** 2 / 2
             if name not in scene.mechanism.robot.independent:
-                total += stop_energy(scene.mechanism.robot, name, angle)
+                total += stop_energy(scene.mechanism, name, angle)
     return total
 
 
-def stop_energy(robot: Robot, name: str, angle: SX) -> SX:
+def stop_energy(mechanism: Mechanism, name: str, angle: SX) -> SX:
     """Return the energy of the stops of a joint with one coordinate, at an angle [rad] or a way [m], in J."""
-    (low, high), beyond = robot.body(name).joint.position, SX(0)
+    (low, high), beyond = mechanism.robot.body(name).joint.position, SX(0)
     for bound, side in ((low, 1.0), (high, -1.0)):
         if math.isfinite(bound):
             beyond += ca.fmax(side * (bound - angle), 0)
-    return limit_stiffness(robot, name)[0] * beyond**2 / 2
+    return stop_springs(mechanism)[name][0] * beyond**2 / 2
 
 
 def joint_energy(scene: Scene, state: State, target: SX) -> SX:
@@ -94,9 +94,9 @@ def joint_energy(scene: Scene, state: State, target: SX) -> SX:
         total += joint.stiffness * ca.sumsqr(turned) / 2
         if math.isfinite(joint.position[1]):
             beyond = ca.fmax(ca.norm_2(turned) - joint.position[1], 0)
-            total += limit_stiffness(robot, name)[0] * beyond**2 / 2
+            total += stop_springs(scene.mechanism)[name][0] * beyond**2 / 2
     for i, name in enumerate(robot.independent):
-        total += stop_energy(robot, name, y[i])
+        total += stop_energy(scene.mechanism, name, y[i])
     if scene.options.control == "position":
         kinematics = outward_velocity_pass(scene.mechanism, state.q, state.v, state.dependent)
         at = seen_joints(scene.mechanism, kinematics) @ y

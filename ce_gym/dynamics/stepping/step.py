@@ -181,9 +181,9 @@ def acting_forces(scene: Scene, state: State, target: SX, dt: float, iterate: SX
     friction = [rubbing.linearise(of_friction)] if rubbing.size else []
     meshes = [Meshes(scene, y, yd, dt).linearise(of_meshes)] if stretching(mechanism) else []
 
-    of_balls = ball_forces(mechanism.robot, state.q, state.v, dt)
+    of_balls = ball_forces(mechanism, state.q, state.v, dt)
     more = [*friction, *yielding_forces(mechanism, kinematics, dt)]
-    unmeshed = sum(more, motors + passive_forces(mechanism.robot, y, yd, dt))
+    unmeshed = sum(more, motors + passive_forces(mechanism, y, yd, dt))
     joints = on_coordinates(mechanism, of_balls, sum(meshes, unmeshed))
     couples = {} if is_moment(dt) else steadying_couples(mechanism, kinematics, dt)
     gravity = {name: kinematics.bodies[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}

@@ -19,7 +19,7 @@ from ce_gym.envs.task.checks import checked_value, merged_rewards
 from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.errors import RobotError, bad, listed_names, unknown
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.sim.arguments import check, check_choice, check_whole
 from ce_gym.sim.devices import Device, device_named
@@ -96,9 +96,9 @@ def make_program(
         given = f"the Robot {robot.name!r}" if isinstance(robot, Robot) else repr(robot)
         raise ValueError(f"robot={given}; expected the name of a robot or a path to a file")
     check("contact_forces", contact_forces, isinstance(contact_forces, bool), "true or false")
-    check("task", task, task in tuple(KNOWN), f"one of {', '.join(KNOWN)}")
+    check("task", task, task in tuple(KNOWN), f"one of {listed_names(task, KNOWN)}")
     levels = (*LEVELS, ELASTIC)
-    check("transmission", transmission, transmission in levels, f"one of {', '.join(levels)}")
+    check("transmission", transmission, transmission in levels, f"one of {listed_names(transmission, levels)}")
     model = Model(robot, transmission)
     figures = own_task(model.robot, task)
     figures = replace(figures, rewards=merged_rewards(figures.rewards, {} if rewards is None else rewards))
@@ -155,7 +155,9 @@ def changed_task(task: Task, changes: Mapping[str, Any]) -> Task:
     known, given = [f.name for f in fields(Task) if f.name != "rewards"], {}
     for name, value in changes.items():
         if name not in known:
-            raise UnknownArgument(f"unexpected keyword argument {name!r}; expected one of rewards, {', '.join(known)}")
+            raise UnknownArgument(
+                f"unexpected keyword argument {name!r}; expected one of {listed_names(name, ['rewards', *known])}"
+            )
         if value is not None:
             given[name] = checked_value(name, value, getattr(task, name))
     return replace(task, **given)

@@ -10,6 +10,7 @@ from ce_gym.envs.task.ground import Ground
 from ce_gym.envs.task.randomisation import Randomised
 from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.registry import terms_of
+from ce_gym.model.errors import check_names
 from ce_gym.sim.kernels import select_contacts, select_pairs
 
 
@@ -45,9 +46,7 @@ class TaskSpec:
         self.metric_terms = terms_of("metric", task.metrics) | terms_of("metric", self.curriculum.metrics)
         self.observation_terms = terms_of("observation", task.observations)
         self.critic_terms = terms_of("observation", task.critic)
-        for name in task.noise:
-            if name not in self.observation_terms:
-                raise ValueError(f"noise={name!r}; expected an observation among {', '.join(self.observation_terms)}")
+        check_names("noise", task.noise, self.observation_terms, "an observation among")
         self.contacts = select_contacts(robot, task.contacts)
         if task.latency[1] > task.n_substeps:
             raise ValueError(
@@ -67,7 +66,7 @@ class TaskSpec:
             ground="field" if self.ground and self.contacts else "flat",
             parameters=self.randomised.parameters,
             self_collisions=select_pairs(self.model.mechanism, task.self_collisions),
-            seldom=tuple(name for name in select_contacts(robot, task.seldom) if name in self.contacts),
+            seldom=tuple(name for name in select_contacts(robot, task.seldom, "seldom") if name in self.contacts),
         )
 
     @property

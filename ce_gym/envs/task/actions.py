@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fnmatch import fnmatch
+from fnmatch import fnmatchcase
 
 import casadi as ca
 import numpy as np
@@ -13,6 +13,7 @@ from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.motor_control import standing_motors
 from ce_gym.dynamics.forces.scene import Control, target_names
 from ce_gym.envs.task.tasks import Task
+from ce_gym.model.errors import check_names, listed_names
 from ce_gym.model.mechanism import Mechanism
 
 CONTROL: dict[str, Control] = {
@@ -46,17 +47,21 @@ class ActionMap:
         robot = mechanism.robot
         self.control: Control = CONTROL[task.actions]
         self.targets = target_names(mechanism, self.control)
-        acting = {n for n in robot.driven if any(fnmatch(n, p) for p in task.action_joints)}
+        rotors_of_motors = {motor.rotor for motor in robot.motors}
+        joints, expected = robot.driven, "patterns of joints among"
+        clusters = [cluster for cluster in mechanism.tree.clusters if rotors_of_motors & set(cluster.bodies)]
         if self.control.startswith("motor"):
-            rotors = {motor.rotor for motor in robot.motors}
-            clusters = [cluster for cluster in mechanism.tree.clusters if acting & set(cluster.independent)]
-            acting = {name for cluster in clusters for name in cluster.bodies if name in rotors}
+            motorised = {name for cluster in clusters for name in cluster.independent}
+            joints = tuple(name for name in joints if name in motorised)
+            expected = f"patterns of joints that motors drive, for actions={task.actions!r}, among"
+        check_names("action_joints", task.action_joints, joints, expected, patterns=True)
+        if not task.action_joints:
+            raise ValueError(f"action_joints={task.action_joints!r}; expected {expected} {listed_names('', joints)}")
+        acting = {n for n in joints if any(fnmatchcase(n, p) for p in task.action_joints)}
+        if self.control.startswith("motor"):
+            moving = [cluster for cluster in clusters if acting & set(cluster.independent)]
+            acting = {name for cluster in moving for name in cluster.bodies if name in rotors_of_motors}
         self.moved = [i for i, name in enumerate(self.targets) if name in acting]
-        if not self.moved:
-            expected = f"patterns of joints among {robot.driven}"
-            if self.control.startswith("motor"):
-                expected = f"{expected} that motors drive, for actions={task.actions!r}"
-            raise ValueError(f"action_joints={task.action_joints!r}; expected {expected}")
         if self.control in ("position", "motor_position"):
             self.rest, self.scale = self._positions(mechanism, task.action_scale)
         else:

@@ -11,6 +11,8 @@ from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.envs.task.tasks import STARTS, Actions
 from ce_gym.envs.task.terrain_tiles import checked_terrain
+from ce_gym.envs.terms.registry import terms_of
+from ce_gym.model.errors import check_names, listed_names
 from ce_gym.sim.arguments import check, check_choice, check_whole, is_number
 
 CHOICES = {"actions": get_args(Actions), "friction": FRICTION, "motors": MOTORS, "method": METHODS}
@@ -53,7 +55,7 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
     if name in ("randomise", "start"):
         check(name, value, isinstance(value, Mapping), "pairs (low, high) by the name of a figure")
         for key in value if name == "start" else ():
-            check(name, key, key in STARTS, f"one of {', '.join(STARTS)}")
+            check(name, key, key in STARTS, f"one of {listed_names(key, STARTS)}")
         return {str(key): _pair(f"{name}[{key!r}]", pair) for key, pair in value.items()}
     if name in TERMS:
         return _terms(name, value)
@@ -67,7 +69,7 @@ def checked_value(name: str, value: Any, old: Any) -> Any:
         check(name, value, isinstance(value, Mapping), "numbers by name")
         for key, figure in value.items():
             check(f"{name}[{key!r}]", figure, number(f"{name}[{key!r}]", figure) >= 0, "0 or more")
-            check(name, key, name != "reset_noise" or key in old, f"one of {', '.join(old)}")
+            check(name, key, name != "reset_noise" or key in old, f"one of {listed_names(key, old)}")
         return {**old, **{str(key): float(figure) for key, figure in value.items()}}
     if isinstance(old, tuple):
         return _names(name, value)
@@ -88,7 +90,7 @@ def merged_rewards(old: Mapping[str, Any], given: Any) -> dict[str, Any]:
         given: What a user gave, likewise; parameters alone leave the weight as it was.
 
     Raises:
-        ValueError: If it is nothing of the kind.
+        ValueError: If it is nothing of the kind, or a term of weight 0 does not exist.
     """
     check("rewards", given, isinstance(given, Mapping), "weights, or mappings of weight and parameters, by name")
     rewards = dict(old)
@@ -102,6 +104,7 @@ def merged_rewards(old: Mapping[str, Any], given: Any) -> dict[str, Any]:
         check(place, value, abs(new["weight"]) <= HEAVIEST, f"a weight from -{HEAVIEST:g} to {HEAVIEST:g}")
         rewards[str(term)] = new if len(new) > 1 else new["weight"]
         if new["weight"] == 0:
+            terms_of("reward", {term: new})
             del rewards[str(term)]
     return rewards
 
@@ -114,6 +117,7 @@ def _terms(name: str, value: Any) -> Any:
             check(f"{name}[{key!r}]", own, isinstance(own, Mapping), "parameters by name")
     else:
         terms = _names(name, value)
+        check_names(name, terms, terms, "a term among")
     check(name, value, len(terms) > 0 or name != "observations", "at least one name")
     return terms
 

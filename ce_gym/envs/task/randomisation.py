@@ -11,6 +11,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.parameters import check_parameter, parameter_defaults
 from ce_gym.envs.task.tasks import RANDOMISED, Range
 from ce_gym.model.description import Robot
+from ce_gym.model.errors import listed_names
 from ce_gym.sim.arguments import check
 
 FACTORS = (
@@ -39,13 +40,14 @@ class Randomised:
         base = robot.bodies[0].name
         names = []
         for name, (low, high) in ranges.items():
-            check("randomise", name, name.split(":")[0] in RANDOMISED, f"one of {', '.join(RANDOMISED)}")
+            kind = name.split(":")[0]
+            check("randomise", name, kind in RANDOMISED, f"one of {listed_names(kind, RANDOMISED)}")
             if not low <= high:
                 raise ValueError(f"randomise[{name!r}]=({low}, {high}); expected low <= high")
             names.append(f"{name}:{base}" if name in ("added_mass", "com_shift") else name)
         self.parameters = tuple(names)
         self._ranges = tuple(ranges.values())
-        self._defaults = list(parameter_defaults(robot, robot.material, self.parameters).values())
+        self._defaults = list(parameter_defaults(robot, robot.material, names, "randomise").values())
         for given, name, bounds, default in zip(ranges, names, self._ranges, self._defaults, strict=True):
             try:
                 check_parameter(robot, name, np.outer(bounds, default) if name in FACTORS else bounds)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ce_gym.model.errors import listed_names
 from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.terrain import Terrain
 
@@ -28,7 +29,7 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
         ValueError: One line that names the argument, its value and what was expected.
     """
     for name, value in given.items():
-        check(f"terrain[{name!r}]", value, name in ARGUMENTS, f"one of {', '.join(ARGUMENTS)} for 'map'")
+        check(f"terrain[{name!r}]", value, name in ARGUMENTS, f"one of {listed_names(name, ARGUMENTS)} for 'map'")
     field: Any = given.get("field")
     file: Any = given.get("file")
     one = (field is None) != (file is None)

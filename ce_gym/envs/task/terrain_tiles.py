@@ -15,6 +15,7 @@ import numpy as np
 
 from ce_gym.envs.task.terrain_kinds import BORDER, KINDS, PLATFORM, Tiles
 from ce_gym.envs.task.terrain_map import checked_map
+from ce_gym.model.errors import listed_names
 from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.terrain import Terrain
 from ce_gym.sim.terrain.files import MOST_HEIGHTS
@@ -74,7 +75,7 @@ def _checked_mixture(given: Any) -> dict[str, dict[str, Any]]:
 
 def _check_arguments(place: str, kind: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
     for name, figure in given.items():
-        expected = f"one of {', '.join(known)}" if known else "no argument"
+        expected = f"one of {listed_names(name, known)}" if known else "no argument"
         check(f"{place}[{name!r}]", figure, name in known, f"{expected} for {kind!r}")
         if name != "kinds":
             _check(f"{place}[{name!r}]", name, figure)

@@ -20,7 +20,11 @@ from ce_gym.dynamics.forces.ground import above_deepest, reach
 from ce_gym.dynamics.recursion.derived import spanning_coordinates
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.dynamics.standing import standing_pose
+from ce_gym.model.errors import check_names
 from ce_gym.model.mechanism import Mechanism
+
+GROUPS = "foot", "knee", "torso"
+"""Groups of contact spheres that the package's own terms look at; a robot need not have all of them."""
 
 
 def _buffer(name: str, document: str, default: SX | None = None) -> property:
@@ -286,7 +290,12 @@ class TermContext:
         """Return body, height above the ground [m] and velocity (3,) [m/s] of each contact sphere of a group.
 
         One that moves around a rim is where it is lowest: the velocity is that of the body there, none if it rolls.
+
+        Raises:
+            ValueError: If neither the robot nor the package's own terms know such a group.
         """
+        known = {contact.group: None for contact in self.mechanism.robot.contacts} | dict.fromkeys(GROUPS)
+        check_names(f"{self.term}: group", [group], known, "a group of contacts among")
         points = []
         for i, sphere in enumerate(self.mechanism.robot.contacts):
             if sphere.group == group:

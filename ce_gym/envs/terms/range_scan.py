@@ -15,6 +15,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.recursion.kinematics import constant
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.grid import check_of, numbers, ray_directions, turned
+from ce_gym.model.errors import listed_names
 
 MOST_PLACES = 4000
 """How many places one sensor looks at, rays times steps."""
@@ -70,7 +71,7 @@ def range_scan(
     check("steps", steps, isinstance(steps, int) and steps >= 1, "a whole number from 1 on")
     bodies = s.kinematics.bodies
     link = link or s.mechanism.robot.bodies[0].name
-    check("link", link, link in bodies, f"one of {', '.join(bodies)}")
+    check("link", link, link in bodies, f"one of {listed_names(link, bodies)}")
     directions = ray_directions(rays, view, pattern)
     check("rays", rays, directions.shape[1] * steps <= MOST_PLACES, f"at most {MOST_PLACES} rays times steps")
     body = bodies[link]

@@ -29,6 +29,7 @@ from ce_gym.envs.terms import (
     terminations,
 )
 from ce_gym.envs.terms.context import TermContext
+from ce_gym.model.errors import listed_names
 from ce_gym.sim.arguments import is_number
 
 Function = Callable[..., SX]
@@ -97,8 +98,8 @@ class Term:
             if value is None:
                 raise TypeError("returns None; expected a CasADi expression")
             return SX(value)
-        except (RuntimeError, NotImplementedError, TypeError) as error:
-            raise ValueError(f"{self.kind} term {self.name!r}: {_advice(error)}") from error
+        except (RuntimeError, NotImplementedError, TypeError, KeyError, AttributeError) as error:
+            raise ValueError(f"{self.kind} term {self.name!r}: {_advice(error, s)}") from error
 
     def number(self, s: TermContext) -> SX:
         """Trace a term that is one number.
@@ -113,12 +114,19 @@ class Term:
         return value
 
 
-def _advice(error: Exception) -> str:
-    """Return what to do about an error of CasADi's, or the first line of the error."""
+def _advice(error: Exception, s: TermContext) -> str:
+    """Return what to do about a name that does not exist or an error of CasADi's, or the first line of the error."""
+    if isinstance(error, AttributeError) and error.obj is s:
+        known = [name for name in dir(TermContext) if not name.startswith("_")]
+        return f"no attribute {error.name!r} of TermContext; expected one of {listed_names(error.name, known)}"
+    if isinstance(error, KeyError):
+        bodies = [body.name for body in s.mechanism.robot.bodies]
+        given = str(error.args[0]) if error.args else ""
+        return given if "has no body" in given else f"no key {given!r}; bodies are {listed_names(given, bodies)}"
     if "truth value" in str(error):
         return "a condition on a traced value (Python's if, and, or, min, max); expected ca.if_else, ca.fmin, ca.fmax"
     text = str(error).strip().splitlines() or [type(error).__name__]
-    if isinstance(error, TypeError):
+    if isinstance(error, TypeError | AttributeError):
         return text[0]
     return f"{text[-1]}; expected arithmetic of CasADi expressions (ca.sqrt, ca.if_else, ca.dot, ...)"
 
@@ -139,13 +147,13 @@ def terms_of(kind: str, given: Mapping[str, Any] | Iterable[str]) -> dict[str, T
 def _term(kind: str, name: str, given: Any) -> Term:
     known = OWN[kind] | _added[kind]
     if name not in known:
-        raise ValueError(f"no {kind} term {name!r}; expected one of {', '.join(sorted(known))}")
+        raise ValueError(f"no {kind} term {name!r}; expected one of {listed_names(name, sorted(known))}")
     parameters = dict(given) if isinstance(given, Mapping) else {"weight": given}
     weight = parameters.pop("weight", 1.0) if kind == "reward" else 1.0
     defaults = parameters_of(known[name])
     for key, value in parameters.items():
         if key not in defaults:
-            expected = f"one of {', '.join(defaults)}" if defaults else "none"
+            expected = f"one of {listed_names(key, defaults)}" if defaults else "none"
             raise ValueError(f"{kind} term {name!r}: parameter {key!r}; expected {expected}")
         if is_number(defaults[key]) and not is_number(value):
             raise ValueError(f"{kind} term {name!r}: {key}={value!r}; expected a finite number")

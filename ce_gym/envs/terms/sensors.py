@@ -14,6 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, seen_joints
 from ce_gym.dynamics.recursion.kinematics import BodyState, constant
 from ce_gym.envs.terms.context import TermContext
+from ce_gym.model.errors import listed_names
 
 
 def gyro(s: TermContext, link: str = "", scale: float = 0.25, bias: float = 0.0) -> SX:
@@ -111,5 +112,5 @@ def _link(s: TermContext, term: str, name: str) -> BodyState:
     bodies = s.kinematics.bodies
     name = name or s.mechanism.robot.bodies[0].name
     if name not in bodies:
-        raise ValueError(f"observation term {term!r}: link={name!r}; expected one of {', '.join(bodies)}")
+        raise ValueError(f"observation term {term!r}: link={name!r}; expected one of {listed_names(name, bodies)}")
     return bodies[name]

@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Iterable
 from dataclasses import fields
-from fnmatch import fnmatch
+from fnmatch import fnmatchcase
 from functools import cache
 
 import numpy as np
@@ -27,9 +27,10 @@ from ce_gym.model.checks.constraint import check_constraint
 from ce_gym.model.checks.supply import check_supply
 from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.coordinates import UNIT_TOLERANCE
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import DriveFriction
-from ce_gym.model.errors import InertiaWarning, bad, unknown
+from ce_gym.model.errors import InertiaWarning, bad, listed_names, unknown
 
 MOST_BODIES = 500
 """Most bodies of a robot: what is done with them takes more than in proportion, and none has as many."""
@@ -84,11 +85,12 @@ def _check_names(robot: Robot, file: str) -> None:
 def _check_inertia(robot: Robot, file: str) -> None:
     """Warn of figures that no rigid body can have, unless they are kept knowingly."""
     impossible = [body.name for body in robot.bodies if violates_triangle_inequality(body)]
+    _check_unique(file, "kept_inertia", robot.kept_inertia)
     for pattern in robot.kept_inertia:
-        if not any(fnmatch(name, pattern) for name in impossible):
-            expected = f"one of {', '.join(impossible)}" if impossible else "nothing: no inertia is impossible"
+        if not any(fnmatchcase(name, pattern) for name in impossible):
+            expected = f"one of {listed_names(pattern, impossible)}" if impossible else "none: no inertia is impossible"
             raise bad(file, "kept_inertia", pattern, expected)
-    unknowing = [name for name in impossible if not any(fnmatch(name, pattern) for pattern in robot.kept_inertia)]
+    unknowing = [name for name in impossible if not any(fnmatchcase(name, pattern) for pattern in robot.kept_inertia)]
     if unknowing:
         _warn_of_inertia(robot.name, tuple(unknowing))
 
@@ -109,8 +111,8 @@ def _check_tree(robot: Robot, file: str) -> None:
             raise bad(file, "body name", body.name, "a name that no other body has")
         if body.parent is not None and body.parent not in seen:
             raise unknown(file, f"{body.kind} {body.name!r} parent", body.parent, seen, "a body listed before it")
-        if body.joint.type == "ball" and body.kind == "rotor":
-            raise bad(file, f"rotor {body.name!r} joint type", "ball", "a joint about one axis")
+        if body.joint.type in ("ball", "prismatic") and body.kind == "rotor":
+            raise bad(file, f"rotor {body.name!r} joint type", body.joint.type, "revolute, because rotors spin")
         if body.joint.type == "free" and (seen or body.parent is not None):
             raise bad(
                 file, f"{body.kind} {body.name!r} joint type", "free", "free only for the first body, on the world"
@@ -193,6 +195,7 @@ def _check_capsules(robot: Robot, file: str) -> None:
         check_finite(file, key, (*capsule.start, *capsule.end))
         if not 0.0 < capsule.radius < math.inf:
             raise bad(file, f"{key} radius", capsule.radius, "more than 0 [m]")
+    _check_unique(file, "self_collisions", [" and ".join(sorted(pair)) for pair in robot.self_collisions])
     for pair in robot.self_collisions:
         for name in pair:
             if name not in links:
@@ -273,8 +276,9 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
     for name, quaternion in robot.pose.balls:
         if name not in robot.balls:
             raise unknown(file, "pose.balls", name, robot.balls, "the name of a body on a ball joint")
-        if not math.isclose(math.hypot(*quaternion), 1.0, rel_tol=RELATIVE_TOLERANCE):
-            raise bad(file, f"pose.balls.{name}", quaternion, "a quaternion (w, x, y, z) of length 1")
+        if len(quaternion) != 4 or not abs(math.hypot(*quaternion) - 1.0) <= UNIT_TOLERANCE:
+            expected = f"a quaternion (w, x, y, z) of norm 1 within {UNIT_TOLERANCE:g}: divide it by its norm"
+            raise bad(file, f"pose.balls.{name}", quaternion, expected)
     _check_within_limits(robot, file)
     _check_assembly(robot, file)
     for key, pairs in (("gains.kp", robot.gains.kp), ("gains.kd", robot.gains.kd)):

@@ -16,6 +16,7 @@ from ce_gym.model.drives import ELASTIC_FACTORS
 from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import mat3
 from ce_gym.model.formats.reading import Section
+from ce_gym.model.mechanism import spin_inertia
 
 RUBBING = "motor_damping", "motor_friction", "joint_damping", "joint_friction"
 KINDS = "link_inertia", "added_mass", "rotor_inertia", *RUBBING, *ELASTIC_FACTORS
@@ -75,7 +76,7 @@ def _with(robot: Robot, kind: str, name: str, value: float) -> Robot:
 def _with_spin(robot: Robot, rotor: Body, factor: float) -> Robot:
     """Scale a rotor's moment about its axis; as a load of the body that carries it, it stays what it is."""
     axis, inertia = np.array(rotor.joint.axis), np.array(rotor.inertial.inertia)
-    more = (factor - 1) * (axis @ inertia @ axis) * np.outer(axis, axis)
+    more = (factor - 1) * spin_inertia(rotor) * np.outer(axis, axis)
     robot = _with_body(robot, replace(rotor, inertial=replace(rotor.inertial, inertia=mat3(inertia + more))))
     if rotor.parent is None:
         return robot

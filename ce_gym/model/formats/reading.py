@@ -157,7 +157,7 @@ class Section:
         if not isinstance(value, str) or not value.strip():
             raise bad(self.file, self.key(key), value, "text")
         if choices and value not in choices:
-            raise unknown(self.file, self.key(key), value, choices, f"one of {', '.join(choices)}")
+            raise unknown(self.file, self.key(key), value, choices, "one of")
         return value
 
     def number(self, key: str, default: Any = _REQUIRED) -> float:

@@ -15,11 +15,11 @@ from ce_gym.model import RobotError
 from ce_gym.model.description import Robot, Shape
 from ce_gym.model.formats.mjcf.source import read_mjcf
 from ce_gym.model.frames import ORIGIN, Placement
+from ce_gym.viewer.meshes.parts import LARGEST, Beside, check_gltf
 from ce_gym.viewer.meshes.visuals import Color, Visual, visuals_of
 
 MOST = 40_000  # triangles of all robots of a page: with them it stays below 5 MB
 FEWEST = 80  # triangles of a mesh, however small its share
-LARGEST = 2**27  # file [bytes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,9 @@ def _full(seen: tuple[Visual, ...]) -> list[Shape | Triangles]:
             warnings.warn(f"{one.file}: mesh is not drawn: {' '.join(str(error).split())[:200]}", stacklevel=2)
             continue
         shown = one.color or color or Shape.color
-        found.append(Triangles(vertices * np.array(one.scale), faces, one.placement, shown))
+        mirrored = np.prod(np.sign(one.scale)) < 0
+        outwards = faces[:, ::-1] if mirrored else faces  # corners counterclockwise, seen from outside
+        found.append(Triangles(vertices * np.array(one.scale), outwards, one.placement, shown))
     return found
 
 
@@ -91,16 +93,21 @@ def _loaded(file: Path, changed: int, index: int) -> tuple[NDArray[np.float64], 
 
     if file.stat().st_size > LARGEST:
         raise ValueError(f"{file.stat().st_size} bytes; expected at most {LARGEST}")
-    is_collada = file.suffix.lower() == ".dae"
+    kind = file.suffix[1:].lower()
+    is_collada, is_gltf = kind == "dae", kind in ("glb", "gltf")
     if is_collada and b"<!DOCTYPE" in file.read_bytes():  # entities can read other files or grow without bound
         raise ValueError("there is a <!DOCTYPE>; expected none")
-    scene: Any = trimesh.load_scene(str(file), file_type=file.suffix[1:].lower(), skip_materials=True)
+    if is_gltf:
+        check_gltf(file)
+    beside: Any = Beside(file)
+    # Materials of .obj files are files of their own.
+    scene: Any = trimesh.load_scene(str(file), file_type=kind, resolver=beside, skip_materials=not is_gltf)
     mesh = scene.to_mesh()
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    scale = _unit(file) if is_collada else 1.0
-    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+    scale, faces = _unit(file) if is_collada else 1.0, _proper(mesh.faces)
+    if not len(faces) or not np.isfinite(mesh.vertices).all():
         raise ValueError("expected triangles with finite corners")
-    return scale * np.array(mesh.vertices, float), _proper(mesh.faces), _color(scene)
+    return scale * np.array(mesh.vertices, float), faces, _color(scene)
 
 
 def _proper(faces: Any) -> NDArray[np.int64]:
@@ -159,4 +166,5 @@ def _thinned(mesh: Triangles, share: float) -> Triangles:
 
     faces = mesh.faces.astype(np.int32)
     vertices, fewer, *_ = fast_simplification.simplify(mesh.vertices, faces, target_count=most)
-    return Triangles(np.asarray(vertices, float), _proper(fewer), mesh.placement, mesh.color)
+    proper = _proper(fewer)
+    return Triangles(np.asarray(vertices, float), proper, mesh.placement, mesh.color) if len(proper) else mesh

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from ce_gym.model.formats.mjcf.equalities import locked_joints
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement, read_mjcf
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.formats.reading import read_yaml
+from ce_gym.model.formats.text_file import one_line
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.graph import UrdfGraph
 from ce_gym.model.formats.urdf.tree import read_tree
@@ -29,7 +31,7 @@ from ce_gym.model.frames import ORIGIN, Placement, Vec3
 
 Color = tuple[float, float, float, float]
 
-KINDS = (".stl", ".obj", ".dae")
+KINDS = (".stl", ".obj", ".dae", ".ply", ".glb", ".gltf")
 SEEN_GROUPS = 3  # MuJoCo's viewer shows geoms of the groups 0, 1 and 2; collision geoms usually are in group 3
 _PLAIN = (0.5, 0.5, 0.5, 1.0)  # a geom's colour where its material's counts
 
@@ -39,7 +41,7 @@ class MeshFile:
     """A mesh of a file.
 
     Attributes:
-        file: A .stl, .obj or .dae file, or the MJCF file that has the mesh.
+        file: A file of one of `KINDS`, or the MJCF file that has the mesh.
         index: Number of the mesh in an MJCF file.
         scale: Factors along its axes.
         placement: Pose in the frame of its body.
@@ -78,14 +80,15 @@ def _read(source: Path, changed: int, floating: bool) -> dict[str, tuple[Visual,
             data = read_yaml(source).data
             source = source.parent / str(data.get("urdf") or data.get("mjcf"))
         items = list(_of_mjcf(source) if source.suffix.lower() == ".xml" else _of_urdf(source, floating))
-    except (RobotError, OSError):  # the robot itself was read, perhaps from another state of the file
+    except (RobotError, OSError) as error:  # the robot itself was read, perhaps from another state of the file
+        warnings.warn(f"{source}: meshes are not drawn: {one_line(error)}", stacklevel=2)
         return {}
     bodies = {body: tuple(one for name, one in items if name == body) for body, _ in items}
     return {body: seen for body, seen in bodies.items() if any(isinstance(one, MeshFile) for one in seen)}
 
 
 def _of_urdf(path: Path, floating: bool) -> Iterator[tuple[str, Visual]]:
-    graph, missing = UrdfGraph(path), list[str]()
+    graph, undrawn = UrdfGraph(path), dict[str, list[str]]()
     frames, colors = (
         read_tree(graph, "floating" if floating else "fixed").frames,
         read.colors_of(graph.file, graph.robot),
@@ -93,24 +96,56 @@ def _of_urdf(path: Path, floating: bool) -> Iterator[tuple[str, Visual]]:
     for link, element in graph.links.items():
         body, frame = frames[link]
         for visual in element.findall("visual") if body else ():
-            mesh, where = visual.find("geometry/mesh"), f"link {link!r}"
-            seen = read.shape(graph.file, where, visual, colors) if mesh is None else _mesh(graph.file, where, visual)
-            missing += [mesh.get("filename", "")] if mesh is not None and seen is None else []
-            if seen is not None and body is not None:
-                color = _own_color(visual, colors, where, graph.file) if mesh is not None else seen.color
-                yield body, replace(seen, placement=compose(frame, seen.placement), color=color)
-    if missing:
-        told = f"{len(missing)} meshes are not there, such as {missing[0]!r}; expected {', '.join(KINDS)} files"
+            where = f"link {link!r}"
+            try:
+                seen = _seen(graph.file, where, visual, colors)
+            except FileNotFoundError as missing:
+                undrawn.setdefault("not there", []).append(str(missing))
+            except _OtherKind as other:
+                undrawn.setdefault("of a kind that is not read", []).append(str(other))
+            except RobotError as error:
+                warnings.warn(f"{error}: its mesh is not drawn", stacklevel=2)
+            else:
+                if seen is not None and body is not None:
+                    yield body, replace(seen, placement=compose(frame, seen.placement))
+    for problem, names in undrawn.items():
+        told = f"{len(names)} meshes are {problem}, such as {names[0]!r}; expected {', '.join(KINDS)} files"
         warnings.warn(f"{path}: {told}: shapes are drawn", stacklevel=2)
 
 
-def _mesh(file: str, where: str, visual: Any) -> MeshFile | None:
+class _OtherKind(Exception):
+    """A file that is there, but not of one of `KINDS`."""
+
+
+def _seen(file: str, where: str, visual: Any, colors: dict[str, Color]) -> Visual | None:
+    """Return a mesh or a primitive of a <visual>, in the frame of its link.
+
+    Raises:
+        FileNotFoundError: A mesh is not there.
+        _OtherKind: It is of a kind that is not read.
+        RobotError: The element is malformed.
+    """
     mesh = visual.find("geometry/mesh")
-    found = resolved(mesh.get("filename", ""), Path(file).parent)
+    if mesh is None:
+        return read.shape(file, where, visual, colors)
+    name = mesh.get("filename", "")
+    found = resolved(name, Path(file).parent)
     if found is None:
-        return None
-    scale = read.numbers(file, where, mesh, "scale", 3) if mesh.get("scale") else (1.0, 1.0, 1.0)
-    return MeshFile(found, scale=(scale[0], scale[1], scale[2]), placement=read.placement(file, where, visual))
+        raise FileNotFoundError(name)
+    if found.suffix.lower() not in KINDS:
+        raise _OtherKind(name)
+    color, place = _own_color(visual, colors, where, file), read.placement(file, where, visual)
+    return MeshFile(found, scale=_scale(file, where, mesh), placement=place, color=color)
+
+
+def _scale(file: str, where: str, mesh: Any) -> Vec3:
+    """Return the factors along the axes of a mesh; one number counts for all of them."""
+    words = mesh.get("scale", "").split()
+    if len(words) < 2:
+        factor = read.number(file, where, mesh if words else None, "scale", 1.0)
+        return (factor, factor, factor)
+    x, y, z = read.numbers(file, where, mesh, "scale", 3)
+    return (x, y, z)
 
 
 def _own_color(visual: Any, colors: dict[str, Color], where: str, file: str) -> Color | None:
@@ -122,20 +157,27 @@ def _own_color(visual: Any, colors: dict[str, Color], where: str, file: str) -> 
 
 
 def resolved(name: str, folder: Path) -> Path | None:
-    """Return the file that a URDF in a folder names; None if it is not there or of another kind.
+    """Return the file that a URDF in a folder names; None if it is not there.
 
-    Of the address of a package, the folder of that name is that of the URDF or above it, or lies beside one of these.
+    Of the address of a package or model, the folder of that name is that of the URDF or above it, or lies beside one of
+    these. Characters such as spaces may be written as `%20`, as addresses have them.
     """
+    places = (place for spelled in (name, unquote(name)) for place in _places(spelled, folder))
+    return next((one for one in places if "\0" not in str(one) and one.is_file()), None)
+
+
+def _places(name: str, folder: Path) -> list[Path]:
+    """Return where a file may be."""
     kind, colons, rest = name.partition("://")
     if not colons:
-        places = [folder / name]
-    elif kind == "package":
-        package, _, inside = rest.partition("/")
-        above = [folder.resolve(), *folder.resolve().parents]
-        places = [one / inside for one in above if one.name == package] + [one / package / inside for one in above]
-    else:
-        places = [Path(rest)] if kind == "file" else []
-    return next((one for one in places if one.suffix.lower() in KINDS and one.is_file()), None)
+        return [folder / name.removeprefix("file:")]
+    if kind == "file":
+        return [Path(rest.removeprefix("localhost"))]
+    if kind not in ("package", "model"):
+        return []
+    package, _, inside = rest.partition("/")
+    above = [folder.resolve(), *folder.resolve().parents]
+    return [one / inside for one in above if one.name == package] + [one / package / inside for one in above]
 
 
 def _of_mjcf(path: Path) -> Iterator[tuple[str, Visual]]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.model.errors import listed_names
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.page.poses import PosedRollout
 from ce_gym.viewer.page.robot import body_paths
@@ -106,7 +107,7 @@ def chosen(found: Sequence[Charts], wanted: Sequence[str], count: int = 3) -> li
     for word in wanted:
         matches = [name for name in known if name.startswith(word)] or [name for name in known if word in name]
         if not matches:
-            raise ViewerError(f"no signal {word!r} to plot; expected one of {', '.join(known)}")
+            raise ViewerError(f"no signal {word!r} to plot; expected one of {listed_names(word, known)}")
         names.append(matches[0])
     if names or not found:
         return names

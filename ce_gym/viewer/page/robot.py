@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.model.description import Body, Robot, Shape
+from ce_gym.model.errors import listed_names
 from ce_gym.model.frames import Placement
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.meshes.triangles import MOST, Triangles
@@ -43,7 +44,7 @@ def placed_scans(scans: Sequence[Mapping[str, Any]], robot: Robot, root: str) ->
     links = {"": next(iter(paths.values())), **paths}
     for scan in scans:
         if scan["link"] not in links:
-            raise ViewerError(f"scan: link={scan['link']!r}; expected one of {', '.join(paths)}")
+            raise ViewerError(f"scan: link={scan['link']!r}; expected one of {listed_names(scan['link'], paths)}")
     return [{**scan, "path": links[scan["link"]]} for scan in scans]
 
 

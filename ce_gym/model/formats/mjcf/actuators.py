@@ -98,7 +98,7 @@ def _largest_force(source: MjcfSource, a: int) -> float:
     if model.actuator_forcelimited[a]:
         largest = float(np.abs(model.actuator_forcerange[a]).max())
     motor = model.actuator_biastype[a] == source.mujoco.mjtBias.mjBIAS_NONE
-    if motor and model.actuator_ctrllimited[a]:
+    if motor and model.actuator_ctrllimited[a] and source.enabled("CLAMPCTRL"):
         gain = abs(float(model.actuator_gainprm[a][0]))
         largest = min(largest, gain * float(np.abs(model.actuator_ctrlrange[a]).max()))
     return largest

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
 from ce_gym.model.description import Body, Inertial, Joint, Shape
 from ce_gym.model.errors import bad
 from ce_gym.model.formats.hinges import coincident_hinges
+from ce_gym.model.formats.mjcf.scenes import robot_hint
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement, rotation
 from ce_gym.model.formats.placement import compose, mat3, merge_inertials, transform_inertial, vec3
 from ce_gym.model.formats.rotor_links import FixedLink
@@ -73,12 +75,18 @@ def read_bodies(
     for index in range(1, model.nbody):
         _add_body(source, tree, index, locked, hinged, apart)
     if not tree.bodies:
-        raise bad(source.file, "bodies", (), "at least one body that moves")
+        hint = robot_hint(Path(source.file))
+        raise bad(source.file, "bodies that move", (), f"a robot, which has a body with a joint{hint}")
     _report_forces(source)
     tree.bodies.sort(key=lambda body: body.joint.type != "free")
     free = [body.name for body in tree.bodies if body.joint.type == "free"]
     if len(free) > 1:
-        raise bad(source.file, "bodies that move freely", tuple(free), "one robot, so at most one free joint")
+        raise bad(
+            source.file,
+            "bodies that move freely",
+            tuple(free),
+            "one robot, so at most one free joint; take the others out",
+        )
     return tree
 
 

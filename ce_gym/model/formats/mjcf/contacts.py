@@ -26,6 +26,7 @@ from ce_gym.model.description import ContactMaterial, ContactSphere
 from ce_gym.model.formats.contact_shapes import DIAGONALS, Sphere, points, spheres_of
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.source import MjcfSource, rotation
+from ce_gym.model.formats.mjcf.touching import can_touch, is_ground, solid, touch_of, touched
 from ce_gym.model.formats.placement import transform_point, vec3
 
 FOOT_BAND = 0.02
@@ -34,54 +35,42 @@ FOOT_BAND = 0.02
 RIM = 4
 """Points on each rim of a cylinder."""
 
-_DEFAULT_SOLVER = ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0))  # MuJoCo's solref and solimp
-
 
 def read_contacts(source: MjcfSource, tree: MjcfTree) -> tuple[tuple[ContactSphere, ...], ContactMaterial, float]:
     """Return the contact spheres, their material, and how high their lowest underside is [m] (0 without any)."""
     geoms = [g for g in range(source.model.ngeom) if _carrier(source, tree, g) is not None]
     ground = [g for g in range(source.model.ngeom) if _carrier(source, tree, g) is None]
-    touching = [g for g in geoms if _touches(source, g, ground)]
     _report_ground(source, ground)
     _report_between(source, tree, geoms)
-    spheres, heights = [], []
-    for geom in touching:
+    spheres, heights, frictions = [], [], list[float]()
+    for geom, friction in _frictions(source, geoms, ground):
         for name, centre, radius in _spheres(source, geom):
             body, frame = tree.frames[source.model.geom_bodyid[geom]]
             point = np.array(source.model.geom_pos[geom]) + rotation(source.model.geom_quat[geom]) @ centre
             spheres.append(ContactSphere(name, str(body), transform_point(frame, vec3(point)), radius))
             world = source.data.geom_xpos[geom] + source.data.geom_xmat[geom].reshape(3, 3) @ centre
             heights.append(float(world[2]) - radius)
-    return _grouped(spheres, heights, tree), _material(source, touching, ground), min(heights, default=0.0)
+            frictions.append(friction)
+    contacts = _grouped(spheres, heights, tree)
+    return contacts, _material(source, contacts, frictions), min(heights, default=0.0)
+
+
+def _frictions(source: MjcfSource, geoms: list[int], ground: list[int]) -> Iterator[tuple[int, float]]:
+    """Iterate over the geoms that can touch the ground and their friction with it; note what else contacts have."""
+    anything, unlike = any(solid(source, g) for g in ground), dict[str, None]()
+    for geom in geoms:
+        under = touched(source, geom, ground)
+        if not under and (anything or not solid(source, geom)):
+            continue
+        touches = [touch_of(source, geom, g) for g in under or [None]]
+        unlike |= {what: None for touch in touches for what in touch.other}
+        yield geom, max(touch.friction for touch in touches)
+    for what in unlike:
+        source.leave_out(what)
 
 
 def _carrier(source: MjcfSource, tree: MjcfTree, geom: int) -> str | None:
     return tree.frames[source.model.geom_bodyid[geom]][0]
-
-
-def _match(source: MjcfSource, a: int, b: int) -> bool:
-    """Whether the masks of two geoms let them touch."""
-    own, other = source.model.geom_contype, source.model.geom_conaffinity
-    return bool(own[a] & other[b] or own[b] & other[a])
-
-
-def _touches(source: MjcfSource, geom: int, ground: list[int]) -> bool:
-    model = source.model
-    solid = [g for g in ground if _solid(source, g)]
-    pairs = {frozenset((int(a), int(b))) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)}
-    if any(frozenset((geom, g)) in pairs for g in ground):
-        return True
-    excluded = {int(x) for x in model.exclude_signature}
-    body = int(model.geom_bodyid[geom])
-    free = [g for g in solid if not {(int(model.geom_bodyid[g]) << 16) + body, body << 16} & excluded]
-    if solid:
-        return any(_match(source, geom, g) for g in free)
-    return _solid(source, geom)
-
-
-def _solid(source: MjcfSource, geom: int) -> bool:
-    """Whether a geom touches anything at all."""
-    return bool(source.model.geom_contype[geom] or source.model.geom_conaffinity[geom])
 
 
 def _spheres(source: MjcfSource, geom: int) -> Iterator[Sphere]:
@@ -143,29 +132,29 @@ def _trunk(spheres: list[ContactSphere], tree: MjcfTree, base: str | None) -> se
     return {base} | {carrier for carrier, bodies in limbs.items() if len(bodies) > 1}
 
 
-def _material(source: MjcfSource, touching: list[int], ground: list[int]) -> ContactMaterial:
-    """Return MuJoCo's friction, the larger of the two that touch; its compliance has no counterpart in N/m."""
-    model = source.model
-    under = [g for g in ground if _solid(source, g)]
-    rough = max((float(model.geom_friction[g][0]) for g in under), default=0.0)
-    values = sorted({max(float(model.geom_friction[g][0]), rough) for g in touching})
-    if len(values) > 1:
-        every = ", ".join(f"{value:g}" for value in values)
-        source.leave_out("friction other than {}", f"{values[-1]:g} (the file has {every})")
-    if any(model.geom_condim[g] > 3 for g in touching):
-        source.leave_out("torsional and rolling friction")
-    solvers = [(tuple(map(float, model.geom_solref[g])), tuple(map(float, model.geom_solimp[g]))) for g in touching]
-    if any(not np.allclose(np.hstack(solver), np.hstack(_DEFAULT_SOLVER)) for solver in solvers):
-        source.leave_out("the compliance of contacts (solref, solimp)")
-    return ContactMaterial(friction=values[-1]) if values else ContactMaterial()
+def _material(source: MjcfSource, contacts: tuple[ContactSphere, ...], frictions: list[float]) -> ContactMaterial:
+    """Return the friction that most feet have, of all contacts if there are no feet.
+
+    MuJoCo's compliance of contacts has no counterpart in N/m.
+    """
+    if not contacts:
+        return ContactMaterial()
+    pairs = list(zip(contacts, frictions, strict=True))
+    feet = [friction for contact, friction in pairs if contact.group == "foot"] or frictions
+    chosen = max(sorted(set(feet), reverse=True), key=feet.count)
+    others: dict[float, list[str]] = {}
+    for contact, friction in pairs:
+        if friction != chosen:
+            others.setdefault(friction, []).append(contact.name)
+    for friction, names in sorted(others.items()):
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        source.leave_out(f"friction other than {chosen:g}: {{}}", f"{friction:g} of {names[0]}{more}")
+    return ContactMaterial(friction=chosen)
 
 
 def _report_ground(source: MjcfSource, ground: list[int]) -> None:
-    model, plane = source.model, source.mujoco.mjtGeom.mjGEOM_PLANE
     for g in ground:
-        normal, height = source.data.geom_xmat[g].reshape(3, 3)[:, 2], source.data.geom_xpos[g][2]
-        flat = model.geom_type[g] == plane and np.allclose(normal, (0, 0, 1)) and abs(height) < 1e-9
-        if _solid(source, g) and not flat:
+        if solid(source, g) and not is_ground(source, g):
             source.leave_out("obstacle {} (the ground is the plane z = 0)", source.name("geom", g))
 
 
@@ -175,7 +164,7 @@ def _report_between(source: MjcfSource, tree: MjcfTree, geoms: list[int]) -> Non
     for i, a in enumerate(geoms):
         for b in geoms[:i]:
             first, second = str(_carrier(source, tree, a)), str(_carrier(source, tree, b))
-            apart = first != second and first != parents[second] and second != parents[first]
-            if apart and _match(source, a, b):
+            jointed = source.enabled("FILTERPARENT") and (first == parents[second] or second == parents[first])
+            if first != second and not jointed and can_touch(source, a, b):
                 source.leave_out("contact between bodies of the robot")
                 return

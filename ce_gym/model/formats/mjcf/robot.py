@@ -32,7 +32,8 @@ from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, shapes
 from ce_gym.model.formats.mjcf.contacts import read_contacts
 from ce_gym.model.formats.mjcf.equalities import choose_independent, locked_joints, read_constraints
 from ce_gym.model.formats.mjcf.rotors import add_rotors
-from ce_gym.model.formats.mjcf.source import MjcfSource, quaternion, read_mjcf, summary
+from ce_gym.model.formats.mjcf.source import MjcfSource, quaternion, read_mjcf, rotation, summary
+from ce_gym.model.formats.mjcf.unmodelled import report_unmodelled
 from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink
@@ -42,6 +43,8 @@ from ce_gym.model.frames import Placement
 
 Angles = tuple[tuple[str, float], ...]  # pairs (body, joint coordinate [rad or m])
 
+UPRIGHT = 1e-3
+"""A base that is inclined by less than this in the reference pose is upright [rad]: keyframes are rounded."""
 DEEPEST = 0.01
 """A reference pose in which contacts are further below ground than this is raised [m]."""
 
@@ -94,13 +97,13 @@ def read_robot(
     tree.bodies[:] = with_rotors(tree.bodies, constraints, [b for b in tree.moved_by.values() if b not in links])
     ties = add_rotors(source, tree, _ratios(gears, tree, driven), driven)
     pose, assembly = _pose(source, tree, independent, lowest)
-    _report_world(source)
+    report_unmodelled(source)
     robot = Robot(
         name=_name(source, path),
         bodies=tuple(tree.bodies),
         constraints=(*constraints, *ties),
         independent=independent,
-        contacts=contacts if source.enabled("CONTACT") else (),
+        contacts=contacts if source.enabled("CONTACT") and source.enabled("CONSTRAINT") else (),
         material=material,
         pose=pose,
         assembly=assembly,
@@ -154,8 +157,11 @@ def _pose(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...], lowe
         address = model.jnt_qposadr[j]
         if model.jnt_type[j] == source.mujoco.mjtJoint.mjJNT_FREE:
             height = float(qpos[address + 2])
-            if not np.allclose(qpos[address + 3 : address + 7], (1, 0, 0, 0), atol=1e-9):
-                source.leave_out("the inclination of the base in the reference pose")
+            up = rotation(qpos[address + 3 : address + 7])[:, 2]  # the base's z axis in the world, whatever the yaw
+            inclination = float(np.arctan2(np.hypot(up[0], up[1]), up[2]))
+            if inclination > UPRIGHT:
+                told = f"{np.degrees(inclination):.3g} degrees"
+                source.leave_out("the inclination of the base in the reference pose ({})", told)
             if source.moved:
                 height -= lowest  # feet just touch
             elif lowest < -DEEPEST:
@@ -172,18 +178,3 @@ def _pose(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...], lowe
             angles[body] = allowed
     dependent = tuple((body, angle) for body, angle in angles.items() if body not in independent)
     return Pose(height, tuple((body, angles.get(body, 0.0)) for body in independent), tuple(balls)), dependent
-
-
-def _report_world(source: MjcfSource) -> None:
-    """Note what acts on the whole robot."""
-    model = source.model
-    for what, value in (("wind", model.opt.wind), ("density", model.opt.density), ("viscosity", model.opt.viscosity)):
-        if np.any(value):
-            source.leave_out("{} of the medium", what)
-    for count, what in ((model.nflex, "deformable bodies"), (model.nplugin, "plugins")):
-        if count:
-            source.leave_out(what)
-    for t in range(model.ntendon):
-        acts = [getattr(model, f"tendon_{key}")[t] for key in ("stiffness", "damping", "frictionloss", "limited")]
-        if any(map(np.any, acts)):
-            source.leave_out("spring, damper, friction or limit of tendon {}", source.name("tendon", t))

@@ -21,15 +21,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ce_gym.model.constraints import LinearConstraint
-from ce_gym.model.description import Body, Joint
+from ce_gym.model.description import UNKNOWN_RATIO, Body, Joint
 from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.equalities import drives_joint, tendon_coefficients
 from ce_gym.model.formats.mjcf.source import MjcfSource
 from ce_gym.model.formats.rotor_links import disc, without_rotors
 from ce_gym.model.frames import Placement
-
-UNKNOWN_RATIO = 1e6
-"""Gear ratio in place of one that is not known: the rotor's own inertia is then 1e-12 of the reflected one."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from ce_gym.model.checks.body import LARGEST_FIGURE
 from ce_gym.model.checks.robot import MOST_BODIES
 from ce_gym.model.errors import RobotError, bad, printable
 from ce_gym.model.formats.mjcf.limits import check_file
+from ce_gym.model.formats.mjcf.scenes import scene_hint
 from ce_gym.model.formats.placement import exact_right_angles, vec3
 from ce_gym.model.formats.text_file import one_line
 from ce_gym.model.frames import Placement, rotation_matrix
@@ -104,11 +105,11 @@ def read_mjcf(path: Path) -> MjcfSource:
     except ImportError:
         raise RobotError(f"{path}: MJCF is read by MuJoCo: expected the package; pip install 'ce_gym[mjcf]'") from None
     try:
-        with _without_log(mujoco):
-            model = mujoco.MjModel.from_xml_path(str(path))
-            source = MjcfSource(str(path), mujoco, model, mujoco.MjData(model))
+        model = _compiled(mujoco, path)
+        source = MjcfSource(str(path), mujoco, model, mujoco.MjData(model))
     except Exception as error:  # MuJoCo raises ValueError, FatalError, MemoryError and others
-        raise RobotError(f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})") from None
+        told = f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})"
+        raise RobotError(told + scene_hint(path, lambda other: _is_readable(mujoco, other))) from None
     _check_figures(str(path), model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, source.data, 0)
@@ -116,6 +117,37 @@ def read_mjcf(path: Path) -> MjcfSource:
         _move_within_limits(source)
     source.forward()
     return source
+
+
+def _compiled(mujoco: Any, path: Path) -> Any:
+    with _without_log(mujoco):
+        model = mujoco.MjModel.from_xml_path(str(path))
+    _switch_off(mujoco, model)
+    return model
+
+
+def _is_readable(mujoco: Any, path: Path) -> bool:
+    try:
+        check_file(path)
+        _compiled(mujoco, path)
+    except Exception:  # as above
+        return False
+    return True
+
+
+def _switch_off(mujoco: Any, model: Any) -> None:
+    """Set to zero what the <flag> of a file disables; gravity, contacts and actuators apart, see `enabled`."""
+    for features, figures in (
+        (("CONSTRAINT", "FRICTIONLOSS"), ("dof_frictionloss", "tendon_frictionloss")),
+        (("CONSTRAINT", "LIMIT"), ("jnt_limited", "tendon_limited")),
+        (("CONSTRAINT", "EQUALITY"), ("eq_active0",)),
+        (("PASSIVE", "SPRING"), ("jnt_stiffness", "tendon_stiffness")),  # PASSIVE: before MuJoCo 3.4
+        (("PASSIVE", "DAMPER"), ("dof_damping", "tendon_damping")),
+    ):
+        bits = [int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{feature}", 0)) for feature in features]
+        if any(model.opt.disableflags & bit for bit in bits):
+            for figure in figures:
+                getattr(model, figure)[:] = 0
 
 
 def _move_within_limits(source: MjcfSource) -> None:

@@ -1,0 +1,60 @@
+"""A robot at a transmission level as MJCF can say it: rotors that MuJoCo cannot hold as bodies become armature.
+
+MuJoCo refuses bodies of less than 1e-15 kg m^2, and a gear multiplies whatever is added to a rotor's inertia by the
+square of its ratio. A rotor below that, or behind a ratio as large as the one that stands for an unknown ratio (see
+`model/formats/mjcf/rotors.py`), is written at `exact` as what it reflects. What armature leaves out of a rotor is its
+own inertia over the ratio, so that is exact to 1 / LARGEST_RATIO of the reflected inertia.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ce_gym.export.joint_ties import Tie, joint_ties
+from ce_gym.model.description import Body, Robot
+from ce_gym.model.mechanism import Mechanism, build_mechanism, seen_from_parent
+
+SMALLEST_INERTIA = 1e-13
+"""Moment of inertia given to a body without any [kg m^2]; MuJoCo refuses moving bodies without inertia."""
+
+LARGEST_RATIO = 1e5
+"""Gear ratio from which on a rotor is written as armature; those of real gears are far below."""
+
+
+def mjcf_mechanism(robot: Robot, level: str) -> Mechanism:
+    """Prepare a robot for MJCF at a transmission level; arguments and errors as of `build_mechanism`."""
+    mechanism = build_mechanism(robot, level, eliminate=False)
+    if level != "exact":
+        return mechanism
+    ties = joint_ties(mechanism)
+    light = {rotor.name: rotor for rotor in robot.rotors() if _is_light(robot, rotor, ties)}
+    if not light:
+        return mechanism
+    bodies = {name: moving for name, moving in mechanism.bodies.items() if name not in light}
+    for rotor in light.values():
+        if rotor.parent is not None:
+            carrier = bodies[rotor.parent]
+            bodies[rotor.parent] = replace(carrier, inertia=carrier.inertia + seen_from_parent(rotor))
+    reflected = build_mechanism(robot, "coupled").spins
+    spins = tuple(tuple(spin for spin in cluster if spin.rotor in light) for cluster in reflected)
+    return replace(mechanism, bodies=bodies, spins=spins)
+
+
+def largest_ratio(tie: Tie) -> float:
+    """Return the largest gear ratio between a rotor and a joint that drives it; 1 if none does."""
+    return max((abs(ratio) for ratio in tie.ratios.values()), default=1.0)
+
+
+def _is_light(robot: Robot, rotor: Body, ties: Mapping[str, Tie]) -> bool:
+    """Whether a rotor is written as armature; one that does more than to spin behind a gear stays a body."""
+    tie, joint, others = ties[rotor.name], rotor.joint, {body.parent for body in robot.bodies}
+    others |= {contact.body for contact in robot.contacts}
+    others |= {body for constraint in robot.constraints if not constraint.linear for body in constraint.bodies}
+    if rotor.name in others or rotor.name in tie.ratios or joint.friction or joint.damping or joint.stiffness:
+        return False
+    axis = np.array(joint.axis)
+    moment = float(axis @ np.array(rotor.inertial.inertia) @ axis)
+    return largest_ratio(tie) >= LARGEST_RATIO or moment < SMALLEST_INERTIA

@@ -1,0 +1,55 @@
+"""Hints for MJCF that is spread over several files: a scene without its robot, a robot that needs its scene."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from ce_gym.model.errors import RobotError
+from ce_gym.model.formats.text_file import read_text
+
+MOST_SEARCHED, MOST_NAMED = 50, 3
+"""How many files beside one are searched for what it lacks, and how many of them a message names."""
+
+
+def scene_hint(path: Path, is_readable: Callable[[Path], bool]) -> str:
+    """Return which files beside an MJCF file include it, as the end of a message that it cannot stand alone.
+
+    Args:
+        path: The file.
+        is_readable: Whether MuJoCo reads a file.
+    """
+    scenes = [other for other, text in _beside(path) if _includes(text, path)]
+    names = [other.name for other in scenes[:MOST_NAMED] if is_readable(other)]
+    return f"; it is a part of {', '.join(names)}: read that" if names else ""
+
+
+def robot_hint(path: Path) -> str:
+    """Return which files beside a scene have robots, as the end of a message that the scene has none."""
+    own = read_text(path, "an MJCF file")
+    names = [
+        other.name
+        for other, text in _beside(path)
+        if re.search(r"<(freejoint|joint)\b", text.partition("<worldbody")[2]) and not _includes(own, other)
+    ]
+    listed = ", ".join(names[:MOST_NAMED])
+    return f"; this may be a scene for the robot in {listed}: read that, or <include> it here" if names else ""
+
+
+def _includes(text: str, part: Path) -> bool:
+    """Whether a text of MJCF includes or attaches a file of some name."""
+    name = rf"[\"'](?:[^\"']*/)?{re.escape(part.name)}[\"']"
+    return re.search(rf"<(?:include|model)\b[^>]*\bfile\s*=\s*{name}", text) is not None
+
+
+def _beside(path: Path) -> Iterator[tuple[Path, str]]:
+    """Iterate over the other MJCF files of a folder and their texts."""
+    for other in sorted(path.parent.glob("*.xml"))[:MOST_SEARCHED]:
+        if other.name != path.name:
+            try:
+                text = read_text(other, "an MJCF file")
+            except RobotError:
+                continue
+            if "<mujoco" in text:
+                yield other, text

@@ -1,0 +1,231 @@
+"""What the pages say of the robots that ship with the package is what the robots' files say.
+
+Each row is a sentence with its figures worked out from the robot: it fails if page or file changes without the other.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ce_gym
+from ce_gym.diagnostics.levels import report_levels
+from ce_gym.diagnostics.levels_text import as_text
+from ce_gym.diagnostics.standing import joints_at_feet, pitch_stiffness, toppling
+from ce_gym.dynamics import Model
+from ce_gym.model import Robot
+from ce_gym.model.mechanism import is_axisymmetric
+
+ROOT = Path(ce_gym.__file__).parents[1]
+WORDS = ("", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+WORDS += ("thirteen", "fourteen", "fifteen", "sixteen")
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.InertiaWarning")
+
+
+@cache
+def model(name: str, level: str = "exact") -> Model:
+    return Model(name, level)
+
+
+def robot(name: str) -> Robot:
+    return model(name).robot
+
+
+def ratios(name: str) -> list[float]:
+    """Return the gear ratios of a robot, ascending: rotors turn by them for a joint."""
+    rotors = {body.name for body in robot(name).rotors()}
+    ties = [tie for tie in robot(name).constraints if tie.linear and rotors & set(tie.bodies)]
+    return sorted({abs(x) for tie in ties for body, x in dict(tie.coefficients).items() if body not in rotors})
+
+
+def undriven(name: str) -> list[str]:
+    """Return the joints that no rotor turns with."""
+    tied = {body for tie in robot(name).constraints for body in tie.bodies}
+    return [joint for joint in robot(name).commanded if joint not in tied]
+
+
+def gains(name: str, *parts: str) -> set[float]:
+    return {gain for joint, gain in robot(name).gains.kp if any(part in joint for part in parts)}
+
+
+def the(values: set[float]) -> str:
+    (value,) = values
+    return f"{value:g}"
+
+
+def instructions(name: str, level: str = "exact") -> int:
+    return model(name, level).n_instructions("forward_dynamics")
+
+
+def damping(name: str) -> str:
+    return f"{max(robot(name).body(joint).joint.damping for joint in robot(name).commanded):g}"
+
+
+def rods(name: str) -> int:
+    return sum(type(tie).__name__ == "RodConstraint" for tie in robot(name).constraints)
+
+
+def belts(name: str) -> bool:
+    rotors = {body.name for body in robot(name).rotors()}
+    return any(tie.linear and rotors & set(tie.bodies) and len(tie.bodies) > 2 for tie in robot(name).constraints)
+
+
+def level_row(name: str) -> str:
+    """Return the figures of `armature` as the report prints them, cells of a row of a page."""
+    line = next(line for line in as_text(report_levels(model(name))).splitlines() if line.startswith("  armature"))
+    return " | ".join(re.split(r"\s{2,}", line.strip())[1:])
+
+
+def floating() -> list[str]:
+    return [name for name in ce_gym.robots() if robot(name).floating]
+
+
+def walking() -> set[str]:
+    return {name.partition("_velocity")[0] for name in ce_gym.shipped_policies() if "_velocity" in name}
+
+
+def stands(name: str) -> str:
+    at_feet = joints_at_feet(model(name))
+    own = pitch_stiffness(model(name), at_feet)
+    return f"{toppling(model(name), at_feet):.{1 if name == 'dr_legs' else 0}f} | {own:.0f} |"
+
+
+def kept(name: str) -> tuple[str, ...]:
+    return robot(name).kept_inertia
+
+
+CHEETAH, HUMANOID, TELLO, ANYMAL, JVRC, G1 = "mini_cheetah", "mit_humanoid", "tello", "anymal_c", "jvrc1", "g1"
+CONTACTS = {
+    **{"Spot": "spot", "ANYmal C": ANYMAL, "T1": "t1", "Mini Cheetah": CHEETAH, "G1": G1, "H1": "h1", "Go1": "go1"},
+    **{"MIT Humanoid": HUMANOID, "Tello": TELLO, "Tello with arms": "tello_with_arms", "JVRC-1": JVRC, "Go2": "go2"},
+    **{"Berkeley Humanoid": "berkeley_humanoid", "Cassie": "cassie", "DR Legs": "dr_legs"},
+}
+STANDING = {"DR Legs": "dr_legs", "Cassie": "cassie", "H1": "h1", "Berkeley Humanoid": "berkeley_humanoid"}
+STANDING |= {"T1": "t1", "G1": G1}
+STATEMENTS: list[tuple[str, Callable[[], str]]] = [
+    ("exactness.md", lambda: f"| gears, ratio {ratios(CHEETAH)[0]:.0f} to {ratios(CHEETAH)[-1]:.0f} (Mini Cheetah) |"),
+    ("exactness.md", lambda: f"| Mini Cheetah (gears of {ratios(CHEETAH)[0]:g} and {ratios(CHEETAH)[-1]:g}) |"),
+    ("exactness.md", lambda: f"| belts, ratio {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g} (MIT Humanoid) |"),
+    ("exactness.md", lambda: f"(gears of {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g}, belts) |"),
+    ("exactness.md", lambda: f"| differentials, ratio {the(set(ratios(TELLO)))} (Tello) |"),
+    ("exactness.md", lambda: f"| Tello (gears of {the(set(ratios(TELLO)))}, differentials) |"),
+    ("exactness.md", lambda: f"| gears, ratio {the(set(ratios(ANYMAL)))} (ANYmal C) |"),
+    ("exactness.md", lambda: f"| ANYmal C (gears of {the(set(ratios(ANYMAL)))}) | {level_row(ANYMAL)} |"),
+    ("exactness.md", lambda: f"| gears, ratio {the(set(ratios(JVRC)))}, rotors light beside the links (JVRC-1) |"),
+    ("exactness.md", lambda: f"| JVRC-1 (gears of {the(set(ratios(JVRC)))}, light rotors) | {level_row(JVRC)} |"),
+    ("exactness.md", lambda: f"| Unitree G1 (ratios of {ratios(G1)[0]:.0f} to {ratios(G1)[-1]:.0f}, cranks and rods"),
+    ("transmission.md", lambda: "as on Mini Cheetah, `coupled` and" if not belts(CHEETAH) else "belts"),
+    ("faq.md", lambda: "Belts and differentials (MIT Humanoid, Tello)" if belts(HUMANOID) and belts(TELLO) else "none"),
+    (
+        "transmission.md",
+        lambda: (
+            f"Of the robots that come along, {' '.join(n for n in ce_gym.robots() if robot(n).elastic)} has such "
+            "figures".replace("mini_cheetah", "Mini Cheetah")
+        ),
+    ),
+    ("faq.md", lambda: f"Cheetah's hips and of JVRC-1's rotors are such. {'' if kept(JVRC) == ('*-rotor',) else '?'}"),
+    ("faq.md", lambda: f'`kept_inertia: ["{"".join(kept(CHEETAH))}"]`'),
+    (
+        "how_it_works.md",
+        lambda: (
+            f"makes {sum(not is_axisymmetric(rotor) for rotor in robot(JVRC).rotors())} of the "
+            f"{sum(1 for _ in robot(JVRC).rotors())} lopsided: its exact forward dynamics takes {instructions(JVRC)} "
+        ),
+    ),
+    ("environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
+    ("README.md", lambda: f"| {instructions(CHEETAH)} / {instructions(CHEETAH, 'armature')} ="),
+    ("README.md", lambda: f"sub-steps of {WORDS[len(floating())]} robots beside MuJoCo's"),
+    ("README.md", lambda: f"Policies of {WORDS[len(walking())]} robots come with the package"),
+    ("README.md", lambda: f"| DR Legs, {WORDS[2 * 3]} loops |"),  # what is published; the file has rods for some links
+    ("robots.md", lambda: f"The {WORDS[len(floating())]} robots of the package that tasks can have"),
+    ("robots.md", lambda: f"a screw with a lead of {2000 * math.pi / ratios('spot')[-1]:.0f} mm"),
+    (
+        "robots.md",
+        lambda: (
+            f"at the knee ({robot('cassie').body('left_shin').joint.stiffness:.0f} N m/rad) and one at the heel "
+            f"({robot('cassie').body('left_heel_spring').joint.stiffness:.0f} N m/rad), both passive"
+        ),
+    ),
+    ("robots.md", lambda: f'forward_dynamics")`, {instructions("cassie"):,} and'),
+    ("robots.md", lambda: f"instructions, 73,514 for {instructions('dr_legs'):,}"),
+    ("robots.md", lambda: f"for a robot {100 * robot('dr_legs').pose.height:.0f} cm high"),
+    ("robots.md", lambda: f"29 g of {robot('dr_legs').total_mass:.1f} kg"),
+    ("robots.md", lambda: f"{WORDS[len(robot('dr_legs').motors) // 2]} servos. Two thighs turn"),
+    ("robots.md", lambda: f"at {_stop('dr_legs', 'left_bracket_a_inner'):.0f}° of yaw and roll of the inner cross"),
+    (
+        "robots.md",
+        lambda: (
+            f"H1 {the(gains('h1', 'hip_roll', 'hip_pitch', 'knee'))} N m/rad at hips and knees "
+            f"({the(gains('h1', 'hip_yaw'))} at the hips' yaw) and {the(gains('h1', 'ankle'))} at the ankles"
+        ),
+    ),
+    (
+        "robots.md",
+        lambda: (
+            "the Berkeley Humanoid "
+            f"{min(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g} to "
+            f"{max(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g}, "
+            f"{the(gains('berkeley_humanoid', 'ffe'))} and {the(gains('berkeley_humanoid', 'faa'))} at the feet"
+        ),
+    ),
+    (
+        "stability.md",
+        lambda: (
+            f"JVRC-1's joints are damped by their files ({damping(CHEETAH)} and {damping(JVRC)} N m s/rad), which "
+            f"takes more than that; MIT Humanoid's and Tello's are {'not at all' if damping(TELLO) == '0' else '?'}"
+        ),
+    ),
+    (
+        "numerics.md",
+        lambda: (
+            f"Mini Cheetah's shanks ({the(gains(CHEETAH, 'knee'))} N m/rad, "
+            f"k = {robot(CHEETAH).material.stiffness / 1e4:g} 10⁴ N/m)"
+        ),
+    ),
+    ("numerics.md", lambda: f", {robot(HUMANOID).material.stiffness / 1e4:g} 10⁴ N/m) 0.05"),
+    *(("robots.md", lambda t=t, n=n: f"| {t} | {len(robot(n).contacts)} |") for t, n in CONTACTS.items()),
+    *(("robots.md", lambda t=t, n=n: f"| {t} | {stands(n)}") for t, n in STANDING.items()),
+]
+
+
+def _kinds(joints: list[str]) -> str:
+    """Return which parts of a body joints belong to: wrists, neck."""
+    parts = dict.fromkeys(re.sub("^(left|right)-", "", joint).split("-")[0] for joint in joints)
+    return " and ".join(f"the {part}" if part == "neck" else f"{part}s" for part in parts)
+
+
+def _stop(name: str, joint: str) -> float:
+    return math.degrees(robot(name).body(joint).joint.position[1])
+
+
+@pytest.mark.parametrize(("page", "statement"), STATEMENTS, ids=range(len(STATEMENTS)))
+def test_a_statement_is_what_the_file_says(page: str, statement: Callable[[], str]):
+    path = ROOT / page if page == "README.md" else ROOT / "docs" / page
+    text = " ".join(path.read_text(encoding="utf-8").split())
+    sentence = " ".join(statement().split())
+    assert sentence in text, f"{page} does not say: {sentence}"
+
+
+def test_most_of_what_the_knee_motor_accelerates_is_rotors():
+    """Three quarters, says transmission.md."""
+    legs = model(HUMANOID)
+    share = legs.mass_matrix(legs.standing_q), model(HUMANOID, "none").mass_matrix(legs.standing_q)
+    knee = legs.nv - len(legs.joint_links) + legs.joint_links.index("left_knee_link")
+    assert 1 - share[1][knee, knee] / share[0][knee, knee] == pytest.approx(0.75, abs=0.03)
+
+
+def test_a_step_is_a_quarter_of_the_legs():
+    """Of the MIT Humanoid, 0.15 m, says terrain.md: from the hips to the soles when its legs are straight."""
+    straight = model(HUMANOID)
+    q = np.array(straight.standing_q)
+    q[7:] = 0.0
+    heights = dict(zip(straight.body_names, straight.body_poses(q)[0][:, 2], strict=True))
+    soles = straight.contact_points(q, np.zeros(straight.nv))[0]
+    feet = [z for z, contact in zip(soles[:, 2], robot(HUMANOID).contacts, strict=True) if contact.group == "foot"]
+    assert 0.15 / (heights["left_hip_ry_link"] - min(feet)) == pytest.approx(0.25, abs=0.02)
