@@ -69,7 +69,7 @@ def commands(page: Path) -> Iterator[str]:
     text = page.read_text(encoding="utf-8")
     for block in blocks(page):
         if block.language == "sh":
-            yield from (line for line in block.text.splitlines() if line.strip())
+            yield from (line for line in block.text.replace("\\\n", " ").splitlines() if line.strip())
     prose = BLOCK.sub("", text)
     yield from (" ".join(code.split()) for code in re.findall(r"`((?:python|make|pip|cp) [^`]+)`", prose))
 

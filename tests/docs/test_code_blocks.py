@@ -66,9 +66,10 @@ def check_command(command: str) -> None:
     words = [word for word in shlex.split(command, comments=True) if word not in ("...",)]
     while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
         words.pop(0)
+    if words:
+        words[0] = Path(words[0]).name  # of an environment that the page has made
     if not words or " ".join(words).startswith(ELSEWHERE):
         return
-    words[0] = Path(words[0]).name  # of an environment that the page has made
     if words[0] == "make":
         targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert set(words[1:]) <= set(targets)
