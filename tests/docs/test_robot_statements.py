@@ -245,7 +245,7 @@ def test_most_of_what_the_knee_motor_accelerates_is_rotors():
 
 
 def test_a_step_is_a_quarter_of_the_legs():
-    """Of the MIT Humanoid, 0.15 m, says terrain_and_sensors.md: from the hips to the soles when its legs are straight."""
+    """Of the MIT Humanoid, 0.15 m (terrain_and_sensors.md): from the hips to the soles when its legs are straight."""
     straight = model(HUMANOID)
     q = np.array(straight.standing_q)
     q[7:] = 0.0
