@@ -4,8 +4,8 @@
 Ray starts the processes, wherever they are; gradients are averaged by torch's all-reduce, see averaged_ppo.py. If a
 process or its machine is lost, all are started again from the last iteration. Settings, files and arguments are those
 of train/fast_ppo.py, and each goes on from the other's policies; `num_envs` and `steps` count all processes together.
-Needs the extra `ray` in an environment of its own, see docs/rllib.md. (Ray is not installed where types are checked,
-hence the line above.) Uses public names of ce_gym only, and no name of a robot or task.
+Needs the extra `ray` in an environment of its own, see docs/how-to/learners.md. (Ray is not installed where types are
+checked, hence the line above.) Uses public names of ce_gym only, and no name of a robot or task.
 
     python train/ray_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --workers 2
     python train/ray_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --workers 8 --address auto --threads 16

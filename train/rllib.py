@@ -1,10 +1,11 @@
 # pyright: reportMissingImports=false
 """Train a policy with RLlib's PPO: processes that step a native batch each, on one machine or on a cluster.
 
-Needs the extra `ray` in an environment of its own, see docs/rllib.md. Settings come from the same files as those of
-train/ppo.py; `num_envs` counts the environments of all processes together. The policy is written as `policy.onnx` with
-its specification, which evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read. Uses public names of
-ce_gym only, and no name of a robot or task. (Ray is not installed where types are checked, hence the line above.)
+Needs the extra `ray` in an environment of its own, see docs/how-to/learners.md. Settings come from the same files as
+those of train/ppo.py; `num_envs` counts the environments of all processes together. The policy is written as
+`policy.onnx` with its specification, which evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read. Uses
+public names of ce_gym only, and no name of a robot or task. (Ray is not installed where types are checked, hence the
+line above.)
 
     python train/rllib.py --env ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --minutes 1
 """

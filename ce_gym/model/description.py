@@ -291,7 +291,7 @@ class Robot:
 
     @property
     def unknown_ratios(self) -> tuple[str, ...]:
-        """The rotors whose gear ratio the robot's file does not say, such as armature in MJCF: see `UNKNOWN_RATIO`."""
+        """The rotors whose gear ratio the robot's file does not say, such as armature in MJCF; see `UNKNOWN_RATIO`."""
         ties = [tie for tie in self.constraints if isinstance(tie, LinearConstraint)]
         steep = [tie for tie in ties if max(abs(x) for _, x in tie.coefficients) >= UNKNOWN_RATIO / 100]
         tied = {name for tie in steep for name in tie.bodies}

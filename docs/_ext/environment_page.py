@@ -175,25 +175,27 @@ def _info(program: TaskProgram) -> str:
 def _arguments(task: Task) -> Iterable[tuple[str, str, str]]:
     for name, (default, meaning) in FIRST.items():
         yield f"`{name}`", f"`{default}`", meaning
-    described = _attributes(Task)
+    described = attributes_of(inspect.getdoc(Task) or "")
     for field in fields(Task):
         if field.name not in ("rewards", "metrics"):
-            yield f"`{field.name}`", f"`{_plain(getattr(task, field.name))}`", described[field.name]
+            yield f"`{field.name}`", f"`{plain(getattr(task, field.name))}`", described[field.name]
 
 
-def _plain(value: Any) -> str:
+def plain(value: Any) -> str:
     """Return a value as a user would write it."""
     if hasattr(value, "items"):
-        return "{" + ", ".join(f'"{k}": {_plain(v)}' for k, v in value.items()) + "}"
+        return "{" + ", ".join(f'"{k}": {plain(v)}' for k, v in value.items()) + "}"
     if isinstance(value, tuple):
-        return "[" + ", ".join(_plain(item) for item in value) + "]"
+        return "[" + ", ".join(plain(item) for item in value) + "]"
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
-def _attributes(thing: Any) -> dict[str, str]:
-    """Return the entries of a docstring's section "Attributes", by name."""
-    text = (inspect.getdoc(thing) or "").split("Attributes:\n")[1].split("\n\n")[0]
-    entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", text, re.MULTILINE)
+def attributes_of(docstring: str) -> dict[str, str]:
+    """Return the entries of the section "Attributes" of a cleaned docstring, by name; none without such a section."""
+    if "Attributes:\n" not in docstring:
+        return {}
+    section = docstring.split("Attributes:\n")[1].split("\n\n")[0]
+    entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.MULTILINE)
     return {name: " ".join(meaning.split()) for name, meaning in entries}
 
 

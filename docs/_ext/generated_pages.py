@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import level_figures
+import reference_tables
 from drawing import tree_drawing
 from environment_page import environment_page, table, title
 from robot_page import picture, robot_page, shipped
@@ -45,8 +46,10 @@ def write_pages(folder: Path) -> None:
         drawn = (folder / "robots" / f"{robot}.png").exists()
         for task in tasks_of(robot):
             _write(folder / "environments" / f"{robot}_{task}.md", environment_page(robot, task, drawn))
-    measured = "```{toctree}\n:hidden:\n\ntraining\n```\n" if (folder.parent / "training.md").exists() else ""
-    _write(folder / "training.inc", measured)
+    for name in ("terms", "context", "task_arguments", "settings", "command_line", "policies"):
+        _write(folder / f"{name}.inc", getattr(reference_tables, name)())
+    for name, text in reference_tables.results().items():
+        _write(folder / "results" / f"{name}.inc", text)
     _write(folder / "environments.inc", _environment_list())
     _write(folder / "robots.inc", _robot_list())
     _write(folder / "motors.inc", _motor_list())
@@ -56,22 +59,20 @@ def write_pages(folder: Path) -> None:
 
 
 def _environment_list() -> str:
-    """A table of links, robots down and tasks across, and the pages' place in the contents."""
+    """A table of links, robots down and tasks across."""
     rows = [
         (
-            f"[{title(robot)}](generated/robots/{robot}.md)",
+            f"[{title(robot)}](/generated/robots/{robot}.md)",
             *(_environment_link(robot, task) for task in TASKS),
             ", ".join(_environment_link(robot, task) for task in tasks_of(robot) if task in SKILLS),
         )
         for robot in ROBOTS
     ]
-    pages = "\n".join(f"generated/environments/{robot}_{task}" for robot in ROBOTS for task in tasks_of(robot))
-    columns = ("", *(task.capitalize() for task in TASKS), "Skills")
-    return f"{table(columns, rows)}\n\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
+    return table(("", *(task.capitalize() for task in TASKS), "Skills"), rows) + "\n"
 
 
 def _environment_link(robot: str, task: str) -> str:
-    return f"[{task.replace('_', ' ')}](generated/environments/{robot}_{task}.md)"
+    return f"[{task.replace('_', ' ')}](/generated/environments/{robot}_{task}.md)"
 
 
 def _robot_list() -> str:
@@ -81,9 +82,9 @@ def _robot_list() -> str:
         robot = shipped(name)
         rotors = len(list(robot.rotors()))
         base = "floating" if robot.floating else "fixed"
-        link = f"[{title(name)}](generated/robots/{name}.md)"
+        link = f"[{title(name)}](/generated/robots/{name}.md)"
         rows.append((link, base, len(robot.independent), rotors, f"{robot.total_mass:.2f}"))
-    pages = "\n".join(f"generated/robots/{name}" for name in robots())
+    pages = "\n".join(f"/generated/robots/{name}" for name in robots())
     columns = ("robot", "base", "independent joints", "rotors", "mass [kg]")
     return f"{table(columns, rows)}\n\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
 
@@ -106,14 +107,14 @@ def _motor_list() -> str:
 def _own_robot(folder: Path) -> str:
     """A picture and the tree of the walk-through's robot: the URDF of the tests' data with the YAML of the page."""
     docs = folder.parent
-    page = (docs / "own_robot.md").read_text(encoding="utf-8")
+    page = (docs / "tutorials" / "own_robot.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"^```yaml\n(# pup.yaml\n.*?)^```", page, re.M | re.S)
     with TemporaryDirectory() as place:
         shutil.copy(docs.parent / "tests" / "data" / "own_robot" / "pup.urdf", place)
         path = Path(place) / "pup.yaml"
         path.write_text(text, encoding="utf-8")
         robot = load_robot(path)
-    return f"{picture(Model(robot), folder / 'pup.png', docs)}\n\n```{{raw}} html\n{tree_drawing(robot)}\n```\n"
+    return f"{picture(Model(robot), folder / 'pup.png', docs, '/')}\n\n```{{raw}} html\n{tree_drawing(robot)}\n```\n"
 
 
 def _write(path: Path, text: str) -> None:

@@ -47,6 +47,6 @@ def acceleration_figures() -> str:
             medians = [percent(error.joints.median) for error in report.errors]
             counts = [model.n_instructions("forward_dynamics") for model in models_of(name).values()]
             cost = [f"{count / counts[2]:.3f}" for count in counts]
-            rows.append((f"[{title(name)}](generated/robots/{name}.md)", *medians, *cost))
+            rows.append((f"[{title(name)}](/generated/robots/{name}.md)", *medians, *cost))
     columns = ("robot", *(f"error, `{level}`" for level in LEVELS[1:]), *(f"cost, `{level}`" for level in LEVELS))
     return table(columns, rows) + "\n"

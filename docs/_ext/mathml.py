@@ -45,7 +45,7 @@ def _mathml(node: nodes.Element, as_block: bool) -> str:
 def _indexed(text: str) -> str:
     """Put the index of a dotted letter beside it; docutils puts it below, where the dot is above."""
     ElementTree.register_namespace("", MATHML)
-    formula = ElementTree.fromstring(text)
+    formula = ElementTree.fromstring(text.replace("&ApplyFunction;", "\u2061"))
     for element in formula.iter(f"{{{MATHML}}}munderover"):
         base, index, dot = element
         if dot.text in DOTS:

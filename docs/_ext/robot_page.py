@@ -87,7 +87,8 @@ def _environments(name: str) -> str:
     if name not in ROBOTS:
         return ""
     links = [f"[{task.replace('_', ' ')}](../environments/{name}_{task}.md)" for task in tasks_of(name)]
-    return f"Environments: {', '.join(links)}."
+    pages = "\n".join(f"../environments/{name}_{task}" for task in tasks_of(name))
+    return f"Environments: {', '.join(links)}.\n\n```{{toctree}}\n:hidden:\n\n{pages}\n```"
 
 
 def _transmissions(report: TransmissionReport) -> list[str]:
@@ -132,8 +133,15 @@ def _sources(robot: Robot) -> str:
     return "\n".join(f"- {text}" for text in texts)
 
 
-def picture(model: Model, path: Path, page: Path) -> str:
-    """Draw a robot in its standing pose, for a page in a folder; nothing if what draws is not installed."""
+def picture(model: Model, path: Path, page: Path, root: str = "") -> str:
+    """Draw a robot in its standing pose, for a page in a folder; nothing if what draws is not installed.
+
+    Args:
+        model: The robot.
+        path: The picture.
+        page: The folder that links to the picture begin at.
+        root: How they begin.
+    """
     from ce_gym.viewer.raytrace.picture import Picture
 
     try:
@@ -141,7 +149,7 @@ def picture(model: Model, path: Path, page: Path) -> str:
     except ViewerError:
         return ""
     path.write_bytes(png(np.asarray(pixels)))
-    return f"![{title(model.robot.name)} in its standing pose]({path.relative_to(page).as_posix()})"
+    return f"![{title(model.robot.name)} in its standing pose]({root}{path.relative_to(page).as_posix()})"
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "api").glob("*.md")])
+HIDDEN = {"generated", "records", "_build"}
+"""Folders of `docs` without pages of the manual."""
+DOCS = [page for page in (ROOT / "docs").rglob("*.md") if not HIDDEN & set(page.relative_to(ROOT).parts)]
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS])
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NAMED = re.compile(r"(?:# |<!-- )([\w-]+\.(?:yaml|urdf|xml|py))(?: -->)?\n")
 
@@ -66,7 +69,7 @@ def commands(page: Path) -> Iterator[str]:
     text = page.read_text(encoding="utf-8")
     for block in blocks(page):
         if block.language == "sh":
-            yield from (line for line in block.text.splitlines() if line.strip())
+            yield from (line for line in block.text.replace("\\\n", " ").splitlines() if line.strip())
     prose = BLOCK.sub("", text)
     yield from (" ".join(code.split()) for code in re.findall(r"`((?:python|make|pip|cp) [^`]+)`", prose))
 

@@ -25,8 +25,7 @@ from ce_gym import __main__ as command_line
 from ce_gym.bench import __main__ as benchmarks
 
 WITH_CODE = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
-COMMANDS = sorted({(name_of(page), command) for page in PAGES for command in commands(page)})
-ELSEWHERE = ("ray start", "python3 -m venv", "pip install torch onnx", "python -c")
+ELSEWHERE = ("ray start", "python3 -m venv", "pip install torch onnx", "python -c", "source ")
 """Beginnings of commands that are not ours to check."""
 
 
@@ -46,17 +45,30 @@ def test_python_blocks_run(page: Path, tmp_path: Path):
 
 
 def test_pages_have_code():
-    assert {"README.md", "docs/start.md", "docs/own_robot.md", "docs/extending.md"} <= {name_of(p) for p in WITH_CODE}
+    pages = {"README.md", "docs/tutorials/first_steps.md", "docs/tutorials/own_robot.md", "docs/how-to/extend.md"}
+    assert pages <= {name_of(p) for p in WITH_CODE}
 
 
-@pytest.mark.parametrize(("page", "command"), COMMANDS, ids=[f"{page}: {command}" for page, command in COMMANDS])
-def test_commands_exist(page: str, command: str):
+def test_commands_exist():
+    """Subcommands, options, scripts, environments, extras and make targets of all commands in all pages."""
+    wrong = []
+    for page in PAGES:
+        for command in commands(page):
+            try:
+                check_command(command)
+            except (Exception, SystemExit) as error:  # a command that cannot be parsed fails in many ways
+                wrong.append(f"{name_of(page)}: {command}: {error}")
+    assert wrong == []
+
+
+def check_command(command: str) -> None:
+    """Raise an error if a command cannot work."""
     words = [word for word in shlex.split(command, comments=True) if word not in ("...",)]
     while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
         words.pop(0)
-    words[0] = Path(words[0]).name  # of an environment that the page has made
-    text = " ".join(words)
-    if text.startswith(ELSEWHERE):
+    if words:
+        words[0] = Path(words[0]).name  # of an environment that the page has made
+    if not words or " ".join(words).startswith(ELSEWHERE):
         return
     if words[0] == "make":
         targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -68,7 +80,7 @@ def test_commands_exist(page: str, command: str):
     elif words[:2] == ["python", "-m"]:
         check_module(words[2], words[3:])
     else:
-        assert words[0] == "python", f"what kind of command is {command!r}?"
+        assert words[0] == "python", "unknown kind of command"
         check_script(ROOT / words[1], words[2:])
 
 

@@ -109,64 +109,88 @@ CONTACTS = {
 STANDING = {"DR Legs": "dr_legs", "Cassie": "cassie", "H1": "h1", "Berkeley Humanoid": "berkeley_humanoid"}
 STANDING |= {"T1": "t1", "G1": G1}
 STATEMENTS: list[tuple[str, Callable[[], str]]] = [
-    ("exactness.md", lambda: f"| gears, ratio {ratios(CHEETAH)[0]:.0f} to {ratios(CHEETAH)[-1]:.0f} (Mini Cheetah) |"),
-    ("exactness.md", lambda: f"| Mini Cheetah (gears of {ratios(CHEETAH)[0]:g} and {ratios(CHEETAH)[-1]:g}) |"),
-    ("exactness.md", lambda: f"| belts, ratio {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g} (MIT Humanoid) |"),
-    ("exactness.md", lambda: f"(gears of {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g}, belts) |"),
-    ("exactness.md", lambda: f"| differentials, ratio {the(set(ratios(TELLO)))} (Tello) |"),
-    ("exactness.md", lambda: f"| Tello (gears of {the(set(ratios(TELLO)))}, differentials) |"),
-    ("exactness.md", lambda: f"| gears, ratio {the(set(ratios(ANYMAL)))} (ANYmal C) |"),
-    ("exactness.md", lambda: f"| ANYmal C (gears of {the(set(ratios(ANYMAL)))}) | {level_row(ANYMAL)} |"),
-    ("exactness.md", lambda: f"| gears, ratio {the(set(ratios(JVRC)))}, rotors light beside the links (JVRC-1) |"),
-    ("exactness.md", lambda: f"| JVRC-1 (gears of {the(set(ratios(JVRC)))}, light rotors) | {level_row(JVRC)} |"),
-    ("exactness.md", lambda: f"| Unitree G1 (ratios of {ratios(G1)[0]:.0f} to {ratios(G1)[-1]:.0f}, cranks and rods"),
-    ("transmission.md", lambda: "as on Mini Cheetah, `coupled` and" if not belts(CHEETAH) else "belts"),
-    ("faq.md", lambda: "Belts and differentials (MIT Humanoid, Tello)" if belts(HUMANOID) and belts(TELLO) else "none"),
     (
-        "transmission.md",
+        "records/exactness.md",
+        lambda: f"| gears, ratio {ratios(CHEETAH)[0]:.0f} to {ratios(CHEETAH)[-1]:.0f} (Mini Cheetah) |",
+    ),
+    ("records/exactness.md", lambda: f"| Mini Cheetah (gears of {ratios(CHEETAH)[0]:g} and {ratios(CHEETAH)[-1]:g}) |"),
+    (
+        "records/exactness.md",
+        lambda: f"| belts, ratio {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g} (MIT Humanoid) |",
+    ),
+    ("records/exactness.md", lambda: f"(gears of {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g}, belts) |"),
+    ("records/exactness.md", lambda: f"| differentials, ratio {the(set(ratios(TELLO)))} (Tello) |"),
+    ("records/exactness.md", lambda: f"| Tello (gears of {the(set(ratios(TELLO)))}, differentials) |"),
+    ("records/exactness.md", lambda: f"| gears, ratio {the(set(ratios(ANYMAL)))} (ANYmal C) |"),
+    ("records/exactness.md", lambda: f"| ANYmal C (gears of {the(set(ratios(ANYMAL)))}) | {level_row(ANYMAL)} |"),
+    (
+        "records/exactness.md",
+        lambda: f"| gears, ratio {the(set(ratios(JVRC)))}, rotors light beside the links (JVRC-1) |",
+    ),
+    (
+        "records/exactness.md",
+        lambda: f"| JVRC-1 (gears of {the(set(ratios(JVRC)))}, light rotors) | {level_row(JVRC)} |",
+    ),
+    (
+        "records/exactness.md",
+        lambda: f"| Unitree G1 (ratios of {ratios(G1)[0]:.0f} to {ratios(G1)[-1]:.0f}, cranks and rods",
+    ),
+    ("explanation/transmission.md", lambda: "as on Mini Cheetah, `coupled` and" if not belts(CHEETAH) else "belts"),
+    (
+        "how-to/faq.md",
+        lambda: "Belts and differentials (MIT Humanoid, Tello)" if belts(HUMANOID) and belts(TELLO) else "none",
+    ),
+    (
+        "reference/robots.md",
         lambda: (
             f"Of the robots that come along, {' '.join(n for n in ce_gym.robots() if robot(n).elastic)} has such "
             "figures".replace("mini_cheetah", "Mini Cheetah")
         ),
     ),
-    ("faq.md", lambda: f"Cheetah's hips and of JVRC-1's rotors are such. {'' if kept(JVRC) == ('*-rotor',) else '?'}"),
-    ("faq.md", lambda: f'`kept_inertia: ["{"".join(kept(CHEETAH))}"]`'),
     (
-        "how_it_works.md",
+        "how-to/faq.md",
+        lambda: f"Cheetah's hips and of JVRC-1's rotors are such. {'' if kept(JVRC) == ('*-rotor',) else '?'}",
+    ),
+    ("how-to/faq.md", lambda: f'`kept_inertia: ["{"".join(kept(CHEETAH))}"]`'),
+    (
+        "explanation/how_it_works.md",
         lambda: (
             f"makes {sum(not is_axisymmetric(rotor) for rotor in robot(JVRC).rotors())} of the "
             f"{sum(1 for _ in robot(JVRC).rotors())} lopsided: its exact forward dynamics takes {instructions(JVRC)} "
         ),
     ),
-    ("environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
+    ("reference/environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
     ("README.md", lambda: f"| {instructions(CHEETAH)} / {instructions(CHEETAH, 'armature')} ="),
     ("README.md", lambda: f"sub-steps of {WORDS[len(floating())]} robots beside MuJoCo's"),
     ("README.md", lambda: f"Policies of {WORDS[len(walking())]} robots come with the package"),
     ("README.md", lambda: f"| DR Legs, {WORDS[2 * 3]} loops |"),  # what is published; the file has rods for some links
-    ("robots.md", lambda: f"The {WORDS[len(floating())]} robots of the package that tasks can have"),
-    ("robots.md", lambda: f"a screw with a lead of {2000 * math.pi / ratios('spot')[-1]:.0f} mm"),
+    ("reference/robots.md", lambda: f"The {WORDS[len(floating())]} robots of the package that tasks can have"),
+    ("reference/robots.md", lambda: f"a screw with a lead of {2000 * math.pi / ratios('spot')[-1]:.0f} mm"),
     (
-        "robots.md",
+        "reference/robots.md",
         lambda: (
             f"at the knee ({robot('cassie').body('left_shin').joint.stiffness:.0f} N m/rad) and one at the heel "
             f"({robot('cassie').body('left_heel_spring').joint.stiffness:.0f} N m/rad), both passive"
         ),
     ),
-    ("robots.md", lambda: f'forward_dynamics")`, {instructions("cassie"):,} and'),
-    ("robots.md", lambda: f"instructions, 73,514 for {instructions('dr_legs'):,}"),
-    ("robots.md", lambda: f"for a robot {100 * robot('dr_legs').pose.height:.0f} cm high"),
-    ("robots.md", lambda: f"29 g of {robot('dr_legs').total_mass:.1f} kg"),
-    ("robots.md", lambda: f"{WORDS[len(robot('dr_legs').motors) // 2]} servos. Two thighs turn"),
-    ("robots.md", lambda: f"at {_stop('dr_legs', 'left_bracket_a_inner'):.0f}° of yaw and roll of the inner cross"),
+    ("reference/robots.md", lambda: f'forward_dynamics")`, {instructions("cassie"):,} and'),
+    ("reference/robots.md", lambda: f"instructions, 73,514 for {instructions('dr_legs'):,}"),
+    ("reference/robots.md", lambda: f"for a robot {100 * robot('dr_legs').pose.height:.0f} cm high"),
+    ("reference/robots.md", lambda: f"29 g of {robot('dr_legs').total_mass:.1f} kg"),
+    ("reference/robots.md", lambda: f"{WORDS[len(robot('dr_legs').motors) // 2]} servos. Two thighs turn"),
     (
-        "robots.md",
+        "reference/robots.md",
+        lambda: f"at {_stop('dr_legs', 'left_bracket_a_inner'):.0f}° of yaw and roll of the inner cross",
+    ),
+    (
+        "reference/robots.md",
         lambda: (
             f"H1 {the(gains('h1', 'hip_roll', 'hip_pitch', 'knee'))} N m/rad at hips and knees "
             f"({the(gains('h1', 'hip_yaw'))} at the hips' yaw) and {the(gains('h1', 'ankle'))} at the ankles"
         ),
     ),
     (
-        "robots.md",
+        "reference/robots.md",
         lambda: (
             "the Berkeley Humanoid "
             f"{min(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g} to "
@@ -175,22 +199,22 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         ),
     ),
     (
-        "stability.md",
+        "explanation/stability.md",
         lambda: (
             f"JVRC-1's joints are damped by their files ({damping(CHEETAH)} and {damping(JVRC)} N m s/rad), which "
             f"takes more than that; MIT Humanoid's and Tello's are {'not at all' if damping(TELLO) == '0' else '?'}"
         ),
     ),
     (
-        "numerics.md",
+        "explanation/numerics.md",
         lambda: (
             f"Mini Cheetah's shanks ({the(gains(CHEETAH, 'knee'))} N m/rad, "
             f"k = {robot(CHEETAH).material.stiffness / 1e4:g} 10⁴ N/m)"
         ),
     ),
-    ("numerics.md", lambda: f", {robot(HUMANOID).material.stiffness / 1e4:g} 10⁴ N/m) 0.05"),
-    *(("robots.md", lambda t=t, n=n: f"| {t} | {len(robot(n).contacts)} |") for t, n in CONTACTS.items()),
-    *(("robots.md", lambda t=t, n=n: f"| {t} | {stands(n)}") for t, n in STANDING.items()),
+    ("explanation/numerics.md", lambda: f", {robot(HUMANOID).material.stiffness / 1e4:g} 10⁴ N/m) 0.05"),
+    *(("reference/robots.md", lambda t=t, n=n: f"| {t} | {len(robot(n).contacts)} |") for t, n in CONTACTS.items()),
+    *(("reference/robots.md", lambda t=t, n=n: f"| {t} | {stands(n)}") for t, n in STANDING.items()),
 ]
 
 
@@ -221,7 +245,7 @@ def test_most_of_what_the_knee_motor_accelerates_is_rotors():
 
 
 def test_a_step_is_a_quarter_of_the_legs():
-    """Of the MIT Humanoid, 0.15 m, says terrain.md: from the hips to the soles when its legs are straight."""
+    """Of the MIT Humanoid, 0.15 m (terrain_and_sensors.md): from the hips to the soles when its legs are straight."""
     straight = model(HUMANOID)
     q = np.array(straight.standing_q)
     q[7:] = 0.0

@@ -189,10 +189,12 @@ def linked(python: Path, extra: str, folder: Path) -> str:
 
 
 def test_the_wheel_trains(python: Path, elsewhere: dict, tmp_path: Path):
-    """As the page for beginners does it, with what the extra asks for."""
+    """As the page about other learners does it, with what the extra asks for."""
     pytest.importorskip("stable_baselines3")
     elsewhere["env"]["PYTHONPATH"] = linked(python, "train", tmp_path / "extra")
-    (code,) = (block.text for block in blocks(ROOT / "docs" / "start.md") if "stable_baselines3" in block.text)
+    (code,) = (
+        block.text for block in blocks(ROOT / "docs" / "how-to" / "learners.md") if "stable_baselines3" in block.text
+    )
     steps = checked([python, "-c", f"{code}\nprint(learner.num_timesteps)"], **elsewhere)
     assert int(steps) == 3072
     assert (tmp_path / "walk.zip").exists()

@@ -1,4 +1,4 @@
-"""RLlib steps our environments natively and learns on them; runs where Ray is installed, see docs/rllib.md."""
+"""RLlib steps our environments natively and learns on them; runs where Ray is installed (docs/how-to/learners.md)."""
 
 import numpy as np
 import pytest

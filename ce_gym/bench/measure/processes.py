@@ -1,7 +1,8 @@
 """Timings in several processes one after the other, of which the fastest counts.
 
-Where code and memory of a process lie makes one in five 15 to 30 % slower than others until it ends (docs/numerics.md),
-and a kernel is loaded once in a process, so that neither rounds nor further copies there tell.
+Where code and memory of a process lie makes one in five 15 to 30 % slower than others until it ends
+(docs/explanation/numerics.md), and a kernel is loaded once in a process, so that neither rounds nor further copies
+there tell.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ Which sides act is said by the acceleration that a stretch is expected to have, 
 iteration before says it would have if the mesh let go of it and all but its own cluster moved on as it does. Is that
 beyond the kink of a side, the side acts, which is right for a drive on its own and nearly so for others. What is still
 wrong in the second iteration counts only if it is more than the motor could do: less changes a step by less than its
-own error, and takes energy, or gives what the next step takes (docs/numerics.md).
+own error, and takes energy, or gives what the next step takes (docs/explanation/numerics.md).
 """
 
 from __future__ import annotations

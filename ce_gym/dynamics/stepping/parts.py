@@ -18,7 +18,7 @@ from ce_gym.model.mechanism import Mechanism
 LARGEST_MOVE = 0.5
 """A step is made in parts if it moves a joint by more [rad or m]."""
 FAST, LARGEST_FAST_MOVE = 40.0, 0.2
-"""The same of a joint that is faster than [rad/s or m/s], as hardly a motor turns one. See docs/numerics.md."""
+"""The same of a joint that is faster than [rad/s or m/s], as hardly a motor turns one: docs/explanation/numerics.md"""
 PROGRESS = ("part", "left", "unfinished")
 """Fraction of the step that is tried, 0 for a robot that is through; fraction ahead; whether it goes on. 1 at first."""
 

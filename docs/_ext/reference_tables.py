@@ -1,0 +1,186 @@
+"""Tables of the reference: terms, the context that terms read, tasks, training settings, commands, policies, results.
+
+Each function returns Markdown that a page includes. Everything comes from docstrings, parsers, settings files, cards of
+policies and results of benchmarks, so that a page cannot say what the code does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+from dataclasses import MISSING, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+from environment_page import attributes_of, plain, table
+
+from ce_gym.__main__ import _parser
+from ce_gym.bench.measure.report import Report, cell_text, read_report
+from ce_gym.envs.task.tasks import RANDOMISED, Task
+from ce_gym.envs.terms.context import TermContext
+from ce_gym.envs.terms.registry import OWN
+
+ROOT = Path(__file__).parents[2]
+KINDS = {"reward": "Rewards", "observation": "Observations", "termination": "Terminations", "metric": "Metrics"}
+
+
+def terms() -> str:
+    """Return one table for each kind of term: name, parameters with defaults, meaning, unit."""
+    parts = []
+    for kind, heading in KINDS.items():
+        rows = [(f"`{name}`", _parameters(f), *_meaning_and_unit(f)) for name, f in sorted(OWN[kind].items())]
+        parts.append(f"## {heading}\n\n{table(('Term', 'Parameters', 'Meaning', 'Unit'), rows)}")
+    return "\n\n".join(parts) + "\n"
+
+
+def context() -> str:
+    """Return the table of what a term can read from its `TermContext`: name, shape, unit, meaning."""
+    rows = []
+    for name, member in sorted(vars(TermContext).items()):
+        if name.startswith("_") or not isinstance(member, property | cached_property):
+            continue
+        text = " ".join((inspect.getdoc(member) or "").split("\n\n")[0].split())
+        shape = re.search(r"(?:shape )?(\([^()]*(?:\([^()]*\)[^()]*)*,[^()]*\))(?: each)?", text)
+        units = re.findall(r"\[([^\]]+)\]", text)
+        meaning = re.sub(r",? ?(?:shape )?\([^()]*,[^()]*\)(?: each)?", "", re.sub(r" ?\[[^\]]+\]", "", text))
+        rows.append((f"`s.{name}`", shape[1] if shape else "scalar", ", ".join(dict.fromkeys(units)) or "-", meaning))
+    functions = [f for name, f in vars(TermContext).items() if inspect.isfunction(f) and not name.startswith("_")]
+    methods = [(f"`s.{f.__name__}({_call(f)})`", _first_line(f)) for f in functions]
+    columns = ("Name", "Shape", "Unit", "Meaning")
+    return f"{table(columns, rows)}\n\n{table(('Method', 'Meaning'), methods)}\n"
+
+
+def task_arguments() -> str:
+    """Return the table of a task's arguments with defaults, and the table of figures that can be randomised."""
+    described, rows = attributes_of(inspect.getdoc(Task) or ""), []
+    for field in fields(Task):
+        if field.default is not MISSING:
+            default = f"`{plain(field.default)}`"
+        elif field.default_factory is not MISSING:
+            default = f"`{plain(field.default_factory())}`"
+        else:
+            default = "of the task"
+        rows.append((f"`{field.name}`", default, described[field.name]))
+    drawn = []
+    for name, text in RANDOMISED.items():
+        unit = re.search(r"\[([^\]]+)\]", text)
+        drawn.append((f"`{name}`", unit[1] if unit else "-", re.sub(r" ?\[[^\]]+\]", "", text)))
+    parameters = table(("Name", "Unit", "Meaning"), drawn)
+    return f"{table(('Argument', 'Default', 'Meaning'), rows)}\n\n## Randomised parameters\n\n{parameters}\n"
+
+
+def settings() -> str:
+    """Return the table of training settings: name, default of PPO and of SHAC, meaning."""
+    meanings: dict[str, str] = {}
+    for file in ("settings.py", "shac.py"):
+        for node in ast.walk(ast.parse((ROOT / "train" / file).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and node.name.endswith("Settings"):
+                meanings |= {k: v for k, v in attributes_of(ast.get_docstring(node) or "").items() if k not in meanings}
+    files = [ROOT / "train" / "config" / name for name in ("default.yaml", "shac/default.yaml")]
+    ppo, shac = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
+    rows = [
+        (f"`{name}`", *(f"`{data[name]}`" if name in data else "" for data in (ppo, shac)), meanings.get(name, ""))
+        for name in dict.fromkeys([*ppo, *shac])
+    ]
+    return table(("Setting", "PPO", "SHAC", "Meaning"), rows) + "\n"
+
+
+def command_line() -> str:
+    """Return a section with a table of options for each subcommand of `python -m ce_gym`."""
+    parts = []
+    for name, parser in _subcommands(_parser()):
+        rows = [(_invocation(action), _default(action), action.help or "") for action in parser._actions]
+        rows = [row for row in rows if row[0] != "`-h`, `--help`"]
+        described = " ".join((parser.description or "").split())
+        usage = " ".join(parser.format_usage().removeprefix("usage: ").split())
+        parts.append(f"## {name}\n\n{described}\n\n```text\n{usage}\n```\n")
+        parts.append(table(("Argument", "Default", "Meaning"), rows) + "\n" if rows else "")
+    return "\n".join(part for part in parts if part)
+
+
+def policies() -> str:
+    """Return the table of trained policies, from their cards: figures and falls on each level."""
+    rows, levels = [], ("exact", "armature", "none")
+    for card in sorted((ROOT / "assets" / "policies").glob("*/card.md")):
+        text, name = card.read_text(encoding="utf-8"), card.parent.name
+        level = name.rsplit("_", 1)[1]
+        facts = {row[0]: row[1] for row in _rows(text, "environment") if len(row) == 2}
+        judged = {row[0].split("`")[1]: row for row in _rows(text, f"`{level}` (trained)") if "`," not in row[0]}
+        heads = _rows(text, f"`{level}` (trained)", head=True)[0]
+        first, fallen = heads[1], heads.index("falls")
+        falls = [judged[one][fallen] if one in judged else "" for one in levels]
+        steps = facts["steps"].replace(",", "")
+        rows.append((f"`{name}`", f"{int(steps) / 1e6:.1f}", f"{judged[level][1]} ({_unit_free(first)})", *falls))
+    columns = ("Policy", "Million steps", "First figure of its card", *(f"Falls on `{level}`" for level in levels))
+    return table(columns, rows) + "\n"
+
+
+def results() -> dict[str, str]:
+    """Return for each benchmark with a results file its tables, each with command, processor and date, by name."""
+    files = sorted((ROOT / "docs" / "results").glob("*.json"))
+    return {file.stem: _report_text(read_report(file)) for file in files}
+
+
+def _report_text(report: Report) -> str:
+    parts = []
+    for part in report.tables:
+        rows = [[cell_text(cell) for cell in row] for row in part.rows]
+        parts.append(f"{part.title}:\n\n{table(part.columns, map(tuple, rows))}")
+    machine = report.machine
+    parts.append(f"`{report.command}`, {machine['processor']}, {machine['cores']} cores, {machine['date']}.")
+    return "\n\n".join(parts) + "\n"
+
+
+def _call(function: Any) -> str:
+    """Return the arguments of a method as in a call, without `self` and without types."""
+    given = list(inspect.signature(function).parameters.values())[1:]
+    return ", ".join(p.name if p.default is p.empty else f"{p.name}={p.default!r}" for p in given)
+
+
+def _parameters(function: Any) -> str:
+    given = list(inspect.signature(function).parameters.values())[1:]
+    return ", ".join(f"`{p.name}={p.default!r}`" for p in given if p.default is not p.empty) or "-"
+
+
+def _first_line(function: Any) -> str:
+    return " ".join((inspect.getdoc(function) or "").split("\n\n")[0].split())
+
+
+def _meaning_and_unit(function: Any) -> tuple[str, str]:
+    text = _first_line(function)
+    units = re.findall(r"\[([^\]]+)\]", text)
+    return re.sub(r" ?\[[^\]]+\]", "", text), ", ".join(dict.fromkeys(units)) or "-"
+
+
+def _subcommands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            yield from action.choices.items()
+
+
+def _invocation(action: argparse.Action) -> str:
+    names = action.option_strings or [str(action.metavar or action.dest)]
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def _default(action: argparse.Action) -> str:
+    unset = action.default in (None, False, argparse.SUPPRESS, [], ())
+    return "" if unset or not action.option_strings else f"`{action.default}`"
+
+
+def _rows(text: str, first: str, head: bool = False) -> list[list[str]]:
+    """Return the rows of the Markdown table in which a row begins with a text; only its head if so wished."""
+    for block in re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE):
+        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()]
+        if any(row[0] == first for row in rows):
+            return rows[:1] if head else rows[2:]
+    raise ValueError(f"no table with a row {first!r}")
+
+
+def _unit_free(heading: str) -> str:
+    return f"{heading} error" if heading.startswith("forward [") else heading
