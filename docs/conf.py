@@ -38,7 +38,7 @@ version = release = ce_gym.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 extensions += ["generated_pages", "mathml"]
-exclude_patterns = ["_build", "records"]
+exclude_patterns = ["_build", "records", "exactness.md"]
 myst_enable_extensions = ["dollarmath", "amsmath", "attrs_inline"]
 myst_heading_anchors = 3
 

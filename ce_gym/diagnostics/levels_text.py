@@ -7,7 +7,7 @@ from ce_gym.dynamics.model import Model
 from ce_gym.model.table import table_text
 
 LIMIT = 0.05
-"""Error from which a level counts as not enough; docs/records/exactness.md."""
+"""Error from which a level counts as not enough; docs/exactness.md."""
 COLUMNS = ("level", "joint torque, worst", "joint frequency, worst", "base turn [deg/rad]", "mass at a foot, worst")
 
 

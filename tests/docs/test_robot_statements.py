@@ -110,29 +110,29 @@ STANDING = {"DR Legs": "dr_legs", "Cassie": "cassie", "H1": "h1", "Berkeley Huma
 STANDING |= {"T1": "t1", "G1": G1}
 STATEMENTS: list[tuple[str, Callable[[], str]]] = [
     (
-        "records/exactness.md",
+        "exactness.md",
         lambda: f"| gears, ratio {ratios(CHEETAH)[0]:.0f} to {ratios(CHEETAH)[-1]:.0f} (Mini Cheetah) |",
     ),
-    ("records/exactness.md", lambda: f"| Mini Cheetah (gears of {ratios(CHEETAH)[0]:g} and {ratios(CHEETAH)[-1]:g}) |"),
+    ("exactness.md", lambda: f"| Mini Cheetah (gears of {ratios(CHEETAH)[0]:g} and {ratios(CHEETAH)[-1]:g}) |"),
     (
-        "records/exactness.md",
+        "exactness.md",
         lambda: f"| belts, ratio {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g} (MIT Humanoid) |",
     ),
-    ("records/exactness.md", lambda: f"(gears of {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g}, belts) |"),
-    ("records/exactness.md", lambda: f"| differentials, ratio {the(set(ratios(TELLO)))} (Tello) |"),
-    ("records/exactness.md", lambda: f"| Tello (gears of {the(set(ratios(TELLO)))}, differentials) |"),
-    ("records/exactness.md", lambda: f"| gears, ratio {the(set(ratios(ANYMAL)))} (ANYmal C) |"),
-    ("records/exactness.md", lambda: f"| ANYmal C (gears of {the(set(ratios(ANYMAL)))}) | {level_row(ANYMAL)} |"),
+    ("exactness.md", lambda: f"(gears of {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g}, belts) |"),
+    ("exactness.md", lambda: f"| differentials, ratio {the(set(ratios(TELLO)))} (Tello) |"),
+    ("exactness.md", lambda: f"| Tello (gears of {the(set(ratios(TELLO)))}, differentials) |"),
+    ("exactness.md", lambda: f"| gears, ratio {the(set(ratios(ANYMAL)))} (ANYmal C) |"),
+    ("exactness.md", lambda: f"| ANYmal C (gears of {the(set(ratios(ANYMAL)))}) | {level_row(ANYMAL)} |"),
     (
-        "records/exactness.md",
+        "exactness.md",
         lambda: f"| gears, ratio {the(set(ratios(JVRC)))}, rotors light beside the links (JVRC-1) |",
     ),
     (
-        "records/exactness.md",
+        "exactness.md",
         lambda: f"| JVRC-1 (gears of {the(set(ratios(JVRC)))}, light rotors) | {level_row(JVRC)} |",
     ),
     (
-        "records/exactness.md",
+        "exactness.md",
         lambda: f"| Unitree G1 (ratios of {ratios(G1)[0]:.0f} to {ratios(G1)[-1]:.0f}, cranks and rods",
     ),
     ("explanation/transmission.md", lambda: "as on Mini Cheetah, `coupled` and" if not belts(CHEETAH) else "belts"),

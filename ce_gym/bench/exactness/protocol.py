@@ -1,4 +1,4 @@
-"""The settings of the studies, as data; docs/records/exactness.md says what they are for. None is fitted to results."""
+"""The settings of the studies, as data; docs/exactness.md says what they are for. None is fitted to results."""
 
 from __future__ import annotations
 
