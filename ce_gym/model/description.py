@@ -311,10 +311,11 @@ class Robot:
         `effort="0"` everywhere), and joints with a spring are passive. Passive joints have positions and speeds as the
         others have, entries in targets that nothing follows, no gains and no actions.
         """
-        idle = [name for name in self.commanded if self.body(name).joint.torque == 0.0]
+        joints = {body.name: body.joint for body in self.bodies}  # names are checked later
+        idle = [name for name in self.commanded if name in joints and joints[name].torque == 0.0]
         if len(idle) < len(self.commanded):
             return tuple(idle)
-        return tuple(name for name in idle if self.body(name).joint.stiffness)
+        return tuple(name for name in idle if joints[name].stiffness)
 
     @property
     def driven(self) -> tuple[str, ...]:
