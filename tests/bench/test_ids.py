@@ -36,7 +36,8 @@ def test_an_id_that_is_right():
     report = ids.run(Namespace(pattern=VELOCITY))
     assert not report.failed
     assert report.tables[0].rows == ()
-    assert ids.run(Namespace(pattern="*Cheetha*")).failed, "a pattern that fits nothing"
+    with pytest.raises(ValueError, match="a pattern that fits an id"):
+        ids.run(Namespace(pattern="*Cheetha*"))
 
 
 def test_an_id_that_is_wrong(wrong, monkeypatch):
