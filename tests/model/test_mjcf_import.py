@@ -227,7 +227,7 @@ def test_joints_that_follow_from_others_keep_their_stops(tmp_path):
 
 
 def test_a_sprung_joint_that_a_tendon_moves_is_not_passive(tmp_path):
-    """Its actuator is left out, with a line; the joint keeps what a joint has."""
+    """The actuator on the tendon of one joint is that joint's."""
     file = tmp_path / "tendon.xml"
     file.write_text(
         """<mujoco model="tendon"><worldbody>
@@ -236,6 +236,5 @@ def test_a_sprung_joint_that_a_tendon_moves_is_not_passive(tmp_path):
         <tendon><fixed name="cable"><joint joint="hinge" coef="1"/></fixed></tendon>
         <actuator><position tendon="cable" kp="20"/><position joint="wrist" kp="5"/></actuator></mujoco>"""
     )
-    with pytest.warns(LossyImportWarning, match="tendon"):
-        robot = load_robot(file)
+    robot = load_robot(file)
     assert robot.body("arm").joint.torque != 0.0
