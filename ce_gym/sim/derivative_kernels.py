@@ -175,7 +175,9 @@ def linearization_program(model: Model, options: StepOptions, whole_state: bool 
     columns = _Columns(linear, iterations_of(model.mechanism, options))
     ground, looks = _ground(model, options)
     given = {
-        name: x.numel() for name, x in linear.given.inputs().items() if name not in ("ground", "samples", "places")
+        name: x.numel()
+        for name, x in linear.given.inputs().items()
+        if name not in ("ground", "region_points", "places")
     }
     buffers = [Buffer(name, size, "rows_in" if name == "target" else "tiles") for name, size in given.items()]
     buffers += ground

@@ -62,7 +62,9 @@ def substeps(
     if len(kept) < len(outputs):
         return substeps(mechanism, options, tuple(kept))
     sizes = {
-        name: function.numel_in(name) for name in function.name_in() if name not in (*ITERATES, "ground", "samples")
+        name: function.numel_in(name)
+        for name in function.name_in()
+        if name not in (*ITERATES, "ground", "region_points")
     }
     sizes |= {"retries": 1, **kept} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= control_sizes(mechanism.robot.layout) if plan.controlled else {}
@@ -191,7 +193,7 @@ def look_up(mechanism: Mechanism, options: StepOptions, at: str = "") -> Parts:
         )
     if options.hulls:
         points, hulls = hull_places_function(mechanism, options), hulls_function(mechanism, options)
-        m, results = points.numel_out(0) // 2, ("places", "ground", "samples")
+        m, results = points.numel_out(0) // 2, ("places", "ground", "region_points")
         buffers += [Buffer("hull_places", 2 * m, "scratch"), Buffer("hull_ground", 3 * m, "scratch")]
         buffers += [Buffer(name, hulls.numel_out(i), "scratch") for i, name in enumerate(results)]
         steps += (

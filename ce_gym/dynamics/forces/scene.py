@@ -86,7 +86,7 @@ class Scene:
         figures: Contact, gains and motor strength.
         ground: Height [m] and slopes dz/dx, dz/dy of the ground under each of the options' `touches`, shape
             (3, n_touches); not used on flat ground.
-        samples: Where on their bodies the regions of hulls touch the ground [m], shape (3, n_regions).
+        region_points: Where on their bodies the regions of hulls touch the ground [m], shape (3, n_regions).
         looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_touches);
             empty if that is where they are.
         choosing: Whether what is seldom near is left out where it is not; else all acts always.
@@ -96,7 +96,7 @@ class Scene:
     options: StepOptions
     figures: Figures
     ground: SX
-    samples: SX = field(default_factory=lambda: SX(3, 0))
+    region_points: SX = field(default_factory=lambda: SX(3, 0))
     looked_up: SX = field(default_factory=SX)
     choosing: bool = False
 
@@ -199,7 +199,7 @@ def contact_spheres(mechanism: Mechanism, options: StepOptions) -> list[ContactS
 def contact_centres(scene: Scene) -> list[tuple[ContactSphere, SX]]:
     """Return all that may touch the ground, and where its centre is in its body [m], shape (3,)."""
     spheres = contact_spheres(scene.mechanism, scene.options)
-    centres = [constant(np.array(sphere.position)) for sphere in spheres] + ca.horzsplit(scene.samples)
+    centres = [constant(np.array(sphere.position)) for sphere in spheres] + ca.horzsplit(scene.region_points)
     poles = [replace(spheres[i], radius=0.0) for i in poles_of(scene.options.hulls)]
     return list(zip([*spheres, *poles], centres, strict=True))
 

@@ -93,13 +93,13 @@ def hulls_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
 
     Returns:
         Function (q, contact_places, contact_ground, hull_ground), or with `dependent` as for `places_function`, ->
-        (places, ground, samples): x and y of the contacts and of the regions of hulls [m], shape (2 n_touches,), the
+        (places, ground, region_points): x and y of contacts and of regions of hulls [m], shape (2 n_touches,), the
         ground of each, shape (3 n_touches,), and where on their bodies regions touch it [m], shape (3 n_regions,).
     """
     given, kinematics = _posed(mechanism, options)
     points, n = _hull_points(options, kinematics), len(options.contacts)
     at, ground = SX.sym("contact_places", 2, n), SX.sym("contact_ground", 3, n)
-    under, samples = SX.sym("hull_ground", 3, points.shape[1]), []
+    under, region_points = SX.sym("hull_ground", 3, points.shape[1]), []
     places, planes, first = [at], [ground], 0
     for hull in options.hulls:
         own = slice(first, first + len(hull.points))
@@ -107,11 +107,15 @@ def hulls_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
         body = kinematics.bodies[hull.body]
         for spot, depth, normal in pressed(hull, body.R[2, :].T, points[2, own], under[:, own], ground[0, :]):
             place = body.point_position(spot)
-            samples.append(spot)
+            region_points.append(spot)
             places.append(place[:2])
             planes.append(ca.vertcat(place[2] + depth / normal[2], -normal[:2] / normal[2]))
     given |= {"contact_places": ca.vec(at), "contact_ground": ca.vec(ground), "hull_ground": ca.vec(under)}
-    results = {"places": ca.horzcat(*places), "ground_next": ca.horzcat(*planes), "samples": ca.horzcat(*samples)}
+    results = {
+        "places": ca.horzcat(*places),
+        "ground_next": ca.horzcat(*planes),
+        "region_points": ca.horzcat(*region_points),
+    }
     return traced("hulls", given, {name: ca.vec(value) for name, value in results.items()})
 
 

@@ -51,7 +51,7 @@ def step_function(
     Returns:
         Function (*state, diverged, *given) -> (*state, diverged, *outputs): `state` are the parts of `State` that the
         scene has; `given` is `target` if there are joints, `parameters` if any are declared, `ground` on a field and
-        `samples` on one with hulls, and
+        `region_points` on one with hulls, and
         `dt` if the options leave it open.
     """
     given, plan = Given(mechanism, options, follows), METHODS[options.method]
@@ -167,8 +167,10 @@ class Given:
         self.parameters = SX.sym("parameters", sum(len(default) for default in defaults.values()))
         self.ground = SX.sym("ground", 3, n if options.ground == "field" else 0)
         self.dt: float = SX.sym("dt") if options.dt is None else options.dt  # type: ignore[assignment]  # used as one
-        self.samples = SX.sym("samples", 3, n - len(options.contacts))
-        self.scene = replace(make_scene(mechanism, options, self.parameters, self.ground), samples=self.samples)
+        self.region_points = SX.sym("region_points", 3, n - len(options.contacts))
+        self.scene = replace(
+            make_scene(mechanism, options, self.parameters, self.ground), region_points=self.region_points
+        )
         self.places = SX.sym("places", 2, n if follows and options.ground == "field" else 0)
         if self.places.numel():
             self.scene = replace(self.scene, looked_up=self.places)
@@ -176,7 +178,7 @@ class Given:
     def inputs(self) -> dict[str, SX]:
         """Return the symbols by name, without empty ones."""
         given = {"target": self.target, "parameters": self.parameters, "ground": ca.vec(self.ground)}
-        given |= {"samples": ca.vec(self.samples), "places": ca.vec(self.places)}
+        given |= {"region_points": ca.vec(self.region_points), "places": ca.vec(self.places)}
         given = {name: value for name, value in given.items() if value.numel()}
         given |= {"dt": self.dt} if isinstance(self.dt, SX) else {}
         return dict(self.state.items()) | {"diverged": self.diverged} | given

@@ -77,8 +77,8 @@ class Field:
         normals = np.tile(np.array([0, 0, 1], np.float32), (len(rays), 1))
         normals[hit, :2] = -((1 - u - v) * a + u * b + v * c)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        samples = start[:2].astype(np.float32) + np.where(hit, distance, 0)[:, None] * rays[:, :2]
-        away = (np.linalg.norm(samples, axis=1) / piece.reach).astype(np.float32)
+        spots = start[:2].astype(np.float32) + np.where(hit, distance, 0)[:, None] * rays[:, :2]
+        away = (np.linalg.norm(spots, axis=1) / piece.reach).astype(np.float32)
         distance[away > 1] = np.inf
         return Met(distance, normals, away)
 
@@ -93,8 +93,8 @@ class Field:
         ground = around(self.terrain, block, MARGIN, MOST)
         x, y, heights = surface(ground)
         middle = block.mean(0)
-        samples = np.meshgrid(x - middle[0], y - middle[1], indexing="ij")
-        vertices = np.stack([*samples, heights[..., 0]], -1).reshape(-1, 3)
+        spots = np.meshgrid(x - middle[0], y - middle[1], indexing="ij")
+        vertices = np.stack([*spots, heights[..., 0]], -1).reshape(-1, 3)
         a = (np.arange(len(x) - 1)[:, None] * len(y) + np.arange(len(y) - 1)).ravel()
         b = a + len(y)
         triangles = np.stack([a, b, b + 1, a, b + 1, a + 1], -1).reshape(-1, 3).astype(np.int32)

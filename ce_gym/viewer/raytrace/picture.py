@@ -202,9 +202,9 @@ class Picture:
         width, height = self._size
         if (seen[:, 2] > -1e-3).any():  # something is beside or behind the camera
             return slice(None), slice(None)
-        samples = seen[:, :2] * [1, -1] / -seen[:, 2:] * self._focus + np.array([width, height]) / 2
-        left, top = np.clip(np.floor(samples.min(0)) - 1, 0, [width, height]).astype(int).tolist()
-        right, bottom = np.clip(np.ceil(samples.max(0)) + 1, 0, [width, height]).astype(int).tolist()
+        spots = seen[:, :2] * [1, -1] / -seen[:, 2:] * self._focus + np.array([width, height]) / 2
+        left, top = np.clip(np.floor(spots.min(0)) - 1, 0, [width, height]).astype(int).tolist()
+        right, bottom = np.clip(np.ceil(spots.max(0)) + 1, 0, [width, height]).astype(int).tolist()
         return slice(top, bottom), slice(left, right)
 
     def _trace(
@@ -221,8 +221,8 @@ class Picture:
         surface = view.eye + found["tfar"][hit, None] * rays[hit] + CLOSE * normal
         ground = ~hit & np.isfinite(backdrop.distance)
         x, y = backdrop.x[ground] * np.float32(TILE), backdrop.y[ground] * np.float32(TILE)
-        samples = np.column_stack([x, y, backdrop.height[ground] + np.float32(CLOSE)])
-        starts = np.concatenate([surface, samples])
+        spots = np.column_stack([x, y, backdrop.height[ground] + np.float32(CLOSE)])
+        starts = np.concatenate([surface, spots])
         dark = self._embree.meets(view.scene, starts, np.broadcast_to(SUN.astype(np.float32), starts.shape))
         sunny, shadow = ~dark[: len(surface)], np.zeros(len(rays), bool)
         shadow[ground] = dark[len(surface) :]
