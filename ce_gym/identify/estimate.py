@@ -30,7 +30,7 @@ LARGEST_ANGLE = 12.6
 """Of a joint [rad], two turns: what is larger is in degrees."""
 
 ROUNDS, GAIN = 4, 1e-4
-"""How often initial states are begun anew at most where transmissions stretch, and the gain that is worth it again."""
+"""How often initial states are begun anew at most, and the gain that is worth it again."""
 UNFIT = 2.0
 """What is left of a measurement is so many times its noise where figures do not fit."""
 
@@ -126,7 +126,7 @@ def _search(shots: Shots, windows: Windows) -> tuple[Problem, Array]:
     parts, start = windows.parts(), np.array([figure.start for figure in shots.figures])
     short = Problem(shots, parts, guesses(shots, parts, start), noise_of_encoders(shots.log))
     x = solve(short, x, 1e-3)
-    for _ in range(ROUNDS if shots.encoders.joints < shots.model.nq else 0):
+    for _ in range(ROUNDS):
         short.weigh(x)
         values = short.values(x)
         if short.begin_anew(x, guesses(shots, parts, values)) < GAIN:

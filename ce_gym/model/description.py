@@ -305,7 +305,7 @@ class Robot:
 
     @property
     def passive(self) -> tuple[str, ...]:
-        """The independent joints without an actuator: their largest torque is 0, and that of another is not.
+        """The independent joints without an actuator, whose largest torque is 0 while that of another is not.
 
         If it is 0 for all of them, the file does not say which joints are driven (CAD exports of URDF files have
         `effort="0"` everywhere), and joints with a spring are passive. Passive joints have positions and speeds as the

@@ -254,8 +254,8 @@ def test_what_is_not_asked_for_costs_nothing_and_adjacent_links_are_left_out():
     assert plain.serialize() == same.serialize()
     assert ("plate", "upper_arm") not in list(separate_links(model.robot))
     for pairs, said in (
-        ([("plate", "upper_arm")], "upper_arm"),  # has no capsule
-        ([("plate", "tail")], "tail"),
+        ([("forearm", "upper_arm")], "upper_arm"),  # has no capsule
+        ([("forearm", "tail")], "tail"),
         ([("plate",)], "plate"),
         ("some", "some"),
     ):

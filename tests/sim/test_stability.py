@@ -54,14 +54,17 @@ def test_a_base_at_fifty_radians_per_second(cheetah: Model):
     assert energy <= 1.0
 
 
-@pytest.mark.parametrize("dt", [0.002, 0.02])
-def test_a_robot_without_motors_never_gains_energy(cheetah: Model, dt: float):
-    """On ground of any stiffness and slip speed; with the energy of its springs, if the step resolves them."""
+@pytest.mark.parametrize(("dt", "most"), [(0.001, 1e-9), (0.002, 1e-3), (0.02, 0.2)])
+def test_a_robot_without_motors_never_gains_energy(cheetah: Model, dt: float, most: float):
+    """On ground of any stiffness and slip speed; with the energy of its springs and stops, if the step resolves them.
+
+    Its stops swing once in 7 to 11 ms.
+    """
     finite, gain, excess, *_ = grid.fall(cheetah, dt, 1.5, "float64")
     assert finite.all()
     assert (excess <= 0).all()
     resolved = np.array(grid.STIFFNESSES) * dt**2 <= 0.5  # stiffer than that, half a kilogram bounces within a step
-    assert (gain[resolved] <= (1e-9 if dt < 0.005 else 0.2)).all()
+    assert (gain[resolved] <= most).all()
 
 
 def test_a_robot_that_stands_is_silent(cheetah: Model):

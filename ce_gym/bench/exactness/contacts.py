@@ -38,7 +38,6 @@ COLUMNS = (
 DESIGNS = tuple(product(RATIOS, INERTIAS))
 BAR, BALANCE = 0.01, 1e-3
 """How near the impulse has to come to the rigid limit on the stiffest ground, and momentum to its balance."""
-PARAMETERS = ("ratio", "rotor_inertia", "stiffness", "damping")
 
 
 @dataclass(frozen=True)
@@ -75,10 +74,12 @@ class Faller:
         smooth = replace(robot.material, friction=0.0, bristle=0.0)
         known = {"contacts": "all", "material": smooth, "normal_law": "kelvin_voigt", "outputs": ("contact_forces",)}
         self.target = self.model.standing_q[7:] * (control == "position")
-        self.sim = Simulator(self.model, len(DESIGNS), step, control=control, parameters=PARAMETERS, **known)
         self.ratio, self.inertia = np.array(DESIGNS).T[..., None]
-        self.sim.set_parameter("ratio", self.ratio)
-        self.sim.set_parameter("rotor_inertia", self.inertia)
+        designs = {"ratio": self.ratio, "rotor_inertia": self.inertia} if level != "none" else {}
+        known["parameters"] = (*designs, "stiffness", "damping")
+        self.sim = Simulator(self.model, len(DESIGNS), step, control=control, **known)
+        for parameter, value in designs.items():
+            self.sim.set_parameter(parameter, value)
 
     def mass_matrix(self, q: Array) -> Array:
         """Return the mass matrix of every design, shape (n_designs, nv, nv); q of shape (n_designs, nq)."""

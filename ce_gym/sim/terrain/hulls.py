@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ce_gym.dynamics.hulls import MOST_POINTS, RISE, Hull, hull_of
-from ce_gym.model.description import ContactSphere, Robot
+from ce_gym.model.description import Robot
 from ce_gym.model.frames import Vec3
 from ce_gym.sim.terrain.field import Terrain
 
@@ -16,9 +16,9 @@ from ce_gym.sim.terrain.field import Terrain
 def hulls_on(robot: Robot, contacts: Sequence[str], terrain: Terrain | None) -> tuple[Hull, ...]:
     """Return the convex shapes among the contacts of a scene that need points between their corners.
 
-    Corners of one shape are the contacts of a primitive, or points of group "foot" on one body with one radius, as of
-    a sole. Points are half a cell apart, or as far as ground as curved as this rises between them by half of `RISE`.
-    None is needed if that is so between any two corners.
+    Corners of one shape are the contacts of a primitive, or points of group "foot" on one link with one radius, as of
+    a sole; such points on the base are legs, with nothing between them. Points are half a cell apart, or as far as
+    ground as curved as this rises between them by half of `RISE`. None is needed if that is so between any two corners.
 
     Args:
         robot: The robot.
@@ -57,10 +57,7 @@ def _shapes(robot: Robot, contacts: Sequence[str]) -> dict[tuple[str, str, float
     spheres = {sphere.name: sphere for sphere in robot.contacts}
     shapes: dict[tuple[str, str, float], dict[int, Vec3]] = {}
     for i, name in enumerate(contacts):
-        if _is_corner(sphere := spheres[name]):
+        sphere = spheres[name]
+        if not sphere.rim and (sphere.shape or (sphere.group == "foot" and sphere.body != robot.bodies[0].name)):
             shapes.setdefault((sphere.body, sphere.shape, sphere.radius), {})[i] = sphere.position
     return {key: corners for key, corners in shapes.items() if len(set(corners.values())) > 1}
-
-
-def _is_corner(sphere: ContactSphere) -> bool:
-    return not sphere.rim and (bool(sphere.shape) or sphere.group == "foot")
