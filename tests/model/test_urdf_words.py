@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ce_gym
+from ce_gym.__main__ import main
 from ce_gym.envs.custom import zero_limits
 from ce_gym.export.new_robot import write_new_robot
 from ce_gym.model import LossyImportWarning, RobotError, load_robot
@@ -78,7 +79,7 @@ def test_every_actuator_of_a_transmission_is_a_motor(load):
     robot = load(arm(f"<transmission name='t'>{joint}{motors}</transmission>"))
     more = diagonal(robot) - diagonal(load(arm()))
     assert more[0] == pytest.approx(10**2 * 2e-5 + 20**2 * 3e-5, rel=1e-9)
-    with pytest.raises(RobotError, match="<mechanicalReduction> is 0[.]0: expected a ratio other than 0"):
+    with pytest.raises(RobotError, match=r"<mechanicalReduction> is 0.*: expected a ratio other"):
         load(arm(f"<transmission name='t'><joint name='elbow'/>{motor.format(0, 2e-5)}</transmission>"))
 
 
@@ -226,6 +227,7 @@ def test_joints_that_move_no_mass_are_fixed_with_a_warning(load, tmp_path: Path,
         assert load_robot(tmp_path / "over.yaml").independent == ("upper", "lower")
 
 
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
 def test_joints_that_move_mass_or_say_that_it_is_0_stay(load):
     motor = TRANSMISSIONS["actuator"].format(j="wrist", n=30, i=4e-5)
     tip = TIP.format("revolute", "").replace("<link name='pad'/>", f"<link name='pad'>{inertial(0.1, 1e-4)}</link>")
@@ -262,6 +264,12 @@ def test_a_new_file_gives_no_gains_to_joints_without_effort(tmp_path: Path):
     assert robot.name == "pup"
     assert {"fl thigh: 1", "on"} <= {*robot.independent}
     assert f"effort is 0: {robot.passive[0]}." in out.read_text()
+
+
+def test_inspect_prints_what_the_file_says_beyond_the_robot(load, tmp_path: Path, capsys):
+    load(arm("<gazebo reference='upper'><mu1>0.3</mu1></gazebo>"))
+    assert main(["inspect", str(tmp_path / "arm.urdf"), "--no-errors", "--no-timing"]) == 0
+    assert "left out: <gazebo>: mu1\n" in capsys.readouterr().out
 
 
 def test_efforts_of_zero_are_said(load):

@@ -133,7 +133,7 @@ class _Reader:
         )
         unread = list(unread_words(graph.robot))
         self.drives = drives_of(graph, unread)
-        self.held = () if graph.is_plus else self._hold_idle_joints(tied)
+        self.held: tuple[str, ...] = () if graph.is_plus else self._hold_idle_joints(tied)
         self.joints = graph.joints
         self.root_is_world = self._root_is_world(base)
         self.apart = [link for link in graph.order if link in apart and self._is_fixed(link)]
