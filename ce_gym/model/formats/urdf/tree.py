@@ -96,8 +96,9 @@ def read_urdf(
 def warn_of_held_joints(file: str, tree: UrdfTree) -> None:
     """Warn in one line of joints that are fixed because they move no mass."""
     if tree.held:
-        more = f" (and {len(tree.held) - 1} more, see Robot.notes)" if len(tree.held) > 1 else ""
-        warnings.warn(f"{file}: {tree.held[0]}{more}", LossyImportWarning, stacklevel=5)
+        first, *others = tree.held
+        more = f" (and {len(others)} more, see Robot.notes)" if others else ""
+        warnings.warn(f"{file}: {first}{more}", LossyImportWarning, stacklevel=5)
 
 
 def read_tree(
