@@ -39,6 +39,11 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
 Each has --help. In Python: gymnasium.make("ce_gym:ce_gym/MiniCheetahVelocity-v0")."""
 
 
+READER_NOTES = ("left out: ", "joint ", "link ")
+"""How notes begin that readers of files make, other than those that a robot's file has itself."""
+MOST_NOTES = 8
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0, or 2 if the user has something to mend."""
     print_anything()
@@ -175,6 +180,10 @@ def _inspect(args: argparse.Namespace) -> int:
         return 0
     print(f"{model.describe()}\n", flush=True)
     problems = missing(model.robot)
+    notes = [note for note in model.robot.notes if note.startswith(READER_NOTES)]
+    print("".join(f"{note}\n" for note in notes[:MOST_NOTES]), end="")
+    if len(notes) > MOST_NOTES:
+        print(f"and {len(notes) - MOST_NOTES} more in `Robot.notes`")
     print("".join(f"Joints have {line}\n" for line in zero_limits(model.robot)), flush=True)
     print("Environments: it has what every task needs\n" if not problems else "Environments lack:")
     print("".join(f"  {problem}\n" for problem in problems), flush=True)

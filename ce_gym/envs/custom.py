@@ -75,7 +75,8 @@ def zero_limits(robot: Robot) -> list[str]:
     joints = [robot.body(name) for name in robot.commanded]
     weak = [body.name for body in joints if body.joint.torque == 0.0 and not body.joint.stiffness]
     slow = [body.name for body in joints if body.joint.velocity == 0.0]
-    lines = [f"no torque: the effort is 0, or there is no actuator, for {_listed(weak)}; nothing drives them"]
+    advice = "nothing drives them; if motors do, write their largest torque into <limit effort>"
+    lines = [f"no torque: the effort is 0, or there is no actuator, for {_listed(weak)}; {advice}"]
     lines += [f"no speed: the velocity is 0 for {_listed(slow)}; speed limits of joints are not simulated"]
     return [line for line, names in zip(lines, (weak, slow), strict=True) if names]
 

@@ -7,14 +7,18 @@ import os
 import re
 from pathlib import Path
 
+import yaml
+
 from ce_gym.export.guesses import BEND, DAMPING_TIME, FULL_TORQUE_AT, Guesses, guess
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
+from ce_gym.model.formats.urdf.graph import UrdfGraph
+from ce_gym.model.formats.urdf.plus import robot_from_graph
 from ce_gym.model.load import load_robot
 
 GUESS = "# GUESS"
-PLAIN = r"[\w./-]+"
-"""Paths that YAML reads without quotes."""
+PLAIN = r"[A-Za-z_./][\w./-]*"
+"""Names and paths that YAML reads without quotes, unless it has another meaning for them, as for `on`."""
 MOST_NOTES = 6
 ANY_GAIN = {"kp": 20.0, "kd": 0.5}
 """Gains of joints of which not even the torque is known [N m/rad, N m s/rad]."""
@@ -39,13 +43,19 @@ def write_new_robot(path: Path, out: Path | None = None) -> tuple[Path, Robot]:
     out = path.with_suffix(".yaml") if out is None else out
     if out.exists():
         raise RobotError(f"{out}: is there already: expected a name that is free; --out gives another")
-    text = new_robot(load_robot(path), kind, _from_folder(path, out.parent))
-    out.write_text(text, encoding="utf-8")
+    robot = robot_from_graph(UrdfGraph(path)) if kind == "urdf" else load_robot(path)  # without a YAML file beside it
+    out.write_text(new_robot(robot, kind, _from_folder(path, out.parent)), encoding="utf-8")
     try:
         return out, load_robot(out)
     except RobotError:  # nothing is left behind that cannot be used
         out.unlink()
         raise
+
+
+def _quoted(name: str) -> str:
+    """Return a name as YAML reads it."""
+    plain = re.fullmatch(PLAIN, name) and isinstance(yaml.safe_load(name), str)
+    return name if plain else json.dumps(name, ensure_ascii=False)
 
 
 def _from_folder(path: Path, folder: Path) -> str:
@@ -69,7 +79,7 @@ def new_robot(robot: Robot, kind: str, name: str) -> str:
     found = guess(robot, has_pose)
     parts = [
         f"# Made by `python -m ce_gym new`. Go through it: what is marked {GUESS[2:]} are rules of thumb.",
-        f"name: {robot.name}\n{kind}: {name if re.fullmatch(PLAIN, name) else json.dumps(name)}",
+        f"name: {_quoted(robot.name)}\n{kind}: {_quoted(name)}",
     ]
     if kind == "urdf":
         parts.append(f"base: {'floating' if robot.floating else 'fixed'}  {GUESS}, from the mass of the first link")
@@ -90,7 +100,8 @@ def _rotors(robot: Robot) -> str:
         "# the # of those that you know; a belt or a differential has several joints in `ratios`.",
         "# rotors:",
     ]
-    lines += [f"#   {j}_rotor: {{inertia: 5e-5, ratios: {{{j}: 9}}}}" for j in robot.independent if j not in driven]
+    joints = [joint for joint in robot.independent if joint not in driven]
+    lines += [f"#   {_quoted(f'{j}_rotor')}: {{inertia: 5e-5, ratios: {{{_quoted(j)}: 9}}}}" for j in joints]
     return "\n".join(lines)
 
 
@@ -103,13 +114,14 @@ def _contacts(robot: Robot, found: Guesses) -> str:
     lines = [f"contacts:  {GUESS}: the lowest points of the lowest limbs; torso is what ends an episode on the ground"]
     for c in found.contacts:
         position = ", ".join(f"{x:g}" for x in c.position)
-        lines.append(f"  {c.name}: {{body: {c.body}, position: [{position}], radius: {c.radius:g}, group: {c.group}}}")
+        place = f"position: [{position}], radius: {c.radius:g}, group: {c.group}"
+        lines.append(f"  {_quoted(c.name)}: {{body: {_quoted(c.body)}, {place}}}")
     return "\n".join(lines)
 
 
 def _pose(found: Guesses, has_pose: bool) -> str:
     how = "as in the file" if has_pose else f"knees bent by {2 * BEND:g} rad"
-    joints = [f"    {joint}: {angle:g}" for joint, angle in found.pose.joints if angle]
+    joints = [f"    {_quoted(joint)}: {angle:g}" for joint, angle in found.pose.joints if angle]
     lines = [f"pose:  {GUESS}: {how}, feet just touching", f"  height: {found.pose.height:g}"]
     return "\n".join([*lines, *(["  joints:", *joints] if joints else [])])
 
@@ -126,6 +138,9 @@ def _gains(robot: Robot, found: Guesses) -> str:
         f"gains:  {GUESS}: all the torque of a joint at an error of {FULL_TORQUE_AT} rad, and kd {DAMPING_TIME} s * kp"
     ]
     for key, column in (("kp", 1), ("kd", 2)):
-        lines += [f"  {key}:", *(f"    {row[0]}: {row[column]:g}" for row in found.gains)]
-        lines += [f"    {joint}: {ANY_GAIN[key]:g}  {GUESS}: {_why(robot, joint)}" for joint in found.no_torque]
+        lines += [f"  {key}:", *(f"    {_quoted(row[0])}: {row[column]:g}" for row in found.gains)]
+        for joint in (joint for joint in found.no_torque if joint not in robot.passive):
+            lines.append(f"    {_quoted(joint)}: {ANY_GAIN[key]:g}  {GUESS}: {_why(robot, joint)}")
+    passive = [joint for joint in found.no_torque if joint in robot.passive]
+    lines += [f"# No gains, because the file says that their effort is 0: {', '.join(passive)}."] if passive else []
     return "\n".join(lines)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import ce_gym
+from ce_gym.__main__ import main
 from ce_gym.envs.custom import zero_limits
 from ce_gym.export.new_robot import write_new_robot
-from ce_gym.model import RobotError, load_robot
+from ce_gym.model import LossyImportWarning, RobotError, load_robot
 
 PUP = Path(__file__).parents[1] / "data" / "own_robot" / "pup.urdf"
 I = 0.02
@@ -70,6 +71,33 @@ def test_transmissions_with_inertia_become_rotors(load, kind: str, joint: str, r
     assert not robot.notes
 
 
+def test_every_actuator_of_a_transmission_is_a_motor(load):
+    """A ratio of 1 at the joint, which ROS writes by default, says nothing beside those of the actuators."""
+    motor = "<actuator><mechanicalReduction>{}</mechanicalReduction><motorInertia>{}</motorInertia></actuator>"
+    joint = "<joint name='shoulder'><mechanicalReduction>1</mechanicalReduction></joint>"
+    motors = motor.format(10, 2e-5) + motor.format(-20, 3e-5)
+    robot = load(arm(f"<transmission name='t'>{joint}{motors}</transmission>"))
+    more = diagonal(robot) - diagonal(load(arm()))
+    assert more[0] == pytest.approx(10**2 * 2e-5 + 20**2 * 3e-5, rel=1e-9)
+    with pytest.raises(RobotError, match=r"<mechanicalReduction> is 0.*: expected a ratio other"):
+        load(arm(f"<transmission name='t'><joint name='elbow'/>{motor.format(0, 2e-5)}</transmission>"))
+
+
+def test_notes_on_many_transmissions_are_one_line(load):
+    one = "<transmission name='{}'><joint name='elbow'/><mechanicalReduction>9</mechanicalReduction></transmission>"
+    (note,) = load(arm("".join(one.format(i) for i in range(7)))).notes
+    assert note.endswith("in transmission '0', '1', '2' and 4 more")
+
+
+def test_springs_of_gazebo_act_at_their_joint(load):
+    spring = "<springStiffness>{}</springStiffness><springReference value='0.25'/>"
+    robot = load(arm(f"<gazebo reference='elbow'>{spring.format(4)}<material>Gazebo/Red</material></gazebo>"))
+    assert (robot.body("lower").joint.stiffness, robot.body("lower").joint.springref) == (4.0, 0.25)
+    assert not robot.notes
+    with pytest.raises(RobotError, match="gazebo 'elbow' <springStiffness value> is 'stiff'"):
+        load(arm(f"<gazebo reference='elbow'>{spring.format('stiff')}</gazebo>"))
+
+
 def test_inertia_that_raisim_adds_at_a_joint_is_kept_at_every_level(load):
     robot = load(arm(joint='<dynamics damping="0.1" rotor_inertia="0.05" stiffness="2.5"/>'))
     assert (diagonal(robot) - diagonal(load(arm())))[0] == pytest.approx(0.05, rel=1e-6)
@@ -95,10 +123,17 @@ def test_a_yaml_file_goes_before_the_transmissions_of_its_urdf(load, tmp_path: P
     ("more", "said"),
     [
         ("<transmission name='t'><joint name='elbow'/><mechanicalReduction>50</mechanicalReduction></transmission>",
-         "transmission 't': <mechanicalReduction>"),
+         "<mechanicalReduction> without an inertia of the motor's rotor in transmission 't'"),
         ("<transmission name='t'><joint name='elbow'/><joint name='shoulder'/><motorInertia>1e-4</motorInertia>"
-         "</transmission>", "transmission 't': <motorInertia>"),
-        ("<gazebo reference='upper'><mu1>0.3</mu1><kp>1e5</kp></gazebo>", "<gazebo>: kp, mu1"),
+         "</transmission>", "<motorInertia>, which needs one joint of the file, in transmission 't'"),
+        ("<gazebo reference='upper'><mu1>0.3</mu1><kp>1e5</kp></gazebo>", "<gazebo>: mu1, kp"),
+        ("<gazebo reference='upper'><mu1>0.3</mu1></gazebo><gazebo reference='lower'><mu1>0.3</mu1></gazebo>",
+         "<gazebo>: mu1 (2 times)"),
+        ("<gazebo reference='upper'><springStiffness>3</springStiffness></gazebo>", "<gazebo>: springStiffness"),
+        ("<mujoco><compiler meshdir='x' balanceinertia='true'/></mujoco>", "<mujoco>: compiler balanceinertia"),
+        ("<transmission name='t'><joint name='elbow'><mechanicalReduction>3</mechanicalReduction></joint><actuator>"
+         "<mechanicalReduction>5</mechanicalReduction><motorInertia>1e-4</motorInertia></actuator></transmission>",
+         "<motorInertia> behind several ratios in transmission 't'"),
         ("<tendon name='x'/>", "<robot><tendon>"),
     ],
 )  # fmt: skip
@@ -117,11 +152,24 @@ def test_namespaces_change_nothing(load, root: str):
     assert load(arm(root=root)).bodies == load(arm()).bodies
 
 
-@pytest.mark.parametrize("encoding", ["iso-8859-1", "utf-16", "utf-8-sig", "utf-8"])
+@pytest.mark.parametrize(
+    "encoding", ["iso-8859-1", "utf-16", "utf-16-le", "utf-8-sig", "utf-8", "gb18030", "shift_jis"]
+)
 def test_files_are_read_in_the_encoding_that_they_declare(load, encoding: str):
     declared = "utf-8" if encoding == "utf-8-sig" else encoding
-    text = f'<?xml version="1.0" encoding="{declared}"?>' + arm().replace("elbow", "Gelenk-Ü")
+    text = f'<?xml version="1.0" encoding="{declared}"?>' + arm().replace(
+        "elbow", "肘" if encoding in ("gb18030", "shift_jis") else "Gelenk-Ü"
+    )
     assert load(text, encoding).independent == ("upper", "lower")
+
+
+def test_a_declared_encoding_that_cannot_be_is_put_right_or_refused(load):
+    """A declaration that can be read byte by byte is not one of UTF-16, whatever it says."""
+    text = '<?xml version="1.0" encoding="{}"?>' + arm()
+    assert load(text.format("utf-16")).bodies == load(arm()).bodies
+    for encoding in ("nonsense", "punycode", "ascii"):
+        with pytest.raises(RobotError, match="cannot be read: expected text in the encoding that its"):
+            load(text.format(encoding) + "<!-- Ü -->")
 
 
 def test_an_undeclared_prefix_is_a_name_like_others(load):
@@ -151,6 +199,43 @@ def test_a_mimic_of_a_joint_that_does_not_move_is_fixed_at_its_offset(load):
     np.testing.assert_allclose(robot.body("lower").inertial.inertia, expected.inertia, rtol=1e-12)
 
 
+def test_a_mimic_with_a_multiplier_of_zero_is_fixed_at_its_offset(load):
+    robot = load(arm(joint='<mimic joint="elbow" multiplier="0" offset="0.5"/>'))
+    assert robot.independent == ("lower",)
+    assert robot.body("lower").placement.position == pytest.approx((0.3 * np.cos(0.5), 0.3 * np.sin(0.5), 0.0))
+    assert any("fixed at 0.5" in note for note in robot.notes)
+
+
+TIP = (
+    "<link name='tip'/><link name='pad'/>"
+    "<joint name='wrist' type='{}'><parent link='lower'/><child link='tip'/><axis xyz='0 0 1'/></joint>"
+    "<joint name='grip' type='prismatic'><parent link='tip'/><child link='pad'/>{}</joint>"
+)
+
+
+@pytest.mark.parametrize("kind", ["revolute", "floating"])
+@pytest.mark.parametrize("mimic", ["", "<mimic joint='wrist'/>"])
+def test_joints_that_move_no_mass_are_fixed_with_a_warning(load, tmp_path: Path, kind: str, mimic: str):
+    """Pinocchio's mass matrix is singular there; that of the other joints is the same."""
+    with pytest.warns(LossyImportWarning, match="'wrist' moves no mass: it is fixed at 0") as caught:
+        robot = load(arm(TIP.format(kind, mimic)))
+    assert len(caught) == 1
+    assert robot.bodies == load(arm(), name="bare.urdf").bodies
+    assert any("'grip'" in note for note in robot.notes)
+    (tmp_path / "over.yaml").write_text("urdf: arm.urdf\n")
+    with pytest.warns(LossyImportWarning, match="'wrist' moves no mass"):
+        assert load_robot(tmp_path / "over.yaml").independent == ("upper", "lower")
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+def test_joints_that_move_mass_or_say_that_it_is_0_stay(load):
+    motor = TRANSMISSIONS["actuator"].format(j="wrist", n=30, i=4e-5)
+    tip = TIP.format("revolute", "").replace("<link name='pad'/>", f"<link name='pad'>{inertial(0.1, 1e-4)}</link>")
+    assert load(arm(f"{tip}<transmission name='t'>{motor}</transmission>")).independent[-2:] == ("tip", "pad")
+    with pytest.raises(RobotError, match="link 'tip' mass is 0"):  # the file says that it is 0
+        load(arm(TIP.format("revolute", "").replace("<link name='tip'/>", f"<link name='tip'>{inertial(0, 0)}</link>")))
+
+
 def test_moving_links_without_inertial_have_no_mass(load):
     text = arm().replace(f'<link name="upper">{inertial(1.5, I)}</link>', '<link name="upper"/>')
     robot = load(text)
@@ -165,6 +250,26 @@ def test_inertia_that_is_negative_by_rounding_is_zero(load):
     np.testing.assert_array_equal(load(text).body("lower").inertial.inertia, load(arm()).body("lower").inertial.inertia)
     with pytest.raises(RobotError, match="positive semidefinite"):
         load(arm().replace(inertial(1.5, I), inertial(1.5, -1e-9)))
+
+
+def test_a_new_file_gives_no_gains_to_joints_without_effort(tmp_path: Path):
+    """Such joints are passive where others have an effort; names that mean something to YAML are quoted."""
+    text = PUP.read_text().replace("fl_thigh", "fl thigh: 1").replace("fr_shank", "on")
+    head, tail = text.split('effort="', 1)
+    urdf = tmp_path / "pup.urdf"
+    urdf.write_text(f'{head}effort="0{tail[tail.index(chr(34)) :]}')
+    (tmp_path / "pup.yaml").write_text("name: another\nurdf: pup.urdf\n")
+    out, robot = write_new_robot(urdf, tmp_path / "mine.yaml")
+    assert len(robot.passive) == 1
+    assert robot.name == "pup"
+    assert {"fl thigh: 1", "on"} <= {*robot.independent}
+    assert f"effort is 0: {robot.passive[0]}." in out.read_text()
+
+
+def test_inspect_prints_what_the_file_says_beyond_the_robot(load, tmp_path: Path, capsys):
+    load(arm("<gazebo reference='upper'><mu1>0.3</mu1></gazebo>"))
+    assert main(["inspect", str(tmp_path / "arm.urdf"), "--no-errors", "--no-timing"]) == 0
+    assert "left out: <gazebo>: mu1\n" in capsys.readouterr().out
 
 
 def test_efforts_of_zero_are_said(load):

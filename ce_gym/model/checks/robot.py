@@ -104,7 +104,7 @@ def _dependent(robot: Robot) -> set[str]:
 def _check_tree(robot: Robot, file: str) -> None:
     """Names are unique, parents come first, and only the first body may be free."""
     if not robot.bodies:
-        raise bad(file, "bodies", (), "at least one body that moves")
+        raise bad(file, "bodies", (), "at least one body that moves: a moving joint, or a root link with mass")
     seen: list[str] = []
     for body in robot.bodies:
         if body.name in seen:

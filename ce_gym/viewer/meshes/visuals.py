@@ -6,7 +6,7 @@ Physics knows nothing of meshes, so that they are no part of a `Robot`; its file
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -63,13 +63,13 @@ def visuals_of(robot: Robot) -> dict[str, tuple[Visual, ...]]:
     source = Path(robot.source)
     if not robot.source or not source.is_file():
         return {}
-    names = {body.name for body in robot.bodies}
-    found = _read(source, source.stat().st_mtime_ns, robot.floating)
+    names = frozenset(body.name for body in robot.bodies)
+    found = _read(source, source.stat().st_mtime_ns, robot.floating, names)
     return {name: seen for name, seen in found.items() if name in names}
 
 
 @lru_cache(maxsize=32)
-def _read(source: Path, changed: int, floating: bool) -> dict[str, tuple[Visual, ...]]:
+def _read(source: Path, changed: int, floating: bool, names: frozenset[str]) -> dict[str, tuple[Visual, ...]]:
     """Read a file as it was at the time `changed`.
 
     Warns:
@@ -79,7 +79,7 @@ def _read(source: Path, changed: int, floating: bool) -> dict[str, tuple[Visual,
         if source.suffix.lower() in (".yaml", ".yml"):
             data = read_yaml(source).data
             source = source.parent / str(data.get("urdf") or data.get("mjcf"))
-        items = list(_of_mjcf(source) if source.suffix.lower() == ".xml" else _of_urdf(source, floating))
+        items = list(_of_mjcf(source) if source.suffix.lower() == ".xml" else _of_urdf(source, floating, names))
     except (RobotError, OSError) as error:  # the robot itself was read, perhaps from another state of the file
         warnings.warn(f"{source}: meshes are not drawn: {one_line(error)}", stacklevel=2)
         return {}
@@ -87,10 +87,10 @@ def _read(source: Path, changed: int, floating: bool) -> dict[str, tuple[Visual,
     return {body: seen for body, seen in bodies.items() if any(isinstance(one, MeshFile) for one in seen)}
 
 
-def _of_urdf(path: Path, floating: bool) -> Iterator[tuple[str, Visual]]:
+def _of_urdf(path: Path, floating: bool, names: Collection[str]) -> Iterator[tuple[str, Visual]]:
     graph, undrawn = UrdfGraph(path), dict[str, list[str]]()
     frames, colors = (
-        read_tree(graph, "floating" if floating else "fixed").frames,
+        read_tree(graph, "floating" if floating else "fixed", tied=names).frames,
         read.colors_of(graph.file, graph.robot),
     )
     for link, element in graph.links.items():

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from ce_gym.model.errors import RobotError, bad
-from ce_gym.model.formats.text_file import check_regular, one_line, read_text
+from ce_gym.model.formats.text_file import check_regular, one_line, read_bytes
 
 MOST_ELEMENTS = 10_000
 """Most elements of a file, copies counted."""
@@ -75,10 +75,12 @@ def _read_pages(path: Path, main: Path, pages: dict[Path, Element]) -> None:
 
 
 def _parsed(path: Path) -> Element:
-    text = read_text(path, "an MJCF file")
+    text = read_bytes(path, "an MJCF file").decode("utf-8", "replace").removeprefix("\ufeff").replace("\r\n", "\n")
     if "<!DOCTYPE" in text:
         raise RobotError(f"{path}: there is a <!DOCTYPE>: expected MJCF without document type and entities")
     text = _without(_without(text, "<!--", "-->"), "<?", "?>")  # MuJoCo takes comments that XML does not allow
+    if "\ufffd" in text:
+        raise RobotError(f"{path}: cannot be read: expected an MJCF file in UTF-8, comments apart")
     start = re.search(r"<([^\s/>]*)", text)
     if start is None or start[1] not in ("mujoco", "mujocoinclude"):
         raise bad(str(path), "root element", start and start[1], "<mujoco>")

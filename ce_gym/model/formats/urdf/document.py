@@ -6,6 +6,8 @@ namespace means nothing. The encoding is the one that the file declares.
 
 from __future__ import annotations
 
+import codecs
+import re
 from pathlib import Path
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
@@ -15,6 +17,13 @@ from ce_gym.model.formats.text_file import one_line, read_bytes
 
 XACRO_DEFINITIONS = ("xacro:property", "xacro:arg")
 """Elements of xacro that add nothing to a robot by themselves."""
+BYTE_ORDER_MARKS = (
+    *((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32")),
+    *((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")),
+    *((b"<\0", "utf-16-le"), (b"\0<", "utf-16-be")),  # no mark, but the first character of every XML file
+)
+ENCODINGS = ("utf", "iso8859", "cp", "ascii", "gb", "hz", "big5", "shift_jis", "euc", "koi8", "mac")
+"""What names of character sets start with in Python; some of its other codecs take very long for large files."""
 
 
 def parse_urdf(path: Path) -> Element:
@@ -23,9 +32,9 @@ def parse_urdf(path: Path) -> Element:
     Raises:
         RobotError: The file cannot be read, is not XML, has a document type, or is xacro that was not expanded.
     """
-    text = read_bytes(path, "a URDF file").lstrip()  # a declaration must come first, and some files begin with a space
+    text = _decoded(path, read_bytes(path, "a URDF file")).lstrip()  # some files begin with a space
     builder = TreeBuilder()
-    parser = expat.ParserCreate()
+    parser = expat.ParserCreate("utf-8")  # whatever the text itself declares
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
     parser.EndElementHandler = builder.end
@@ -36,7 +45,7 @@ def parse_urdf(path: Path) -> Element:
 
     parser.StartDoctypeDeclHandler = refuse_document_type
     try:
-        parser.Parse(text, True)
+        parser.Parse(text.encode(), True)
         root = builder.close()
     except (expat.ExpatError, AssertionError, ValueError, LookupError) as error:
         if isinstance(error, RobotError):
@@ -48,11 +57,30 @@ def parse_urdf(path: Path) -> Element:
     return root
 
 
+def _decoded(path: Path, data: bytes) -> str:
+    """Return the text of a file in the encoding that a byte order mark or its XML declaration says; else UTF-8."""
+    declared = re.match(rb"""\s*<\?xml[^>]*?encoding\s*=\s*["']([\w.:-]+)""", data)
+    encoding = declared[1].decode("ascii", "replace") if declared else "utf-8"
+    if re.match("utf-?(16|32)|ucs", encoding, re.IGNORECASE):
+        encoding = "utf-8"  # the declaration was read byte by byte, so it is wrong
+    encoding = next((name for mark, name in BYTE_ORDER_MARKS if data.startswith(mark)), encoding)
+    try:
+        if not codecs.lookup(encoding).name.startswith(ENCODINGS):
+            raise LookupError(f"unknown encoding: {encoding}")
+        text = data.decode(encoding)
+        text.encode()
+    except (LookupError, ValueError) as error:
+        expected = "text in the encoding that its <?xml encoding> declares, UTF-8 without one"
+        raise RobotError(f"{path}: cannot be read: expected {expected} ({one_line(error)})") from None
+    return text
+
+
 def _refuse_xacro(file: str, root: Element) -> None:
     """Refuse a file whose macros were not expanded: links and numbers are missing in it."""
     for element in root.iter():
         wants = element.tag.startswith("xacro:") and element.tag not in XACRO_DEFINITIONS
-        value = next((value for value in element.attrib.values() if "${" in value or "$(" in value), None)
+        texts = (*element.attrib.values(), element.text or "")
+        value = next((text for text in texts if "${" in text or "$(" in text), None)
         if wants or (value is not None and not element.tag.startswith("xacro:")):
             found = f"<{element.tag}>" if wants else value
             raise bad(file, "xacro", found, "a plain URDF; expand it first: xacro FILE > robot.urdf")

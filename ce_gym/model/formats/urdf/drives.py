@@ -1,6 +1,6 @@
 """Motors that a URDF describes -> rotors behind gears.
 
-- <transmission> of one joint with <mechanicalReduction> and <motorInertia>, in the transmission, its joint or its
+- <transmission> of one joint with <mechanicalReduction> and <motorInertia>, in the transmission, its joint or each
   actuator (ROS control), or with <drake:gear_ratio value> and <drake:rotor_inertia value> (Drake).
 - <dynamics rotor_inertia> (RaiSim): an inertia that is added at the joint, so a rotor whose ratio is not known.
 
@@ -10,7 +10,7 @@ Each becomes a thin disc without mass about the joint's axis, mounted where the 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from xml.etree.ElementTree import Element
 
@@ -27,6 +27,9 @@ WORDS = {
 }
 UNMODELLED = ("type", "joint", "actuator", "hardwareInterface", "role", "offset")
 """Other elements of a <transmission>, which say nothing of inertia."""
+_READ = {*UNMODELLED, *(tag for words in WORDS.values() for tag in words)}
+MOST_NAMES = 3
+"""Most transmissions that a note names."""
 
 
 @dataclass(frozen=True)
@@ -116,37 +119,66 @@ def _forget_ratio(rotor: Body, rotors: list[Body], gears: list[LinearConstraint]
 
 def _transmissions(graph: UrdfGraph, notes: list[str]) -> Iterator[Drive]:
     by_name: Mapping[str, str] = {joint.name: link for link, joint in graph.joints.items()}
+    left_out: dict[str, list[str]] = {}
     for i, element in enumerate(graph.robot.findall("transmission")):
-        where = f"transmission {element.get('name') or i + 1!r}"
-        figures = {key: _figure(graph.file, where, element, words) for key, words in WORDS.items()}
+        name = element.get("name") or str(i + 1)
+        where = f"transmission {name!r}"
         joints = [joint.get("name", (joint.text or "").strip()) for joint in element.findall("joint")]
-        known = {tag for words in WORDS.values() for tag in words} | set(UNMODELLED)
-        unread = sorted({child.tag for part in element.iter() for child in part} - known)
-        if unread:
-            notes.append(f"left out: {where}: {', '.join(f'<{tag}>' for tag in unread)}")
-        inertia, ratio = figures["inertia"], figures["ratio"]
-        if len(joints) == 1 and joints[0] in by_name and inertia:
-            yield Drive(where, by_name[joints[0]], inertia, ratio or 1.0)
-        elif inertia:
-            notes.append(f"left out: {where}: <motorInertia>, which needs one joint of the file")
-        elif ratio not in (None, 0.0, 1.0, -1.0):
-            notes.append(f"left out: {where}: <mechanicalReduction> without an inertia of the motor's rotor")
+        motors = list(_motors(graph.file, where, element))
+        unread = {child.tag for part in element.iter() for child in part} - _READ
+        for tag in sorted(unread):
+            left_out.setdefault(f"<{tag}>", []).append(name)
+        for inertia, ratios in motors:
+            if len(joints) != 1 or joints[0] not in by_name:
+                left_out.setdefault("<motorInertia>, which needs one joint of the file,", []).append(name)
+            elif len(ratios) > 1:
+                left_out.setdefault("<motorInertia> behind several ratios", []).append(name)
+            else:
+                yield Drive(where, by_name[joints[0]], inertia, ratios[0])
+        if not motors and any(
+            abs(ratio) not in (0.0, 1.0) for ratio in _figures(graph.file, where, element.iter(), "ratio")
+        ):
+            key = "<mechanicalReduction> without an inertia of the motor's rotor"
+            left_out.setdefault(key, []).append(name)
+    notes += [f"left out: {words} in transmission {_listed(names)}" for words, names in left_out.items()]
 
 
-def _figure(file: str, where: str, transmission: Element, words: tuple[str, ...]) -> float | None:
-    """Return the number in the first element of some names, as text or as `value`; None if there is none."""
-    element = next((part for part in transmission.iter() if part.tag in words), None)
-    if element is None:
-        return None
-    text = element.get("value", element.text or "")
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    negative = value < 0.0 and words == WORDS["inertia"]
-    if not math.isfinite(value) or negative:
-        raise bad(file, f"{where} <{element.tag}>", text, "a finite number" + (" that is not negative" * negative))
-    return value
+def _motors(file: str, where: str, transmission: Element) -> Iterator[tuple[float, list[float]]]:
+    """Iterate over the inertia of each motor and its ratio; several ratios if it is not clear which one is meant.
+
+    A figure belongs to the <actuator> that it stands in, otherwise to all. A ratio of 1 beside another says nothing.
+    """
+    actuators = transmission.findall("actuator")
+    inside = {part for actuator in actuators for part in actuator.iter()}
+    shared = [part for part in transmission.iter() if part not in inside]
+    for parts, others in (*((list(actuator.iter()), shared) for actuator in actuators), (shared, list(inside))):
+        for inertia in _figures(file, where, parts, "inertia"):
+            ratios = {*_figures(file, where, parts, "ratio"), *_figures(file, where, others, "ratio")}
+            if 0.0 in ratios and inertia:
+                raise bad(file, f"{where} <mechanicalReduction>", 0.0, "a ratio other than 0")
+            if inertia:
+                yield inertia, sorted(ratios - {1.0}) or [1.0]
+
+
+def _figures(file: str, where: str, parts: Iterable[Element], key: str) -> list[float]:
+    """Return the numbers in elements that say a ratio or an inertia, as text or as `value`."""
+    found = []
+    for element in (part for part in parts if part.tag in WORDS[key]):
+        text = element.get("value", element.text or "")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        negative = value < 0.0 and key == "inertia"
+        if not math.isfinite(value) or negative:
+            raise bad(file, f"{where} <{element.tag}>", text, "a finite number" + (" that is not negative" * negative))
+        found.append(value)
+    return found
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(map(repr, names[:MOST_NAMES])) + more
 
 
 def _added_inertias(graph: UrdfGraph) -> Iterator[Drive]:

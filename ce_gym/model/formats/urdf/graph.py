@@ -81,6 +81,11 @@ class UrdfGraph:
                 welded.add(other)
         return (other for other in self.order if other in welded)
 
+    def hold(self, link: str) -> None:
+        """Fix the joint of a link at 0, and those that mimic it at their offsets."""
+        self.joints[link] = replace(self.joints[link], type="fixed")
+        self.joints = {joint.child: joint for joint in self._without_idle_mimics(list(self.joints.values()))}
+
     def _links(self) -> dict[str, Element]:
         links: dict[str, Element] = {}
         for element in self.robot.findall("link"):
@@ -111,7 +116,7 @@ class UrdfGraph:
         return list(joints.values())
 
     def _without_idle_mimics(self, joints: list[UrdfJoint]) -> list[UrdfJoint]:
-        """Return the joints; those that mimic a joint that does not move are fixed.
+        """Return the joints; those that mimic a joint that does not move, or 0 times one that does, are fixed.
 
         A <mimic> on a fixed joint means nothing: the joint does not move.
         """
@@ -122,11 +127,15 @@ class UrdfGraph:
             for name, joint in by_name.items():
                 mimic = joint.element.find("mimic")
                 other = None if mimic is None else by_name.get(mimic.get("joint", ""))
-                if joint.type == "fixed" or mimic is None or other is None or other.type != "fixed":
+                if joint.type in ("fixed", "floating") or mimic is None or other is None:
                     continue
                 ratio, offset = (read.number(self.file, joint.where, mimic, k, d) for k, d in MIMIC_DEFAULTS)
-                by_name[name] = replace(joint, type="fixed", offset=ratio * other.offset + offset)
-                self.notes.append(f"{joint.where} mimics {other.name!r}, which is fixed: it is fixed, too")
+                if other.type != "fixed" and ratio != 0.0:
+                    continue
+                at = ratio * other.offset + offset
+                by_name[name] = replace(joint, type="fixed", offset=at)
+                why = "which is fixed" if other.type == "fixed" else "0 times"
+                self.notes.append(f"{joint.where} mimics {other.name!r}, {why}: it is fixed at {at:g}")
                 changed = True
         return list(by_name.values())
 

@@ -30,7 +30,7 @@ from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.drives import add_rotors
 from ce_gym.model.formats.urdf.graph import UrdfGraph
-from ce_gym.model.formats.urdf.tree import Base, Frame, UrdfTree, read_tree
+from ce_gym.model.formats.urdf.tree import Base, Frame, UrdfTree, read_tree, warn_of_held_joints
 
 _LOOP_TYPES: dict[str, Literal["revolute", "ball"]] = {
     "revolute": "revolute",
@@ -42,7 +42,7 @@ _TRUTH = {"true": True, "1": True, "false": False, "0": False}
 
 
 def robot_from_graph(graph: UrdfGraph, base: Base | None = None) -> Robot:
-    """Read a URDF or URDF+ file that has been parsed. A plain URDF has no rotors; its <mimic> joints are constraints.
+    """Read a URDF or URDF+ file that has been parsed. Its <mimic> joints are constraints.
 
     Args:
         graph: The parsed file.
@@ -50,8 +50,12 @@ def robot_from_graph(graph: UrdfGraph, base: Base | None = None) -> Robot:
 
     Raises:
         RobotError: The file is malformed or describes something that cannot be.
+
+    Warns:
+        LossyImportWarning: Joints are fixed because they move no mass.
     """
     tree = read_tree(graph, base)
+    warn_of_held_joints(graph.file, tree)
     constraints = (*tree.constraints, *_couplings(graph, tree), *_loops(graph, tree))
     independent = tuple(_independent(graph, tree))
     dependent = [body.name for body in tree.bodies if body.name not in independent]

@@ -8,23 +8,25 @@ Vendors write rotors as links on fixed joints. Whoever knows that they are rotor
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from ce_gym.model.checks.body import check_body
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Inertial, Joint, Shape
-from ce_gym.model.errors import bad, unknown
+from ce_gym.model.errors import LossyImportWarning, bad, unknown
 from ce_gym.model.formats.placement import compose, mat3, merge_inertials, transform_inertial
 from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.drives import Drive, drives_of
-from ce_gym.model.formats.urdf.graph import UrdfGraph, UrdfJoint
-from ce_gym.model.formats.urdf.vocabulary import unread_words
+from ce_gym.model.formats.urdf.graph import MIMIC_DEFAULTS, UrdfGraph, UrdfJoint
+from ce_gym.model.formats.urdf.vocabulary import SPRINGS, unread_words
 from ce_gym.model.frames import ZERO, Placement, added
 
 Base = Literal["floating", "fixed"]
@@ -48,6 +50,7 @@ class UrdfTree:
         fixed: Links that were asked for to be kept apart, by name.
         collisions: The <collision> elements of every link that has some, in the link's frame; None for a mesh.
         drives: Motors that the file describes.
+        held: A line for each joint that is fixed because it moves no mass.
     """
 
     name: str
@@ -58,9 +61,12 @@ class UrdfTree:
     fixed: Mapping[str, FixedLink]
     collisions: Mapping[str, tuple[Shape | None, ...]]
     drives: tuple[Drive, ...]
+    held: tuple[str, ...]
 
 
-def read_urdf(path: Path, base: Base | None = None, apart: Collection[str] = ()) -> UrdfTree:
+def read_urdf(
+    path: Path, base: Base | None = None, apart: Collection[str] = (), tied: Collection[str] = ()
+) -> UrdfTree:
     """Read a URDF file.
 
     Args:
@@ -68,23 +74,38 @@ def read_urdf(path: Path, base: Base | None = None, apart: Collection[str] = ())
         base: Whether the root link is a body that moves freely or is fixed to the world. By default the root is fixed
             if it is called "world" or has no mass.
         apart: Names of links to keep apart if they hang on a fixed joint; others mean nothing.
+        tied: Names of links that may move without mass, because more is tied to them than the file says.
 
     Raises:
         RobotError: The file is missing, malformed, or describes something that is not a tree of rigid bodies; or it is
             URDF+, whose loops and couplings must not be lost.
+
+    Warns:
+        LossyImportWarning: Joints are fixed because they move no mass.
     """
     graph = UrdfGraph(path)
     if graph.is_plus:
         raise bad(graph.file, "<loop>, <coupling> or independent", "URDF+", "a plain URDF; load the URDF+ file itself")
-    tree = read_tree(graph, base, apart)
+    tree = read_tree(graph, base, apart, tied)
+    warn_of_held_joints(graph.file, tree)
     for body in tree.bodies:
         check_body(body, graph.file)
     return tree
 
 
-def read_tree(graph: UrdfGraph, base: Base | None = None, apart: Collection[str] = ()) -> UrdfTree:
+def warn_of_held_joints(file: str, tree: UrdfTree) -> None:
+    """Warn in one line of joints that are fixed because they move no mass."""
+    if tree.held:
+        first, *others = tree.held
+        more = f" (and {len(others)} more, see Robot.notes)" if others else ""
+        warnings.warn(f"{file}: {first}{more}", LossyImportWarning, stacklevel=5)
+
+
+def read_tree(
+    graph: UrdfGraph, base: Base | None = None, apart: Collection[str] = (), tied: Collection[str] = ()
+) -> UrdfTree:
     """Read the tree of a file that has been parsed; as `read_urdf`, but the figures of bodies are not checked."""
-    return _Reader(graph, base, apart).tree()
+    return _Reader(graph, base, apart, tied).tree()
 
 
 def _without_rounding(inertials: dict[str, Inertial | None]) -> dict[str, Inertial | None]:
@@ -104,16 +125,21 @@ def _without_rounding(inertials: dict[str, Inertial | None]) -> dict[str, Inerti
 class _Reader:
     """One pass over one file; holds the look-up tables the pass needs."""
 
-    def __init__(self, graph: UrdfGraph, base: Base | None, apart: Collection[str]):
-        self.graph, self.file, self.joints = graph, graph.file, graph.joints
+    def __init__(self, graph: UrdfGraph, base: Base | None, apart: Collection[str], tied: Collection[str]):
+        self.graph, self.file = graph, graph.file
         self.colors = read.colors_of(self.file, graph.robot)
+        self.springs = self._gazebo_springs()
         self.inertials = _without_rounding(
             {name: read.inertial(self.file, f"link {name!r}", link) for name, link in graph.links.items()}
         )
+        unread = list(unread_words(graph.robot))
+        self.drives = drives_of(graph, unread)
+        self.held: tuple[str, ...] = () if graph.is_plus else self._hold_idle_joints(tied)
+        self.joints = graph.joints
         self.root_is_world = self._root_is_world(base)
         self.apart = [link for link in graph.order if link in apart and self._is_fixed(link)]
         self.frames = self._frames()
-        self.notes = [*graph.notes, *unread_words(graph.robot)]
+        self.notes = [*graph.notes, *self.held, *unread]
 
     def tree(self) -> UrdfTree:
         bodies = tuple(self._body(link) for link in self.graph.order if self._moves(link))
@@ -122,14 +148,48 @@ class _Reader:
         fixed = {link: self._fixed(link) for link in self.apart}
         collisions = {link: tuple(self._shapes_of(link, "collision")) for link in self.graph.order}
         collisions = {link: shapes for link, shapes in collisions.items() if shapes}
-        drives = drives_of(self.graph, self.notes)
-        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes), fixed, collisions, drives)
+        return UrdfTree(name, bodies, self.frames, mimics, tuple(self.notes), fixed, collisions, self.drives, self.held)
+
+    def _hold_idle_joints(self, tied: Collection[str]) -> tuple[str, ...]:
+        """Fix the joints of frames, or of links without <inertial>, that move no mass; return a line for each.
+
+        Left alone: joints that motors, other files or links with mass depend on.
+        """
+        joints, heavy = self.graph.joints, {*tied, *(drive.link for drive in self.drives)}
+        for link in reversed(self.graph.order):  # children first
+            inertial = self.inertials[link]
+            if link in heavy or (inertial is not None and (inertial.mass or np.any(inertial.inertia))):
+                heavy |= {link, joints[link].parent} if link in joints else {link}
+        mimics = {joint: joint.element.find("mimic") for joint in joints.values()}
+        needed = {mimic.get("joint") for joint, mimic in mimics.items() if mimic is not None and joint.child in heavy}
+        idle = [
+            joint
+            for joint, mimic in mimics.items()
+            if joint.child not in heavy and joint.name not in needed and mimic is None and joint.type != "fixed"
+        ]
+        idle = [joint for joint in idle if joint.type == "floating" or self.inertials[joint.child] is None]
+        for joint in idle:
+            self.graph.hold(joint.child)
+        expected = "give its link an <inertial> to let it move"
+        return tuple(f"{joint.where} moves no mass: it is fixed at 0; {expected}" for joint in idle)
+
+    def _gazebo_springs(self) -> dict[str, dict[str, float]]:
+        """Return the figures of springs that <gazebo> elements give joints, by the name of the joint."""
+        found: dict[str, dict[str, float]] = {}
+        for element in self.graph.robot.findall("gazebo"):
+            for part in (part for part in element if part.tag in SPRINGS):
+                joint, text = element.get("reference", ""), part.get("value", part.text or "")
+                where = f"gazebo {joint!r}"
+                value = read.numbers(self.file, where, Element(part.tag, value=text), "value", 1)[0]
+                found.setdefault(joint, {})[SPRINGS[part.tag]] = value
+        return found
 
     def _root_is_world(self, base: Base | None) -> bool:
         floating = [joint for joint in self.joints.values() if joint.type == "floating"]
         for joint in floating:
             if joint.parent != self.graph.root or base == "fixed":
-                raise bad(self.file, f"{joint.where} type", "floating", "a joint with one degree of freedom")
+                expected = "a joint with one degree of freedom; fixed for a frame, floating only on a root without mass"
+                raise bad(self.file, f"{joint.where} type", "floating", expected)
         mass = added(part.mass for link in self.graph.welded_to(self.graph.root) if (part := self.inertials[link]))
         if floating and mass:
             raise bad(self.file, f"link {self.graph.root!r} mass", mass, "none, because a floating joint hangs on it")
@@ -183,6 +243,7 @@ class _Reader:
         if joint is not None and joint.type != "floating":
             parent, pose = self._attachment(joint, self.frames)
             motion = read.joint(self.file, joint.where, joint.element, joint.type)
+            motion = replace(motion, **self.springs.get(joint.name, {}))
         shapes = tuple(shape for part in parts for shape in self._shapes(part, self.frames[part][1]))
         return Body(link, "link", parent, pose, motion, merge_inertials(inertials), shapes)
 
@@ -208,8 +269,5 @@ class _Reader:
                 raise unknown(
                     self.file, f"{joint.where} <mimic joint>", mimic.get("joint"), by_name, "the name of a joint"
                 )
-            ratio = read.number(self.file, joint.where, mimic, "multiplier", 1.0)
-            if ratio == 0.0:
-                raise bad(self.file, f"{joint.where} <mimic multiplier>", ratio, "a ratio other than 0")
-            offset = read.number(self.file, joint.where, mimic, "offset", 0.0)
+            ratio, offset = (read.number(self.file, joint.where, mimic, key, value) for key, value in MIMIC_DEFAULTS)
             yield LinearConstraint(f"{joint.name} mimic", ((joint.child, 1.0), (other.child, -ratio)), offset)

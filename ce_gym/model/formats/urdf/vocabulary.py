@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from xml.etree.ElementTree import Element
 
 CHILDREN = {
-    "robot": {"link", "joint", "material", "transmission", "gazebo", "loop", "coupling", "loop_joint"},
+    "robot": {"link", "joint", "material", "transmission", "gazebo", "mujoco", "loop", "coupling", "loop_joint"},
     "link": {"inertial", "visual", "collision"},
     "inertial": {"origin", "mass", "inertia"},
     "collision": {"origin", "geometry", "material"},
@@ -39,6 +39,13 @@ ATTRIBUTES = {
     "mimic": {"joint", "multiplier", "offset"},
 }
 """Attributes that are read."""
+EXTENSIONS = {
+    "gazebo": {"material", "sensor", "visual"},
+    "mujoco": {"meshdir", "assetdir", "strippath", "discardvisual"},
+}
+"""Elements for other programs, and words in them that are for the eye, for sensors or for files."""
+SPRINGS = {"springStiffness": "stiffness", "springReference": "springref"}
+"""Words of <gazebo reference="JOINT"> that are read, and the figure of the joint that each is."""
 READ_ELSEWHERE = ("visual", "material", "transmission", "loop", "coupling", "loop_joint")
 """Elements whose content is not looked at here."""
 
@@ -46,15 +53,30 @@ READ_ELSEWHERE = ("visual", "material", "transmission", "loop", "coupling", "loo
 def unread_words(robot: Element) -> tuple[str, ...]:
     """Return a note for each kind of element or attribute that nothing reads, with how often it occurs."""
     counts = Counter(_unread("", robot))
-    return tuple(f"left out: {word}{f' ({count} times)' if count > 1 else ''}" for word, count in counts.items())
+    words = [f"<{tag}>: {', '.join(_counted(of))}" for tag in EXTENSIONS if (of := Counter(_extended(robot, tag)))]
+    return tuple(f"left out: {word}" for word in (*_counted(counts), *words))
+
+
+def _counted(words: Counter[str]) -> list[str]:
+    return [f"{word}{f' ({count} times)' if count > 1 else ''}" for word, count in words.items()]
+
+
+def _extended(robot: Element, tag: str) -> Iterator[str]:
+    """Iterate over the words for another program that nothing reads, with their attributes where these say it all."""
+    joints = {joint.get("name") for joint in robot.findall("joint") if joint.get("type") != "fixed"}
+    for element in robot.findall(tag):
+        springs = SPRINGS if element.get("reference") in joints else ()
+        for child in element:
+            names = [name for name in child.attrib if name not in ("name", "value", "type", "filename")]
+            words = [f"{child.tag} {name}" for name in names if name not in EXTENSIONS[tag]]
+            if child.tag not in EXTENSIONS[tag] and child.tag not in springs and (words or not names):
+                yield from words or [child.tag]
 
 
 def _unread(parent: str, element: Element) -> Iterator[str]:
     """Iterate over the words under an element that nothing reads, as `<joint><calibration>` or `<limit jerk>`."""
     tag = element.tag
-    if tag == "gazebo" and parent == "robot":
-        words = sorted({child.tag for child in element})
-        yield f"<gazebo>: {', '.join(words)}" if words else "<gazebo>"
+    if tag in EXTENSIONS and parent == "robot":
         return
     if parent and tag not in CHILDREN.get(parent, ()):
         yield f"<{parent}><{tag}>"

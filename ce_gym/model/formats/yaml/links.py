@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,9 @@ from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.urdf.drives import Drive
 from ce_gym.model.formats.urdf.tree import Base, Frame, read_urdf
+
+_TIES = ("rotors", "constraints", "independent")
+"""Keys under which links are named that move although the URDF alone gives them no mass."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,8 @@ def read_links(path: Path, file: Section) -> Links:
         if "gears" in file:
             raise bad(file.file, "gears", "given", "none: a URDF has no armature; give `rotors`")
         base: Base | None = file.text("base", None, choices=("floating", "fixed"))  # type: ignore[assignment]
-        tree = read_urdf(path.parent / file.text("urdf"), base, rotors.data)
+        tied = {word for key in _TIES for word in _words(file.data.get(key))}
+        tree = read_urdf(path.parent / file.text("urdf"), base, rotors.data, tied)
         independent = _not_tied(tree.bodies, tree.constraints)
         robot = Robot(tree.name, tree.bodies, tree.constraints, independent, notes=tree.notes)
         return Links(robot, dict(tree.frames), tree.fixed, tree.collisions, tree.drives, driven)
@@ -64,6 +68,15 @@ def read_links(path: Path, file: Section) -> Links:
         raise bad(file.file, "base", file.get("base"), "none, because an MJCF file says itself what its base is")
     robot, frames, fixed = read_robot(path.parent / file.text("mjcf"), file.section("gears"), driven, rotors.data)
     return Links(robot, frames, fixed, {})
+
+
+def _words(value: object) -> Iterator[str]:
+    """Iterate over the texts in a part of a file."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for item in value.items() if isinstance(value, dict) else value:
+            yield from _words(item)
 
 
 def names_in(section: Section, key: str) -> tuple[str, ...]:
