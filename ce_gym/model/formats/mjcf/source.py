@@ -199,7 +199,8 @@ def _check_figures(file: str, model: Any) -> None:
     if (model.dof_armature < 0.0).any():
         raise bad(file, "armature", float(model.dof_armature.min()), "0 or more [kg m^2 or kg]")
     if max(model.nbody - 1, model.nv) > MOST_BODIES:
-        raise bad(file, "number of bodies", model.nbody - 1, f"at most {MOST_BODIES} and as many joints")
+        found = f"{model.nbody - 1} bodies with {model.nv} degrees of freedom"
+        raise bad(file, "size", found, f"at most {MOST_BODIES} of each")
 
 
 def placement(position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> Placement:
