@@ -21,9 +21,8 @@ from ce_gym.model.errors import listed_names
 from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
-    "speed", "beside", "instructions", "throughput", "tracking", "stability", "friction", "paper", "accuracy",
-    "adaptive", "soak", "gpu", "digests", "fuzz", "files", "ids", "gradients", "derivatives", "exactness", "growth",
-    "surroundings", "servo", "identification", "all",
+    "speed", "beside", "instructions", "throughput", "tracking", "stability", "accuracy", "adaptive", "derivatives",
+    "growth", "gpu", "digests", "files", "all",
 )  # fmt: skip
 
 

@@ -24,7 +24,6 @@ QUICK: dict[str, tuple[str, ...]] = {
     "growth": ("--joints", "2", "5", "10", "20", "--robots", "1", "64", "4096", *ROUNDS),
     "throughput": ROUNDS,
     "derivatives": ROUNDS,
-    "friction": (),
     "stability": ("--quick",),
     "accuracy": ("--quick",),
     "adaptive": ("--quick",),

@@ -107,44 +107,6 @@ def test_mujocos_own_batches_come_to_the_same_states():
     np.testing.assert_array_equal(found, ours.trajectory(control)[:, :, 1 : 1 + ours.model.nq])
 
 
-def test_every_figure_of_a_small_robot(tmp_path):
-    pytest.importorskip("mujoco")
-    from ce_gym.bench.speed import batch as speed_batch
-    from ce_gym.bench.speed import robots as speed_robots
-
-    robot = load_robot("four_bar")
-    measured = speed_robots.measure(robot, "exact", num_envs=16, dt=0.005, rounds=1)
-    assert not measured.skipped
-    assert measured.operations > 100
-    assert 4 * 2 <= measured.bytes_per_robot["float32"] < measured.bytes_per_robot["float64"] < 1000
-    times = speed_robots.time_table([measured])
-    assert all(isinstance(cell, float) and cell > 0 for cell in times.rows[0][2:])
-    work = speed_robots.work_table([measured], {"float64": 1e11, "float32": 2e11})
-    assert 0 < work.rows[0][4] < 100
-
-    batches = speed_batch.measure(robot, (1, 16), 0.005, 1)
-    assert [row[0] for row in batches.rows] == [1, 16]
-    assert {"ours, float64, one core", "MuJoCo, armature, one core"} <= set(batches.columns)
-    batches.write_csv(tmp_path / "batch.csv")
-    assert len((tmp_path / "batch.csv").read_text().splitlines()) == 3
-    pytest.importorskip("matplotlib")
-    assert speed_batch.draw(batches, tmp_path).stat().st_size > 10_000
-
-
-def test_a_peer_that_cannot_is_named(monkeypatch):
-    pytest.importorskip("mujoco")
-    from ce_gym.bench.speed import robots as speed_robots
-    from ce_gym.bench.speed import stepping
-
-    def refuse(*_):
-        raise RobotError("four_bar: no way to say it")
-
-    monkeypatch.setattr(stepping, "mujoco_batch", refuse)
-    measured = speed_robots.measure(load_robot("four_bar"), "exact", num_envs=16, dt=0.005, rounds=1)
-    assert measured.skipped == ["MuJoCo, four_bar exact: four_bar: no way to say it"]
-    assert speed_robots.time_table([measured]).rows[0][-3:] == (None, None, None)
-
-
 def test_tables_in_markdown_and_csv(tmp_path):
     table = Table("Times", ("robot", "us"), (("a", 0.123456), ("b", None)))
     assert table.as_markdown().splitlines()[2:] == ["| robot | us |", "| --- | --- |", "| a | 0.1235 |", "| b |  |"]

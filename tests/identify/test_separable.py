@@ -1,11 +1,8 @@
 """What is held and what estimates then are, on columns of the test's own: a linear problem, solved without the code."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from ce_gym.bench.accuracy.identification import combined
 from ce_gym.identify.figures import Figure
 from ce_gym.identify.separable import Held, covariance_of, held_of, hold, lines_of
 
@@ -55,14 +52,6 @@ def test_of_three_figures_that_act_alike_two_are_held_and_the_third_stands_for_b
         assert "the data cannot separate it from motor_friction:c;" in line
         assert "1 to 1" not in line
     assert lines[0].startswith("rotor_inertia:a is held at 1, as in the robot's file: ")
-
-
-def test_the_truth_of_an_estimate_has_all_that_is_held():
-    """As least squares have it that hold figures at what they are not."""
-    held, _, values, _ = found_in(columns(1e-4))
-    truth = combined(SimpleNamespace(figures=FIGURES, held=held), PLANTED)  # type: ignore[arg-type]
-    np.testing.assert_allclose(truth[2:], values[2:], rtol=1e-6)
-    np.testing.assert_allclose(truth[:2], [PLANTED[A.name], PLANTED[B.name]])
 
 
 def test_a_figure_that_is_felt_by_nothing_else_is_known_badly_and_shifts_nothing():

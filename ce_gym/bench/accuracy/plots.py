@@ -11,10 +11,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+
 from ce_gym.bench.accuracy.curves import MARGIN, Curve, Delivered, Measured
 from ce_gym.bench.accuracy.scenarios import SINGLE
-from ce_gym.bench.paper.plots import BLUE, GREEN, GREY, ORANGE, RED, SKY, STYLE, plt
 
+matplotlib.use("Agg")  # pictures go to files, whether or not there is a display
+from matplotlib import pyplot as plt
+
+BLUE, SKY, GREEN, ORANGE, RED, GREY = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#777777"
+STYLE: dict[str, Any] = {
+    "font.size": 9.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "legend.frameon": False,
+}
 COLUMNS = 4
 OURS = {
     "euler": ("ce_gym, Euler", SKY, "o-"),

@@ -1,16 +1,12 @@
 """Stability: every time step, stiffness and slip speed on every robot; tests of others; endurance; and a map of it all.
 
-The parts are in grid.py (the map), cases.py (tests of small mechanisms), robots.py (endurance), resting.py (MuJoCo on
-the same cells) and plots.py.
+The parts are in grid.py (the map), cases.py (tests of small mechanisms), robots.py (endurance) and plots.py.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import itertools
-from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +17,6 @@ from ce_gym.bench.stability import plots as stability_plots
 from ce_gym.bench.stability import robots as stability_robots
 from ce_gym.bench.stability.cases import CASES
 from ce_gym.dynamics.model import Model
-from ce_gym.model import Robot, load_robot
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.viewer.console import shown
 
@@ -30,12 +25,7 @@ PATIENCE, COLLAPSE, STANDING, FUZZ = 120.0, 3.0, 600.0, 1_000_000
 """Longest time to come to rest [s], time of a collapse [s], time of standing [s], robot-steps of random torques."""
 RETRY = 6
 """Halvings of a step for those whom random torques break."""
-PARTS = ("map", "cases", "robots", "beside")
-BESIDE = ("drop_3cm", "drop_3cm elastic", "stairs", "shanks", "biped")
-RESTING = 20.0
-"""Scenes that come to rest beside MuJoCo, and how long they have [s]."""
-FINE = 5.0
-"""Steps below which no energy should rise at all [ms]."""
+PARTS = ("map", "cases", "robots")
 DRIFT = 1e-3
 """Largest drift of a robot that stands [m]."""
 
@@ -48,8 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--quick", action="store_true", help="one robot, two time steps, short waits: a minute")
     parser.add_argument("--skip", nargs="+", default=[], choices=PARTS, help="parts to leave out")
-    damping = "of all joints of these robots [N m s/rad], instead of their own"
-    parser.add_argument("--joint-damping", type=float, metavar="D", help=damping)
     parser.add_argument("--picture", type=Path, metavar="FILE", help="also draw the map to a PNG file")
 
 
@@ -57,7 +45,7 @@ def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
     quick = arguments.quick
     robots = arguments.robot[:1] if quick else arguments.robot
-    models = {name: Model(damped(load_robot(name), arguments.joint_damping)) for name in robots}
+    models = {name: Model(name) for name in robots}
     report = Report("stability")
     if "map" not in arguments.skip:
         steps = (0.002, 0.01) if quick else arguments.dt
@@ -73,17 +61,7 @@ def run(arguments: argparse.Namespace) -> Report:
     if "robots" not in arguments.skip:
         standing, fuzz = (60.0, 100_000) if quick else (STANDING, FUZZ)
         report_robots(report, models, standing, fuzz)
-    if "beside" not in arguments.skip:
-        report_beside(report, BESIDE[:1] if quick else BESIDE, (4, 1) if quick else None)
     return report
-
-
-def damped(robot: Robot, damping: float | None) -> Robot:
-    """Return a robot with another damping at all its independent joints [N m s/rad]; itself for None."""
-    if damping is None:
-        return robot
-    joints = {name: replace(robot.body(name).joint, damping=damping) for name in robot.independent}
-    return replace(robot, bodies=tuple(replace(b, joint=joints.get(b.name, b.joint)) for b in robot.bodies))
 
 
 def report_map(report: Report, maps: dict[str, list[grid.Map]]) -> None:
@@ -115,29 +93,12 @@ def report_map(report: Report, maps: dict[str, list[grid.Map]]) -> None:
     passive = int((gain <= grid.ROUNDING).sum())
     text = f"{passive} of {n}, worst {gain.max():.1e} of the energy lost"
     met(Requirement("map: energy with springs and bristles never rises, without motors", text, passive == n))
-    report_rises(report, maps)
     report.remarks.append(
         "Speed at rest: rms over all coordinates and 100 steps in a row [m/s and rad/s], once below the bar or when "
         "the time is up. Energy gained: largest rise above the lowest so far, springs included; kinetic and potential: "
         "highest above the start; both as shares of the energy that a robot loses when it collapses. What is gained at "
         "coarse steps is in stiff springs that a corner dips into within a step; they do not give it back."
     )
-
-
-def report_rises(report: Report, maps: dict[str, list[grid.Map]]) -> None:
-    """Add a row for each cell in which the sum of all energies rises, and the bar below 5 ms."""
-    rows: list[tuple[Cell, ...]] = []
-    for name, m in ((name, m) for name, steps in maps.items() for m in steps):
-        for i, j in np.argwhere(m.finite & (m.gain > grid.ROUNDING)):
-            cell = (name, 1e3 * m.dt, f"{grid.STIFFNESSES[i]:.0e}", 1e3 * grid.SLIP_SPEEDS[j])
-            rows.append((*cell, float(m.gain[i, j]), str(m.source[i, j]), float(m.when[i, j])))
-    columns = ("robot", "dt [ms]", "k [N/m]", "slip speed [mm/s]", "gained / lost", "by", "most at [s]")
-    title = "Cells in which energy with springs and bristles rises, and what adds most where it rises most"
-    report.tables.append(Table(title, columns, tuple(rows)))
-    fine = [str(row[5]) for row in rows if float(str(row[1])) < FINE]
-    n = sum(m.finite.size for steps in maps.values() for m in steps if 1e3 * m.dt < FINE)
-    said = ", ".join([f"{n - len(fine)} of {n}", *(f"{count} by {source}" for source, count in Counter(fine).items())])
-    report.requirements.append(Requirement(f"map: the same below {FINE:g} ms", said, not fine))
 
 
 def report_cases(report: Report) -> None:
@@ -180,16 +141,3 @@ def report_robots(report: Report, models: dict[str, Model], standing: float, fuz
         Requirement("random torques up to the limits: none lost", f"{lost}", lost == 0),
         Requirement(f"the same with up to {RETRY} halvings of a step that fails", f"{given_up}", given_up == 0),
     ]
-
-
-def report_beside(report: Report, names: tuple[str, ...], steps: tuple[int, ...] | None) -> None:
-    """Add what comes to rest beside MuJoCo, with every integrator; nothing without it."""
-    if importlib.util.find_spec("mujoco") is None:
-        report.remarks.append("Cells beside MuJoCo: skipped, mujoco is not installed.")
-        return
-    from ce_gym.bench.stability import resting
-
-    table, behind = resting.measure(names, steps or resting.STEPS, RESTING)
-    report.tables.append(table)
-    text = ", ".join(behind) or "none moves"
-    report.requirements.append(Requirement("beside MuJoCo: at rest wherever some way of its is", text, not behind))

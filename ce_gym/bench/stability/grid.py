@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.stability.rises import SOURCES, Largest, sources
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
 
@@ -53,8 +52,6 @@ class Map:
         gain: Largest rise of the mechanical energy above its lowest value so far, springs included, while robots
             collapse without motors, as a share of all they lose [-].
         excess: Highest sum of kinetic and potential energy above that at the start, same unit [-].
-        source: Which of `SOURCES` adds most in the step in which the energy of the start that gains most rises most.
-        when: The end of that step [s].
     """
 
     dt: float
@@ -63,8 +60,6 @@ class Map:
     settled: float
     gain: Array
     excess: Array
-    source: Array
-    when: Array
 
 
 def measure(model: Model, dt: float, patience: float, collapse: float, dtype: str = "float64") -> Map:
@@ -102,43 +97,25 @@ def stand(model: Model, dt: float, patience: float, dtype: str) -> tuple[Array, 
     return worst(sim.diverged) == 0, worst(speed), time
 
 
-def fall(model: Model, dt: float, time: float, dtype: str) -> tuple[Array, Array, Array, Array, Array]:
-    """Let robots collapse without motors; return whether they stay finite, gain, excess, source, when, see `Map`."""
-    sim = scene(model, dt, "torque", ("energy", "contact_forces"), dtype)
+def fall(model: Model, dt: float, time: float, dtype: str) -> tuple[Array, Array, Array]:
+    """Let robots collapse without motors; return whether they stay finite, gain and excess, see `Map`."""
+    sim = scene(model, dt, "torque", ("energy",), dtype)
     q, v = starts(model, FALL, 0.5)
     sim.set_state(q, v)
     nothing = np.zeros(len(model.joint_links))
     start = np.sum(model.energy(sim.q, sim.v), axis=0)
-    last, lowest, gain, excess = start, start.copy(), np.zeros_like(start), np.full_like(start, -np.inf)
-    before = sim.snapshot()
-    largest = Largest.none(before, sim.contact_forces)
+    lowest, gain, excess = start.copy(), np.zeros_like(start), np.full_like(start, -np.inf)
     every = max(1, round(0.01 / dt))
     for i in range(round(time / dt)):
         sim.step(nothing)
-        energy, after = np.asarray(sim.energy, dtype=np.float64), sim.snapshot()
-        largest.take(i, energy - last, before, after, sim.contact_forces)
+        energy = np.asarray(sim.energy, dtype=np.float64)
         gain = np.maximum(gain, energy - lowest)
         lowest = np.minimum(lowest, energy)
-        last, before = energy, after
         if i % every == 0:
             excess = np.maximum(excess, np.sum(model.energy(sim.q, sim.v), axis=0) - start)
     lost = start - lowest
     bad = np.where(sim.diverged, np.inf, 0.0)
-    source, when = _of_the_worst(gain / lost, sources(model, largest, stiffnesses(), dt), dt * (largest.step + 1))
-    return worst(sim.diverged) == 0, worst(gain / lost + bad), worst(excess / lost + bad), source, when
-
-
-def _of_the_worst(gain: Array, added: Array, when: Array) -> tuple[Array, Array]:
-    """Return source and time of the start of each cell that gains most, both shape SHAPE."""
-    rows, columns = np.indices(SHAPE)
-    first = gain.reshape(STARTS, *SHAPE).argmax(axis=0), rows, columns
-    names = np.asarray(SOURCES)[added.argmax(axis=1)]
-    return names.reshape(STARTS, *SHAPE)[first], when.reshape(STARTS, *SHAPE)[first]
-
-
-def stiffnesses() -> Array:
-    """Return the stiffness of the ground of every robot of a scene [N/m]."""
-    return np.tile(np.repeat(STIFFNESSES, SHAPE[1]), STARTS)
+    return worst(sim.diverged) == 0, worst(gain / lost + bad), worst(excess / lost + bad)
 
 
 def scene(model: Model, dt: float, control: str, outputs: tuple[str, ...], dtype: str) -> Simulator:

@@ -13,14 +13,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
+from tripod import TRIPOD
 
-from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.model import load_robot, robots
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim import Simulator
-from ce_gym.viewer.console import shown
 
 NUM_ENVS = 256
 """Robots in a batch."""
@@ -41,7 +41,6 @@ class Case:
     Attributes:
         robot, level, dtype, control: Which.
         steps: Sub-steps of robots.
-        retried: How many of them were made in parts.
         diverged: Robots that diverged and were not made to.
         complaints: What was not as it should be, one line each.
     """
@@ -51,7 +50,6 @@ class Case:
     dtype: str
     control: str
     steps: int = 0
-    retried: int = 0
     diverged: int = 0
     complaints: list[str] = field(default_factory=list)
 
@@ -62,7 +60,6 @@ class Case:
         while self.steps < share:
             self.episode(batch, alone, rng)
             self.steps += NUM_ENVS * DRAWS * N_SUBSTEPS
-        self.retried = batch.n_retried
 
     def episode(self, batch: Any, alone: Any, rng: np.random.Generator) -> None:
         """Make one episode."""
@@ -110,33 +107,15 @@ def all_cases(names: Iterable[str]) -> list[Case]:
     return found
 
 
-def run(substeps: float, names: Iterable[str] | None = None, seed: int = 0) -> Report:
-    """Make `substeps` sub-steps of robots, shared among all cases; Ctrl-C reports those that are done."""
-    cases, done, left = all_cases(names or robots()), list[Case](), substeps
-    rng = np.random.default_rng(seed)
-    try:
-        for case in shown(cases, "robots"):
-            case.run(left / (len(cases) - len(done)), rng)
-            left -= case.steps
-            done.append(case)
-    except KeyboardInterrupt:
-        pass
-    return reported(done, len(cases))
+def test_random_sub_steps_of_a_robot():
+    case = Case(TRIPOD, "exact", "float64", "position")
+    case.run(1, np.random.default_rng(0))
+    assert case.steps == NUM_ENVS * DRAWS * N_SUBSTEPS
+    assert (case.diverged, case.complaints) == (0, [])
 
 
-def reported(done: list[Case], cases: int) -> Report:
-    """Return the report on cases."""
-    report, steps = Report("substeps"), sum(case.steps for case in done)
-    complaints = [text for case in done for text in dict.fromkeys(case.complaints)]
-    rows = tuple(
-        (c.robot, c.level, c.dtype, c.control, c.steps, c.retried, c.diverged, len(c.complaints)) for c in done
-    )
-    columns = ("robot", "level", "precision", "control", "sub-steps", "made in parts", "diverged", "complaints")
-    report.tables.append(Table(f"{steps:.3g} sub-steps under random targets and torques", columns, rows))
-    claim = "every failure flagged, none spread, nothing that is not finite"
-    measured = f"{len(complaints)} complaints in {len(done)} of {cases} cases"
-    report.requirements.append(Requirement(claim, measured, not complaints and len(done) == cases))
-    diverged = sum(case.diverged for case in done)
-    report.requirements.append(Requirement("robots do not diverge at the default step", f"{diverged}", not diverged))
-    report.remarks += complaints[:20]
-    return report
+@pytest.mark.stress
+@pytest.mark.parametrize("case", all_cases(robots()), ids=str)
+def test_random_sub_steps_of_all_robots(case: Case):
+    case.run(1e6, np.random.default_rng(0))
+    assert (case.diverged, case.complaints) == (0, [])

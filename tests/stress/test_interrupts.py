@@ -16,10 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
-
-from ce_gym.bench.measure.report import Report, Requirement, Table
-from ce_gym.viewer.console import shown
 
 ROBOT, ENVIRONMENT = "mini_cheetah", "ce_gym/MiniCheetahVelocity-v0"
 NUM_ENVS = 200
@@ -76,24 +74,22 @@ class Case:
             self.complaints.append(f"{self.name}: neither before the call nor after it")
 
 
-def run(times: int, seed: int = 0) -> Report:
-    """Interrupt `times` calls, of all cases in turn, then a long one."""
-    rng = np.random.default_rng(seed)
+@pytest.mark.stress
+def test_each_call_is_made_whole_or_not_at_all(minutes: float):
+    rng, end = np.random.default_rng(0), time.monotonic() + 60 * minutes
     cases = [make(threads) for threads in THREADS for make in (short_steps, long_steps, same_step, next_step)]
-    for number in shown(range(times), "interrupts"):
-        cases[number % len(cases)].interrupt(rng)
+    while time.monotonic() < end:
+        for case in cases:
+            case.interrupt(rng)
+    assert not [text for case in cases for text in case.complaints]
+    assert all(sum(getattr(case, name) for case in cases) for name in ("before", "after"))
+
+
+@pytest.mark.stress
+def test_a_long_call_answers_soon():
     seconds, unharmed = long_call()
-    report = Report("interrupts")
-    rows = tuple((case.name, case.before, case.after, len(case.complaints)) for case in cases)
-    report.tables.append(Table("Calls interrupted by Ctrl-C", ("", "not made", "made", "complaints"), rows))
-    complaints = [text for case in cases for text in case.complaints]
-    claim = f"{times} calls interrupted, each made whole or not at all"
-    report.requirements.append(Requirement(claim, f"{len(complaints)} complaints", not complaints))
-    claim = f"a call of {LONG} sub-steps answers within {SOON:g} s and leaves the state as it was"
-    measured = f"{seconds:.2f} s, {'as it was' if unharmed else 'changed'}"
-    report.requirements.append(Requirement(claim, measured, unharmed and seconds < SOON))
-    report.remarks += complaints[:20]
-    return report
+    assert unharmed
+    assert seconds < SOON
 
 
 def short_steps(threads: int) -> Case:

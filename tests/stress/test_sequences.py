@@ -1,11 +1,13 @@
-"""Calls in any order, a fixed number of sequences; `python -m ce_gym.bench fuzz` goes on for longer."""
+"""Calls in any order on a batch of robots: a fixed number of short sequences, and long ones at random."""
+
+import random
+import time
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sequences import Environments, Simulators, carry_out
 from tripod import TRIPOD
-
-from ce_gym.bench.fuzz.sequences import Environments, Simulators, carry_out
 
 PLACES = {
     "simulators": lambda: Simulators(TRIPOD),
@@ -45,3 +47,14 @@ def test_a_divergence_happens():
     envs = Environments(TRIPOD)
     carry_out(envs, [("diverge", 0), ("step", 1)])
     assert 0 < envs.batch.n_diverged < 9
+
+
+@pytest.mark.stress
+def test_sequences_for_longer(minutes):
+    end, seed = time.perf_counter() + 60 * minutes, 0
+    while time.perf_counter() < end:
+        rng = random.Random(seed)
+        kind = rng.choice(("simulators", "SameStep", "NextStep"))
+        beside = Simulators("mini_cheetah") if kind == "simulators" else Environments("mini_cheetah", kind)
+        carry_out(beside, [(rng.choice(beside.OPERATIONS), rng.randrange(10**6)) for _ in range(rng.randrange(60))])
+        seed += 1

@@ -1,19 +1,14 @@
-"""Robot files changed at random, and calls in any order: a sound robot or one line; robots that do not disturb others.
+"""Robot files changed at random: values, keys, elements and branches of the four formats replaced, moved, removed.
 
-Values, keys, elements and whole branches of files in the four formats are replaced, doubled, moved and removed. A robot
-that is accepted must have a positive definite mass matrix, and forward dynamics that inverse dynamics takes back. Every
-tenth case is a sequence of calls on a batch of robots, see `ce_gym.bench.fuzz.sequences`.
+A robot that is accepted must have a positive definite mass matrix, and forward dynamics that inverse dynamics takes
+back.
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
 import random
-import tempfile
-import time
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,8 +17,6 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from ce_gym.bench.fuzz.sequences import Environments, Simulators, carry_out
-from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.dynamics.model import Model
 from ce_gym.export.mjcf import to_mjcf
 from ce_gym.model import RobotError, assets_folder, load_robot
@@ -34,35 +27,7 @@ VALUES: tuple[Any, ...] = (
 )
 LOOP = """<loop name="pin" type="revolute"><predecessor link="link2"><origin xyz="1 0 0"/></predecessor>
 <successor link="link3"><origin xyz="0.5 0 0"/></successor><axis xyz="0 0 1"/></loop></robot>"""
-SOUND, REFUSED, ALONE = "sound robot", "refused in one line", "as alone"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the benchmark."""
-    parser.add_argument("--minutes", type=float, default=1.0, help="how long to go on (default: 1)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first case (default: 0)")
-
-
-def run(arguments: argparse.Namespace) -> Report:
-    """Change files until time is up."""
-    counts: Counter[tuple[str, str]] = Counter()
-    slowest, bad, end, seed = 0.0, [], time.perf_counter() + 60.0 * arguments.minutes, arguments.seed
-    with tempfile.TemporaryDirectory() as folder:
-        while time.perf_counter() < end:
-            start = time.perf_counter()
-            kind, outcome = case(seed, Path(folder)) if seed % 10 else sequence(seed)
-            slowest = max(slowest, time.perf_counter() - start)
-            counts[kind, outcome] += 1
-            if outcome not in (SOUND, REFUSED, ALONE):
-                bad.append(f"seed {seed}: {kind}: {outcome}")
-            seed += 1
-    report = Report("fuzz")
-    rows = tuple((*key, count) for key, count in sorted(counts.items()))
-    report.tables.append(Table("Robot files changed at random, sequences of calls", ("what", "outcome", "cases"), rows))
-    report.tables.append(Table("Slowest", ("case [s]",), ((slowest,),)))
-    found = "; ".join(bad[:5]) or f"{sum(counts.values())} cases"
-    report.requirements.append(Requirement("a sound robot, one line, robots as alone: always", found, not bad))
-    return report
+SOUND, REFUSED = "sound robot", "refused in one line"
 
 
 def case(seed: int, folder: Path) -> tuple[str, str]:
@@ -71,19 +36,6 @@ def case(seed: int, folder: Path) -> tuple[str, str]:
     kind = rng.choice(tuple(FORMATS))
     path = FORMATS[kind](rng, folder)
     return kind, outcome_of(path)
-
-
-def sequence(seed: int) -> tuple[str, str]:
-    """Carry out one sequence of calls; returns what on and what became of it."""
-    rng = random.Random(seed)
-    kind = rng.choice(("simulators", "SameStep", "NextStep"))
-    beside = Simulators("mini_cheetah") if kind == "simulators" else Environments("mini_cheetah", kind)
-    calls = [(rng.choice(beside.OPERATIONS), rng.randrange(10**6)) for _ in range(rng.randrange(60))]
-    try:
-        carry_out(beside, calls)
-    except Exception as error:  # a fuzzer wants to know of everything
-        return f"calls, {kind}", f"{type(error).__name__}: {str(error)[:200]}"
-    return f"calls, {kind}", ALONE
 
 
 def outcome_of(path: Path) -> str:

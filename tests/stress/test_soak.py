@@ -9,23 +9,24 @@ hold more threads and files (sockets are files), though every other environment 
 
 from __future__ import annotations
 
-import argparse
 import gc
 import threading
 import time
 from dataclasses import dataclass, field
 from typing import Any
 
+import gymnasium
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from ce_gym.bench.measure.report import Report, Requirement, Table
-from ce_gym.bench.soak import interrupts, substeps
+import ce_gym
 from ce_gym.compile.system import open_files, resident_memory
-from ce_gym.viewer.console import shown
 
 NUM_ENVS = 64
 """Robots in a batch."""
+STEPS = 150
+"""Control steps in one environment before the next."""
 EPISODE = 60
 """Control steps until time is up."""
 SPOIL_EVERY = 25
@@ -55,44 +56,34 @@ class Account:
     complaints: list[str] = field(default_factory=list)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of this benchmark."""
-    parser.add_argument("--minutes", type=float, default=30.0, help="how long to go on")
-    parser.add_argument("--env", action="append", help="environment id, may be repeated; all by default")
-    parser.add_argument("--steps", type=int, default=150, help="control steps in one environment before the next")
-    parser.add_argument("--seed", type=int, default=0, help="of actions and failures")
-    parser.add_argument("--interrupts", type=int, metavar="N", help="instead, interrupt N calls by Ctrl-C")
-    parser.add_argument("--substeps", type=float, metavar="N", help="instead, make N random sub-steps of all robots")
-    parser.add_argument("--robot", action="append", help="robot of --substeps, may be repeated; all by default")
+@pytest.mark.stress
+def test_environments_for_long(minutes: float):
+    accounts = {name: Account() for name in sorted(ce_gym.environment_ids())}
+    soaked(accounts, minutes)
 
 
-def run(arguments: argparse.Namespace) -> Report:
-    """Run the soak; at least one round through the environments, and `WARM_UP` more to judge memory by."""
-    if arguments.interrupts:
-        return interrupts.run(arguments.interrupts, arguments.seed)
-    if arguments.substeps:
-        return substeps.run(arguments.substeps, arguments.robot, arguments.seed)
-    import ce_gym
+def test_an_environment_for_seconds():
+    soaked({"ce_gym/MiniCheetahVelocity-v0": Account()}, 0.05)
 
-    ids = arguments.env or sorted(ce_gym.environment_ids())
-    rng, accounts = np.random.default_rng(arguments.seed), {name: Account() for name in ids}
-    memory, held = list[float](), list[int]()
-    end = time.monotonic() + 60 * arguments.minutes
+
+def soaked(accounts: dict[str, Account], minutes: float) -> None:
+    """Go through environments until time is up, at least `WARM_UP + 1` times, and judge what came of it."""
+    rng, memory, held = np.random.default_rng(0), list[float](), list[int]()
+    end = time.monotonic() + 60 * minutes
     while len(memory) <= WARM_UP or time.monotonic() < end:
-        for name in shown(ids, f"round {len(memory) + 1}"):
-            soak(name, arguments.steps, rng, accounts[name])
-            if time.monotonic() > end and len(memory) > WARM_UP:
-                break
+        for name, account in accounts.items():
+            soak(name, STEPS, rng, account)
         gc.collect()
         memory.append(resident_memory())
         held.append(threading.active_count() + open_files())
-    return reported(accounts, memory, held, arguments.minutes)
+    assert not [text for account in accounts.values() for text in account.complaints]
+    assert all(account.spoilt == account.diverged > 0 for account in accounts.values())
+    assert max(memory[WARM_UP:]) - memory[WARM_UP] <= GROWTH
+    assert max(held[WARM_UP:]) <= held[WARM_UP]
 
 
 def soak(env_id: str, steps: int, rng: np.random.Generator, account: Account) -> None:
     """Take `steps` control steps in a fresh batch of one environment, and keep account of them."""
-    import gymnasium
-
     mode = str(rng.choice(["SameStep", "NextStep"]))
     made: dict[str, Any] = {"num_envs": NUM_ENVS, "max_episode_steps": EPISODE, "num_threads": int(rng.integers(1, 3))}
     envs: Any = gymnasium.make_vec(env_id, autoreset_mode=mode, **made).unwrapped
@@ -149,25 +140,3 @@ def inconsistent(
     if any((values[~over] != 0).any() for values in terms.values()):
         wrong.append("sums of an episode that has not ended")
     return wrong
-
-
-def reported(accounts: dict[str, Account], memory: list[float], held: list[int], minutes: float) -> Report:
-    """Return the report of a soak."""
-    report = Report("soak")
-    rows = tuple((n, a.steps, a.episodes, a.spoilt, a.diverged, len(a.complaints)) for n, a in accounts.items())
-    columns = ("environment", "robot steps", "episodes", "spoilt", "flagged", "complaints")
-    report.tables.append(Table(f"Random actions for {minutes:g} minutes", columns, rows))
-    spoilt, flagged = (sum(getattr(a, name) for a in accounts.values()) for name in ("spoilt", "diverged"))
-    claim = "robots flagged as diverged are those that were spoilt"
-    report.requirements.append(Requirement(claim, f"{flagged} of {spoilt}", flagged == spoilt > 0))
-    complaints = [text for account in accounts.values() for text in account.complaints]
-    report.requirements.append(Requirement("nothing inconsistent", f"{len(complaints)}", not complaints))
-    grown = max(memory[WARM_UP:]) - memory[WARM_UP]
-    claim = f"after {WARM_UP + 1} rounds the process grows by no more than {GROWTH:g} MiB"
-    measured = f"{grown:.1f} MiB in {len(memory) - WARM_UP - 1} more rounds ({memory[WARM_UP]:.0f} MiB)"
-    report.requirements.append(Requirement(claim, measured, not grown > GROWTH))
-    more = max(held[WARM_UP:]) - held[WARM_UP]
-    claim = f"after {WARM_UP + 1} rounds it holds no more threads and open files"
-    report.requirements.append(Requirement(claim, f"{more} more than {held[WARM_UP]}", more <= 0))
-    report.remarks += complaints[:20]
-    return report

@@ -1,1 +1,0 @@
-"""Where exact transmissions matter: controllers, contacts and designs made on simplified levels, judged on exact."""

@@ -1,1 +1,0 @@
-"""Files and calls at random: what must never break, whatever is tried."""

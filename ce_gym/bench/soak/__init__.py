@@ -1,1 +1,0 @@
-"""Minutes of steps that must not fail, leak or be torn."""
