@@ -106,9 +106,9 @@ def spatial_loop() -> Robot:
 
 
 MADE = {"slider_crank": slider_crank, "ball_loop": ball_loop, "world_loop": world_loop, "spatial_loop": spatial_loop}
-SHIPPED = ("tello", "tello_with_arms", "cassie", "four_bar", "six_bar", "planar_leg_linkage")
+SHIPPED = ("tello", "cassie", "four_bar", "six_bar", "planar_leg_linkage")
 # The diagonal of the reflected inertia varies with the pose:
-VARYING = ("tello", "tello_with_arms", "cassie", "slider_crank")
+VARYING = ("tello", "cassie", "slider_crank")
 CASES = [
     pytest.param(name, level, id=f"{name}-{level}")
     for name in (*SHIPPED, *MADE)
