@@ -4,11 +4,12 @@ PYTHON ?= python3
 BIN := .venv/bin
 EXTRAS := viewer,video,fast,identify,train,export,rsl-rl,gpu,bench,docs,dev
 
-.PHONY: help venv demo test arm lint types docs gallery links wheel clean
+.PHONY: help venv demo test quick arm lint types docs gallery links wheel clean
 
 help:
 	@echo "make demo    train Mini Cheetah to walk, then write a rollout to look at in a browser (a few minutes)"
 	@echo "make test    run the tests"
+	@echo "make quick   run the tests that take a few seconds each: some minutes"
 	@echo "make arm     on a PC with Debian: some tests, and results bit by bit, on emulated 64-bit Arm (hours)"
 	@echo "make lint    ruff: style and format"
 	@echo "make types   pyright: types, as on Linux, macOS and Windows"
@@ -35,6 +36,9 @@ demo: .venv/installed
 
 test: .venv/installed
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+quick: .venv/installed
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow and not stress"
 
 arm: .venv/installed
 	tests/arm.sh

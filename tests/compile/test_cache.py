@@ -175,6 +175,7 @@ DAMAGES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_entry_is_compiled_again_and_replaced(filled, damage, capfd):
     path, computed = filled
@@ -197,6 +198,7 @@ def test_nothing_beside_the_entries_is_run(filled):
     assert finish(start(path.parent)) == (computed, False, "")
 
 
+@pytest.mark.slow
 def test_processes_may_compile_at_once(tmp_path):
     both = [finish(process) for process in [start(tmp_path), start(tmp_path)]]
     assert both[0][0] == both[1][0]
@@ -228,6 +230,7 @@ def no_room(*arguments, **options):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", ["mkstemp", "write", "close", "replace"])
 def test_a_full_disk_is_done_without(original, tmp_path, monkeypatch, capfd, call):
     computed = original[1]

@@ -234,6 +234,7 @@ def test_other_dtypes_are_refused():
         lane_count(np.int32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("rows", DTYPES)
 def test_many_values_become_rows(dtype, rows):

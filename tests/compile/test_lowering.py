@@ -108,6 +108,7 @@ def random_graph(seed, n_operations=250):
     return ca.Function(f"graph_{seed}", [x], [ca.vertcat(*nodes[-12:])])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_random_graphs(seed, evaluate):
     function = random_graph(seed)
@@ -149,6 +150,7 @@ def test_minimum_ignores_nan_as_casadi_does(evaluate):
     np.testing.assert_array_equal(values, np.hstack(by_casadi(function, x, y)))
 
 
+@pytest.mark.slow
 def test_a_nan_stays_in_its_lane(evaluate):
     function = random_graph(3)
     x = samples(16, 6, "float64")

@@ -44,6 +44,7 @@ def function_of(name):
     return ca.Function(name, [x], [getattr(ca, name)(x)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RANGES)
 def test_error(name, dtype, evaluate):
     rng = np.random.default_rng(0)

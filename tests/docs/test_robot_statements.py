@@ -228,6 +228,7 @@ def _stop(name: str, joint: str) -> float:
     return math.degrees(robot(name).body(joint).joint.position[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "statement"), STATEMENTS, ids=range(len(STATEMENTS)))
 def test_a_statement_is_what_the_file_says(page: str, statement: Callable[[], str]):
     path = ROOT / page if page == "README.md" else ROOT / "docs" / page

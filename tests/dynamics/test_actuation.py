@@ -174,6 +174,7 @@ def test_dry_friction_holds_without_a_nanometre(rubbing, dt: float):
         assert (q[0] != 0.3) == moves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.001, 0.01])
 @pytest.mark.parametrize("dt", [0.0005, 0.005, 0.01])
 def test_what_a_knee_loses_from_rest(friction: float, dt: float):
@@ -217,6 +218,7 @@ def lossy(robot: Robot, **changes) -> Robot:
     return replace(robot, motors=tuple(replace(motor, **changes) for motor in robot.motors))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid_leg", "mit_humanoid", "tello"])
 def test_saturation_acts_at_the_motors(name: str):
     """Joint torques are shared out to the motors, clipped there, and carried back: `W^T clip(W^-T tau)`.

@@ -63,6 +63,7 @@ def assert_close(ours: np.ndarray, theirs: np.ndarray, tolerance: float = TOLERA
     assert np.abs(ours - theirs).max(initial=0.0) <= tolerance * max(1.0, np.abs(theirs).max(initial=0.0))
 
 
+@pytest.mark.slow
 def test_kinematics(case: Case):
     positions, rotations = case.model.body_poses(case.q)
     angular, linear = case.model.body_velocities(case.q, case.v)
@@ -90,6 +91,7 @@ def test_constraints(case: Case):
             assert np.linalg.matrix_rank(rows, 1e-8) == spanning - case.model.nv
 
 
+@pytest.mark.slow
 def test_accelerations(case: Case):
     wrenches = {n: np.random.default_rng(i).normal(0, 5, 6) for i, n in enumerate(case.model.body_names)}
     free = case.model.forward_dynamics(case.q, case.v, case.tau)
@@ -101,6 +103,7 @@ def test_accelerations(case: Case):
             assert_close(ours[i], dense.acceleration(tau), RATIOS.get(case.model.robot.name, TOLERANCE))
 
 
+@pytest.mark.slow
 def test_forces(case: Case):
     M, bias = case.model.mass_matrix(case.q), case.model.bias_force(case.q, case.v)
     tau = case.model.inverse_dynamics(case.q, case.v, case.vdot)

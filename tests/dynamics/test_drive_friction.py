@@ -168,6 +168,7 @@ def errors(name: str, steps: tuple[float, ...]) -> list[float]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*SERVO, "sharp"])
 def test_a_servo_moves_as_its_authors_models_say(name: str):
     """M1 to M6 with a servo's figures against the authors' scheme in steps of 10 us; errors go down with the step."""

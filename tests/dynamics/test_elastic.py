@@ -148,6 +148,7 @@ def thrown(stiffness: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array(energies), diverged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [28.0, 3e4, 3e6])
 def test_twelve_drives_take_energy_from_nowhere(stiffness: float):
     """Whose flanks are settled together: what a motor could do is the most by which one may be wrong."""

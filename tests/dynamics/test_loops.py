@@ -64,6 +64,7 @@ def test_inverse_dynamics_undoes_forward_dynamics(model: Model):
     assert np.linalg.eigvalsh(M).min() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_power_balance(model: Model, level: str):
     """The rate of change of energy is the power of the forces."""
@@ -81,6 +82,7 @@ def test_power_balance(model: Model, level: str):
     assert abs(power - tau @ v) < 2e-5 * max(1.0, abs(tau @ v), np.abs(vdot).max() * np.abs(v).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_velocity_terms_follow_from_the_mass_matrix(model: Model, level: str):
     """Lagrange's equations for joints on a base at rest: `dM/dt v - d(v^T M v / 2)/dq`, by differences of `M`."""
@@ -209,6 +211,7 @@ def test_any_independent_joint_will_do():
         np.testing.assert_allclose(model.spanning_acceleration(q, v, vdot), expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", np.linspace(0.1, 3.0, 30))
 def test_dead_centre_is_refused(angle):
     """Crank and rocker about one axis, with a coupler that just reaches: rounding decides whether the loop closes."""

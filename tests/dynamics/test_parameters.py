@@ -73,6 +73,7 @@ def with_inertial(robot: Robot, body: str, **changes) -> Robot:
     return replace(robot, bodies=tuple(bodies))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_default_changes_nothing(tripod: Robot, states, name: str):
     values = parameter_defaults(tripod, tripod.material, (name,))
@@ -163,6 +164,7 @@ def test_link_inertia_is_that_about_the_centre_of_mass(tripod: Robot, states):
     assert_different(ours, results(tripod, states))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ELASTIC_FACTORS)
 def test_figures_of_one_elastic_drive(kind: str):
     leg = load_robot("mini_cheetah")
@@ -185,6 +187,7 @@ SHAPES = {"as it is": {}, "tilted": {"inertia": TILTED}, "eccentric": {"com": (0
 """Of rotors: those about no principal axis are bodies of the recursion at the exact level."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["exact", "coupled", "armature"])
 @pytest.mark.parametrize("which", ["all", "one"])
 @pytest.mark.parametrize("shape", SHAPES)
@@ -252,6 +255,7 @@ def with_ratios(robot: Robot, factor: float) -> Robot:
     return replace(robot, constraints=tuple(regeared(tie) for tie in robot.constraints))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motors", ["ideal", "limited"])
 @pytest.mark.parametrize("level", LEVELS)
 def test_ratio_is_that_of_every_gear(tripod: Robot, states, level: str, motors: str):

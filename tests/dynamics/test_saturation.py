@@ -84,6 +84,7 @@ def test_on_the_torque_speed_line_too(inertia: float, target: float):
     assert float(result["v_next"]) == pytest.approx(end, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robot", "level"), [("mini_cheetah", "exact"), ("tello", "none"), ("tello", "exact")])
 def test_no_robot_exceeds_its_limits_or_stays_below_for_nothing(robot: str, level: str):
     """Thrown about by random targets: every torque is what is asked for at the end of the step, clipped."""

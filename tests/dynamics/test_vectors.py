@@ -129,6 +129,7 @@ def test_every_file_is_here():
     assert {case.file for case in CASES.values()} == set(FILES)
 
 
+@pytest.mark.slow
 def test_every_quantity_is_known(vectors: Vectors):
     """A quantity that is not on this list would not be compared."""
     compared = {"q_span", "v_span", "yd", "tau", "ydd", "qdd_span", "id_ydd", "id_tau", "bias", "g_span", "cond_H", "H"}
@@ -155,6 +156,7 @@ def test_velocities_and_positions(case: Case, vectors: Vectors):
         assert_close(case, np.einsum("nij,nj->ni", group.T, group.v), vectors["yd"][group.states])
 
 
+@pytest.mark.slow
 def test_forward_dynamics(case: Case, vectors: Vectors):
     for group in vectors.groups:
         tau = transposed(group.T, vectors["tau"][group.states])

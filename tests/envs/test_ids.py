@@ -27,6 +27,7 @@ CHECKED = (  # each has to be compiled; `pytest tests/stress -m stress` checks t
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", CHECKED)
 def test_gymnasium_check_env_is_silent(env_id: str):
     env = gymnasium.make(env_id)

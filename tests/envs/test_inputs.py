@@ -47,6 +47,7 @@ BAD_ACTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("action", "message"), BAD_ACTIONS.values(), ids=BAD_ACTIONS)
 @pytest.mark.parametrize("single", [True, False], ids=["single", "vector"])
 def test_bad_actions_leave_the_environment_as_it_was(single: bool, action, message: str):

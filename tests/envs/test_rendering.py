@@ -158,6 +158,7 @@ def test_a_robot_in_a_pit_is_not_hidden_by_its_rim():
     assert size(pit) > 0.8 * size(ce_gym.Terrain.flat())
 
 
+@pytest.mark.slow
 def test_environments_show_their_ground(capsys: pytest.CaptureFixture[str]):
     pytest.importorskip("embreex")
     pytest.importorskip("meshcat")

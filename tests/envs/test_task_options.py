@@ -22,6 +22,7 @@ def zeros(envs) -> np.ndarray:
     return np.zeros(envs.action_space.shape, np.float32)
 
 
+@pytest.mark.slow
 def test_a_term_of_ones_own():
     @ce_gym.reward
     def twice_the_height(s):
@@ -64,6 +65,7 @@ def test_only_some_joints_act():
     assert np.abs(torque[:, [i for i in range(2) if i not in still]]).min() > np.abs(torque[:, still]).mean()
 
 
+@pytest.mark.slow
 def test_late_actions():
     """A delay of all sub-steps is the action of the step before; of none, the present one."""
     actions = np.random.default_rng(0).uniform(-1, 1, (6, 4, 2)).astype(np.float32)
@@ -91,6 +93,7 @@ def test_history_shows_the_newest_first():
     np.testing.assert_array_equal(third[:, 2 * size :], first[:, :size])
 
 
+@pytest.mark.slow
 def test_noise_is_for_the_policy_only():
     arguments = {"critic": ["contact_forces", "rotor_speeds", "torques"], "obs_mode": "dict"}
     clean, noisy = make(512, **arguments), make(512, noise={"joint_positions": 0.05}, **arguments)
@@ -201,6 +204,7 @@ def test_bad_arguments(arguments: dict, message: str):
     assert caught.value.__cause__ is None
 
 
+@pytest.mark.slow
 def test_steps_of_their_own():
     """Every environment to its tolerance: alone as among others, and to what finer steps of one length give."""
     actions = np.random.default_rng(0).uniform(-1, 1, (5, 3, make(3).single_action_space.shape[0])).astype(np.float32)

@@ -59,6 +59,7 @@ def expected_speed(v: np.ndarray, before: np.ndarray) -> np.ndarray:
     return 2.0 * 0.02 * np.exp(-np.square(v[:, 3:5] - before).sum(1) / 0.25)
 
 
+@pytest.mark.slow
 def test_a_reward_with_memory_and_an_observation_from_outside(outside: dict):
     """Both follow what numpy says, through resets; a single environment does the same, bit for bit."""
     n = 5
@@ -115,6 +116,7 @@ TASKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", TASKS.values(), ids=TASKS)
 def test_the_schema_is_what_the_programs_have(options: dict):
     """Every state buffer of the compiled programs is in the schema, with its size, and vice versa."""

@@ -55,6 +55,7 @@ def test_a_picture_is_seen_from_above(tmp_path, file, depth, kind):
     assert shown.origin == expected.origin
 
 
+@pytest.mark.slow
 def test_episodes_begin_on_the_map_and_inside_of_it(file):
     q, field = begun({"kind": "map", "file": file, "cell": CELL})
     for along, half in ((q[:, 0], 3.05 - 1.0), (q[:, 1], 2.05 - 1.0)):
@@ -64,6 +65,7 @@ def test_episodes_begin_on_the_map_and_inside_of_it(file):
     assert np.abs(above - standing).max() < 0.08, "of the heights around, and of the noise of joints"
 
 
+@pytest.mark.slow
 def test_where_they_begin_can_be_chosen():
     q, _ = begun({"kind": "map", "field": ce_gym.Terrain(HEIGHTS, CELL), "begin": [[1.0, 1.2], [2, 2]]})
     assert q[:, 0].min() >= 1.0
@@ -77,6 +79,7 @@ def test_a_terrain_is_a_map_and_another_one_needs_no_other_kernel():
     np.testing.assert_array_equal(programs[1].task.terrain["field"].heights, 2 * HEIGHTS)
 
 
+@pytest.mark.slow
 def test_heights_in_any_order_of_memory_are_one_terrain():
     model, ends = ce_gym.Model("mini_cheetah"), []
     for heights in (HEIGHTS, np.asfortranarray(HEIGHTS)):

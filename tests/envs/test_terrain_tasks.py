@@ -124,6 +124,7 @@ def test_flat_ground_costs_nothing():
     assert make_program("mini_cheetah", "velocity", terrain="flat", command_curriculum=1.0).task == program.task
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "dtype"), [*((kind, "float64") for kind in KINDS), ("slope", "float32")])
 def test_episodes_begin_on_the_ground_in_the_middle_of_a_tile(kind: str, dtype: str):
     envs = make(96, terrain={"kind": kind, "curriculum": False}, dtype=dtype)
@@ -176,6 +177,7 @@ def test_a_fallen_robot_has_fallen_wherever_it_is(where: str):
     assert terminated.tolist() == [True, False]
 
 
+@pytest.mark.slow
 def test_feet_on_slopes_know_that_they_touch():
     """What the task sees of the contacts is what the physics makes of them, half way up a slope too."""
     terrain = {"kind": "slope", "angle": 0.3, "curriculum": False}

@@ -116,6 +116,7 @@ NOBODYS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edited", "changed"),
     [

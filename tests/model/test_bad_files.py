@@ -323,6 +323,7 @@ def check(answer: dict | None, parts: list[str]) -> None:
     assert re.search(".*".join(map(re.escape, parts)), answer["message"]), answer["message"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("mujoco") is None, reason="needs mujoco")
 @pytest.mark.parametrize(("name", "parts"), cases(MJCF))
 def test_mjcf(loaded, name, parts):
@@ -339,6 +340,7 @@ def test_nothing_is_printed(loaded, suffix):
     assert loaded[suffix][""]["printed"] == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".xml", ".urdf"])
 def test_damaged_files_show_nothing_but_our_errors(tmp_path, suffix):
     """Cut, double and replace words at random: a robot or a RobotError, nothing else."""

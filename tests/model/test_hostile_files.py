@@ -111,6 +111,7 @@ def loaded(tmp_path_factory):
     return {suffix: answers(write(folders[suffix], table, suffix)) for suffix, table in FORMATS.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("suffix", "name", "parts"),
     [pytest.param(s, *case.values, id=f"{case.id}{s}") for s, table in FORMATS.items() for case in cases(table)],

@@ -198,6 +198,7 @@ class Peer:
         return met + free @ np.linalg.solve(free.T @ M @ free, force)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "level"), CASES)
 def test_mujoco_has_the_same_dynamics(name, level):
     """With forces on all joints that MuJoCo has, dependent ones and rotors too; ours come through `actuator_matrix`."""
@@ -220,6 +221,7 @@ def test_mujoco_has_the_same_dynamics(name, level):
         assert np.abs(found - expected).max() <= TOLERANCE * max(1.0, np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "level"), CASES)
 def test_round_trip(name, level, tmp_path):
     """Exported and imported again: the same forward dynamics."""
@@ -241,6 +243,7 @@ def test_round_trip(name, level, tmp_path):
         assert np.abs(again - vdot).max() <= TOLERANCE * max(1.0, np.abs(vdot).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*SHIPPED, *MADE])
 def test_the_file_starts_assembled(name):
     """MuJoCo's initial configuration and the keyframe are our reference pose, loops closed, coordinates and all."""
@@ -309,6 +312,7 @@ def with_light_rotors(factor: float) -> Robot:
     return dataclasses.replace(robot, bodies=tuple(bodies), constraints=tuple(ties))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["exact", "coupled"])
 @pytest.mark.parametrize("factor", [30.0, 100.0, 1e5, 1e7])
 def test_rotors_too_light_for_mujoco_keep_their_reflected_inertia(factor, level, tmp_path):

@@ -92,6 +92,7 @@ def test_it_stands_on_its_feet_and_has_what_tasks_need(name):
     assert min(under[contact.name] for contact in robot.contacts if contact.group != "foot") > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_levels_differ_in_what_rotors_do(name):
     robot = load_robot(name)

@@ -61,6 +61,7 @@ def test_loops_stay_closed(name: str):
         assert np.abs(Dense(model.robot, q_span, v_span).constraints()[0]).max() <= 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("made", [four_bar, rod_leg])
 def test_free_linkages_keep_their_energy(made, level: str):

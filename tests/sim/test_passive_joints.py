@@ -48,6 +48,7 @@ def test_where_no_joint_has_a_torque_those_with_springs_are_passive():
     assert replace(pair(), bodies=tuple(idle)).passive == ("blade",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ce_gym.LEVELS)
 @pytest.mark.parametrize("control", ["position", "torque", "motor_position", "motor_torque"])
 @pytest.mark.parametrize("motors", ["ideal", "limited"])

@@ -45,6 +45,7 @@ def run(model: Model, start, rows=slice(None), threads: int = 1, dtype: str = "f
     return sim
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "level", "method"),
     [
@@ -126,6 +127,7 @@ def test_state_is_a_copy(model: Model):
     np.testing.assert_array_equal(sim.q[0], model.standing_q)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "dt", "stiffness", "dtype"),
     [*itertools.product((TRIPOD,), (0.0005, 0.01), (1e4, 1e6), DTYPES), ("mini_cheetah", 0.01, 1e6, "float32")],

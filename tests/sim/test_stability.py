@@ -21,6 +21,7 @@ def cheetah() -> Model:
     return Model("mini_cheetah")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", QUICK, ids=lambda case: case.__name__)
 def test_case(case):
     """The bars are written where the figures are measured."""
@@ -28,6 +29,7 @@ def test_case(case):
     assert outcome.met, f"{outcome.required}: {outcome.measured}"
 
 
+@pytest.mark.slow
 def test_a_chain_of_many_rods_swings():
     """For half a second from horizontal, on undamped joints: Euler's gain of energy stays below a tenth of it."""
     n = 40
@@ -42,6 +44,7 @@ def test_a_chain_of_many_rods_swings():
     assert np.abs(sim.v).max() > 1.0
 
 
+@pytest.mark.slow
 def test_standing_for_a_minute(cheetah: Model):
     stood = robots.stand(cheetah, 60.0)
     assert stood.drift < 1e-6
@@ -54,6 +57,7 @@ def test_a_base_at_fifty_radians_per_second(cheetah: Model):
     assert energy <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dt", "most"), [(0.001, 1e-9), (0.002, 1e-3), (0.02, 0.2)])
 def test_a_robot_without_motors_never_gains_energy(cheetah: Model, dt: float, most: float):
     """On ground of any stiffness and slip speed; with the energy of its springs and stops, if the step resolves them.
@@ -67,6 +71,7 @@ def test_a_robot_without_motors_never_gains_energy(cheetah: Model, dt: float, mo
     assert (gain[resolved] <= most).all()
 
 
+@pytest.mark.slow
 def test_a_robot_that_stands_is_silent(cheetah: Model):
     """At the coarsest step, on ground of any stiffness and slip speed; on the softest it rocks for a minute."""
     finite, speed, _ = grid.stand(cheetah, 0.02, 120.0, "float64")
@@ -74,11 +79,13 @@ def test_a_robot_that_stands_is_silent(cheetah: Model):
     assert (speed <= 1e-6).all()
 
 
+@pytest.mark.slow
 def test_random_torques_lose_no_robot():
     """Light shanks without rotors turn by more than a radian in a step."""
     assert robots.fuzz(Model("mini_cheetah", "none"), 100_000) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["euler", "extrapolated"])
 def test_contacts_in_the_air_do_nothing(cheetah: Model, method: str):
     """Far above the ground a robot moves as one that has no contacts, to the last digits."""
@@ -111,6 +118,7 @@ def test_a_corner_that_is_hit_second_is_seen():
     assert deepest < 2e-3
 
 
+@pytest.mark.slow
 def test_slip_speed_differs_from_robot_to_robot():
     robot = scenes.block(pull=1.2 * 0.5 * 9.81)
     together = Simulator(Model(robot), 2, 0.004, control="torque", parameters=("slip_speed",))
@@ -123,6 +131,7 @@ def test_slip_speed_differs_from_robot_to_robot():
         np.testing.assert_allclose(together.q[i], alone.q[0], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_energy_is_what_moves_falls_and_is_bent(cheetah: Model):
     """On its springs, which carry its weight: half a square of the weight over the stiffness, and no more."""
     sim = scenes.simulator(scenes.block(), 0.01)

@@ -182,6 +182,7 @@ def test_a_lost_place_stays_in_its_lane():
 # Slopes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "radius"), [*((method, 0.03) for method in METHODS), ("euler", 0.0)])
 def test_a_slope_is_flat_ground_under_tilted_gravity(method: str, radius: float):
     """A block with spin, sliding: the same motion seen from the slope, whatever the method and the heading."""
@@ -219,6 +220,7 @@ def test_a_block_slides_and_sticks_as_coulomb_says(angle: float):
 # Bumps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.0, 0.02])
 @pytest.mark.parametrize("mu", [0.0, 0.8])
 def test_bumps_give_no_energy(radius: float, mu: float):

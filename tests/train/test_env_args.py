@@ -129,6 +129,7 @@ def test_a_policy_acts_in_the_environment_that_it_was_trained_in(tmp_path, capsy
     assert job.env_kwargs == {"horizon": 30}
 
 
+@pytest.mark.slow
 def test_an_id_of_a_module_outside_the_package_trains_plays_and_is_judged(tmp_path, monkeypatch, capsys):
     """And its module is imported by the user's own words only."""
     pytest.importorskip("meshcat")

@@ -48,6 +48,7 @@ def parameters(policy):
         return arrays["theta"]
 
 
+@pytest.mark.slow
 def test_it_learns_as_the_reference_does(trained, tmp_path):
     reference = reference_train(job(tmp_path, 30_000, tensorboard=False))
     ours, theirs = (evaluate(run.model, ID, episodes=32) for run in (trained, reference))
@@ -94,6 +95,7 @@ def test_the_command_on_its_card_repeats_it(trained):
     assert again.out.name.endswith("-fast")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learn", [train, reference_train])
 def test_what_is_for_training_only_is_no_part_of_the_policy(learn, tmp_path):
     given = {"dt": 0.004, "max_episode_steps": 7}
@@ -130,6 +132,7 @@ def test_seeds_differ(tmp_path):
     assert not np.array_equal(parameters(first), parameters(second))
 
 
+@pytest.mark.slow
 def test_interrupted_and_resumed_is_as_if_it_never_stopped(tmp_path):
     """On a robot, whose environments can be restored: the same bits, of the policy and of all that is reported."""
     options = {"env": ROBOT, "settings": ["num_envs=16", "rollout=24", "target_kl=0.01", "final_entropy=0"]}

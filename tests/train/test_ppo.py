@@ -52,6 +52,7 @@ def trained(tmp_path_factory):
     return train(job(tmp_path_factory.mktemp("run"), 30_000))
 
 
+@pytest.mark.slow
 def test_it_learns(trained):
     untrained = PPO("MlpPolicy", make_sb3_vec_env(ID, 1), device="cpu", seed=0)
     before = evaluate(untrained, ID, episodes=32)
@@ -235,6 +236,7 @@ for script in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_every_script_explains_itself():
     """All in one process, which imports the learner once."""
     names = ("ppo", "evaluate", "transfer", "demo", "export", "sim2sim", "card")

@@ -200,6 +200,7 @@ class FullDisk:
 both = pytest.mark.parametrize("learn", [train, train_fast], ids=["reference", "fast"])
 
 
+@pytest.mark.slow
 @both
 def test_training_goes_on_if_there_is_no_room_for_a_checkpoint(learn, tmp_path, capsys, monkeypatch):
     FullDisk(monkeypatch, "checkpoints")

@@ -32,6 +32,7 @@ def world(level, n=3, seed=0, **kwargs):
     return MujocoWorld(envs.envs.unwrapped, obs, level), envs, obs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["armature", "exact"])
 def test_robots_start_in_the_same_state(level):
     made, envs, obs = world(level)
@@ -46,6 +47,7 @@ def test_robots_start_in_the_same_state(level):
     assert made.twin.model.njnt == 1 + 12 + len(rotors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cassie"])
 def test_robots_with_loops_start_closed_and_stand_as_ours_do(name):
     """Dependent joints and rotors are where loops put them; springs without actuators get no targets."""
@@ -180,6 +182,7 @@ def test_a_step_on_the_ground_is_one_of_ours():
     assert ours.v[0, 5] > -0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["armature", "exact"])
 def test_both_fly_alike(level):
     """High above the ground, where there are no contacts to differ in, and at small steps."""
@@ -203,6 +206,7 @@ def test_both_fly_alike(level):
     np.testing.assert_allclose(theirs[:, 12:24], obs[:, 12:24], atol=0.01)  # joint positions
 
 
+@pytest.mark.slow
 def test_a_history_is_kept_newest_first():
     made, _, obs = world("armature", robot=TRIPOD, history=3)
     size = obs.shape[1] // 3
@@ -295,6 +299,7 @@ def test_the_verdict_compares_like_with_like(theirs, passes):
 BLANK = {"forward_error": 0.0, "lateral_error": 0.0, "episode_length": 1.0}
 
 
+@pytest.mark.slow
 def test_the_program_compares_four_simulations(tmp_path, capsys):
     small = ["num_envs=16", "rollout=8", "steps=300", "minibatches=2", "training={}"]
     settings = load_settings(config_file(ROBOT_ENV), small)
@@ -312,6 +317,7 @@ def test_the_program_compares_four_simulations(tmp_path, capsys):
     assert result["passed"] is (code == 0)
 
 
+@pytest.mark.slow
 def test_mistakes_are_one_line(tmp_path, capsys):
     assert main([str(tmp_path / "missing.zip")]) == 2
     assert "\n" not in capsys.readouterr().err.strip()

@@ -163,6 +163,7 @@ def test_no_arguments_say_what_there_is(capsys: pytest.CaptureFixture[str]) -> N
     assert all(word in out for word in ("list", "inspect", "view", "play", "bench"))
 
 
+@pytest.mark.slow
 def test_list_and_inspect_name_the_robot(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
     listed = capsys.readouterr().out.split()

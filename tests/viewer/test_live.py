@@ -47,6 +47,7 @@ def ask(session: Session, **message: Any) -> None:
     request_of(message)(session)
 
 
+@pytest.mark.slow
 def test_it_goes_where_it_is_driven(session: Session):
     ask(session, do="drive", shares=[0.5, 0, 0])
     assert session.command.tolist() == [0.5, 0, 0]
