@@ -43,7 +43,7 @@ def test_every_robot_with_loops_is_here():
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_loops_stay_closed(name: str):
-    """60 s under random torque, 10 s of large robots, anew every 0.1 s: the gap that the kernel itself sees is at most 1e-10 m."""
+    """60 s under random torque, 10 s of large robots: the gap that the kernel itself sees is at most 1e-10 m."""
     model = Model(ROBOTS[name]())
     simulator = Simulator(model, 8, DT, control="torque", outputs=("loop_gap", "nearness"))
     limit = np.array([min(model.robot.body(joint).joint.torque, 10.0) for joint in model.joint_links])
