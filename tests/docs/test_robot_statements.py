@@ -101,13 +101,6 @@ def kept(name: str) -> tuple[str, ...]:
 
 
 CHEETAH, HUMANOID, TELLO, ANYMAL, JVRC, G1 = "mini_cheetah", "mit_humanoid", "tello", "anymal_c", "jvrc1", "g1"
-CONTACTS = {
-    **{"Spot": "spot", "ANYmal C": ANYMAL, "T1": "t1", "Mini Cheetah": CHEETAH, "G1": G1, "H1": "h1", "Go1": "go1"},
-    **{"MIT Humanoid": HUMANOID, "Tello": TELLO, "Tello with arms": "tello_with_arms", "JVRC-1": JVRC, "Go2": "go2"},
-    **{"Berkeley Humanoid": "berkeley_humanoid", "Cassie": "cassie", "DR Legs": "dr_legs"},
-}
-STANDING = {"DR Legs": "dr_legs", "Cassie": "cassie", "H1": "h1", "Berkeley Humanoid": "berkeley_humanoid"}
-STANDING |= {"T1": "t1", "G1": G1}
 STATEMENTS: list[tuple[str, Callable[[], str]]] = [
     (
         "exactness.md",
@@ -141,13 +134,6 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         lambda: "Belts and differentials (MIT Humanoid, Tello)" if belts(HUMANOID) and belts(TELLO) else "none",
     ),
     (
-        "reference/robots.md",
-        lambda: (
-            f"Of the robots that come along, {' '.join(n for n in ce_gym.robots() if robot(n).elastic)} has such "
-            "figures".replace("mini_cheetah", "Mini Cheetah")
-        ),
-    ),
-    (
         "how-to/faq.md",
         lambda: f"Cheetah's hips and of JVRC-1's rotors are such. {'' if kept(JVRC) == ('*-rotor',) else '?'}",
     ),
@@ -160,41 +146,15 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         ),
     ),
     ("reference/environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
+    (
+        "reference/robots.md",
+        lambda: (
+            f"at knee and heel, of {robot('cassie').body('left_shin').joint.stiffness:.0f} and "
+            f"{robot('cassie').body('left_heel_spring').joint.stiffness:.0f} N m/rad"
+        ),
+    ),
+    ("reference/robots.md", lambda: f"moved by {WORDS[len(robot('dr_legs').motors) // 2]} servos"),
     ("README.md", lambda: f"| of {WORDS[len(walking())]} robots, evaluated"),
-    ("reference/robots.md", lambda: f"The {WORDS[len(floating())]} robots of the package that tasks can have"),
-    ("reference/robots.md", lambda: f"a screw with a lead of {2000 * math.pi / ratios('spot')[-1]:.0f} mm"),
-    (
-        "reference/robots.md",
-        lambda: (
-            f"at the knee ({robot('cassie').body('left_shin').joint.stiffness:.0f} N m/rad) and one at the heel "
-            f"({robot('cassie').body('left_heel_spring').joint.stiffness:.0f} N m/rad), both passive"
-        ),
-    ),
-    ("reference/robots.md", lambda: f'forward_dynamics")`, {instructions("cassie"):,} and'),
-    ("reference/robots.md", lambda: f"instructions, 73,514 for {instructions('dr_legs'):,}"),
-    ("reference/robots.md", lambda: f"for a robot {100 * robot('dr_legs').pose.height:.0f} cm high"),
-    ("reference/robots.md", lambda: f"29 g of {robot('dr_legs').total_mass:.1f} kg"),
-    ("reference/robots.md", lambda: f"{WORDS[len(robot('dr_legs').motors) // 2]} servos. Two thighs turn"),
-    (
-        "reference/robots.md",
-        lambda: f"at {_stop('dr_legs', 'left_bracket_a_inner'):.0f}° of yaw and roll of the inner cross",
-    ),
-    (
-        "reference/robots.md",
-        lambda: (
-            f"H1 {the(gains('h1', 'hip_roll', 'hip_pitch', 'knee'))} N m/rad at hips and knees "
-            f"({the(gains('h1', 'hip_yaw'))} at the hips' yaw) and {the(gains('h1', 'ankle'))} at the ankles"
-        ),
-    ),
-    (
-        "reference/robots.md",
-        lambda: (
-            "the Berkeley Humanoid "
-            f"{min(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g} to "
-            f"{max(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g}, "
-            f"{the(gains('berkeley_humanoid', 'ffe'))} and {the(gains('berkeley_humanoid', 'faa'))} at the feet"
-        ),
-    ),
     (
         "explanation/stability.md",
         lambda: (
@@ -210,8 +170,6 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         ),
     ),
     ("explanation/numerics.md", lambda: f", {robot(HUMANOID).material.stiffness / 1e4:g} 10⁴ N/m) 0.05"),
-    *(("reference/robots.md", lambda t=t, n=n: f"| {t} | {len(robot(n).contacts)} |") for t, n in CONTACTS.items()),
-    *(("reference/robots.md", lambda t=t, n=n: f"| {t} | {stands(n)}") for t, n in STANDING.items()),
 ]
 
 
