@@ -155,9 +155,10 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
     (
         "explanation/how_it_works.md",
         lambda: (
-            f"makes {sum(not is_axisymmetric(rotor) for rotor in robot(JVRC).rotors())} of the "
-            f"{sum(1 for _ in robot(JVRC).rotors())} lopsided: its exact forward dynamics takes {instructions(JVRC)} "
+            f"{sum(not is_axisymmetric(rotor) for rotor in robot(JVRC).rotors())} of the "
+            f"{sum(1 for _ in robot(JVRC).rotors())} rotors of JVRC-1 are of this kind"
         ),
+    ),
     ),
     ("reference/environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
     ("README.md", lambda: f"| {instructions(CHEETAH)} / {instructions(CHEETAH, 'armature')} ="),
