@@ -159,7 +159,6 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
             f"{sum(1 for _ in robot(JVRC).rotors())} rotors of JVRC-1 are of this kind"
         ),
     ),
-    ),
     ("reference/environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
     ("README.md", lambda: f"| {instructions(CHEETAH)} / {instructions(CHEETAH, 'armature')} ="),
     ("README.md", lambda: f"sub-steps of {WORDS[len(floating())]} robots beside MuJoCo's"),
@@ -206,14 +205,6 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
             f"takes more than that; MIT Humanoid's and Tello's are {'not at all' if damping(TELLO) == '0' else '?'}"
         ),
     ),
-    (
-        "explanation/numerics.md",
-        lambda: (
-            f"Mini Cheetah's shanks ({the(gains(CHEETAH, 'knee'))} N m/rad, "
-            f"k = {robot(CHEETAH).material.stiffness / 1e4:g} 10⁴ N/m)"
-        ),
-    ),
-    ("explanation/numerics.md", lambda: f", {robot(HUMANOID).material.stiffness / 1e4:g} 10⁴ N/m) 0.05"),
     *(("reference/robots.md", lambda t=t, n=n: f"| {t} | {len(robot(n).contacts)} |") for t, n in CONTACTS.items()),
     *(("reference/robots.md", lambda t=t, n=n: f"| {t} | {stands(n)}") for t, n in STANDING.items()),
 ]
