@@ -63,10 +63,6 @@ def instructions(name: str, level: str = "exact") -> int:
     return model(name, level).n_instructions("forward_dynamics")
 
 
-def damping(name: str) -> str:
-    return f"{max(robot(name).body(joint).joint.damping for joint in robot(name).commanded):g}"
-
-
 def rods(name: str) -> int:
     return sum(type(tie).__name__ == "RodConstraint" for tie in robot(name).constraints)
 
@@ -196,13 +192,6 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
             f"{min(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g} to "
             f"{max(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g}, "
             f"{the(gains('berkeley_humanoid', 'ffe'))} and {the(gains('berkeley_humanoid', 'faa'))} at the feet"
-        ),
-    ),
-    (
-        "explanation/stability.md",
-        lambda: (
-            f"JVRC-1's joints are damped by their files ({damping(CHEETAH)} and {damping(JVRC)} N m s/rad), which "
-            f"takes more than that; MIT Humanoid's and Tello's are {'not at all' if damping(TELLO) == '0' else '?'}"
         ),
     ),
     *(("reference/robots.md", lambda t=t, n=n: f"| {t} | {len(robot(n).contacts)} |") for t, n in CONTACTS.items()),
