@@ -11,7 +11,6 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import ce_gym
@@ -223,14 +222,3 @@ def test_most_of_what_the_knee_motor_accelerates_is_rotors():
     share = legs.mass_matrix(legs.standing_q), model(HUMANOID, "none").mass_matrix(legs.standing_q)
     knee = legs.nv - len(legs.joint_links) + legs.joint_links.index("left_knee_link")
     assert 1 - share[1][knee, knee] / share[0][knee, knee] == pytest.approx(0.75, abs=0.03)
-
-
-def test_a_step_is_a_quarter_of_the_legs():
-    """Of the MIT Humanoid, 0.15 m (terrain_and_sensors.md): from the hips to the soles when its legs are straight."""
-    straight = model(HUMANOID)
-    q = np.array(straight.standing_q)
-    q[7:] = 0.0
-    heights = dict(zip(straight.body_names, straight.body_poses(q)[0][:, 2], strict=True))
-    soles = straight.contact_points(q, np.zeros(straight.nv))[0]
-    feet = [z for z, contact in zip(soles[:, 2], robot(HUMANOID).contacts, strict=True) if contact.group == "foot"]
-    assert 0.15 / (heights["left_hip_ry_link"] - min(feet)) == pytest.approx(0.25, abs=0.02)
