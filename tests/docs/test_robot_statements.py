@@ -142,10 +142,6 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
             "figures".replace("mini_cheetah", "Mini Cheetah")
         ),
     ),
-    (
-        "how-to/faq.md",
-        lambda: f"Cheetah's hips and of JVRC-1's rotors are such. {'' if kept(JVRC) == ('*-rotor',) else '?'}",
-    ),
     ("how-to/faq.md", lambda: f'`kept_inertia: ["{"".join(kept(CHEETAH))}"]`'),
     (
         "explanation/how_it_works.md",
