@@ -151,10 +151,8 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         ),
     ),
     ("reference/environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
-    ("README.md", lambda: f"| {instructions(CHEETAH)} / {instructions(CHEETAH, 'armature')} ="),
-    ("README.md", lambda: f"sub-steps of {WORDS[len(floating())]} robots beside MuJoCo's"),
-    ("README.md", lambda: f"Policies of {WORDS[len(walking())]} robots come with the package"),
-    ("README.md", lambda: f"| DR Legs, {WORDS[2 * 3]} loops |"),  # what is published; the file has rods for some links
+    ("README.md", lambda: f"[{len(ce_gym.robots())} models](docs/reference/robots.md)"),
+    ("README.md", lambda: f"[{WORDS[len(walking())]} robots](docs/reference/policies.md)"),
     ("reference/robots.md", lambda: f"The {WORDS[len(floating())]} robots of the package that tasks can have"),
     ("reference/robots.md", lambda: f"a screw with a lead of {2000 * math.pi / ratios('spot')[-1]:.0f} mm"),
     (
