@@ -112,10 +112,6 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         "how-to/faq.md",
         lambda: "Belts and differentials (MIT Humanoid, Tello)" if belts(HUMANOID) and belts(TELLO) else "none",
     ),
-    (
-        "how-to/faq.md",
-        lambda: f"Cheetah's hips and of JVRC-1's rotors are such. {'' if kept(JVRC) == ('*-rotor',) else '?'}",
-    ),
     ("how-to/faq.md", lambda: f'`kept_inertia: ["{"".join(kept(CHEETAH))}"]`'),
     (
         "explanation/how_it_works.md",
@@ -133,7 +129,7 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         ),
     ),
     ("reference/robots.md", lambda: f"moved by {WORDS[len(robot('dr_legs').motors) // 2]} servos"),
-    ("README.md", lambda: f"| of {WORDS[len(walking())]} robots, evaluated"),
+    ("README.md", lambda: f"| [{WORDS[len(walking())]} robots](docs/reference/policies.md), evaluated"),
 ]
 
 
