@@ -203,14 +203,15 @@ class Assembler:
 
     def _jacobians_around(self, q: Array, spread: float) -> list[Array]:
         """Return the Jacobian of all rows in configurations near `q` that are closed, on the same branch."""
-        closed_there = max(CLOSED, 10 * np.abs(self._all(q)[0]).max())  # rounded loops are as open everywhere
-        values, directions = np.linalg.svd(self._scaled(self._all(q)[1]))[1:]
-        free = directions[(values > REDUNDANT).sum() :]
-        samples = np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, len(free))) @ free
+        gap, directions = np.abs(self._all(q)[0]).max(), np.eye(self.n)
+        if gap >= CLOSED:  # a rounded loop is only nearly closed, and must not be led to where it closes exactly
+            values, directions = np.linalg.svd(self._scaled(self._all(q)[1]))[1:]
+            directions = directions[(values > REDUNDANT).sum() :]
+        samples = np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, len(directions))) @ directions
         found = []
         for start in q + self.unit * samples:
-            closed, gap = self._close(start, list(range(self.n)), REDUNDANT)
-            if gap < closed_there and np.abs((closed - start) / self.unit).max() < FARTHEST:
+            closed, left = self._close(start, list(range(self.n)), REDUNDANT)
+            if left < max(CLOSED, 10 * gap) and np.abs((closed - start) / self.unit).max() < FARTHEST:
                 found.append(self._all(closed)[1])
         return found
 
