@@ -7,6 +7,7 @@ eliminated, and on which branch the loops are.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import casadi as ca
@@ -117,7 +118,9 @@ class Assembler:
             raise self._error("says nothing that joints and linear constraints do not: expected it left out")
         count = self.n - len(self.A) - len(rows)
         if count == 0:
-            raise self._error("leaves its joints no freedom: expected fewer constraints")
+            raise self._error(
+                "leaves its joints no freedom: expected fewer constraints, or repeated ones that agree to 1e-5"
+            )
         if len(self.independent) != count:
             chosen = ", ".join(self.cluster.independent) or "none"
             freedoms = (
@@ -189,8 +192,10 @@ class Assembler:
     def _independent_rows(self, q: Array) -> tuple[int, ...]:
         """Find rows that are not implied by others, in configurations around the reference pose that meet them all."""
         Ks: list[Array] = []
-        for spread in SPREADS if np.abs(self._all(q)[0]).max() < NEARLY_CLOSED else ():
-            Ks += self._jacobians_around(q, spread) if len(Ks) < ENOUGH else []
+        gap = np.abs(self._all(q)[0]).max()
+        limits = (max(CLOSED, 10 * gap), NEARLY_CLOSED) if gap < NEARLY_CLOSED else ()
+        for limit, spread in itertools.product(limits, SPREADS):
+            Ks += self._jacobians_around(q, spread, limit) if len(Ks) < ENOUGH else []
         if not Ks:
             raise self._error("does not close at the standing pose, nor near it: expected `pose` and `assembly` near")
         first, kept = len(self.A), list(range(len(self.A)))
@@ -201,17 +206,19 @@ class Assembler:
                     kept.append(row)
         return tuple(sorted(row - first for row in kept[first:]))
 
-    def _jacobians_around(self, q: Array, spread: float) -> list[Array]:
-        """Return the Jacobian of all rows in configurations near `q` that are closed, on the same branch."""
-        gap, directions = np.abs(self._all(q)[0]).max(), np.eye(self.n)
-        if gap >= CLOSED:  # a rounded loop is only nearly closed, and must not be led to where it closes exactly
+    def _jacobians_around(self, q: Array, spread: float, limit: float) -> list[Array]:
+        """Return the Jacobian of all rows in configurations near `q` with gaps below `limit`, on the same branch."""
+        directions = np.eye(self.n)
+        if (
+            np.abs(self._all(q)[0]).max() >= CLOSED
+        ):  # a rounded loop is only nearly closed, and must not be led to where it closes exactly
             values, directions = np.linalg.svd(self._scaled(self._all(q)[1]))[1:]
             directions = directions[(values > REDUNDANT).sum() :]
         samples = np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, len(directions))) @ directions
         found = []
         for start in q + self.unit * samples:
             closed, left = self._close(start, list(range(self.n)), REDUNDANT)
-            if left < max(CLOSED, 10 * gap) and np.abs((closed - start) / self.unit).max() < FARTHEST:
+            if left < limit and np.abs((closed - start) / self.unit).max() < FARTHEST:
                 found.append(self._all(closed)[1])
         return found
 
