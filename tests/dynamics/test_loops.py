@@ -222,7 +222,7 @@ def test_dead_centre_is_refused(angle):
     )
     pin = LoopConstraint("pin", "revolute", "coupler", "rocker", Placement((1.0, 0.0, 0.0)), Placement((0.5, 0.0, 0.0)))
     pose, rest = Pose(joints=(("crank", angle),)), (("coupler", 3.0), ("rocker", angle + np.pi))
-    with pytest.raises(RobotError, match=r"the cluster tied by pin (is singular|has 1 independent joints)"):
+    with pytest.raises(RobotError, match=r"tied by pin, (is singular|has 2 freedoms)"):
         Model(Robot("dead", bodies, (pin,), ("crank",), pose=pose, assembly=rest))
 
 
@@ -243,7 +243,7 @@ def test_singular_choice_is_refused():
 
 
 def test_wrong_loops_are_refused():
-    with pytest.raises(RobotError, match=r"pin, gear has 2 independent joints: expected 1"):
+    with pytest.raises(RobotError, match=r"pin, gear, has 1 freedom, .*: expected as many independent joints"):
         Model(four_bar(independent=("crank", "coupler")))
     pin = four_bar().constraints[0]
     assert isinstance(pin, LoopConstraint)

@@ -56,6 +56,26 @@ def mjcf(world: str, equality: str = "", tendon: str = "", actuator: str = "", e
     return f'<mujoco model="m"><compiler angle="radian" autolimits="true"/>{extra}{inside}</mujoco>'
 
 
+def parallel(tie: str, error: float) -> str:
+    """Return a platform on three parallel cranks; the third repeats the second but for `error` in length and tilt.
+
+    The cranks end on the platform, or are welded to a body that is hinged there.
+    """
+    tops = {1: 0.4, 2: 0.4 + error}
+    pins = "".join(
+        f'<body name="pin_{i}" pos="{0.3 * i} 0 {top - 0.4}"><joint axis="0 1 {error}"/>{lump(0.1)}</body>'
+        for i, top in tops.items()
+    )
+    world = f'<body name="crank"><joint name="crank" axis="0 1 0"/>{lump()}<body name="platform" pos="0.1 0 0.4">'
+    world += f'<joint axis="0 1 0"/>{lump(2)}{pins if tie == "weld" else ""}</body></body>'
+    equality = ""
+    for i, top in tops.items():
+        world += f'<body name="rod_{i}" pos="{0.3 * i} 0 0"><joint axis="{error} 1 0"/>{lump()}</body>'
+        connect = f'<connect body1="rod_{i}" body2="platform" anchor="0.1 0 {top!r}"/>'
+        equality += f'<weld body1="rod_{i}" body2="pin_{i}"/>' if tie == "weld" else connect
+    return mjcf(world, equality, actuator='<motor joint="crank"/>')
+
+
 GEOMS = """<worldbody><geom name="floor" type="plane" size="0 0 1" friction="0.6"/>
 <body name="trunk" pos="0 0 0.5"><freejoint/>
 <geom name="hull" type="box" size="0.2 0.1 0.05" friction="0.6"/><geom name="look" type="sphere" size=".1" contype="0"

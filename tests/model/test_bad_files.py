@@ -204,8 +204,11 @@ URDF_PLUS = {
         edited(BARS, ('independent="true"', 'independent="yes"')),
         ["'joint1' independent", "'yes'", "true or"],
     ),
-    "none independent": (edited(BARS, ('independent="true"', 'independent="false"')), ["0", "1"]),
-    "all independent": (BARS.replace('independent="false"', 'independent="true"'), ["3", "1"]),
+    "none independent": (edited(BARS, ('independent="true"', 'independent="false"')), ["has 1 freedom", "unlike none"]),
+    "all independent": (
+        BARS.replace('independent="false"', 'independent="true"'),
+        ["has 1 freedom", "unlike link1, link2, link3"],
+    ),
     "coupling end": (edited(LEG, ('<successor link="knee_rotor"', '<successor link="rotor"')), ["'rotor'", "rotor"]),
     "coupling ends": (
         edited(LEG, ('<successor link="knee_rotor"/>', "")),

@@ -395,7 +395,7 @@ CAM = FunctionConstraint("cam", "export_cam", ("crank",), ("slider",))
             "rotor 'wheel', which 'coupled' leaves out, is an independent",
         ),
         (changed(0, first="wheel"), "none", "constraint 'push' ends on rotor 'wheel', which 'none' leaves out"),
-        (changed(1, length=9.0), "exact", "the cluster tied by .*link.* does not close at the standing pose, "),
+        (changed(1, length=9.0), "exact", "tied by .*link.*, does not close at the standing pose, "),
         ({"constraints": slider_crank().constraints[:3]}, "exact", "do not determine"),
     ],
 )

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
-from mjcf_files import ANKLE, BARS, CHAIN, CONNECT, RODS, SEVEN, lump, mjcf
+from mjcf_files import ANKLE, BARS, CHAIN, CONNECT, RODS, SEVEN, lump, mjcf, parallel
 
 from ce_gym.dynamics import Model
 from ce_gym.export.mjcf import to_mjcf
@@ -105,6 +105,35 @@ class Held(Peer):
         assert np.abs(ours - theirs).max() <= TOLERANCE * np.abs(theirs).max()
 
 
+@pytest.mark.parametrize(("actuated", "dependent"), [("a", "finger"), ("f", "arm")])
+@pytest.mark.parametrize("polynomial", ["0.1 1 0 0 0", "0.1 1 0.3 -0.2 0.1"])
+def test_the_joint_with_the_actuator_is_independent(write, actuated, dependent, polynomial):
+    equality = f'<joint joint1="f" joint2="a" polycoef="{polynomial}"/>'
+    path = write(mjcf(CHAIN, equality, actuator=f'<motor joint="{actuated}"/>'))
+    robot = load_robot(path)
+    assert {body.name for body in robot.bodies} - set(robot.independent) == {dependent}
+    compare(path, robot, spread=0.1)
+
+
+def test_a_tendon_without_play_couples_its_joints(write):
+    """As the equality that holds it at the middle of its range, 0.3."""
+    tendon = '<fixed name="t" {}><joint joint="a" coef="2"/><joint joint="f" coef="1"/></fixed>'
+    with pytest.warns(LossyImportWarning, match="play of tendon t"):
+        robot = load_robot(write(mjcf(CHAIN, "", tendon.format('range="0.299 0.301"'))))
+    assert robot.constraints == (LinearConstraint("t", (("arm", 2.0), ("finger", 1.0)), pytest.approx(0.3)),)
+    at_pose = 2 * 0.4  # `ref` of joint a, which an equality counts from
+    twin = write(mjcf(CHAIN, f'<tendon tendon1="t" polycoef="{0.3 - at_pose} 0 0 0 0"/>', tendon.format("")))
+    compare(twin, robot)
+
+
+def test_names_made_for_equalities_are_of_no_other(write):
+    equality = '<joint name="finger_to_arm" joint1="w1" joint2="s"/><joint joint1="f" joint2="a"/>'
+    first, second = (tie.name for tie in load_robot(write(mjcf(CHAIN, equality))).constraints)
+    assert first == "finger_to_arm"
+    assert second.startswith("finger_to_arm")
+    assert second != first
+
+
 def test_gears_written_as_rotor_bodies_are_rotors(write):
     disc = '<inertial mass="0.2" pos="0 0 0" diaginertia="1e-3 1e-3 2e-3"/>'
     world = (
@@ -124,16 +153,33 @@ def test_gears_written_as_rotor_bodies_are_rotors(write):
         CONNECT,
         '<connect name="pin" site1="tip" site2="top"/>',
         '<weld name="w" body1="rod" body2="handle"/>',
+        '<weld name="pin" body1="rod" body2="rocker" anchor="0 0 0.4" torquescale="0"/>',
     ],
 )
 def test_closed_loops(write, equality):
     handle = f'<body name="handle" pos="0 0 0.4"><joint name="handle" axis="0 1 0"/>{lump(0.1)}</body>'
-    world = BARS.replace('<site name="top"', handle + '<site name="top"') if "weld" in equality else BARS
+    world = BARS.replace('<site name="top"', handle + '<site name="top"') if "handle" in equality else BARS
     path = write(mjcf(world, equality, actuator='<motor joint="crank"/>'))
     robot = load_robot(path)
     assert robot.independent == ("crank",)
     assert all(isinstance(tie, LoopConstraint) for tie in robot.constraints)
     compare(path, robot, "exact")
+
+
+@pytest.mark.parametrize(("tie", "error"), [("connect", 1e-9), ("weld", 1e-7), ("connect", 3e-6)])
+def test_parallel_rods_repeat_each_other_within_the_digits_of_a_file(write, tie, error):
+    path = write(parallel(tie, error))
+    robot = load_robot(path)
+    assert robot.independent == ("crank",)
+    assert any("of rod_2 and " in note and "adds only" in note for note in robot.notes)
+    compare(path, robot, spread=0.2, rounding=10 * error)
+
+
+def test_rods_that_contradict_each_other_leave_no_freedom(write):
+    with pytest.warns(LossyImportWarning, match="actuator"):
+        robot = load_robot(write(parallel("connect", 1e-3)))
+    with pytest.raises(RobotError, match=r"the loop of .*, rod_1, rod_2, .*no freedom.* agree to 1e-05"):
+        Model(robot)
 
 
 def test_a_welded_tip_leaves_one_freedom_of_seven(write):

@@ -90,7 +90,7 @@ def test_mjcf_has_no_actuator_of_it():
 
 
 def test_it_is_passive_again_when_mjcf_is_read_back(tmp_path):
-    """So is every joint with a spring that no actuator of a file drives; without any actuator, joints await torques."""
+    """So is every joint that no actuator of a file drives, with or without a spring; without any actuator, none is."""
     pytest.importorskip("mujoco")
     path = tmp_path / "pair.xml"
     path.write_text(to_mjcf(pair(), "none"))
@@ -99,6 +99,8 @@ def test_it_is_passive_again_when_mjcf_is_read_back(tmp_path):
     assert [name for name, _ in (*again.gains.kp, *again.gains.kd)] == ["arm", "arm"]
     blade = again.body("blade").joint
     assert (blade.stiffness, blade.springref) == (STIFFNESS, 0.3)
+    path.write_text(to_mjcf(pair(stiffness=0.0), "none"))
+    assert ce_gym.load_robot(path).passive == ("blade",)
     root = ET.fromstring(path.read_text())
     for parent, tag in ((root, "actuator"), (root, "keyframe")):
         parent.remove(next(parent.iter(tag)))

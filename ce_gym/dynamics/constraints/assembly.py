@@ -7,6 +7,7 @@ eliminated, and on which branch the loops are.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import casadi as ca
@@ -17,6 +18,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.elimination import eliminate, linear_rows
 from ce_gym.dynamics.constraints.residuals import residual
 from ce_gym.model.clusters import Cluster
+from ce_gym.model.constraints import Constraint, LoopConstraint
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
 
@@ -26,12 +28,21 @@ CLOSED = 1e-10
 """Largest residual of a constraint that is met at the reference pose."""
 SINGULAR = 1e-7
 """Smallest singular value, relative to the largest, of loops that are not singular."""
-REDUNDANT = 1e-6
-"""Smallest singular value of rows, each with a largest entry of 1, that do not repeat each other: files are rounded."""
-NEARLY_CLOSED = 1e-6
+REDUNDANT = 1e-5
+"""Smallest singular value of scaled rows that do not repeat each other.
+
+Files with six digits turn the axes of a planar loop against each other by up to 3e-6.
+"""
+DISTINCT = 0.05
+"""The same of rows that are taken first: of two that repeat each other, the better one."""
+VANISHING = 1e-9
+"""Scale of rows that vanish."""
+NEARLY_CLOSED = 1e-5
 """Largest residual of rounded rows in configurations that meet all others."""
 SAMPLES, SPREADS = 6, (0.3, 0.1, 0.03)
 """Configurations around the reference pose that are tried, and how far from it, in units of the coordinates."""
+ENOUGH = 3
+"""How many of them must be closed before nearer ones are tried."""
 FARTHEST = 0.5
 """How far a configuration may move when it is closed: beyond, it is on another branch, which may be singular."""
 
@@ -61,9 +72,12 @@ class Assembly:
 
 def nonlinear_rows(robot: Robot, cluster: Cluster, q: SX) -> SX:
     """Return the rows of a cluster's constraints that are not linear, at spanning coordinates `q` (n,)."""
+    return ca.vertcat(*[rows for _, rows in _rows_by_tie(robot, cluster, q)])
+
+
+def _rows_by_tie(robot: Robot, cluster: Cluster, q: SX) -> list[tuple[Constraint, SX]]:
     angles = {body: q[i] for i, body in enumerate(cluster.bodies)}
-    ties = [tie for tie in cluster.constraints if not tie.linear]
-    return ca.vertcat(*[residual(robot, tie, angles) for tie in ties])
+    return [(tie, residual(robot, tie, angles)) for tie in cluster.constraints if not tie.linear]
 
 
 class Assembler:
@@ -78,7 +92,9 @@ class Assembler:
         self.robot, self.cluster, self.n = robot, cluster, len(cluster.bodies)
         self.A, self.b = linear_rows(cluster)
         symbol = SX.sym("q", self.n)
-        rows = nonlinear_rows(robot, cluster, symbol)
+        by_tie = _rows_by_tie(robot, cluster, symbol)
+        self.counts = [(tie, rows.numel()) for tie, rows in by_tie]
+        rows = ca.vertcat(*[rows for _, rows in by_tie])
         self.n_rows = rows.numel()
         self.evaluate = ca.Function("rows", [symbol], [ca.densify(rows), ca.densify(ca.jacobian(rows, symbol))])
         pattern = np.array(ca.DM(ca.sparsify(ca.jacobian(rows, symbol)).sparsity(), 1).full())
@@ -97,26 +113,40 @@ class Assembler:
         if not all(np.isfinite(x).all() for x in self._all(start)):
             raise self._error("is not a number at the standing pose: expected `pose` and `assembly` where it is one")
         q, gap = self._close(start, self.dependent)
-        closed = gap < CLOSED
-        rows = self._independent_rows(q if closed else self._close(q, list(range(self.n)))[0])
+        rows = self._independent_rows(q if gap < CLOSED else self._close(start, list(range(self.n)), REDUNDANT)[0])
         if not rows:
             raise self._error("says nothing that joints and linear constraints do not: expected it left out")
         count = self.n - len(self.A) - len(rows)
-        if len(self.independent) != count:
-            raise self._error(f"has {len(self.independent)} independent joints: expected {count} of them")
         if count == 0:
-            raise self._error("leaves its joints no freedom: expected fewer constraints")
-        if not closed:
             raise self._error(
-                f"does not close at the standing pose, gap {gap:.2g}: expected `pose` and `assembly` near"
+                "leaves its joints no freedom: expected fewer constraints, or repeated ones that agree to 1e-5"
             )
+        if len(self.independent) != count:
+            chosen = ", ".join(self.cluster.independent) or "none"
+            freedoms = (
+                f"{count} freedom{'s' * (count > 1)}, as {len(rows) + len(self.A)} constraints tie {self.n} joints"
+            )
+            raise self._error(f"has {freedoms}: expected as many independent joints, unlike {chosen}")
+        if gap >= CLOSED:
+            q = self._close_rounded(start, rows, gap)
         condition = self._condition(q, rows)
         linear = eliminate(self.cluster, last=self.appears)
         return Assembly(q, linear.B, linear.q0, linear.unknown, rows, self.n_rows - len(rows), condition)
 
+    def _close_rounded(self, q: Array, rows: tuple[int, ...], gap: float) -> Array:
+        """Return coordinates that meet the rows that are kept; the others, which repeat them, may be rounded."""
+        kept = [*range(len(self.A)), *(len(self.A) + row for row in rows)]
+        q, left = self._close(q, self.dependent, kept=kept)
+        if left >= CLOSED or np.abs(self._all(q)[0]).max() > NEARLY_CLOSED:
+            raise self._error(
+                f"does not close at the standing pose, gap {gap:.2g}: expected `pose` and `assembly` near"
+            )
+        return q
+
     def _error(self, problem: str) -> RobotError:
+        bodies = ", ".join(name for name in self.cluster.bodies if self.robot.body(name).kind == "link")
         names = ", ".join(tie.name for tie in self.cluster.constraints)
-        return RobotError(f"{self.robot.source or self.robot.name}: the cluster tied by {names} {problem}")
+        return RobotError(f"{self.robot.source or self.robot.name}: the loop of {bodies}, tied by {names}, {problem}")
 
     def _units(self) -> Array:
         """Units of the coordinates [rad or m], shape (n,): in theirs, rotors move about as fast as what they drive.
@@ -136,22 +166,24 @@ class Assembler:
         linear = (self.A @ q - self.b) / scale
         return np.concatenate([linear, phi[:, 0]]), np.vstack([self.A / scale[:, None], K]) * self.unit
 
-    def _close(self, q: Array, free: list[int], smallest: float = 1e-10) -> tuple[Array, float]:
-        """Move the coordinates `free` until the constraints are met, by a damped Gauss-Newton iteration.
+    def _close(
+        self, q: Array, free: list[int], smallest: float = 1e-10, kept: list[int] | slice = slice(None)
+    ) -> tuple[Array, float]:
+        """Move the coordinates `free` until the rows `kept` are met, by a damped Gauss-Newton iteration.
 
         Directions whose singular value is below `smallest`, relative to the largest, are left alone: along them the
         iteration would wander far for the sake of a rounding error.
         """
         q = q.copy()
         for _ in range(200):
-            phi, K = self._all(q)
+            phi, K = (x[kept] for x in self._all(q))
             if not (np.isfinite(phi).all() and np.isfinite(K).all()):
                 return q, np.inf
             if np.abs(phi).max() < 1e-15:
                 break
             step = -np.linalg.lstsq(K[:, free], phi, rcond=smallest)[0]
             q[free] += self.unit[free] * step * min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
-        return q, float(np.abs(self._all(q)[0]).max())
+        return q, float(np.abs(self._all(q)[0][kept]).max())
 
     def _start(self) -> Array:
         given = dict(self.robot.pose.joints) | dict(self.robot.assembly)
@@ -159,24 +191,50 @@ class Assembler:
 
     def _independent_rows(self, q: Array) -> tuple[int, ...]:
         """Find rows that are not implied by others, in configurations around the reference pose that meet them all."""
-        Ks = next((Ks for spread in SPREADS if (Ks := self._jacobians_around(q, spread))), [])
+        Ks: list[Array] = []
+        gap = np.abs(self._all(q)[0]).max()
+        limits = (max(CLOSED, 10 * gap), NEARLY_CLOSED) if gap < NEARLY_CLOSED else ()
+        for limit, spread in itertools.product(limits, SPREADS):
+            Ks += self._jacobians_around(q, spread, limit) if len(Ks) < ENOUGH else []
         if not Ks:
             raise self._error("does not close at the standing pose, nor near it: expected `pose` and `assembly` near")
         first, kept = len(self.A), list(range(len(self.A)))
-        for row in range(first, first + self.n_rows):
-            if max(_smallest(K[[*kept, row]]) for K in Ks) > REDUNDANT:
-                kept.append(row)
-        return tuple(row - first for row in kept[first:])
+        scaled = [self._scaled(K) for K in Ks]
+        for least in (DISTINCT, REDUNDANT):
+            for row in (row for row in range(first, first + self.n_rows) if row not in kept):
+                if max(_smallest(K[[*kept, row]]) for K in scaled) > least:
+                    kept.append(row)
+        return tuple(sorted(row - first for row in kept[first:]))
 
-    def _jacobians_around(self, q: Array, spread: float) -> list[Array]:
-        """Return the Jacobian of all rows in configurations near `q` that are closed, on the same branch."""
-        samples = self.unit * np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, self.n))
+    def _jacobians_around(self, q: Array, spread: float, limit: float) -> list[Array]:
+        """Return the Jacobian of all rows in configurations near `q` with gaps below `limit`, on the same branch."""
+        directions = np.eye(self.n)
+        if (
+            np.abs(self._all(q)[0]).max() >= CLOSED
+        ):  # a rounded loop is only nearly closed, and must not be led to where it closes exactly
+            values, directions = np.linalg.svd(self._scaled(self._all(q)[1]))[1:]
+            directions = directions[(values > REDUNDANT).sum() :]
+        samples = np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, len(directions))) @ directions
         found = []
-        for start in q + samples:
-            closed, gap = self._close(start, list(range(self.n)), REDUNDANT)
-            if gap < NEARLY_CLOSED and np.abs((closed - start) / self.unit).max() < FARTHEST:
+        for start in q + self.unit * samples:
+            closed, left = self._close(start, list(range(self.n)), REDUNDANT)
+            if left < limit and np.abs((closed - start) / self.unit).max() < FARTHEST:
                 found.append(self._all(closed)[1])
         return found
+
+    def _scaled(self, K: Array) -> Array:
+        """Scale rows to a largest entry of 1: the three of a loop's origin together, those of its axis not at all.
+
+        In a planar loop the rows across its plane vanish but for rounding, and must not be scaled up.
+        """
+        scale = np.abs(K).max(axis=1)
+        row = len(self.A)
+        for tie, count in self.counts:
+            if isinstance(tie, LoopConstraint):
+                scale[row : row + 3] = scale[row : row + 3].max()
+                scale[row + 3 : row + count] = 1.0
+            row += count
+        return np.divide(K, scale[:, None], out=np.zeros_like(K), where=scale[:, None] > VANISHING)
 
     def _condition(self, q: Array, rows: tuple[int, ...]) -> float:
         """Condition number of the dependent columns, each row scaled to its largest entry."""
@@ -195,8 +253,5 @@ class Assembler:
 
 
 def _smallest(K: Array) -> float:
-    """Smallest singular value of rows scaled to their largest entry; 0 if a row vanishes."""
-    scale = np.abs(K).max(axis=1, initial=0.0, keepdims=True)
-    if (scale < 1e-9).any() or K.shape[0] > K.shape[1]:
-        return 0.0
-    return float(np.linalg.svd(K / scale, compute_uv=False)[-1])
+    """Smallest singular value of rows; 0 if there are more rows than columns."""
+    return 0.0 if K.shape[0] > K.shape[1] else float(np.linalg.svd(K, compute_uv=False)[-1])

@@ -19,7 +19,7 @@ from ce_gym.model.formats.mjcf.source import MjcfSource
 
 Array = NDArray[np.float64]
 
-RANK_TOLERANCE = 1e-6
+RANK_TOLERANCE = 1e-5
 """Relative size of rows, columns and singular values of a constraint Jacobian that count as zero: files are rounded."""
 VANISHING = 1e-9
 """Size of a row that counts as zero where all rows of its kind are as small."""
