@@ -5,6 +5,7 @@ Each row is a sentence with its figures worked out from the robot: it fails if p
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from functools import cache
@@ -15,6 +16,7 @@ import pytest
 import ce_gym
 from ce_gym.diagnostics.levels import report_levels
 from ce_gym.diagnostics.levels_text import as_text
+from ce_gym.diagnostics.standing import joints_at_feet, pitch_stiffness, toppling
 from ce_gym.dynamics import Model
 from ce_gym.model import Robot
 from ce_gym.model.mechanism import is_axisymmetric
@@ -47,9 +49,17 @@ def undriven(name: str) -> list[str]:
     return [joint for joint in robot(name).commanded if joint not in tied]
 
 
+def gains(name: str, *parts: str) -> set[float]:
+    return {gain for joint, gain in robot(name).gains.kp if any(part in joint for part in parts)}
+
+
 def the(values: set[float]) -> str:
     (value,) = values
     return f"{value:g}"
+
+
+def instructions(name: str, level: str = "exact") -> int:
+    return model(name, level).n_instructions("forward_dynamics")
 
 
 def rods(name: str) -> int:
@@ -75,11 +85,19 @@ def walking() -> set[str]:
     return {name.partition("_velocity")[0] for name in ce_gym.shipped_policies() if "_velocity" in name}
 
 
+def holds(name: str) -> bool:
+    """Whether the position gains of the ankles are larger than weight times height above them."""
+    at_feet = joints_at_feet(model(name))
+    return pitch_stiffness(model(name), at_feet) > toppling(model(name), at_feet)
+
+
 def kept(name: str) -> tuple[str, ...]:
     return robot(name).kept_inertia
 
 
 CHEETAH, HUMANOID, TELLO, ANYMAL, JVRC, G1 = "mini_cheetah", "mit_humanoid", "tello", "anymal_c", "jvrc1", "g1"
+_STANDING = {"cassie": "Cassie", "dr_legs": "DR Legs", "h1": "H1", "berkeley_humanoid": "Berkeley Humanoid"}
+_STANDING |= {"g1": "G1", "t1": "T1"}
 STATEMENTS: list[tuple[str, Callable[[], str]]] = [
     (
         "exactness.md",
@@ -112,6 +130,12 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         "how-to/faq.md",
         lambda: "Belts and differentials (MIT Humanoid, Tello)" if belts(HUMANOID) and belts(TELLO) else "none",
     ),
+    (
+        "reference/robot_files.md",
+        lambda: f"{' '.join(n for n in ce_gym.robots() if robot(n).elastic)} has such values".replace(
+            "mini_cheetah", "Mini Cheetah"
+        ),
+    ),
     ("how-to/faq.md", lambda: f'`kept_inertia: ["{"".join(kept(CHEETAH))}"]`'),
     (
         "explanation/how_it_works.md",
@@ -121,15 +145,34 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
         ),
     ),
     ("reference/environments.md", lambda: f"(the {_kinds(undriven(JVRC))} of JVRC-1)"),
+    ("reference/robots.md", lambda: f"The {WORDS[len(floating())]} robots of the package that tasks can have"),
+    ("reference/robots.md", lambda: f"a screw with a lead of {2000 * math.pi / ratios('spot')[-1]:.0f} mm"),
     (
         "reference/robots.md",
         lambda: (
-            f"at knee and heel, of {robot('cassie').body('left_shin').joint.stiffness:.0f} and "
-            f"{robot('cassie').body('left_heel_spring').joint.stiffness:.0f} N m/rad"
+            f"at the knee ({robot('cassie').body('left_shin').joint.stiffness:.0f} N m/rad) and the heel "
+            f"({robot('cassie').body('left_heel_spring').joint.stiffness:.0f} N m/rad)"
         ),
     ),
-    ("reference/robots.md", lambda: f"moved by {WORDS[len(robot('dr_legs').motors) // 2]} servos"),
-    ("README.md", lambda: f"| [{WORDS[len(walking())]} robots](docs/reference/policies.md), evaluated"),
+    ("reference/robots.md", lambda: f"{WORDS[len(robot('dr_legs').motors) // 2]} motors for a leg"),
+    (
+        "reference/robots.md",
+        lambda: (
+            f"H1 has {the(gains('h1', 'hip_roll', 'hip_pitch', 'knee'))} N m/rad at hips and knees "
+            f"({the(gains('h1', 'hip_yaw'))} at the hips' yaw) and {the(gains('h1', 'ankle'))} at the ankles"
+        ),
+    ),
+    (
+        "reference/robots.md",
+        lambda: (
+            "The Berkeley Humanoid has "
+            f"{min(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g} to "
+            f"{max(gains('berkeley_humanoid', 'hr', 'haa', 'hfe', 'kfe')):g}, and "
+            f"{the(gains('berkeley_humanoid', 'ffe'))} and {the(gains('berkeley_humanoid', 'faa'))} at the feet"
+        ),
+    ),
+    ("reference/robots.md", lambda: f"{_titles(_STANDING, True)} | stands"),
+    ("reference/robots.md", lambda: f"| {_titles(_STANDING, False)} | falls"),
 ]
 
 
@@ -139,11 +182,13 @@ def _kinds(joints: list[str]) -> str:
     return " and ".join(f"the {part}" if part == "neck" else f"{part}s" for part in parts)
 
 
-@pytest.mark.slow
+def _titles(robots: dict[str, str], stand: bool) -> str:
+    return ", ".join(title for name, title in robots.items() if holds(name) == stand)
+
+
 @pytest.mark.parametrize(("page", "statement"), STATEMENTS, ids=range(len(STATEMENTS)))
 def test_a_statement_is_what_the_file_says(page: str, statement: Callable[[], str]):
-    path = ROOT / page if page == "README.md" else ROOT / "docs" / page
-    text = " ".join(path.read_text(encoding="utf-8").split())
+    text = " ".join((ROOT / "docs" / page).read_text(encoding="utf-8").split())
     sentence = " ".join(statement().split())
     assert sentence in text, f"{page} does not say: {sentence}"
 
