@@ -111,12 +111,7 @@ STATEMENTS: list[tuple[str, Callable[[], str]]] = [
     ("exactness.md", lambda: f"(gears of {ratios(HUMANOID)[0]:g} to {ratios(HUMANOID)[-1]:g}, belts) |"),
     ("exactness.md", lambda: f"| differentials, ratio {the(set(ratios(TELLO)))} (Tello) |"),
     ("exactness.md", lambda: f"| Tello (gears of {the(set(ratios(TELLO)))}, differentials) |"),
-    ("exactness.md", lambda: f"| gears, ratio {the(set(ratios(ANYMAL)))} (ANYmal C) |"),
     ("exactness.md", lambda: f"| ANYmal C (gears of {the(set(ratios(ANYMAL)))}) | {level_row(ANYMAL)} |"),
-    (
-        "exactness.md",
-        lambda: f"| gears, ratio {the(set(ratios(JVRC)))}, rotors light beside the links (JVRC-1) |",
-    ),
     (
         "exactness.md",
         lambda: f"| JVRC-1 (gears of {the(set(ratios(JVRC)))}, light rotors) | {level_row(JVRC)} |",

@@ -159,7 +159,7 @@ def test_the_study_that_comes_along_is_what_its_page_says():
     study = read_study(SHIPPED)
     assert study.seeds == list(range(1, 11))
     assert [arm.env_args["transmission"] for arm in study.arms.values()] == ["exact", "armature", "none", "armature"]
-    text = (ROOT / "docs" / "exactness.md").read_text()
+    text = (ROOT / "docs" / "records" / "exactness.md").read_text()
     for task in study.tasks.values():
         assert f"`{task.figures[0]}`" in text
         assert task.env in ce_gym.environment_ids()
