@@ -20,7 +20,7 @@ matplotlib.use("Agg")  # pictures go to files, whether or not there is a display
 from matplotlib import pyplot as plt
 
 BLUE, SKY, GREEN, ORANGE, RED, GREY = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#777777"
-STYLE: dict[str, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
