@@ -47,7 +47,7 @@ def test_two_codes_agree_on_a_block(name: str):
     scene = short(name, 5)
     limit = Ours(scene, Way("extrapolated"), 1).run(2000)
     assert np.abs(limit[-1] - scene.q).max() > 1e-4
-    assert rms_error(scene, accuracy_contact.block(scene, 600), limit) < 1e-7
+    assert rms_error(scene, accuracy_contact.robot(scene, 4000), limit) < 1e-7
 
 
 @pytest.mark.slow
