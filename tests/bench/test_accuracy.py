@@ -47,7 +47,7 @@ def test_two_codes_agree_on_a_block(name: str):
     scene = short(name, 5)
     limit = Ours(scene, Way("extrapolated"), 1).run(2000)
     assert np.abs(limit[-1] - scene.q).max() > 1e-4
-    assert rms_error(scene, accuracy_contact.robot(scene, 4000), limit) < 1e-7
+    assert rms_error(scene, accuracy_contact.explicit(scene, 4000), limit) < 1e-7
 
 
 @pytest.mark.slow
@@ -55,7 +55,7 @@ def test_two_codes_agree_on_a_block(name: str):
 def test_two_codes_agree_on_robots_that_touch(name: str, holds: int):
     """On the edge of a step, between links, and on feet behind rods and springs."""
     scene = short(name, holds)
-    error = rms_error(scene, accuracy_contact.robot(scene, 8000), Ours(scene, scene.ours[1], 1).run(1000))
+    error = rms_error(scene, accuracy_contact.explicit(scene, 8000), Ours(scene, scene.ours[1], 1).run(1000))
     coarse = rms_error(scene, Ours(scene, scene.ours[1], 1).run(10), Ours(scene, scene.ours[1], 1).run(1000))
     assert error < 3e-5 < 10 * error + 3e-5 < coarse
 
@@ -65,7 +65,7 @@ def test_two_codes_agree_on_a_robot_that_lands():
     scene = short("drop_3cm", 5)
     lower = replace(scene, q=scene.q - 0.03 * np.eye(len(scene.q))[2])
     limit = Ours(lower, Way("euler", friction="secant"), 1).run(8000)
-    error = rms_error(lower, accuracy_contact.robot(lower, 20_000), limit)
+    error = rms_error(lower, accuracy_contact.explicit(lower, 20_000), limit)
     coarse = rms_error(lower, Ours(lower, Way("euler", friction="secant"), 1).run(100), limit)
     assert error < 1e-5 < 10 * error + 1e-5 < coarse
 

@@ -17,6 +17,7 @@ from small_mechanisms import GRAVITY, GROUND, simulator
 
 from ce_gym import Model, Robot, Simulator, load_robot
 
+pytestmark = pytest.mark.slow
 NO_TORQUE = np.zeros(0)
 
 
@@ -112,7 +113,6 @@ def test_momentum_of_a_quadruped_in_free_fall_is_that_of_gravity():
     np.testing.assert_allclose(linear_momentum(sim) - before, [0.0, 0.0, -weight], atol=0.02 * weight)
 
 
-@pytest.mark.slow
 def test_a_humanoid_stands_under_stiff_position_control():
     """SimBenchmark: gains of 5e4 N m/rad, 20 s at 2.5 ms (theirs: 0.5 ms)."""
     robot = load_robot("jvrc1")
@@ -178,7 +178,6 @@ def largest_gain(robot: Robot, time: float, method: str) -> float:
     return (highest - start) / (start - lowest)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mass_ratio", [1e-4, 1e-2, 1.0, 1e2, 1e4])
 def test_double_pendulums_of_any_mass_ratio_keep_their_energy(mass_ratio: float):
     robot = mechanisms.chain(2, mass_ratio)
@@ -186,7 +185,6 @@ def test_double_pendulums_of_any_mass_ratio_keep_their_energy(mass_ratio: float)
     assert largest_gain(robot, 5.0, "extrapolated") <= 0.01
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 10, 30, 100])
 def test_chains_keep_their_energy(n: int):
     robot = mechanisms.chain(n)

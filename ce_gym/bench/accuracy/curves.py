@@ -206,7 +206,7 @@ def reference(scene: Scene) -> tuple[Array, Array, Measured]:
             truth,
             Measured(scene, rms_error(scene, accuracy_references.theirs(scene, scene.reference), truth)),
         )
-    truth = accuracy_contact.robot(scene, 40_000)
+    truth = accuracy_contact.explicit(scene, 40_000)
     fine = Ours(scene, Way("extrapolated", scene.exact), 1)
     limit = fine.run(4000)
     measured = Measured(scene, rms_error(scene, limit, truth))

@@ -23,13 +23,13 @@ from ce_gym.sim.kernel_key import model_key
 SX = ca.SX
 
 
-def robot(scene: Scene, n: int) -> Array:
-    """Return positions of a robot at the end of every hold, with `n` steps to a hold, shape (n_holds, nq)."""
+def explicit(scene: Scene, n: int) -> Array:
+    """Return positions at the end of every hold, with `n` steps to a hold, shape (n_holds, nq)."""
     model = Model(scene.robot)
 
     ground = "" if scene.terrain is None else f"{scene.terrain} {scene.terrain.heights[:, 0].tolist()}"
     sources = source_fingerprint(__name__, restated.__name__)
-    key = f"{sources} {model_key(model)} {ground} {scene.touching}"
+    key = f"{sources} {model_key(model)} {ground} {scene.touching} {scene.push is not None}"
 
     def build() -> Program:
         step = _midpoint_step(scene)
