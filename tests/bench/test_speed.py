@@ -50,36 +50,29 @@ def test_the_peak_is_of_multiply_adds_that_are_done(dtype):
     assert competitors.peak(dtype).work == 2 * chains * links * competitors.PEAK_REPEATS * lanes
 
 
-@pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid", "jvrc1", "four_bar", "planar_leg_linkage"])
+@pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid", "jvrc1"])
 def test_pinocchio_has_the_same_dynamics(name):
-    pytest.importorskip("pinocchio")
+    pin = pytest.importorskip("pinocchio")
     from ce_gym.bench.peers import pinocchio as pinocchio_peer
 
     robot, rng = load_robot(name), np.random.default_rng(3)
     model, peer = Model(robot, "armature"), pinocchio_peer.load(robot)
-    q, tau = model.standing_q.copy(), rng.uniform(-5, 5, model.nv)
-    v = np.zeros(model.nv)
-    if not len(peer.loops):
-        q[-len(robot.independent) :] += rng.uniform(-0.5, 0.5, len(robot.independent))
-        v = rng.uniform(-2, 2, model.nv)
-    if robot.floating:
-        q[3:7] = rng.normal(size=4)
-        q[3:7] /= np.linalg.norm(q[3:7])
+    q, v, tau = model.standing_q.copy(), rng.uniform(-2, 2, model.nv), rng.uniform(-5, 5, model.nv)
+    q[7:] += rng.uniform(-0.5, 0.5, len(robot.independent))
+    q[3:7] = rng.normal(size=4)
+    q[3:7] /= np.linalg.norm(q[3:7])
     expected = model.forward_dynamics(q, v, tau)
-    methods = peer.methods()
-    assert set(methods) == ({"constraintDynamics", "lcaba"} if len(peer.loops) else {"aba", "crba + rnea"})
-    for method in methods.values():
-        theirs = np.asarray(method(peer.positions(q), peer.velocities(v), peer.velocities(tau)))
-        np.testing.assert_allclose(peer.accelerations(theirs), expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+    state = peer.positions(q), peer.velocities(v), peer.velocities(tau)
+    theirs = np.asarray(pin.aba(peer.model, peer.model.createData(), *state))
+    np.testing.assert_allclose(peer.accelerations(theirs), expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 
 def test_pinocchio_says_what_it_cannot():
     pytest.importorskip("pinocchio")
     from ce_gym.bench.peers import pinocchio as pinocchio_peer
 
-    with pytest.raises(RobotError, match="tello: constraint 'left-hip-rod-1' is none of Pinocchio's") as caught:
+    with pytest.raises(RobotError, match="tello: constraint 'left-hip-rod-1' ties joints, which aba does not know"):
         pinocchio_peer.load(load_robot("tello"))
-    assert "\n" not in str(caught.value)
 
 
 def test_mujoco_on_two_threads_is_mujoco_on_one():

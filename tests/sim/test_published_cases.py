@@ -185,7 +185,7 @@ def test_double_pendulums_of_any_mass_ratio_keep_their_energy(mass_ratio: float)
     assert largest_gain(robot, 5.0, "extrapolated") <= 0.01
 
 
-@pytest.mark.parametrize("n", [5, 10, 30, 100])
+@pytest.mark.parametrize("n", [5, 10, 30])
 def test_chains_keep_their_energy(n: int):
     robot = mechanisms.chain(n)
     assert math.isfinite(largest_gain(robot, 1.0, "euler"))

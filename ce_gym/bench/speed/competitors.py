@@ -191,6 +191,24 @@ def mujoco_forward(robot: Robot, level: str, repeats: int = 256) -> Competitor:
     return Competitor(forward, repeats)
 
 
+def pinocchio_peer(robot: Robot) -> dict[str, Competitor]:
+    """Return Pinocchio's `aba`, its derivatives and the call of a single joint; nothing where it is not installed.
+
+    Raises:
+        RobotError: If Pinocchio's `aba` does not know the robot.
+    """
+    try:
+        from ce_gym.bench.peers import pinocchio
+    except ImportError:
+        return {}
+    peer = pinocchio.load(robot)
+    return {
+        "Pinocchio aba": pinocchio.forward_dynamics(peer),
+        "Pinocchio computeABADerivatives": pinocchio.derivatives(peer),
+        "Pinocchio (call of a single joint)": pinocchio.overhead(),
+    }
+
+
 def peak(dtype: str) -> Competitor:
     """Return chains of multiply-adds, compiled as steps are; one unit of work is one floating-point operation."""
     kernel, lanes = peak_kernel(dtype), lane_count(dtype)

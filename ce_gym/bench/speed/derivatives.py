@@ -193,24 +193,12 @@ def _dynamics(robot: Robot, arguments: argparse.Namespace, report: Report) -> No
         "derivatives, compiled": competitors.forward_dynamics(robot, "armature", n, derivatives=True),
         "Model.forward_dynamics_derivatives": Competitor(lambda: model.forward_dynamics_derivatives(*given), n),
     }
-    sides |= _pinocchio(robot, report)
+    try:
+        sides |= competitors.pinocchio_peer(robot)
+    except RobotError as error:
+        report.remarks.append(f"Pinocchio: {error}")
     timings = interleaved(sides, arguments.rounds, time.thread_time)
     first = timings["derivatives, compiled"]
     rows = [(name, 1e6 * timing.best, ratio(timing, first).median) for name, timing in timings.items()]
     title = f"Forward dynamics and its derivatives, {robot.name} armature, double precision"
     report.tables.append(Table(title, ("side", "best [us]", "times ours, compiled"), tuple(rows)))
-
-
-def _pinocchio(robot: Robot, report: Report) -> dict[str, Competitor]:
-    try:
-        from ce_gym.bench.peers import pinocchio as peers
-
-        peer = peers.load(robot)
-    except (ImportError, RobotError) as error:
-        report.remarks.append(f"Pinocchio: {error}")
-        return {}
-    return {
-        "Pinocchio aba": peers.competitors(peer)["aba"],
-        "Pinocchio computeABADerivatives": peers.derivatives(peer),
-        "Pinocchio (call of a single joint)": peers.overhead(),
-    }

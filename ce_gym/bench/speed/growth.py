@@ -14,13 +14,12 @@ from collections.abc import Collection
 import numpy as np
 
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
-from ce_gym.bench.measure.timing import Competitor, interleaved
+from ce_gym.bench.measure.timing import interleaved
 from ce_gym.bench.peers import stand
 from ce_gym.bench.speed import competitors
 from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Pose, Robot, load_robot
-from ce_gym.model.errors import RobotError
 from ce_gym.model.generators import link_and_rotor_chain
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.viewer.console import shown
@@ -67,9 +66,10 @@ def joints(lengths: Collection[int], rounds: int, report: Report) -> None:
         start = time.perf_counter()
         sides = {"ours": competitors.forward_dynamics(robot, "exact", 256)}
         compiled = time.perf_counter() - start
-        sides |= {"MuJoCo": competitors.mujoco_forward(robot, "armature"), **_pinocchio(robot)}
+        sides |= {"MuJoCo": competitors.mujoco_forward(robot, "armature"), **competitors.pinocchio_peer(robot)}
         timings = interleaved(sides, rounds, time.thread_time)
-        times = [1e6 * timings[name].best if name in timings else None for name in ("ours", "MuJoCo", "aba")]
+        names = ("ours", "MuJoCo", "Pinocchio aba")
+        times = [1e6 * timings[name].best if name in timings else None for name in names]
         rows.append((n, *counts, *times, compiled))
     columns = ("joints", *(f"{level} [instructions]" for level in LEVELS))
     columns += ("exact [us]", "MuJoCo armature [us]", "Pinocchio aba [us]", "trace and compile, or load [s]")
@@ -137,13 +137,3 @@ def plate(n: int) -> Robot:
 def straightness(x: list[Cell], y: list[Cell]) -> float:
     """Return the share r^2 of the variance of y that a straight line in x explains."""
     return float(np.corrcoef(np.array(x, float), np.array(y, float))[0, 1] ** 2)
-
-
-def _pinocchio(robot: Robot) -> dict[str, Competitor]:
-    """Pinocchio's `aba` of a robot, if it is installed and knows it."""
-    try:
-        from ce_gym.bench.peers import pinocchio
-
-        return {"aba": pinocchio.competitors(pinocchio.load(robot))["aba"]}
-    except (ImportError, RobotError):
-        return {}
