@@ -21,8 +21,8 @@ from ce_gym.model.errors import listed_names
 from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
-    "speed", "beside", "instructions", "throughput", "tracking", "stability", "accuracy", "adaptive", "derivatives",
-    "growth", "gpu", "digests", "files", "all",
+    "speed", "beside", "instructions", "throughput", "tracking", "stability", "accuracy", "derivatives",
+    "growth", "gpu", "digests", "all",
 )  # fmt: skip
 
 

@@ -26,7 +26,6 @@ QUICK: dict[str, tuple[str, ...]] = {
     "derivatives": ROUNDS,
     "stability": ("--quick",),
     "accuracy": ("--quick",),
-    "adaptive": ("--quick",),
 }
 """The benchmarks, with the arguments of a short run."""
 NOT_INSTALLED = 2

@@ -39,9 +39,9 @@ def test_exactness_costs_no_more_than_required():
 
 def test_bare_robot_has_one_group_of_contacts():
     pytest.importorskip("mujoco")
-    from ce_gym.bench.speed import benchmark as speed
+    from ce_gym.bench.peers.stand import bare
 
-    robot = speed.bare(load_robot("mini_cheetah"), "foot")
+    robot = bare(load_robot("mini_cheetah"), "foot")
     assert len(robot.contacts) == 4
     assert not any(body.shapes for body in robot.bodies)
 
@@ -49,9 +49,9 @@ def test_bare_robot_has_one_group_of_contacts():
 def test_mujoco_stands_at_its_converged_settings_and_not_with_too_few_iterations():
     pytest.importorskip("mujoco")
     from ce_gym.bench.peers import mujoco_settings
-    from ce_gym.bench.speed import benchmark as speed
+    from ce_gym.bench.peers.stand import bare
 
-    robot = speed.bare(load_robot("mini_cheetah"), "foot")
+    robot = bare(load_robot("mini_cheetah"), "foot")
     _, reference = mujoco_settings.watched(robot, "armature", mujoco_settings.Settings(0.001, "Euler"), 4)
     assert reference.like(reference)
     assert reference.contacts == 4.0
@@ -76,31 +76,13 @@ def test_what_counts_as_standing_alike(change, alike):
 def test_ours_stands_like_mujoco():
     pytest.importorskip("mujoco")
     from ce_gym.bench.peers import mujoco_settings, stand
-    from ce_gym.bench.speed import benchmark as speed
     from ce_gym.dynamics.model import Model
     from ce_gym.sim import Simulator
 
-    robot = speed.bare(load_robot("mini_cheetah"), "foot")
+    robot = stand.bare(load_robot("mini_cheetah"), "foot")
     settings = mujoco_settings.Settings(0.001, "Euler", solimp=mujoco_settings.STIFF)
     _, reference = mujoco_settings.watched(robot, "exact", settings, 4)
     ours = stand.watch_ours(Simulator(Model(robot, "exact"), num_envs=4), robot)
     assert ours.like(reference)
     assert ours.contacts == 4.0
     assert ours.height == pytest.approx(reference.height, abs=0.05)
-
-
-def test_forward_dynamics_kernel_computes_forward_dynamics():
-    pytest.importorskip("mujoco")
-    from ce_gym.bench.speed import forward
-    from ce_gym.compile import aligned_zeros, lane_count
-    from ce_gym.dynamics.model import Model
-
-    robot, lanes = load_robot("mit_humanoid_leg"), lane_count("float64")
-    model = Model(robot, "exact")
-    states = forward.random_states(model, lanes)
-    arrays = {name: aligned_zeros((1, rows.shape[1], lanes), "float64") for name, rows in states.items()}
-    for name, rows in states.items():
-        arrays[name][0] = rows.T
-    forward.kernel(robot, "exact", "float64")(arrays, lanes)
-    expected = model.forward_dynamics(states["q"], states["v"], states["tau"])
-    np.testing.assert_allclose(arrays["vdot"][0].T, expected, rtol=1e-9, atol=1e-9)

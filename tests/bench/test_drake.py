@@ -11,7 +11,6 @@ pytest.importorskip("mujoco")
 from ce_gym import Model
 from ce_gym.bench.accuracy import benchmark as accuracy
 from ce_gym.bench.accuracy import drake_peer
-from ce_gym.bench.accuracy.coulomb import PUSHES
 from ce_gym.bench.accuracy.curves import ERROR_CONTROL, Curve, Measured, Point, comparisons, rms_error
 from ce_gym.bench.accuracy.references import smooth as accuracy_references
 from ce_gym.bench.accuracy.scenarios import BLOCK_FRICTION, GRAVITY, HOLD, SCENES, Scene
@@ -26,18 +25,17 @@ def short(name: str, holds: int) -> Scene:
     return replace(scene, drive=scene.drive[:holds], push=None if scene.push is None else scene.push[:holds])
 
 
-def test_is_named_as_skipped_where_it_is_not_installed(tmp_path, monkeypatch):
-    pytest.importorskip("matplotlib")
+def test_is_named_as_skipped_where_it_is_not_installed(monkeypatch):
     monkeypatch.setattr(drake_peer, "available", lambda: False)
     monkeypatch.setattr(accuracy, "QUICK_STEPS", (1, 5))
     scene = short("tumble", 2)
     monkeypatch.setitem(SCENES, "tumble", lambda: scene)
-    given = argparse.Namespace(out=tmp_path, scenes=["tumble"], rounds=1, quick=True)
+    given = argparse.Namespace(scenes=["tumble"], rounds=1, quick=True, picture=None, points=None)
     for peers, named in ((["Drake"], [drake_peer.SKIPPED]), ([], [])):
         given.peers = peers
         report = accuracy.run(given)
         assert [remark for remark in report.remarks if remark.startswith("Drake")] == named
-        assert report.requirements == []
+        assert not [r for r in report.requirements if "time at equal error" in r.claim]
 
 
 def test_what_is_asked_of_an_integrator_is_no_step():
@@ -117,7 +115,7 @@ def test_a_block_slides_as_far_as_coulomb_says(method: str):
 
     scene = SCENES["slide"]()
     path = Peer(scene, "none", method, HOLD / 20 if method in DISCRETE else 1e-5).run()
-    exact = 0.5 * (PUSHES["slide"] - 1.0) * BLOCK_FRICTION * GRAVITY * scene.duration**2
+    exact = 0.5 * (2.0 - 1.0) * BLOCK_FRICTION * GRAVITY * scene.duration**2
     assert path[-1, 0] == pytest.approx(exact, rel=0.01)
     glides = HOLD / 20 * BLOCK_FRICTION * GRAVITY * scene.duration if method in ("sap", "similar") else 0.0
     assert scene.q[2] - 1e-4 < path[-1, 2] < scene.q[2] + glides + 1e-4  # contacts as stiff as ours, but see docs

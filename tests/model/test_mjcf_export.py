@@ -27,7 +27,8 @@ def random_state(model, rng):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_mujoco_has_the_same_dynamics(name, level):
     pytest.importorskip("mujoco")
-    from ce_gym.bench.peers import mujoco as mujoco_peer
+    import mujoco_dynamics
+
     from ce_gym.export.mujoco_model import load
 
     robot = load_robot(name)
@@ -36,8 +37,8 @@ def test_mujoco_has_the_same_dynamics(name, level):
     for _ in range(3):
         q, v, tau = random_state(model, rng)
         M, vdot = model.mass_matrix(q), model.forward_dynamics(q, v, tau)
-        assert np.abs(mujoco_peer.mass_matrix(peer, robot, q) - M).max() <= 1e-9 * np.abs(M).max()
-        theirs = mujoco_peer.forward_dynamics(peer, robot, q, v, tau)
+        assert np.abs(mujoco_dynamics.mass_matrix(peer, robot, q) - M).max() <= 1e-9 * np.abs(M).max()
+        theirs = mujoco_dynamics.forward_dynamics(peer, robot, q, v, tau)
         assert np.abs(theirs - vdot).max() <= 1e-9 * np.abs(vdot).max()
 
 
@@ -110,7 +111,7 @@ HOP = """<mujoco model="hop"><worldbody><geom type="plane" size="0 0 1"/><body n
 def test_armature_survives_a_round_trip(armature, gear, level, tmp_path):
     """The file's own joint inertia, that of MuJoCo's equalities written again, and that read again."""
     mujoco = pytest.importorskip("mujoco")
-    from ce_gym.bench.peers import mujoco as mujoco_peer
+    import mujoco_dynamics
 
     path = tmp_path / "hop.xml"
     path.write_text(HOP.format(armature, gear))
@@ -122,7 +123,7 @@ def test_armature_survives_a_round_trip(armature, gear, level, tmp_path):
     q = Model(robot, level).standing_q
     path.write_text(to_mjcf(robot, level))
     again = Model(load_robot(path), level)
-    written = mujoco_peer.mass_matrix(mujoco.MjModel.from_xml_path(str(path)), robot, q)
+    written = mujoco_dynamics.mass_matrix(mujoco.MjModel.from_xml_path(str(path)), robot, q)
     for found in (written[6, 6], again.mass_matrix(again.standing_q)[6, 6]):
         assert found - (M[6, 6] - armature) == pytest.approx(armature, rel=1e-6, abs=1e-12)
 

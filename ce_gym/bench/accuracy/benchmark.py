@@ -1,64 +1,71 @@
 """Time against error: work-precision curves of ours, MuJoCo's and Drake's methods, in flight, in loops and in contact.
 
-For every scene each method runs at steps from 20 ms down; its error is plotted against its time on one core. In smooth
-scenes the truth is what two independent codes agree on. In contact every code has a law of its own, and each is held
-against its own limit. Writes a picture, a CSV file and a Markdown table.
+For every scene each method runs at steps from 20 ms down; its error is compared with its time on one core. In smooth
+scenes the truth is what two independent codes agree on. In contact every code has a law of its own, and the error of
+each is that against its own limit for short steps.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import statistics
+from collections.abc import Sequence
 from pathlib import Path
 
 from ce_gym.bench.accuracy import drake_peer
-from ce_gym.bench.accuracy.coulomb import PUSHES, distance_table
-from ce_gym.bench.accuracy.curves import OUR_STEPS, PEER_STEPS, Comparison, Measured, comparisons, measure
+from ce_gym.bench.accuracy.curves import (
+    MARGIN,
+    OUR_STEPS,
+    PEER_STEPS,
+    Comparison,
+    Measured,
+    comparisons,
+    measure,
+    time_to,
+)
 from ce_gym.bench.accuracy.scenarios import SCENES
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.viewer.console import shown
 
 REQUIRED = 20.0
 """How many times as long as ours a peer has to take at every error that both reach."""
+LARGEST_MEDIAN = 3.0
+"""Largest median over scenes and tolerances of the adaptive method's error, as a multiple of its tolerance."""
 PEERS = ("MuJoCo", "Drake")
 QUICK_SCENES, QUICK_STEPS = ("tumble", "belt_leg", "drop_3cm", "slide"), (1, 5, 20, 100)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    parser.add_argument("--out", type=Path, default=Path("accuracy"), help="folder for picture, CSV and table")
     parser.add_argument("--scenes", nargs="+", choices=tuple(SCENES), help="all by default")
     parser.add_argument("--peers", nargs="+", choices=PEERS, default=PEERS, help="all that are installed by default")
     parser.add_argument("--rounds", type=int, default=3, help="how often each point is timed")
     parser.add_argument("--quick", action="store_true", help="four scenes, few steps, one round")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="also draw the curves to a PNG file")
+    parser.add_argument("--points", type=Path, metavar="FILE", help="also write all points to a CSV file")
 
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
-    from ce_gym.bench.accuracy import plots as accuracy_plots
-
-    out: Path = arguments.out
-    out.mkdir(parents=True, exist_ok=True)
-    ours, theirs, rounds = OUR_STEPS, PEER_STEPS, arguments.rounds
+    names, our_steps, peer_steps, rounds = arguments.scenes or SCENES, OUR_STEPS, PEER_STEPS, arguments.rounds
     if arguments.quick:
-        ours, theirs, rounds = QUICK_STEPS, QUICK_STEPS, 1
+        names, our_steps, peer_steps, rounds = arguments.scenes or QUICK_SCENES, QUICK_STEPS, QUICK_STEPS, 1
     peers = [peer for peer in arguments.peers if peer != "Drake" or drake_peer.available()]
-    theirs = theirs if "MuJoCo" in peers else ()
-    measured, more = [], []
+    more = []
     if "Drake" in peers:
         from ce_gym.bench.accuracy.drake_peer.sides import sides as drake_sides
 
         more = [drake_sides]
-    for name in shown(arguments.scenes or (QUICK_SCENES if arguments.quick else SCENES), "scenes"):
-        measured.append(measure(SCENES[name](), ours, theirs, rounds, more))
-        write_csv(out / "accuracy.csv", measured)
-    beside = {peer: [m for m in measured if any(curve.code == peer for curve in m.curves)] for peer in peers}
-    tables = [table for peer, scenes in beside.items() if scenes for table in peer_tables(scenes, peer)]
-    if any(m.scene.name in PUSHES for m in measured):
-        tables.append(distance_table())
-    (out / "accuracy.md").write_text("\n\n".join(table.as_markdown() for table in tables) + "\n", encoding="utf-8")
-    picture = accuracy_plots.draw(measured, out)
-    report = Report("accuracy", tables, [requirement(m, peer) for peer, scenes in beside.items() for m in scenes])
+    mujoco_steps = peer_steps if "MuJoCo" in peers else ()
+    measured = [measure(SCENES[name](), our_steps, mujoco_steps, rounds, more) for name in shown(names, "scenes")]
+    report = Report("accuracy")
+    for peer in peers:
+        scenes = [m for m in measured if any(curve.code == peer for curve in m.curves)]
+        known = reference_table(scenes) if peer == "MuJoCo" else limit_table(scenes, peer)
+        report.tables += [table for table in (time_table(scenes, peer), known) if table.rows]
+        report.requirements += [requirement(m, peer) for m in scenes]
+    add_tolerances(measured, report)
     report.remarks.append(
         "Time: CPU time of one core for one robot and one simulated second, best of the rounds; both sides take "
         "turns. Smooth scenes: error against the truth; ours at the exact level, MuJoCo at any. Contact: every code "
@@ -66,14 +73,13 @@ def run(arguments: argparse.Namespace) -> Report:
     )
     if set(arguments.peers) > set(peers):
         report.remarks.append(drake_peer.SKIPPED)
-    report.remarks.append(f"Written: {picture}, {out}/accuracy.csv, {out}/accuracy.md")
+    if arguments.picture:
+        from ce_gym.bench.accuracy import plots
+
+        plots.draw(measured, arguments.picture)
+    if arguments.points:
+        write_points(arguments.points, measured)
     return report
-
-
-def peer_tables(measured: list[Measured], code: str) -> list[Table]:
-    """Return what there is to say about a peer: times, and how well it is known what it is held against."""
-    known = reference_table(measured) if code == "MuJoCo" else limit_table(measured, code)
-    return [table for table in (time_table(measured, code), known) if table.rows]
 
 
 def time_table(measured: list[Measured], code: str = "MuJoCo") -> Table:
@@ -119,7 +125,37 @@ def requirement(m: Measured, code: str = "MuJoCo") -> Requirement:
     return Requirement(claim, text, (worst.ratio or 0.0) >= REQUIRED)
 
 
-def write_csv(path: Path, measured: list[Measured]) -> None:
+def add_tolerances(measured: Sequence[Measured], report: Report) -> None:
+    """Add the error that the adaptive method delivers at each tolerance, and its time beside fixed steps."""
+    rows = [row for m in measured for row in tolerance_rows(m)]
+    if not rows:
+        return
+    columns = ("scene", "tolerance", "error", "error / tolerance", "time [us]", "/ best fixed step, extrapolated")
+    report.tables.append(Table("Adaptive steps in double precision, for one simulated second", columns, tuple(rows)))
+    ratios = [row[3] for row in rows]
+    median = statistics.median(ratios)
+    claim = f"adaptive steps: error / tolerance, median at most {LARGEST_MEDIAN:.0f}"
+    text = f"{median:.2f} of {len(ratios)}, largest {max(ratios):.1f}"
+    report.requirements.append(Requirement(claim, text, median <= LARGEST_MEDIAN))
+
+
+def tolerance_rows(m: Measured) -> list[tuple[str, float, float, float, float, float | None]]:
+    """Return a row for each tolerance that a step of a whole hold misses and whose error the references can tell."""
+    ours = {curve.method: curve for curve in m.curves if curve.code == "ce_gym" and curve.level == m.scene.exact}
+    if not {"adaptive", "extrapolated"} <= ours.keys():
+        return []
+    fixed, adaptive, rows = ours["extrapolated"], ours["adaptive"], []
+    smallest = MARGIN * m.known(adaptive)
+    for point in adaptive.points:
+        tolerance, error = point.dt, m.error(point)
+        if tolerance < m.error(fixed.points[0]) and error >= smallest:
+            best = time_to(fixed, m.errors(fixed), error)
+            slower = point.seconds / best if best else None
+            rows.append((m.scene.name, tolerance, error, error / tolerance, 1e6 * point.seconds, slower))
+    return rows
+
+
+def write_points(path: Path, measured: list[Measured]) -> None:
     """Write every point: both errors and the time."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

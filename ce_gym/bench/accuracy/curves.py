@@ -206,8 +206,7 @@ def reference(scene: Scene) -> tuple[Array, Array, Measured]:
             truth,
             Measured(scene, rms_error(scene, accuracy_references.theirs(scene, scene.reference), truth)),
         )
-    explicit, n = (accuracy_contact.robot, 40_000) if scene.robot.independent else (accuracy_contact.block, 400)
-    truth = explicit(scene, n)
+    truth = accuracy_contact.explicit(scene, 40_000)
     fine = Ours(scene, Way("extrapolated", scene.exact), 1)
     limit = fine.run(4000)
     measured = Measured(scene, rms_error(scene, limit, truth))
@@ -323,43 +322,3 @@ def _fastest(measured: Measured, curves: Sequence[Curve], error: float) -> tuple
         return None, ""
     best = min(reached, key=lambda c: reached[c])
     return reached[best], best.label.split(" ", 1)[1]
-
-
-@dataclass(frozen=True)
-class Delivered:
-    """One tolerance on one scene.
-
-    Attributes:
-        scene: Its name.
-        asked: The tolerance [rad or m].
-        error: What was delivered.
-        seconds: Time for one robot and simulated second [s].
-        fixed: The same of the extrapolated method at the best fixed step for that error; None if none reaches it.
-        best: The same of the best method.
-        taken: Steps of a robot, mean.
-        refused: Attempts that were refused.
-        missed: Steps that missed the tolerance at the shortest length.
-        counts: Whether the tolerance decided anything: most steps were shorter than the longest, and the error is not
-            below what references are known to.
-    """
-
-    scene: str
-    asked: float
-    error: float
-    seconds: float
-    fixed: float | None
-    best: float | None
-    taken: float
-    refused: float
-    missed: float
-    counts: bool
-
-    @property
-    def ratio(self) -> float:
-        """Error delivered over error asked."""
-        return self.error / self.asked
-
-    @property
-    def slower(self) -> float | None:
-        """Time over that of the extrapolated method at its best fixed step."""
-        return self.seconds / self.fixed if self.fixed else None

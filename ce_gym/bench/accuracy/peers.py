@@ -14,7 +14,7 @@ import numpy as np
 from mujoco import rollout
 
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
-from ce_gym.bench.accuracy.statements import GROUNDS, Stating, ratios, stated
+from ce_gym.bench.accuracy.statements import ratios, stated
 from ce_gym.dynamics.model import Model
 from ce_gym.export import mujoco_model
 from ce_gym.export.mujoco_batch import STATE
@@ -24,9 +24,9 @@ from ce_gym.model.mechanism import ELASTIC
 mujoco.set_mju_user_warning(lambda _: None)  # it would write to a file; `Peer.diverged` says what matters
 
 
-def compiled(scene: Scene, level: str, stiff: bool = False, ground: Stating | None = None) -> mujoco.MjModel:
+def compiled(scene: Scene, level: str, stiff: bool = False) -> mujoco.MjModel:
     """Compile a scene for MuJoCo at a transmission level; torques act on the joints directly, without actuators."""
-    robot, level, also = stated(scene, level, ground)
+    robot, level, also = stated(scene, level)
     model = mujoco_model.compiled(robot, level, Settings(1e-3, solimp=STIFF if stiff else None), also)
     if scene.control == "torque":
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
@@ -74,14 +74,12 @@ class Family:
         scene: The scene.
         level: Transmission level.
         stiff: Whether equalities are held as stiffly as the step allows, or by MuJoCo's default.
-        ground: What states the ground, if it is not flat.
     """
 
-    def __init__(self, scene: Scene, level: str, stiff: bool, ground: Stating | None = None) -> None:
-        self.scene, self.level, self.stiff, self.ground = scene, level, stiff, ground
-        of = [ground.__name__.replace("_", " ")] if ground else []
-        self.name = ", ".join([level, *of, *(["stiff equalities"] if stiff else [])])
-        self.model = compiled(scene, level, stiff, ground)
+    def __init__(self, scene: Scene, level: str, stiff: bool) -> None:
+        self.scene, self.level, self.stiff = scene, level, stiff
+        self.name = f"{level}, stiff equalities" if stiff else level
+        self.model = compiled(scene, level, stiff)
         self.start = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, initial_state(scene, self.model), self.start, STATE)
         if scene.control == "torque":
@@ -98,10 +96,9 @@ class Family:
 
 
 def families(scene: Scene) -> list[Family]:
-    """Return MuJoCo's ways to state a scene: grounds and levels, then equalities held stiffly where there are any."""
-    grounds: tuple[Stating | None, ...] = (None,) if scene.terrain is None else GROUNDS
-    soft = [Family(scene, level, False, ground) for ground in grounds for level in scene.levels]
-    return [*soft, *(Family(scene, one.level, True, one.ground) for one in soft if one.tied)]
+    """Return MuJoCo's ways to state a scene: levels, then equalities held stiffly where there are any."""
+    soft = [Family(scene, level, stiff=False) for level in scene.levels]
+    return [*soft, *(Family(scene, family.level, stiff=True) for family in soft if family.tied)]
 
 
 class Peer:

@@ -7,13 +7,12 @@ is that of Okabe and Ito.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 
-from ce_gym.bench.accuracy.curves import MARGIN, Curve, Delivered, Measured
+from ce_gym.bench.accuracy.curves import MARGIN, Curve, Measured
 from ce_gym.bench.accuracy.scenarios import SINGLE
 
 matplotlib.use("Agg")  # pictures go to files, whether or not there is a display
@@ -47,8 +46,8 @@ DRAKE, DRAKE_MARKERS = "#B8A000", {"discrete": "P", "fixed steps": "X", "error c
 MARKERS = {"Euler": "o", "implicitfast": "^", "discrete": "s", "RK4": "D"}
 
 
-def draw(measured: list[Measured], out: Path) -> Path:
-    """Draw all scenes; returns the file."""
+def draw(measured: list[Measured], file: Path) -> None:
+    """Draw all scenes."""
     rows = math.ceil(len(measured) / COLUMNS)
     columns = min(COLUMNS, len(measured))
     style: dict[Any, Any] = {**STYLE, "lines.linewidth": 1.2, "lines.markersize": 3.5}
@@ -76,10 +75,9 @@ def draw(measured: list[Measured], out: Path) -> Path:
         figure.suptitle("Error against time, one robot on one core (left and below is better)", fontweight="bold")
         ordered = dict(sorted(handles.items()))
         figure.legend(list(ordered.values()), list(ordered), loc="outside lower center", ncols=4)
-        path = out / "accuracy.png"
-        figure.savefig(path, dpi=90)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(file, dpi=90)
         plt.close(figure)
-    return path
 
 
 def _look(curve: Curve, exact: str) -> tuple[str, dict[str, Any]]:
@@ -96,26 +94,3 @@ def _look(curve: Curve, exact: str) -> tuple[str, dict[str, Any]]:
     marker = MARKERS[curve.method]
     label = f"MuJoCo {curve.method}, {VARIANTS[kind]}"
     return label, {"color": COLORS[kind], "marker": marker, "linestyle": "--", "markerfacecolor": "none"}
-
-
-def draw_adaptive(found: Sequence[Delivered], out: Path) -> Path:
-    """Draw error delivered against error asked, and time against that of the best fixed step; returns the file."""
-    with plt.rc_context({**STYLE, "lines.linewidth": 1.0, "lines.markersize": 3.5}):
-        figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 4.2), layout="constrained")
-        colors = plt.get_cmap("tab20").colors  # type: ignore[attr-defined]
-        for i, name in enumerate(dict.fromkeys(d.scene for d in found)):
-            rows = [d for d in found if d.scene == name and d.counts]
-            look = {"marker": "os^D"[i % 4], "color": colors[i % 20], "label": name}
-            left.plot([d.asked for d in rows], [d.error for d in rows], **look)
-            timed = [(d.error, d.slower) for d in rows if d.slower is not None]
-            right.plot([error for error, _ in timed], [slower for _, slower in timed], **look)
-        ends = sorted({d.asked for d in found})
-        left.plot(ends, ends, color=GREY, linestyle="--", label="as asked")
-        left.set(xscale="log", yscale="log", xlabel="asked [m, rad]", ylabel="delivered [m, rad]", title="Error")
-        right.axhline(1.0, color=GREY, linestyle="--")
-        right.set(xscale="log", yscale="log", xlabel="error delivered [m, rad]", title="Time / best fixed step")
-        figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize="small")
-        path = out / "adaptive.png"
-        figure.savefig(path, dpi=90)
-        plt.close(figure)
-    return path

@@ -24,14 +24,14 @@ Stating: TypeAlias = Callable[[Scene, mujoco.MjSpec], None]
 """Adds something of a scene to a description."""
 
 
-def stated(scene: Scene, level: str, ground: Stating | None) -> tuple[Robot, str, Callable[[mujoco.MjSpec], None]]:
+def stated(scene: Scene, level: str) -> tuple[Robot, str, Callable[[mujoco.MjSpec], None]]:
     """Return the robot that is to be exported, at which level, and what completes its description."""
 
     def also(spec: mujoco.MjSpec) -> None:
         for say in said:
             say(scene, spec)
 
-    said = [ground] if ground else []
+    said: list[Stating] = [boxes] if scene.terrain is not None else []
     if scene.touching:
         said.append(capsules)
     if level != ELASTIC:
@@ -80,54 +80,20 @@ HALF_WIDTH, DEEP = 3.0, 1.0
 
 
 def boxes(scene: Scene, spec: mujoco.MjSpec) -> None:
-    """Add a box for every step of stairs, sharp where a field of ours is round."""
-    x, heights, cell = _profile(scene)
+    """Add a box for every step of stairs, sharp where a field of ours is round; MuJoCo's height field is slower."""
+    terrain = scene.terrain
+    assert terrain is not None  # asked for only where there is a field
+    heights = terrain.heights[:, 0]
+    x = terrain.origin[0] + terrain.cell * np.arange(len(heights))
     edges = [*np.flatnonzero(np.diff(heights)), len(heights) - 1]
     for first, last in pairwise(edges):
-        start, end = (x[i] + cell / 2 for i in (first, last))
+        start, end = (x[i] + terrain.cell / 2 for i in (first, last))
         half = [(end - start) / 2 + (HALF_WIDTH if last == edges[-1] else 0.0), HALF_WIDTH, DEEP / 2]
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=[start + half[0], 0.0, heights[last] - DEEP / 2],
             size=half,
-            **_ground(scene),
+            friction=[scene.robot.material.friction, 0.005, 0.0001],
+            contype=0,  # only contact spheres touch the ground
+            conaffinity=1,
         )
-
-
-def height_field(scene: Scene, spec: mujoco.MjSpec) -> None:
-    """Add the heights of the stairs as MuJoCo's height field, flat triangles between them, in place of the plane."""
-    spec.delete(spec.geom("ground"))
-    x, heights, cell = _profile(scene)
-    before = round(1.0 / cell)  # on level ground before and after
-    heights = np.pad(heights, before, mode="edge")
-    long, most = (len(heights) - 1) * cell / 2, heights.max()
-    field = spec.add_hfield(
-        name="stairs",
-        size=[long, HALF_WIDTH, most, DEEP],
-        nrow=2,
-        ncol=len(heights),
-        userdata=np.tile(heights / most, 2).tolist(),
-    )
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_HFIELD,
-        hfieldname=field.name,
-        pos=[x[0] - before * cell + long, 0.0, 0.0],
-        **_ground(scene),
-    )
-
-
-GROUNDS: tuple[Stating, ...] = (boxes, height_field)
-"""MuJoCo's ways to say what stairs are."""
-
-
-def _profile(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return places along x, heights and the distance between places [m] of a field that is alike along y."""
-    terrain = scene.terrain
-    assert terrain is not None  # statements of the ground are asked for where there is a field
-    heights = terrain.heights[:, 0]
-    return terrain.origin[0] + terrain.cell * np.arange(len(heights)), heights, terrain.cell
-
-
-def _ground(scene: Scene) -> dict[str, object]:
-    """Return what geoms of the ground have in common: only contact spheres touch them."""
-    return {"friction": [scene.robot.material.friction, 0.005, 0.0001], "contype": 0, "conaffinity": 1}

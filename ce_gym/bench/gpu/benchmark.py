@@ -1,4 +1,4 @@
-"""GPU: agreement with the CPU, registers, sub-steps and environment steps per second, MuJoCo Warp, learning.
+"""GPU: agreement with the CPU, registers, sub-steps and environment steps per second, MuJoCo Warp.
 
 Without a GPU it prints what can be known without one: agreement, of the emitted source run by the CPU, and what
 the kernels take, by the run-time compiler; the rest it names as not measured, with the reason.
@@ -40,7 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batches", type=int, nargs="+", default=BATCHES, help="sizes of batches that are timed")
     parser.add_argument("--num-envs", type=int, default=256, help="robots of a batch whose agreement is measured")
     parser.add_argument("--rounds", type=int, default=5, help="how often each is timed")
-    parser.add_argument("--train", metavar="SCRIPT", help="train/rsl_rl_ppo.py, to measure learning; takes minutes")
 
 
 def run(arguments: argparse.Namespace) -> Report:
@@ -80,7 +79,6 @@ def _speed(
         ("sub-steps/s, exact, feet on the ground, best batch", required["sub-steps"], _substeps),
         ("environment steps/s, exact, best batch", required["environment"], _environment),
         ("times as fast as MuJoCo Warp", required["warp"], _warp),
-        ("learning to walk, rsl_rl", "", _learning),
     ]
     for what, bar, measure in shown(rows, "measurements"):
         if reason:
@@ -113,10 +111,6 @@ def _warp(arguments: argparse.Namespace, device: Device, report: Report) -> None
     ratio = max(max(r.values()) for r in ours.values()) / max(max(r.values()) for r in theirs.values())
     claim = f"at least {REQUIRED['warp']:g} times as fast as MuJoCo Warp, best batch of either"
     report.requirements.append(Requirement(claim, f"{ratio:.1f}", ratio >= REQUIRED["warp"]))
-
-
-def _learning(arguments: argparse.Namespace, _device: Device, report: Report) -> None:
-    gpu_speed.learning(arguments.train, report)
 
 
 def _require(report: Report, what: str, claim: str, rates: dict[str, dict[int, float]]) -> None:

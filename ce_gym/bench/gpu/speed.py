@@ -1,15 +1,12 @@
-"""Rates on a GPU: sub-steps, environment steps, learning. Every function here needs a GPU."""
+"""Rates on a GPU: sub-steps and environment steps. Every function here needs a GPU."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-from ce_gym.bench.measure.report import Report, Table
+from ce_gym.bench.measure.report import Table
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device
@@ -90,24 +87,6 @@ def environment(robot: str, device: Device, sizes: Sequence[int], dtypes: Sequen
 
             rates.setdefault(f"ours, {dtype}", {})[size] = best_rate(work, size * CALLS, rounds)
     return rates
-
-
-def learning(script: str | None, report: Report) -> None:
-    """Train with rsl_rl on the GPU and add how long it took and what the policy is worth, in the script's words.
-
-    Raises:
-        Unmeasured: If there is no script, or it fails.
-    """
-    if script is None or not Path(script).is_file():
-        raise Unmeasured("takes minutes; ask for it with --train train/rsl_rl_ppo.py")
-    start = time.perf_counter()
-    command = [sys.executable, script, "--env", "ce_gym/MiniCheetahVelocity-v0", "--device", "cuda"]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)
-    if finished.returncode:
-        raise Unmeasured(f"{script} failed: {(finished.stderr.strip().splitlines() or ['no message'])[-1]}")
-    took = time.perf_counter() - start
-    report.remarks.append(f"Learning, {' '.join(command[1:])}: {took:.0f} s with compilation and evaluation.")
-    report.remarks.append("\n".join(finished.stdout.strip().splitlines()[-12:]))
 
 
 def rate_table(title: str, rates: Rates) -> Table:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from ce_gym.bench.gpu.speed import DT, SUBSTEPS, Rates, Unmeasured, best_rate
-from ce_gym.bench.speed import benchmark as speed
+from ce_gym.bench.peers import stand
 from ce_gym.export import mujoco_model
 from ce_gym.model import load_robot
 
@@ -28,7 +28,7 @@ def rates(robot: str, sizes: Sequence[int], rounds: int) -> Rates:
 
     found: Rates = {}
     for level in ("exact", "armature"):
-        model = mujoco_model.load(speed.bare(load_robot(robot), "foot"), level, timestep=DT, integrator="Euler")
+        model = mujoco_model.load(stand.bare(load_robot(robot), "foot"), level, timestep=DT, integrator="Euler")
         model.opt.iterations, model.opt.ls_iterations = 4, 4
         data = mujoco.MjData(model)
         mujoco.mj_resetDataKeyframe(model, data, 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,19 +27,6 @@ class Table:
     def as_text(self) -> str:
         """Return the table with aligned columns: text to the left, numbers to the right."""
         return f"{self.title}\n\n{table_text(self.columns, self.rows, indent='', text=cell_text)}"
-
-    def as_markdown(self) -> str:
-        """Return the table in Markdown, under its title."""
-        cells = [list(self.columns), ["---"] * len(self.columns)]
-        cells += [[cell_text(cell) for cell in row] for row in self.rows]
-        return "\n".join([f"{self.title}:", "", *(f"| {' | '.join(row)} |" for row in cells)])
-
-    def write_csv(self, path: Path) -> None:
-        """Write columns and rows; None becomes an empty cell."""
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(self.columns)
-            writer.writerows(self.rows)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
-"""Pinocchio as a peer: the tree of a robot with armature, and its loops as constraints.
+"""Pinocchio as a peer: the tree of a robot with armature; `aba` knows neither loops nor tied joints.
 
-Pinocchio's Python API (https://github.com/stack-of-tasks/pinocchio) has traps: joints not numbered depth
-first make `crba` wrong without a word; `lcaba` ends the process unless `computeJointMinimalOrdering` was called before;
-constraints go in vectors of Pinocchio's own; `aba` knows no tied joints. Pinocchio's base velocity is [linear,
+Joints that are not numbered depth first make Pinocchio's `crba` wrong without a word. Its base velocity is [linear,
 angular], its quaternion (x, y, z, w); ours are the other way round. (Compiled modules carry no types, hence the line
 above.)
 """
@@ -18,20 +16,16 @@ import pinocchio as pin  # type: ignore[import-not-found]
 from numpy.typing import NDArray
 
 from ce_gym.bench.measure.timing import Competitor
-from ce_gym.dynamics.standing import standing_pose
 from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf import mass_properties
 from ce_gym.export.mjcf_equalities import joint_armature
-from ce_gym.model.constraints import LinearConstraint, LoopConstraint
+from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
 from ce_gym.model.mechanism import Mechanism, build_mechanism
 
 Array = NDArray[np.float64]
 Call = Callable[[], object]
-
-PROXIMAL = (1e-10, 1e-4, 20)
-"""Accuracy, compliance mu and most iterations of constrained dynamics: as accurate as mu allows, in few iterations."""
 
 AXES = ("X", "Y", "Z")
 
@@ -44,28 +38,24 @@ class Peer:
         robot: What it was made from.
         model: The tree, armature included.
         names: Our body of each of its joints, in Pinocchio's order.
-        loops: Constraint models, one for each closed loop.
     """
 
     robot: Robot
     model: pin.Model
     names: tuple[str, ...]
-    loops: pin.StdVec_RigidConstraintModel
 
     def positions(self, q: Array) -> Array:
-        """Return Pinocchio's positions for ours, shape (nq,) to (model.nq,); loops are as in the standing pose."""
-        joints = standing_pose(build_mechanism(self.robot)).q
+        """Return Pinocchio's positions for ours, shape (nq,) to (model.nq,)."""
         base = 7 if self.robot.floating else 0
-        joints = joints | dict(zip(self.robot.independent, q[base:], strict=True))
+        joints = dict(zip(self.robot.independent, q[base:], strict=True))
         head = [*q[:3], *q[4:7], q[3]] if base else []
         return np.array([*head, *(joints[name] for name in self.names if name in joints)])
 
     def velocities(self, v: Array) -> Array:
-        """Return Pinocchio's velocities, or forces, for ours, shape (nv,) to (model.nv,); dependent joints have 0."""
+        """Return Pinocchio's velocities, or forces, for ours, shape (nv,) to (model.nv,)."""
         base = 6 if self.robot.floating else 0
         joints = dict(zip(self.robot.independent, v[base:], strict=True))
-        names = self.names[1:] if base else self.names
-        return np.array([*v[3:base], *v[: min(3, base)], *(joints.get(name, 0.0) for name in names)])
+        return np.array([*v[3:base], *v[: min(3, base)], *(joints[name] for name in self.names if name in joints)])
 
     def accelerations(self, a: Array) -> Array:
         """Return our accelerations for Pinocchio's, shape (model.nv,) to (nv,)."""
@@ -73,26 +63,6 @@ class Peer:
         names = self.names[1:] if base else self.names
         joints = dict(zip(names, a[base:], strict=True))
         return np.array([*a[3:base], *a[: min(3, base)], *(joints[name] for name in self.robot.independent)])
-
-    def methods(self) -> dict[str, Callable[[Array, Array, Array], Array]]:
-        """Return Pinocchio's ways to forward dynamics of this robot: from its positions, velocities and forces."""
-        model, data = self.model, self.model.createData()
-        if not len(self.loops):
-            return {
-                "aba": lambda q, v, tau: pin.aba(model, data, q, v, tau),
-                "crba + rnea": lambda q, v, tau: _by_mass_matrix(model, data, q, v, tau),
-            }
-        constraints = pin.StdVec_RigidConstraintData()
-        constraints.extend([loop.createData() for loop in self.loops])
-        settings, other = pin.ProximalSettings(*PROXIMAL), model.createData()
-        pin.initConstraintDynamics(model, data, self.loops, constraints)
-        pin.computeJointMinimalOrdering(model, other, self.loops)
-        return {
-            "constraintDynamics": lambda q, v, tau: pin.constraintDynamics(
-                model, data, q, v, tau, self.loops, constraints, settings
-            ),
-            "lcaba": lambda q, v, tau: pin.lcaba(model, other, q, v, tau, self.loops, constraints, settings),
-        }
 
 
 def load(robot: Robot) -> Peer:
@@ -107,25 +77,20 @@ def load(robot: Robot) -> Peer:
     ties = joint_ties(mechanism)
     for constraint in robot.constraints:
         moving = [body for body in constraint.bodies if body in mechanism.bodies]
-        if isinstance(constraint, LinearConstraint):
-            if len(moving) == len(constraint.bodies):
-                raise RobotError(f"{robot.name}: constraint {constraint.name!r} ties joints, which aba does not know")
-        elif not isinstance(constraint, LoopConstraint):
-            raise RobotError(f"{robot.name}: constraint {constraint.name!r} is none of Pinocchio's rigid constraints")
-    if any(set(ties[spin.rotor].ratios) - set(robot.independent) for spins in mechanism.spins for spin in spins):
-        raise RobotError(f"{robot.name}: armature inside a loop varies with the pose, which Pinocchio's cannot")
+        if not isinstance(constraint, LinearConstraint) or len(moving) == len(constraint.bodies):
+            raise RobotError(f"{robot.name}: constraint {constraint.name!r} ties joints, which aba does not know")
     model, names = _tree(mechanism, joint_armature(mechanism, ties))
-    return Peer(robot, model, names, _loops(robot, model))
+    return Peer(robot, model, names)
 
 
-def competitors(peer: Peer, n_states: int = 64) -> dict[str, Competitor]:
-    """Return each of its methods called from a Python loop on standing states with random velocities and forces."""
-    states = _states(peer, n_states)
-    return {name: Competitor(_loop(method, states), n_states) for name, method in peer.methods().items()}
+def forward_dynamics(peer: Peer, n_states: int = 64) -> Competitor:
+    """Return `aba` called from a Python loop on standing states with random velocities and forces."""
+    model, data = peer.model, peer.model.createData()
+    return Competitor(_loop(lambda q, v, tau: pin.aba(model, data, q, v, tau), _states(peer, n_states)), n_states)
 
 
 def derivatives(peer: Peer, n_states: int = 64) -> Competitor:
-    """Return `computeABADerivatives`, of a robot without loops, called from a Python loop on such states."""
+    """Return `computeABADerivatives` called from a Python loop on such states."""
     model, data = peer.model, peer.model.createData()
     call = _loop(lambda q, v, tau: pin.computeABADerivatives(model, data, q, v, tau), _states(peer, n_states))
     return Competitor(call, n_states)
@@ -133,12 +98,10 @@ def derivatives(peer: Peer, n_states: int = 64) -> Competitor:
 
 def _states(peer: Peer, n_states: int) -> list[tuple[Array, Array, Array]]:
     rng = np.random.default_rng(0)
-    q = np.array([0.0] * 3 + [1.0] + [0.0] * 3 if peer.robot.floating else [])
-    pose = dict(peer.robot.pose.joints)
-    q = peer.positions(np.array([*q, *(pose.get(name, 0.0) for name in peer.robot.independent)]))
-    moving = 0.0 if len(peer.loops) else 1.0  # random velocities would tear loops apart
-    nv = peer.model.nv
-    return [(q, moving * rng.uniform(-2, 2, nv), rng.uniform(-10, 10, nv)) for _ in range(n_states)]
+    pose, nv = dict(peer.robot.pose.joints), peer.model.nv
+    base = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0] if peer.robot.floating else []
+    q = peer.positions(np.array([*base, *(pose.get(name, 0.0) for name in peer.robot.independent)]))
+    return [(q, rng.uniform(-2, 2, nv), rng.uniform(-10, 10, nv)) for _ in range(n_states)]
 
 
 def overhead(n_calls: int = 64) -> Competitor:
@@ -157,13 +120,6 @@ def _loop(method: Callable[[Array, Array, Array], object], states: list[tuple[Ar
             method(*state)
 
     return run
-
-
-def _by_mass_matrix(model: pin.Model, data: pin.Data, q: Array, v: Array, tau: Array) -> Array:
-    bias = pin.rnea(model, data, q, v, np.zeros(model.nv))
-    pin.crba(model, data, q)
-    pin.cholesky.decompose(model, data)
-    return pin.cholesky.solve(model, data, tau - bias)
 
 
 def _tree(mechanism: Mechanism, armature: dict[str, float]) -> tuple[pin.Model, tuple[str, ...]]:
@@ -198,15 +154,3 @@ def _joint(kind: str, axis: Array) -> pin.JointModel:
         if np.allclose(axis, np.eye(3)[i]):
             return getattr(pin, f"JointModel{family}{letter}")()
     return getattr(pin, {"R": "JointModelRevoluteUnaligned", "P": "JointModelPrismaticUnaligned"}[family])(axis)
-
-
-def _loops(robot: Robot, model: pin.Model) -> pin.StdVec_RigidConstraintModel:
-    loops = pin.StdVec_RigidConstraintModel()
-    for loop in robot.constraints:
-        if isinstance(loop, LoopConstraint):
-            sides = []
-            for body, place in ((loop.first, loop.first_placement), (loop.second, loop.second_placement)):
-                joint = model.getJointId(body) if body else 0
-                sides += [joint, pin.SE3(np.array(place.rotation).reshape(3, 3), np.array(place.position))]
-            loops.append(pin.RigidConstraintModel(pin.ContactType.CONTACT_3D, model, *sides))
-    return loops

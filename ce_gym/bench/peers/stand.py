@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,13 @@ class Behaviour:
         """Whether the robots stand as they do in a reference: upright, gears engaged, at most half as fast again."""
         engaged = self.slip <= LARGEST_SLIP
         return self.finite and engaged and self.height > 0.75 and self.speed <= 1.5 * reference.speed
+
+
+def bare(robot: Robot, contacts: str) -> Robot:
+    """Return the robot with one group of contacts ("all" keeps every one), and without visual shapes."""
+    kept = tuple(contact for contact in robot.contacts if contacts in ("all", contact.group))
+    bodies = tuple(replace(body, shapes=()) for body in robot.bodies)
+    return replace(robot, contacts=kept, bodies=bodies)
 
 
 def targets(robot: Robot, num_envs: int, n_targets: int, seed: int) -> Array:

@@ -7,7 +7,6 @@ in turn; MuJoCo gets the fastest settings with which it still stands as it does 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
 from dataclasses import dataclass
 
@@ -16,7 +15,7 @@ import numpy as np
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, Timing, interleaved, ratio
 from ce_gym.bench.peers import mujoco_settings, stand
-from ce_gym.bench.speed import peak, stepping
+from ce_gym.bench.speed import competitors
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Robot, load_robot
 from ce_gym.sim import Simulator
@@ -46,9 +45,9 @@ def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
     if arguments.quick:
         arguments.rounds = 3
-    stepping.quiet()
+    competitors.silence_mujoco()
     report = Report("speed")
-    _compare(bare(load_robot(arguments.robot), arguments.contacts), arguments, report)
+    _compare(stand.bare(load_robot(arguments.robot), arguments.contacts), arguments, report)
     report.remarks.append(
         "CPU time of one thread. MuJoCo: mujoco.rollout, no visual geoms, dense Jacobian, pyramidal cones, islands "
         "off, no sensors, energy or callbacks, and the fastest of the settings tried with which it stands. ce_gym: "
@@ -61,7 +60,7 @@ def _compare(robot: Robot, arguments: argparse.Namespace, report: Report) -> Non
     """Compare one robot's sub-step with MuJoCo at its best, and with the machine's peak."""
     sides = [_our_side(robot, level, dtype, arguments) for level in IN_DEPTH for dtype in DTYPES]
     sides += [_mujoco_side(robot, level, arguments.dt) for level in IN_DEPTH]
-    peaks = {f"peak {dtype}": peak.competitor(dtype) for dtype in DTYPES}
+    peaks = {f"peak {dtype}": competitors.peak(dtype) for dtype in DTYPES}
     timings = interleaved({s.name: s.competitor for s in sides} | peaks, arguments.rounds, clock=time.thread_time)
     report.tables.append(_step_table(robot, sides, timings))
     for level in IN_DEPTH:
@@ -73,7 +72,7 @@ def _compare(robot: Robot, arguments: argparse.Namespace, report: Report) -> Non
     report.requirements.append(Requirement(claim, str(gain), gain.cautious >= LEAST_GAIN))
     rows: list[tuple[Cell, ...]] = []
     for dtype in DTYPES:
-        work = stepping.operations(Model(robot, transmission="exact"), dtype, arguments.dt)
+        work = competitors.operations(Model(robot, transmission="exact"), dtype, arguments.dt)
         step, most = timings[f"ce_gym exact {dtype}"], timings[f"peak {dtype}"]
         share = 100.0 * work * ratio(most, step).median
         rows.append((dtype, 1e-9 / most.best, work, 1e-9 * work / step.best, share))
@@ -81,13 +80,6 @@ def _compare(robot: Robot, arguments: argparse.Namespace, report: Report) -> Non
         report.requirements.append(Requirement(claim, f"{share:.1f} %", share >= LEAST_SHARE))
     columns = ("dtype", "peak [GFLOP/s]", "FLOP/sub-step", "sub-step [GFLOP/s]", "% of peak, by rounds")
     report.tables.append(Table(f"Operations per second of one core, {robot.name} exact", columns, tuple(rows)))
-
-
-def bare(robot: Robot, contacts: str) -> Robot:
-    """Return the robot with one group of contacts ("all" keeps every one), and without visual shapes."""
-    kept = tuple(contact for contact in robot.contacts if contacts in ("all", contact.group))
-    bodies = tuple(dataclasses.replace(body, shapes=()) for body in robot.bodies)
-    return dataclasses.replace(robot, contacts=kept, bodies=bodies)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import time
 
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved, ratio
-from ce_gym.bench.speed import stepping
+from ce_gym.bench.speed import competitors
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.custom import missing
 from ce_gym.model import Robot, RobotError, load_robot, robots
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
-    stepping.quiet()
+    competitors.silence_mujoco()
     report, rows = Report("beside"), []
     for name in arguments.robots or [name for name in robots() if not missing(load_robot(name))]:
         rows.append(_row(load_robot(name), arguments, report))
@@ -48,13 +48,14 @@ def run(arguments: argparse.Namespace) -> Report:
 def _row(robot: Robot, arguments: argparse.Namespace, report: Report) -> tuple[Cell, ...]:
     others = [contact.name for contact in robot.contacts if contact.group != "foot"]
     sides: dict[str, Competitor] = {
-        "ours": stepping.ours(Model(robot), "float64", NUM_ENVS, 1, arguments.dt, seldom=others),
+        "ours": competitors.sub_steps(Model(robot), "float64", NUM_ENVS, 1, arguments.dt, seldom=others),
     }
     for level in ("exact", *SIMPLEST):
         if level == SIMPLEST[1] and SIMPLEST[0] in sides:
             continue
         try:
-            sides[level] = stepping.theirs(stepping.mujoco_batch(robot, level, MUJOCO_ENVS, 1, arguments.dt), robot)
+            batch = competitors.mujoco_batch(robot, level, MUJOCO_ENVS, 1, arguments.dt)
+            sides[level] = competitors.mujoco_steps(batch, robot)
         except (RobotError, ValueError) as error:
             report.remarks.append(f"MuJoCo, {robot.name} {level}: {error}")
     timings = interleaved(sides, arguments.rounds, time.thread_time)

@@ -9,11 +9,8 @@ turns in one run. (MuJoCo's compiled modules carry no types, hence the line abov
 from __future__ import annotations
 
 import argparse
-import os
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 
 import mujoco
@@ -22,16 +19,11 @@ import numpy as np
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, Timing, interleaved, ratio
 from ce_gym.bench.peers import mujoco_settings, stand
-from ce_gym.bench.speed import forward, stepping
-from ce_gym.bench.speed.benchmark import bare
-from ce_gym.compile import Call, calls_of
-from ce_gym.compile.cache import FOLDER_VARIABLE
+from ce_gym.bench.speed import competitors
 from ce_gym.dynamics.model import Model
-from ce_gym.dynamics.stepping.derivatives import adjoint_function, primal_function
 from ce_gym.export.mujoco_batch import STATE, Batch
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.errors import RobotError
-from ce_gym.sim.derivative_kernels import linearization_program, load_linearization_kernel
 from ce_gym.sim.derivatives import StepDerivatives
 from ce_gym.sim.simulator import Simulator
 from ce_gym.viewer.console import shown
@@ -47,7 +39,7 @@ MUJOCO_STATES = 8
 DIFFERENCE = 1e-6
 """Of MuJoCo's finite differences, forward ones, which are twice as fast as central ones."""
 LINEARIZE = {"in flight": 13.0, "standing": 25.0}
-LARGEST = {"backward": 3.0, "parameters": 1.3, "compile": 15.0}
+LARGEST = {"backward": 3.0, "parameters": 1.3}
 LEAST_OVER_MUJOCO = 80.0
 
 
@@ -61,15 +53,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
-    stepping.quiet()
-    report, robot = Report("derivatives"), bare(load_robot(arguments.robot), "foot")
+    competitors.silence_mujoco()
+    report, robot = Report("derivatives"), stand.bare(load_robot(arguments.robot), "foot")
     sides: dict[str, Competitor] = {}
     for level in shown(LEVELS, "set up"):
         sides |= _ours(Model(robot, level), arguments)
     sides |= _mujoco(robot, LEVELS[1], arguments.dt)
     _steps(sides, interleaved(sides, arguments.rounds, time.thread_time), report)
     _dynamics(robot, arguments, report)
-    _kernels(robot, report)
     report.remarks.append(
         f"ce_gym: {arguments.num_envs} robots a call, float64, Python calls and records included; `backward` makes "
         f"iterations again; parameters are {', '.join(PARAMETERS)}. MuJoCo: forward differences, from a Python loop."
@@ -196,65 +187,18 @@ def _dynamics(robot: Robot, arguments: argparse.Namespace, report: Report) -> No
     """Add times of forward dynamics and of its derivatives by q, v and tau, beside Pinocchio's."""
     n = 64
     model = Model(robot, "armature")
-    given = [forward.random_states(model, n)[name] for name in ("q", "v", "tau")]
+    given = [competitors.random_states(model, n)[name] for name in ("q", "v", "tau")]
     sides = {
-        "forward dynamics, compiled": forward.ours(robot, "armature", "float64", n),
-        "derivatives, compiled": forward.ours(robot, "armature", "float64", n, derivatives=True),
+        "forward dynamics, compiled": competitors.forward_dynamics(robot, "armature", n),
+        "derivatives, compiled": competitors.forward_dynamics(robot, "armature", n, derivatives=True),
         "Model.forward_dynamics_derivatives": Competitor(lambda: model.forward_dynamics_derivatives(*given), n),
     }
-    sides |= _pinocchio(robot, report)
+    try:
+        sides |= competitors.pinocchio_peer(robot)
+    except RobotError as error:
+        report.remarks.append(f"Pinocchio: {error}")
     timings = interleaved(sides, arguments.rounds, time.thread_time)
     first = timings["derivatives, compiled"]
     rows = [(name, 1e6 * timing.best, ratio(timing, first).median) for name, timing in timings.items()]
     title = f"Forward dynamics and its derivatives, {robot.name} armature, double precision"
     report.tables.append(Table(title, ("side", "best [us]", "times ours, compiled"), tuple(rows)))
-
-
-def _pinocchio(robot: Robot, report: Report) -> dict[str, Competitor]:
-    try:
-        from ce_gym.bench.peers import pinocchio as peers
-
-        peer = peers.load(robot)
-    except (ImportError, RobotError) as error:
-        report.remarks.append(f"Pinocchio: {error}")
-        return {}
-    return {
-        "Pinocchio aba": peers.competitors(peer)["aba"],
-        "Pinocchio computeABADerivatives": peers.derivatives(peer),
-        "Pinocchio (call of a single joint)": peers.overhead(),
-    }
-
-
-def _kernels(robot: Robot, report: Report) -> None:
-    """Add instructions of kernels, and the time that they take to compile."""
-    rows: list[tuple[Cell, ...]] = []
-    model = Model(robot, LEVELS[0])
-    options = Simulator(model, outputs=()).options
-    once, back = (make(model.mechanism, options) for make in (primal_function, adjoint_function))
-    program = linearization_program(model, options)
-    forwards = sum(call.function.n_instructions() for call in calls_of(program.steps) if isinstance(call, Call))
-    rows.append(("one iteration of a step", once.n_instructions()))
-    rows.append(("its reverse mode", back.n_instructions()))
-    rows.append(("linearize, with all iterations that there can be", forwards))
-    report.tables.append(Table(f"Kernels of {robot.name} exact", ("what", "instructions"), tuple(rows)))
-    with _nothing_cached():
-        start = time.process_time()
-        load_linearization_kernel(model, options, "float64")
-        seconds = time.process_time() - start
-    claim = f"compilation of linearize, at most {LARGEST['compile']:g} s of one core"
-    report.requirements.append(Requirement(claim, f"{seconds:.1f} s", seconds <= LARGEST["compile"]))
-
-
-@contextmanager
-def _nothing_cached() -> Iterator[None]:
-    """Let kernels be kept in a folder of their own for a while."""
-    before = os.environ.get(FOLDER_VARIABLE)
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ[FOLDER_VARIABLE] = folder
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ[FOLDER_VARIABLE]
-            else:
-                os.environ[FOLDER_VARIABLE] = before

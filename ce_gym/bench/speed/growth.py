@@ -1,34 +1,30 @@
-"""Cost as work grows: joints, contacts, bodies tied together, robots in a batch, threads; time to compile, memory.
+"""Cost as work grows: joints, contacts, robots in a batch, threads; time to compile, memory.
 
 Chains of links with geared rotors grow from 2 to 200 joints, beside MuJoCo's `mj_forward` and Pinocchio's `aba` with
-armature; parallel chains are tied at a depth, which makes one cluster of any size; a plate stands on more and more
-spheres, beside MuJoCo. Competitors of a row take turns; times are those of the calling thread.
+armature; a plate stands on more and more spheres, beside MuJoCo. Competitors of a row take turns; times are those of
+the calling thread.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
 from collections.abc import Collection
 
 import numpy as np
 
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
-from ce_gym.bench.measure.timing import Competitor, interleaved
-from ce_gym.bench.speed import forward, stepping
-from ce_gym.bench.speed.benchmark import bare
+from ce_gym.bench.measure.timing import interleaved
+from ce_gym.bench.peers import stand
+from ce_gym.bench.speed import competitors
 from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Pose, Robot, load_robot
-from ce_gym.model.errors import RobotError
-from ce_gym.model.generators import link_and_rotor_chain, transmission_parallel_chain
+from ce_gym.model.generators import link_and_rotor_chain
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.viewer.console import shown
 
 JOINTS = (2, 5, 10, 20, 50, 100, 200)
-TIED = (2, 4, 8, 12, 16, 24, 32)
-"""Bodies in one cluster."""
 CONTACTS = (0, 1, 4, 16, 36, 64)
 ROBOTS = (1, 8, 64, 512, 4096, 32_768, 262_144, 1_048_576)
 LEAST_R2 = 0.99
@@ -40,7 +36,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     parser.add_argument("--robot", default="mini_cheetah", help="name or path of the robot of batches and threads")
     parser.add_argument("--joints", type=int, nargs="*", default=JOINTS, help="lengths of the chain")
-    parser.add_argument("--tied", type=int, nargs="*", default=TIED, help="bodies in a cluster; even")
     parser.add_argument("--contacts", type=int, nargs="*", default=CONTACTS, help="spheres under the plate")
     parser.add_argument("--robots", type=int, nargs="*", default=ROBOTS, help="sizes of batches")
     parser.add_argument("--dt", type=float, default=0.005, help="sub-step [s]")
@@ -49,15 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
-    stepping.quiet()
+    competitors.silence_mujoco()
     report = Report("growth")
     if arguments.joints:
         joints(arguments.joints, arguments.rounds, report)
-    if arguments.tied:
-        report.tables.append(tied(arguments.tied))
     if arguments.contacts:
         report.tables.append(contacts(arguments.contacts, arguments.dt, arguments.rounds))
-    robot = bare(load_robot(arguments.robot), "foot")
+    robot = stand.bare(load_robot(arguments.robot), "foot")
     if arguments.robots:
         report.tables.append(crowd(robot, arguments.robots, arguments.dt, arguments.rounds))
     report.tables.append(threads(robot, arguments.dt, arguments.rounds))
@@ -71,11 +64,12 @@ def joints(lengths: Collection[int], rounds: int, report: Report) -> None:
         robot = link_and_rotor_chain(1, n)
         counts = [Model(robot, transmission=level).n_instructions("forward_dynamics") for level in LEVELS]
         start = time.perf_counter()
-        sides = {"ours": forward.ours(robot, "exact", "float64", 256)}
+        sides = {"ours": competitors.forward_dynamics(robot, "exact", 256)}
         compiled = time.perf_counter() - start
-        sides |= {"MuJoCo": forward.mujoco_forward(robot, "armature"), **_pinocchio(robot)}
+        sides |= {"MuJoCo": competitors.mujoco_forward(robot, "armature"), **competitors.pinocchio_peer(robot)}
         timings = interleaved(sides, rounds, time.thread_time)
-        times = [1e6 * timings[name].best if name in timings else None for name in ("ours", "MuJoCo", "aba")]
+        names = ("ours", "MuJoCo", "Pinocchio aba")
+        times = [1e6 * timings[name].best if name in timings else None for name in names]
         rows.append((n, *counts, *times, compiled))
     columns = ("joints", *(f"{level} [instructions]" for level in LEVELS))
     columns += ("exact [us]", "MuJoCo armature [us]", "Pinocchio aba [us]", "trace and compile, or load [s]")
@@ -86,25 +80,13 @@ def joints(lengths: Collection[int], rounds: int, report: Report) -> None:
         report.requirements.append(Requirement(claim, f"{measured:.5f}", measured >= LEAST_R2))
 
 
-def tied(sizes: Collection[int]) -> Table:
-    """Let one cluster grow in two parallel chains of 16 links: instructions, beside those of the chains untied."""
-    rows: list[tuple[Cell, ...]] = []
-    for size in shown(sizes, "clusters"):
-        robot = transmission_parallel_chain(max(TIED) // 2, size)
-        free = dataclasses.replace(robot, constraints=(), independent=tuple(body.name for body in robot.bodies))
-        counts = [Model(r).n_instructions("forward_dynamics") for r in (robot, free)]
-        rows.append((size, *counts, counts[0] / counts[1]))
-    columns = ("bodies in the cluster", "tied [instructions]", "untied [instructions]", "ratio")
-    return Table("Forward dynamics of two chains of 16 links, tied at a depth", columns, tuple(rows))
-
-
 def contacts(numbers: Collection[int], dt: float, rounds: int) -> Table:
     """Let the spheres under a plate grow: time of a sub-step beside MuJoCo's."""
     rows: list[tuple[Cell, ...]] = []
     for n in shown(numbers, "contacts"):
         robot = plate(n)
-        sides = {"ours": stepping.ours(Model(robot), "float64", 256, 1, dt)}
-        sides["MuJoCo"] = stepping.theirs(stepping.mujoco_batch(robot, "none", 32, 1, dt), robot)
+        sides = {"ours": competitors.sub_steps(Model(robot), "float64", 256, 1, dt)}
+        sides["MuJoCo"] = competitors.mujoco_steps(competitors.mujoco_batch(robot, "none", 32, 1, dt), robot)
         timings = interleaved(sides, rounds, time.thread_time)
         ours, theirs = (1e6 * timings[name].best for name in sides)
         rows.append((n, ours, theirs, theirs / ours))
@@ -116,9 +98,9 @@ def crowd(robot: Robot, sizes: Collection[int], dt: float, rounds: int) -> Table
     """Let the batch grow: time of one robot's sub-step on one core, and memory."""
     model = Model(robot)
     rows: list[tuple[Cell, ...]] = []
-    each = {dtype: stepping.bytes_per_robot(model, dtype, dt) for dtype in ("float64", "float32")}
+    each = {dtype: competitors.bytes_per_robot(model, dtype, dt) for dtype in ("float64", "float32")}
     for size in shown(sizes, "robots"):
-        sides = {dtype: stepping.ours(model, dtype, size, 1, dt) for dtype in each}
+        sides = {dtype: competitors.sub_steps(model, dtype, size, 1, dt) for dtype in each}
         timings = interleaved(sides, min(rounds, 3) if size > 1 << 16 else rounds, time.thread_time)
         row = [cell for d in each for cell in (1e6 * timings[d].best, 2.0**-20 * each[d] * size)]
         rows.append((size, *row))
@@ -127,16 +109,14 @@ def crowd(robot: Robot, sizes: Collection[int], dt: float, rounds: int) -> Table
 
 
 def threads(robot: Robot, dt: float, rounds: int) -> Table:
-    """Let the threads grow: robots' sub-steps per second, and what memory would allow."""
+    """Let the threads grow: robots' sub-steps per second."""
     model = Model(robot)
     rows: list[tuple[Cell, ...]] = []
     numbers = [n for n in (1, 2, 4, 8, 16, 32, 64, 128) if n <= usable_cores()]
-    sides = {str(n): stepping.ours(model, "float64", 4096, n, dt) for n in numbers}
+    sides = {str(n): competitors.sub_steps(model, "float64", 4096, n, dt) for n in numbers}
     timings = interleaved(sides, rounds)
     for n in numbers:
         rows.append((n, 1e-6 / timings[str(n)].best, timings["1"].best / timings[str(n)].best))
-    bandwidth, each = copied(), stepping.bytes_per_robot(model, "float64", dt)
-    rows.append((f"bound by memory: {1e-9 * bandwidth:.1f} GB/s, {each} B a robot", 1e-6 * bandwidth / each, None))
     columns = ("threads", "sub-steps [million/s]", "times one")
     return Table(f"Threads, {robot.name} exact, 4096 robots, float64", columns, tuple(rows))
 
@@ -157,20 +137,3 @@ def plate(n: int) -> Robot:
 def straightness(x: list[Cell], y: list[Cell]) -> float:
     """Return the share r^2 of the variance of y that a straight line in x explains."""
     return float(np.corrcoef(np.array(x, float), np.array(y, float))[0, 1] ** 2)
-
-
-def copied(size: int = 1 << 28) -> float:
-    """Return the bytes that one core reads and writes per second when it copies `size` bytes [B/s]."""
-    source, target = np.ones(size // 8), np.ones(size // 8)
-    timing = interleaved({"copy": Competitor(lambda: np.copyto(target, source), 2 * size)}, 5)
-    return 1.0 / timing["copy"].best
-
-
-def _pinocchio(robot: Robot) -> dict[str, Competitor]:
-    """Pinocchio's `aba` of a robot, if it is installed and knows it."""
-    try:
-        from ce_gym.bench.peers import pinocchio
-
-        return {"aba": pinocchio.competitors(pinocchio.load(robot))["aba"]}
-    except (ImportError, RobotError):
-        return {}

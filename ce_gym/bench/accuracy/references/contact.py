@@ -3,9 +3,9 @@
 The law is that of `ce_gym.dynamics.forces.contact` in the limit of no step length: a contact of depth d > 0 that moves
 out at v_n pushes with lam = max(0, k d - c v_n). Its bristle s follows the sliding velocity, s' = v_t, as far as
 |s| <= mu lam / k_t; it resists with min(1, mu lam / |x|) x, where x = k_t s + (mu lam / v_s) v_t. Nothing here is
-linearised, predicted or taken one step ahead, so the steps have to be tiny. The block is plain numpy and rigid-body
-mechanics; robots take the acceleration from `Model`'s forward dynamics under wrenches. Midpoint rule throughout. On
-stairs a sphere meets the plane that their surface has where a sphere on the plane under its centre would touch it.
+linearised, predicted or taken one step ahead, so the steps of the midpoint rule have to be tiny. Accelerations come
+from `Model`'s forward dynamics under wrenches. On stairs a sphere meets the plane that their surface has where a sphere
+on the plane under its centre would touch it.
 """
 
 from __future__ import annotations
@@ -23,74 +23,13 @@ from ce_gym.sim.kernel_key import model_key
 SX = ca.SX
 
 
-def block(scene: Scene, n: int) -> Array:
-    """Return positions of a block at the end of every hold, with `n` steps to a hold, shape (n_holds, 7)."""
-    robot, law = scene.robot, scene.robot.material
-    body = robot.bodies[0].inertial
-    corners, J = np.array([c.position for c in robot.contacts]), np.array(body.inertia)
-    gravity, h = np.array(robot.gravity), HOLD / n
-    push = np.zeros((scene.holds, 3)) if scene.push is None else scene.push
-    p, R, v, w, s = scene.q[:3].copy(), np.eye(3), np.zeros(3), np.zeros(3), np.zeros((len(corners), 2))
-
-    def forces(p: Array, R: Array, v: Array, w: Array, s: Array) -> tuple[Array, Array, Array, Array]:
-        """Linear and angular acceleration, sliding velocities, and how far bristles may bend."""
-        arms = corners @ R.T
-        velocity = v + np.cross(R @ w, arms)
-        depth, up, slide = -(p[2] + arms[:, 2]), velocity[:, 2], velocity[:, :2]
-        lam = np.where(depth > 0, np.maximum(law.stiffness * depth - law.damping * up, 0.0), 0.0)
-        cone = law.friction * lam
-        x = law.bristle * s + (cone / law.slip_speed)[:, None] * slide
-        size = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-30)
-        f = np.column_stack([-np.minimum(1.0, cone / size)[:, None] * x, lam])
-        moment = R.T @ np.cross(arms, f).sum(axis=0)
-        return (
-            gravity + push[hold] + f.sum(axis=0) / body.mass,
-            np.linalg.solve(J, moment - np.cross(w, J @ w)),
-            slide * (lam > 0)[:, None],
-            cone / law.bristle,
-        )
-
-    path = np.empty((scene.holds, 7))
-    for hold in range(scene.holds):
-        for _ in range(n):
-            a, alpha, slide, reach = forces(p, R, v, w, s)
-            middle = p + h / 2 * v, _turned(R, h / 2 * w), v + h / 2 * a, w + h / 2 * alpha
-            a, alpha, slide, reach = forces(*middle, _bent(s + h / 2 * slide, reach))
-            p, R = p + h * middle[2], _turned(R, h * middle[3])
-            v, w = v + h * a, w + h * alpha
-            s = _bent(s + h * slide, reach)
-        path[hold] = [*p, *_quaternion(R)]
-    return path
-
-
-def _bent(s: Array, reach: Array) -> Array:
-    size = np.maximum(np.hypot(s[:, 0], s[:, 1]), 1e-30)
-    return s * np.minimum(1.0, reach / size)[:, None]
-
-
-def _turned(R: Array, rotation: Array) -> Array:
-    """Rodrigues' formula."""
-    angle = float(np.linalg.norm(rotation))
-    if angle == 0.0:
-        return R
-    x, y, z = rotation / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return R @ (np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
-
-
-def _quaternion(R: Array) -> Array:
-    """Of a rotation by less than half a turn."""
-    w = np.sqrt(1.0 + np.trace(R)) / 2
-    return np.array([w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))])
-
-
-def robot(scene: Scene, n: int) -> Array:
-    """Return positions of a robot at the end of every hold, with `n` steps to a hold, shape (n_holds, nq)."""
+def explicit(scene: Scene, n: int) -> Array:
+    """Return positions at the end of every hold, with `n` steps to a hold, shape (n_holds, nq)."""
     model = Model(scene.robot)
 
     ground = "" if scene.terrain is None else f"{scene.terrain} {scene.terrain.heights[:, 0].tolist()}"
     sources = source_fingerprint(__name__, restated.__name__)
-    key = f"{sources} {model_key(model)} {ground} {scene.touching}"
+    key = f"{sources} {model_key(model)} {ground} {scene.touching} {scene.push is not None}"
 
     def build() -> Program:
         step = _midpoint_step(scene)
@@ -104,7 +43,10 @@ def robot(scene: Scene, n: int) -> Array:
     arrays["q"][0], arrays["v"][0], arrays["dt"][:] = scene.q[:, None], scene.v[:, None], HOLD / n
     path = np.empty((scene.holds, model.nq))
     for i, target in enumerate(scene.drive):
-        arrays["target"][0] = target[:, None]
+        if len(target):
+            arrays["target"][0] = target[:, None]
+        if scene.push is not None:
+            arrays["push"][0] = scene.push[i][:, None]
         kernel(arrays, lanes, repeats={"n": n})
         path[i] = arrays["q"][0, :, 0]
     return path
@@ -114,20 +56,21 @@ def _midpoint_step(scene: Scene) -> ca.Function:
     """Trace one explicit midpoint step of a floating robot under position control, against the ground and itself."""
     model = Model(scene.robot)
     q, v, s = SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("s", 2 * len(model.contact_names))
-    target, h = SX.sym("target", len(model.joint_links)), SX.sym("dt")
-    q_rate, v_rate, slide, reach = _rates(scene, model, q, v, s, target)
+    target, push, h = SX.sym("target", len(model.joint_links)), SX.sym("push", 3), SX.sym("dt")
+    q_rate, v_rate, slide, reach = _rates(scene, model, q, v, s, target, push)
     half = q + h / 2 * q_rate, v + h / 2 * v_rate, _bent_symbols(s + h / 2 * slide, reach)
-    q_rate, v_rate, slide, reach = _rates(scene, model, *half, target)
+    q_rate, v_rate, slide, reach = _rates(scene, model, *half, target, push)
     q_next = q + h * q_rate
     q_next[3:7] /= ca.norm_2(q_next[3:7])
-    after = [q_next, v + h * v_rate, _bent_symbols(s + h * slide, reach)]
-    n = 3 if s.numel() else 2  # no bristles without contacts
-    names, state = ["q", "v", "s"][:n], [q, v, s][:n]
-    given, ends = [*state, target, h], [f"{name}_next" for name in names]
-    return ca.Function("step", given, after[:n], [*names, "target", "dt"], ends)
+    after = {"q": q_next, "v": v + h * v_rate, "s": _bent_symbols(s + h * slide, reach)}
+    before = {"q": q, "v": v, "s": s, "target": target, "push": push, "dt": h}
+    given = {name: symbol for name, symbol in before.items() if symbol.numel()}  # no bristles without contacts
+    changed = {name: after[name] for name in given if name in after}
+    ends = [f"{name}_next" for name in changed]
+    return ca.Function("step", list(given.values()), list(changed.values()), list(given), ends)
 
 
-def _rates(scene: Scene, model: Model, q: SX, v: SX, s: SX, target: SX) -> tuple[SX, SX, SX, list[SX]]:
+def _rates(scene: Scene, model: Model, q: SX, v: SX, s: SX, target: SX, push: SX) -> tuple[SX, SX, SX, list[SX]]:
     """Return time derivatives of positions and velocities, sliding velocities, and how far bristles may bend."""
     law, robot = model.robot.material, model.robot
     w, x, y, z = ca.vertsplit(q[3:7])
@@ -166,6 +109,9 @@ def _rates(scene: Scene, model: Model, q: SX, v: SX, s: SX, target: SX) -> tuple
     bodies = Moving(model.body_names, (places[0], places[1]), turns, moving)
     for which, wrench in pressed(scene, bodies):
         wrenches[which] += wrench
+    if scene.push is not None:  # at the origin of the base, which is its centre of mass
+        force = robot.bodies[0].inertial.mass * push
+        wrenches[0] += ca.vertcat(ca.cross(q[:3], force), force)
     kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
     torques = []
     for i, name in enumerate(robot.independent):

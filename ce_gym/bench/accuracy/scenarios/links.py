@@ -34,6 +34,6 @@ def shanks() -> Scene:
             targets[:, i] += CROSS if right == front else -CROSS
             start[7 + i] = targets[0, i]
     coarse = tuple(Way(method, dtype="float32") for method in METHODS_IN_CONTACT)
-    ours = (*SMOOTH, Way("adaptive"), *coarse)
+    ours = (*SMOOTH, *coarse)
     title, still = "Legs pressed on each other", np.zeros(model.nv)
     return Scene("shanks", title, robot, start, still, targets, "position", ours=ours, touching=PAIRS, spread=0.003)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.speed.benchmark import bare
+from ce_gym.bench.peers.stand import bare
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.frames import Mat3
@@ -109,7 +109,7 @@ class Scene:
         return len(self.drive)
 
 
-SMOOTH = (Way("euler"), Way("extrapolated"), Way("rk4"))
+SMOOTH = (Way("euler"), Way("extrapolated"), Way("rk4"), Way("adaptive"))
 IN_CONTACT = tuple(Way(method, friction=how) for how in ("tangent", "secant") for method in METHODS_IN_CONTACT)
 ROUGH = (*IN_CONTACT, *(replace(way, dtype="float32") for way in IN_CONTACT))
 APPROXIMATE = Way("euler", "armature")

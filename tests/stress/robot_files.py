@@ -1,57 +1,44 @@
-# pyright: reportAttributeAccessIssue=false
-"""Robot files of others, in a folder: which load, what is left out, whether MuJoCo or Pinocchio finds the same robot.
+"""Robot files of a folder beside MuJoCo (MJCF) or Pinocchio (URDF): mass, mass matrix and accelerations at `armature`.
 
-For a checkout of Menagerie, or the cache of robot_descriptions. MJCF files are compared with MuJoCo, URDF files with
-Pinocchio: total mass, mass matrix and accelerations in a random state, at `armature`. Files with tied joints or loops
-load but are not compared, since the peers solve those softly. (Compiled modules carry no types, hence the line above.)
+Files with tied joints or loops load but are not compared, since the peers solve those softly.
 """
 
 from __future__ import annotations
 
-import argparse
-import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.dynamics.model import Model
-from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot
+from ce_gym.model import Robot, RobotError, load_robot
 from ce_gym.model.formats.mjcf.balls import balls_in_loops
 from ce_gym.model.formats.mjcf.bodies import read_bodies
 from ce_gym.model.formats.mjcf.equalities import locked_joints
 from ce_gym.model.formats.mjcf.source import read_mjcf
-from ce_gym.viewer.console import shown
 
 Array = NDArray[np.float64]
 Dynamics = tuple[float, Array, Array]  # total mass [kg], mass matrix, acceleration, both in our coordinates
 
-BAR = 1e-9
-COLUMNS = ("file", "outcome", "joints", "mass [kg]", "mass", "mass matrix", "acceleration", "left out")
-LONGEST = 100
+TOLERANCE = 1e-9
+"""Of differences relative to the peer's largest figure."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the benchmark."""
-    parser.add_argument("folder", type=Path, help="a folder with MJCF and URDF files, searched with all below it")
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a file.
 
+    Attributes:
+        text: "same", "DIFFERS", "loads" if nothing was compared, or why the file was refused.
+        joints: Number of independent joints, if it loads.
+        errors: Of mass, mass matrix and acceleration, relative; empty if nothing was compared.
+    """
 
-def run(arguments: argparse.Namespace) -> Report:
-    """Try every file."""
-    report = Report("files")
-    with warnings.catch_warnings():
-        for category in (LossyImportWarning, InertiaWarning):
-            warnings.simplefilter("ignore", category)
-        rows = tuple(row(path, arguments.folder) for path in shown(list(files(arguments.folder)), "files"))
-    report.tables.append(Table("Robot files, differences from the peer relative to its largest figure", COLUMNS, rows))
-    loaded = sum(cells[1] in ("same", "loads") for cells in rows)
-    claim = f"figures beside the peer's <= {BAR:g} where they are compared"
-    errors = [float(x) for cells in rows for x in cells[4:7] if x is not None]
-    report.requirements.append(Requirement(claim, f"{max(errors, default=0.0):.1e}", max(errors, default=0.0) <= BAR))
-    report.remarks.append(f"{loaded} of {len(rows)} files load")
-    return report
+    text: str
+    joints: int | None = None
+    errors: tuple[float, ...] = ()
 
 
 def files(folder: Path) -> Iterator[Path]:
@@ -62,26 +49,24 @@ def files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def row(path: Path, folder: Path) -> tuple[Cell, ...]:
-    """Return the row of one file."""
-    name = str(path.relative_to(folder))
+def outcome(path: Path) -> Outcome:
+    """Load a file and compare it with its peer in a random state."""
     try:
         robot = load_robot(path)
         model = Model(robot, "armature")
     except RobotError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-        return (name, reason if len(reason) <= LONGEST else f"{reason[:LONGEST]}...", *[None] * 6)
-    facts = (len(robot.independent), robot.total_mass)
+        return Outcome(str(error).removeprefix(f"{path}: "))
+    joints = len(robot.independent)
     if any(not _is_gear(robot, tie.name) for tie in robot.constraints):
-        return (name, "loads", *facts, None, None, None, len(robot.notes))
+        return Outcome("loads", joints)
     q, v, tau = _state(model)
     try:
         theirs = (_pinocchio if path.suffix == ".urdf" else _mujoco)(path, robot, q, v, tau)
-    except Exception as error:  # a peer that cannot read the file, or is not installed
-        return (name, f"loads; no peer ({type(error).__name__})", *facts, None, None, None, len(robot.notes))
+    except Exception as error:  # a peer that cannot read the file
+        return Outcome(f"loads; no peer ({type(error).__name__})", joints)
     ours = (robot.total_mass, model.mass_matrix(q), model.forward_dynamics(q, v, tau))
-    errors = [float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(ours, theirs, strict=True)]
-    return (name, "same" if max(errors) <= BAR else "DIFFERS", *facts, *errors, len(robot.notes))
+    errors = tuple(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(ours, theirs, strict=True))
+    return Outcome("same" if max(errors) <= TOLERANCE else "DIFFERS", joints, errors)
 
 
 def _is_gear(robot: Robot, tie: str) -> bool:

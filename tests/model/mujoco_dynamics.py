@@ -1,8 +1,4 @@
-# pyright: reportAttributeAccessIssue=false
-"""MuJoCo's mass matrix and forward dynamics of the same robot, in our coordinates.
-
-(MuJoCo's compiled modules carry no types, hence the line above.)
-"""
+"""The mass matrix and forward dynamics of an exported robot by MuJoCo, in our coordinates."""
 
 from __future__ import annotations
 

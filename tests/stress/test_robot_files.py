@@ -1,4 +1,4 @@
-"""Robot files of others: what the table says of files that agree with their peer, differ from it, or are refused."""
+"""Robot files of others: MuJoCo and Pinocchio find the same robot in them. `--folder` names files of your own."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
-from ce_gym.bench.peers import files
+import robot_files
 
 pytest.importorskip("mujoco")
 pytest.importorskip("pinocchio")
+pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
 ROOT = Path(__file__).parents[2]
 LINK = '<inertial pos="0.1 0.02 0" mass="2" fullinertia="0.02 0.03 0.04 0.001 -0.002 0.003"/>'
 MJCF = f"""<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint/>{LINK}
@@ -41,32 +41,15 @@ def folder(tmp_path):
     return tmp_path
 
 
-@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
-def test_the_table(folder, monkeypatch):
-    rows = {path.name: files.row(path, folder) for path in files.files(folder)}
-    assert set(rows) == {
-        "hopper.xml",
-        "balls.xml",
-        "nameless.xml",
-        "locked.xml",
-        "dragged.xml",
-        "two.xml",
-        "pup.urdf",
-    }, "a scene without a robot is no robot"
-    for name, joints in (
-        ("hopper.xml", 3),
-        ("nameless.xml", 3),
-        ("locked.xml", 2),
-        ("balls.xml", 2),
-        ("dragged.xml", 3),
-        ("pup.urdf", 8),
-    ):
-        assert rows[name][1:3] == ("same", joints)
-        assert all(isinstance(x, float) and x <= files.BAR for x in rows[name][4:7])
-    assert (
-        rows["two.xml"][1] == "bodies that move freely is ('trunk', 'b'): expected one robot, so at most one free joint"
-    )
-    load = files.load_robot
+def test_peers_find_the_same_robots(folder, monkeypatch):
+    found = {path.name: robot_files.outcome(path) for path in robot_files.files(folder)}
+    joints = {"hopper.xml": 3, "nameless.xml": 3, "locked.xml": 2, "balls.xml": 2, "dragged.xml": 3, "pup.urdf": 8}
+    assert set(found) == {*joints, "two.xml"}, "a scene without a robot is no robot"
+    for name, number in joints.items():
+        assert (found[name].text, found[name].joints) == ("same", number)
+        assert len(found[name].errors) == 3
+    assert found["two.xml"].text.endswith("expected one robot, so at most one free joint")
+    load = robot_files.load_robot
 
     def heavier(path):
         """The same robot with a toe that is a gram heavier."""
@@ -75,5 +58,18 @@ def test_the_table(folder, monkeypatch):
         toe = replace(toe, inertial=replace(toe.inertial, mass=toe.inertial.mass + 1e-3))
         return replace(robot, bodies=(*bodies, toe, *robot.rotors()))
 
-    monkeypatch.setattr(files, "load_robot", heavier)
-    assert files.row(folder / "hopper.xml", folder)[1] == "DIFFERS"
+    monkeypatch.setattr(robot_files, "load_robot", heavier)
+    assert robot_files.outcome(folder / "hopper.xml").text == "DIFFERS"
+
+
+@pytest.mark.stress
+@pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+def test_files_of_a_folder(request):
+    """Files of a folder, a checkout of MuJoCo Menagerie for example."""
+    folder = request.config.getoption("--folder")
+    if folder is None:
+        pytest.skip("no folder; expected --folder FOLDER")
+    found = {path.relative_to(folder): robot_files.outcome(path) for path in robot_files.files(folder)}
+    for path, outcome in found.items():
+        print(f"{path}: {outcome.text}")
+    assert not [path for path, outcome in found.items() if outcome.text == "DIFFERS"]

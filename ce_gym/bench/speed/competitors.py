@@ -1,0 +1,236 @@
+# pyright: reportAttributeAccessIssue=false
+"""What the speed benchmarks time: sub-steps and forward dynamics, ours and MuJoCo's, and the peak of the processor.
+
+In sub-steps, targets jitter around the standing pose. Both sides go on for half a second and then return to the
+standing pose, so that a robot that falls is not timed on the ground. (MuJoCo's compiled modules carry no types, hence
+the line above.)
+"""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Sequence
+from itertools import count, islice
+
+import casadi as ca
+import mujoco
+import numpy as np
+
+from ce_gym.bench.measure.timing import Competitor
+from ce_gym.bench.peers import stand
+from ce_gym.compile import (
+    Buffer,
+    Call,
+    Kernel,
+    Program,
+    Repeat,
+    aligned_zeros,
+    calls_of,
+    lane_count,
+    load_kernel,
+    source_fingerprint,
+)
+from ce_gym.compile.lowering.counting import floating_point_operations
+from ce_gym.dynamics.model import Model
+from ce_gym.export import mujoco_model
+from ce_gym.export.mujoco_batch import Batch
+from ce_gym.export.mujoco_model import STIFF, Settings
+from ce_gym.model import Robot
+from ce_gym.sim import Simulator
+from ce_gym.sim.kernel_key import model_key
+from ce_gym.sim.substeps import substeps
+
+SUBSTEPS = 4
+"""Sub-steps of one call: one step of a policy."""
+TARGETS = 8
+"""How many sets of targets take turns, one for each call."""
+CALLS_UNTIL_RESET = 25
+"""Calls after which robots begin again from the standing pose."""
+ROBOT_CALLS = 4096 * CALLS_UNTIL_RESET
+"""Robots times calls that are timed together: of batches up to 4096, whole half seconds."""
+CHAINS, LINKS = 16, 4
+"""Chains of multiply-adds for the peak: enough to hide the latency of two units, and few enough to stay in registers.
+Code goes through one chain after the other, since links of all chains must fit into what a CPU looks ahead."""
+PEAK_REPEATS = 400_000
+"""Several milliseconds: a core that has done scalar work takes a while to reach its pace in vector work."""
+
+
+def sub_steps(
+    model: Model, dtype: str, num_envs: int, num_threads: int, dt: float, seldom: Sequence[str] = ()
+) -> Competitor:
+    """Return calls of `Simulator.step`, copying of targets included; one unit of work is one robot's sub-step."""
+    sim = Simulator(model, num_envs, dt, dtype, num_threads, seldom=seldom)
+    start, made = sim.snapshot(), count()
+    calls = max(1, ROBOT_CALLS // num_envs)
+    targets = np.ascontiguousarray(stand.targets(model.robot, num_envs, TARGETS, seed=2).swapaxes(0, 1))
+
+    def run() -> None:
+        for i in islice(made, calls):
+            if i % CALLS_UNTIL_RESET == 0:
+                sim.restore(start)
+            sim.step(targets[i % TARGETS], n_substeps=SUBSTEPS)
+
+    return Competitor(run, num_envs * calls * SUBSTEPS)
+
+
+def operations(model: Model, dtype: str, dt: float) -> int:
+    """Return floating-point operations of one robot's sub-step; what only some steps do is not counted."""
+    sim = Simulator(model, 1, dt, dtype)
+    _, _, steps = substeps(model.mechanism, sim.options, ("torque", "contact_forces"))
+    calls = [call for call in calls_of(steps) if isinstance(call, Call) and not call.only_if]
+    return sum(floating_point_operations(call.function, dtype) for call in calls)
+
+
+def bytes_per_robot(model: Model, dtype: str, dt: float) -> int:
+    """Return the memory that one more robot of a Simulator takes [B]."""
+    Simulator(model, 8, dt, dtype)  # loads the kernel, whose memory is not the robots'
+    sizes = []
+    for num_envs in (1024, 2048):
+        tracemalloc.start()
+        sim = Simulator(model, num_envs, dt, dtype)
+        sizes.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+        del sim
+    return round((sizes[1] - sizes[0]) / 1024)
+
+
+def mujoco_batch(robot: Robot, level: str, num_envs: int, num_threads: int, dt: float) -> Batch:
+    """Return MuJoCo's robots in their standing pose, at settings with which Mini Cheetah stands.
+
+    Raises:
+        RobotError: If MJCF cannot say what the robot is at this level.
+        ValueError: If MuJoCo refuses it.
+    """
+    settings = Settings(dt, "Euler", "Newton", 4, 4, STIFF if level == "exact" else None)
+    return Batch(mujoco_model.compiled(robot, level, settings), num_envs, num_threads)
+
+
+def mujoco_steps(batch: Batch, robot: Robot) -> Competitor:
+    """Return a rollout; one unit of work is one robot's step."""
+    calls = CALLS_UNTIL_RESET * max(1, 32 // batch.num_envs)
+    driven = [robot.independent.index(name) for name in robot.driven]  # passive joints have no actuator
+    targets = stand.targets(robot, batch.num_envs, TARGETS, seed=2)[..., driven]
+    controls = [np.repeat(targets[:, i : i + 1], SUBSTEPS, axis=1) for i in range(TARGETS)]
+    out, start, made = np.empty((batch.num_envs, SUBSTEPS, batch.states.shape[1])), batch.states.copy(), count()
+
+    def run() -> None:
+        for i in islice(made, calls):
+            if i % CALLS_UNTIL_RESET == 0:
+                batch.states[:] = start
+            batch.trajectory(controls[i % TARGETS], out)
+            batch.states[:] = out[:, -1]
+
+    return Competitor(run, batch.num_envs * SUBSTEPS * calls)
+
+
+def silence_mujoco() -> None:
+    """Keep MuJoCo from writing a log of robots that fall over."""
+    mujoco.set_mju_user_warning(lambda _: None)
+
+
+def dynamics_kernel(robot: Robot, level: str, dtype: str, derivatives: bool = False) -> Kernel:
+    """Compile forward dynamics of a robot, or its derivatives with respect to q, v and tau, on tiles."""
+    model = Model(robot, transmission=level)
+
+    def build() -> Program:
+        function = model.casadi_function("forward_dynamics")
+        if derivatives:
+            function = model.derivatives("forward_dynamics", function.name_in()).casadi_function("jacobian")
+        inputs, outputs = tuple(function.name_in()), tuple(function.name_out())
+        sizes = {name: function.numel_in(name) for name in inputs} | {n: function.numel_out(n) for n in outputs}
+        buffers = tuple(Buffer(name, n, "tiles") for name, n in sizes.items())
+        return Program(f"{robot.name} {level} {function.name()}", buffers, (Call(function, inputs, outputs),))
+
+    return load_kernel(f"{source_fingerprint(__name__)} {model_key(model)} {derivatives}", build, dtype)
+
+
+def random_states(model: Model, num_envs: int) -> dict[str, np.ndarray]:
+    """Return positions around the standing pose, random velocities and forces, shapes (num_envs, nq or nv)."""
+    rng = np.random.default_rng(0)
+    q = model.standing_q + rng.uniform(-0.3, 0.3, (num_envs, model.nq))  # loops can still be assembled
+    if model.robot.floating:
+        q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+    shape = (num_envs, model.nv)
+    return {"q": q, "v": rng.uniform(-2.0, 2.0, shape), "tau": rng.uniform(-10.0, 10.0, shape), "vdot": np.zeros(shape)}
+
+
+def forward_dynamics(robot: Robot, level: str, num_envs: int, derivatives: bool = False) -> Competitor:
+    """Return our kernel in double precision on random states; one unit of work is the acceleration of one robot."""
+    kernel, lanes, repeats = dynamics_kernel(robot, level, "float64", derivatives), lane_count("float64"), 8
+    num_envs = -(-num_envs // lanes) * lanes
+    rows = random_states(Model(robot, transmission=level), num_envs)
+    arrays = {}
+    for name, buffer in kernel.buffers.items():
+        arrays[name] = aligned_zeros((num_envs // lanes, buffer.size, lanes), "float64")
+        if name in rows:
+            arrays[name][:] = rows[name].reshape(-1, lanes, buffer.size).swapaxes(1, 2)
+
+    def run() -> None:
+        for _ in range(repeats):
+            kernel(arrays, num_envs, num_threads=1)
+
+    return Competitor(run, num_envs * repeats)
+
+
+def mujoco_forward(robot: Robot, level: str, repeats: int = 256) -> Competitor:
+    """Return `mj_forward` in the standing pose; one unit of work is one call.
+
+    Raises:
+        RobotError: If MJCF cannot say what the robot is at this level.
+    """
+    model = mujoco_model.load(robot, level)
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT if model.neq else mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.opt.disableflags |= off | mujoco.mjtDisableBit.mjDSBL_SENSOR
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+
+    def forward() -> None:
+        for _ in range(repeats):
+            mujoco.mj_forward(model, data)
+
+    return Competitor(forward, repeats)
+
+
+def pinocchio_peer(robot: Robot) -> dict[str, Competitor]:
+    """Return Pinocchio's `aba`, its derivatives and the call of a single joint; nothing where it is not installed.
+
+    Raises:
+        RobotError: If Pinocchio's `aba` does not know the robot.
+    """
+    try:
+        from ce_gym.bench.peers import pinocchio
+    except ImportError:
+        return {}
+    peer = pinocchio.load(robot)
+    return {
+        "Pinocchio aba": pinocchio.forward_dynamics(peer),
+        "Pinocchio computeABADerivatives": pinocchio.derivatives(peer),
+        "Pinocchio (call of a single joint)": pinocchio.overhead(),
+    }
+
+
+def peak(dtype: str) -> Competitor:
+    """Return chains of multiply-adds, compiled as steps are; one unit of work is one floating-point operation."""
+    kernel, lanes = peak_kernel(dtype), lane_count(dtype)
+    arrays = {name: aligned_zeros((1, buffer.size, lanes), dtype) for name, buffer in kernel.buffers.items()}
+    arrays["factor"][:] = 0.5  # the chains settle at 1
+
+    def run() -> None:
+        kernel(arrays, lanes, repeats={"times": PEAK_REPEATS}, num_threads=1)
+
+    return Competitor(run, 2 * CHAINS * LINKS * PEAK_REPEATS * lanes)
+
+
+def peak_kernel(dtype: str) -> Kernel:
+    """Compile `CHAINS` chains in which `LINKS` times x becomes factor[0] x + factor[1]."""
+
+    def build() -> Program:
+        x, factor = ca.SX.sym("x", CHAINS), ca.SX.sym("factor", 2)
+        after = x
+        for _ in range(LINKS):
+            after = factor[0] * after + factor[1]
+        call = Call(ca.Function("chains", [x, factor], [after]), ("x", "factor"), ("x",))
+        buffers = (Buffer("x", CHAINS, "tiles"), Buffer("factor", 2, "tiles"))
+        return Program("chains of multiply-adds", buffers, (Repeat("times", (call,)),))
+
+    return load_kernel(source_fingerprint(__name__), build, dtype)
