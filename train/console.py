@@ -55,7 +55,10 @@ def say_missing(program: str, error: ModuleNotFoundError) -> int:
     Raises:
         ModuleNotFoundError: If it is a part of ce_gym itself.
     """
-    package = str(error.name).split(".")[0]
+    if error.name is None:  # Gymnasium's, of a module that an id names
+        print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    package = error.name.split(".")[0]
     if package == "ce_gym":
         raise error
     how = f"ce_gym[{EXTRAS[package]}]" if package in EXTRAS else package

@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"ce_gym.bench: no benchmark {name!r}; expected one of {listed_names(name, BENCHMARKS)}", file=sys.stderr)
         return 2
     parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
-    parser.add_argument("--json", metavar="FILE", type=Path, help="also write the report to a JSON file")
+    parser.add_argument("--json", metavar="FILE", help="also write the report to a JSON file")
     try:
         benchmark = load(name)
         benchmark.add_arguments(parser)
@@ -92,20 +92,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         missing = f"{name} needs {error.name}, which is not installed"
         print(f'ce_gym.bench: {missing}: pip install "ce_gym[bench]"', file=sys.stderr)
         return 2
-    report.command = f"python -m ce_gym.bench {shlex.join([name, *_without_json(rest)])}"
+    words = [word for word in argv if word not in ("--json", arguments.json)]
+    report.command = f"python -m ce_gym.bench {shlex.join(words)}"
     print(report.as_text())
     if arguments.json:
-        arguments.json.write_text(report.as_json(), encoding="utf-8")
+        Path(arguments.json).write_text(report.as_json(), encoding="utf-8")
     return int(report.failed)
-
-
-def _without_json(arguments: Sequence[str]) -> list[str]:
-    """Return arguments without the name of the report's file."""
-    kept = list(arguments)
-    if "--json" in kept:
-        place = kept.index("--json")
-        del kept[place : place + 2]
-    return kept
 
 
 if __name__ == "__main__":

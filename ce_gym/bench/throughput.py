@@ -1,10 +1,9 @@
-"""Environment steps per second with random actions, all included; overhead of a call; compile time; memory."""
+"""Environment steps per second with random actions, all included; overhead of a call; compile time."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from typing import Any
 
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, interleaved
-from ce_gym.compile.system import resident_memory, usable_cores
+from ce_gym.compile.system import usable_cores
 
 MEASURED = ("exact", "armature")
 """Transmission levels."""
@@ -41,28 +40,6 @@ print(json.dumps([imported - start, made - imported, time.perf_counter() - made]
 """
 
 
-CROWD, MOST_MEMORY = 65_536, 1024.0
-"""Robots in the batch whose memory is measured, and the largest peak of the process that holds it [MiB]."""
-
-MEMORY = """
-import json, sys
-import gymnasium, numpy, ce_gym
-from ce_gym.compile.system import peak_memory, resident_memory
-
-def steps(n):
-    envs = gymnasium.make_vec(sys.argv[1], num_envs=n, autoreset_mode="SameStep")
-    envs.reset(seed=0)
-    for _ in range(3):
-        envs.step(numpy.zeros(envs.action_space.shape, numpy.float32))
-    return envs
-
-steps(8)
-before = resident_memory()
-envs = steps(int(sys.argv[2]))
-print(json.dumps([before, resident_memory(), peak_memory()]))
-"""
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     parser.add_argument("--env", default="ce_gym/MiniCheetahVelocity-v0", help="environment id")
@@ -76,8 +53,6 @@ def run(arguments: argparse.Namespace) -> Report:
     steps_per_second(arguments, report)
     overhead(arguments, report)
     first_step(arguments, report)
-    if not math.isnan(resident_memory()):
-        memory(arguments, report)
     return report
 
 
@@ -155,20 +130,6 @@ def first_step(arguments: argparse.Namespace, report: Report) -> None:
     report.requirements.append(Requirement(claim, f"{compile_time:.2f} s", compile_time <= LONGEST_COMPILE))
     claim = f"gymnasium.make in the next process, at most {LONGEST_MAKE:g} s"
     report.requirements.append(Requirement(claim, f"{warm[1]:.2f} s", warm[1] <= LONGEST_MAKE))
-
-
-def memory(arguments: argparse.Namespace, report: Report) -> None:
-    """Measure a process with a crowd: before it, with it, and at the most."""
-    command = [sys.executable, "-c", MEMORY, arguments.env, str(CROWD)]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)
-    if finished.returncode != 0:
-        raise RuntimeError(f"{CROWD} of {arguments.env} did not take a step:\n{finished.stderr}")
-    before, after, peak = json.loads(finished.stdout.splitlines()[-1])
-    row = (CROWD, before, after, peak, 1024 * (after - before) / CROWD)
-    columns = ("environments", "before [MiB]", "with them [MiB]", "peak [MiB]", "each [KiB]")
-    report.tables.append(Table("Resident memory of the process", columns, (row,)))
-    claim = f"{CROWD:,} of {arguments.env} in at most {MOST_MEMORY:g} MiB, Python and all"
-    report.requirements.append(Requirement(claim, f"{peak:.0f} MiB", peak <= MOST_MEMORY))
 
 
 def fresh_process(env_id: str, cache_folder: str) -> tuple[float, float, float]:

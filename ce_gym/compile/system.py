@@ -1,4 +1,4 @@
-"""What operating systems do not have in common: users, usable cores, memory of a process, names of CPUs, forks.
+"""What operating systems do not have in common: users, usable cores, names of CPUs, forks.
 
 The only file that may call what some system lacks.
 """
@@ -10,8 +10,8 @@ import platform
 from collections.abc import Callable
 from pathlib import Path
 
-CPUINFO, STATUS = Path("/proc/cpuinfo"), Path("/proc/self/status")
-"""Where Linux tells about the CPU and about this process."""
+CPUINFO = Path("/proc/cpuinfo")
+"""Where Linux describes the CPU."""
 
 
 def _nothing() -> None:
@@ -38,24 +38,6 @@ def processor() -> str:
     return _fields(CPUINFO).get("model name") or platform.processor() or platform.machine()
 
 
-def resident_memory() -> float:
-    """Return the resident memory of this process [MiB]; NaN where the system does not tell."""
-    return _mebibytes("VmRSS")
-
-
-def peak_memory() -> float:
-    """Return the largest resident memory that this process has had [MiB]; NaN where the system does not tell."""
-    return _mebibytes("VmHWM")
-
-
-def open_files() -> int:
-    """Return how many files and sockets this process has open; 0 where the system does not tell."""
-    try:
-        return len(os.listdir("/proc/self/fd"))
-    except OSError:
-        return 0
-
-
 def at_fork(
     before: Callable[[], object] = _nothing,
     in_parent: Callable[[], object] = _nothing,
@@ -65,11 +47,6 @@ def at_fork(
     register = getattr(os, "register_at_fork", None)
     if register:
         register(before=before, after_in_parent=in_parent, after_in_child=in_child)
-
-
-def _mebibytes(name: str) -> float:
-    kibibytes = _fields(STATUS).get(name)
-    return int(kibibytes.split()[0]) / 1024 if kibibytes else float("nan")
 
 
 def _fields(path: Path) -> dict[str, str]:

@@ -21,7 +21,7 @@ from ce_gym.bench.accuracy.peers import Family, Peer
 from ce_gym.bench.accuracy.references import contact as accuracy_contact
 from ce_gym.bench.accuracy.references import restated as accuracy_restated
 from ce_gym.bench.accuracy.references import smooth as accuracy_references
-from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, SINGLE, Scene, Way
+from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Scene, Way
 from ce_gym.model.checks.collisions import colliding
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -91,14 +91,6 @@ def test_mujoco_runs_the_same_scene():
     assert rms_error(scene, Peer(armature, "RK4", 20).run(), truth) > 100 * errors[0]
     assert stiff.tied
     assert not armature.tied
-
-
-@pytest.mark.parametrize("integrator", [name for name in accuracy_curves.INTEGRATORS if name != "RK4"])
-def test_each_integrator_of_mujoco_comes_to_its_limit_at_first_order(integrator: str):
-    family = Family(short("stiff_1e3", 3), "armature", stiff=False)
-    limit = Peer(family, "RK4", 1000).run()
-    coarse, fine = (rms_error(family.scene, Peer(family, integrator, n).run(), limit) for n in (50, 200))
-    assert coarse / fine == pytest.approx(4.0, rel=0.2)
 
 
 def test_stairs_restated_are_the_terrain():
@@ -211,19 +203,6 @@ def test_comparison_ends_where_references_do():
     assert not accuracy.requirement(Measured(scene, 1e-6, [slow, theirs])).met
     lost = curve("MuJoCo", [50.0, 500.0, 5000.0], [1e1, 1e1, 1e1])
     assert accuracy.requirement(Measured(scene, 1e-6, [ours, lost])).verdict == "none"
-
-
-def test_single_precision_is_named_and_double_is_beside_it():
-    scene = short("tumble", 1)
-    double = curve("ce_gym", [2.0, 20.0, 200.0], [1e-1, 1e-3, 1e-5])
-    fast = replace(double.points[0], seconds=1.0)
-    single = Curve("ce_gym", "exact", Way("m", dtype="float32").name, (fast,))
-    theirs = curve("MuJoCo", [50.0, 500.0, 5000.0], [1e-1, 1e-3, 1e-5])
-    found = comparisons(Measured(scene, 1e-6, [double, single, theirs]))
-    assert (found[0].ratio, found[0].double_ratio) == pytest.approx((50.0, 25.0))
-    assert found[0].method.endswith(SINGLE)
-    assert found[2].ratio == found[2].double_ratio == pytest.approx(25.0)
-    assert not found[2].method.endswith(SINGLE)
 
 
 def test_single_precision_is_as_near_as_its_steps_allow():

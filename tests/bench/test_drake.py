@@ -11,7 +11,7 @@ pytest.importorskip("mujoco")
 from ce_gym import Model
 from ce_gym.bench.accuracy import benchmark as accuracy
 from ce_gym.bench.accuracy import drake_peer
-from ce_gym.bench.accuracy.curves import ERROR_CONTROL, Curve, Measured, Point, comparisons, rms_error
+from ce_gym.bench.accuracy.curves import rms_error
 from ce_gym.bench.accuracy.references import smooth as accuracy_references
 from ce_gym.bench.accuracy.scenarios import BLOCK_FRICTION, GRAVITY, HOLD, SCENES, Scene
 from ce_gym.model.frames import rotation_matrix
@@ -36,23 +36,6 @@ def test_is_named_as_skipped_where_it_is_not_installed(monkeypatch):
         report = accuracy.run(given)
         assert [remark for remark in report.remarks if remark.startswith("Drake")] == named
         assert not [r for r in report.requirements if "time at equal error" in r.claim]
-
-
-def test_what_is_asked_of_an_integrator_is_no_step():
-    """Rows begin at the longest steps of both sides, and time to an error counts all of a peer's curves."""
-
-    def curve(code: str, method: str, seconds: float, errors: tuple[float, float]) -> Curve:
-        points = tuple(
-            Point(x, s, e, e) for x, s, e in zip((0.02, 0.002), (seconds, 10 * seconds), errors, strict=True)
-        )
-        return Curve(code, "exact", method, points)
-
-    ours, steps = curve("ce_gym", "m", 1.0, (1e-3, 1e-5)), curve("Drake", "discrete", 10.0, (1e-1, 1e-2))
-    asked = curve("Drake", ERROR_CONTROL, 50.0, (1e-3, 1e-5))
-    measured = Measured(short("tumble", 1), 1e-6, [ours, steps, asked])
-    found = comparisons(measured, "Drake")
-    assert [c.theirs for c in found] == pytest.approx([10.0, 50.0, 50.0, 50.0 * 10**0.5, 500.0])
-    assert all(c.theirs is None for c in comparisons(measured))
 
 
 @needs_drake
@@ -119,15 +102,3 @@ def test_a_block_slides_as_far_as_coulomb_says(method: str):
     assert path[-1, 0] == pytest.approx(exact, rel=0.01)
     glides = HOLD / 20 * BLOCK_FRICTION * GRAVITY * scene.duration if method in ("sap", "similar") else 0.0
     assert scene.q[2] - 1e-4 < path[-1, 2] < scene.q[2] + glides + 1e-4  # contacts as stiff as ours, but see docs
-
-
-@needs_drake
-def test_knows_which_scenes_it_states():
-    from ce_gym.bench.accuracy.drake_peer.sides import STATED, sides
-
-    assert set(STATED) <= set(SCENES)
-    scene = short("stick", 2)
-    measured = Measured(scene, 1e-9)
-    names = {side.name for side in sides(scene, np.zeros((2, 7)), measured)}
-    assert {name[1:] for name in measured.limits} == {name[1:2] for name in names}
-    assert sides(short("trot", 1), np.zeros((1, 19)), measured) == []

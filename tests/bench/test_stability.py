@@ -20,7 +20,7 @@ def flat_map(dt: float, **changes) -> stability_grid.Map:
     """A map without a fault, but for the changes."""
     shape = stability_grid.SHAPE
     figures = {"finite": np.ones(shape, bool), "chatter": np.full(shape, 1e-9), "gain": np.zeros(shape)}
-    return stability_grid.Map(**({"dt": dt, "settled": 1.0, "excess": np.full(shape, -0.1)} | figures | changes))
+    return stability_grid.Map(**({"dt": dt, "excess": np.full(shape, -0.1)} | figures | changes))
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def test_a_robot_without_motors_never_gains_energy(cheetah: Model, dt: float, mo
 
     Its stops swing once in 7 to 11 ms.
     """
-    finite, gain, excess, *_ = grid.fall(cheetah, dt, 1.5, "float64")
+    finite, gain, excess, *_ = grid.fall(cheetah, dt, 1.5)
     assert finite.all()
     assert (excess <= 0).all()
     resolved = np.array(grid.STIFFNESSES) * dt**2 <= 0.5  # stiffer than that, half a kilogram bounces within a step
@@ -77,7 +77,7 @@ def test_a_robot_without_motors_never_gains_energy(cheetah: Model, dt: float, mo
 @pytest.mark.slow
 def test_a_robot_that_stands_is_silent(cheetah: Model):
     """At the coarsest step, on ground of any stiffness and slip speed; on the softest it rocks for a minute."""
-    finite, speed, _ = grid.stand(cheetah, 0.02, 120.0, "float64")
+    finite, speed = grid.stand(cheetah, 0.02, 120.0)
     assert finite.all()
     assert (speed <= 1e-6).all()
 

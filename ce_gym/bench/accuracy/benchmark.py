@@ -62,8 +62,8 @@ def run(arguments: argparse.Namespace) -> Report:
     report = Report("accuracy")
     for peer in peers:
         scenes = [m for m in measured if any(curve.code == peer for curve in m.curves)]
-        known = reference_table(scenes) if peer == "MuJoCo" else limit_table(scenes, peer)
-        report.tables += [table for table in (time_table(scenes, peer), known) if table.rows]
+        if scenes:
+            report.tables += [time_table(scenes, peer), reference_table(scenes, peer)]
         report.requirements += [requirement(m, peer) for m in scenes]
     add_tolerances(measured, report)
     report.remarks.append(
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> Report:
     return report
 
 
-def time_table(measured: list[Measured], code: str = "MuJoCo") -> Table:
+def time_table(measured: list[Measured], code: str) -> Table:
     """Return the least times at every decade of error, ours and a peer's."""
     rows: list[tuple[Cell, ...]] = []
     for m in measured:
@@ -95,22 +95,16 @@ def time_table(measured: list[Measured], code: str = "MuJoCo") -> Table:
     return Table(title, columns, tuple(rows))
 
 
-def reference_table(measured: list[Measured]) -> Table:
-    """Return how far two codes agree on the truth, and how well MuJoCo's own limits are known."""
+def reference_table(measured: list[Measured], code: str) -> Table:
+    """Return how far two codes agree on the truth, and how well the limits of a peer's methods are known."""
     rows: list[tuple[Cell, ...]] = []
     for m in measured:
         second = "MuJoCo's matrices, null space of its Jacobian" if m.scene.smooth else "our law again, explicit"
-        theirs = [value for (code, _), value in m.limits.items() if code == "MuJoCo"]
-        first = "rk8" if m.scene.smooth else "extrapolated, 5 us"
-        rows.append((m.scene.name, first, second, m.agreement, min(theirs), max(theirs)))
-    columns = ("scene", "ours", "the other", "they differ by", "MuJoCo's limits known to", "at worst")
-    return Table("References", columns, tuple(rows))
-
-
-def limit_table(measured: list[Measured], code: str) -> Table:
-    """Return how well each limit of a peer in contact is known."""
-    rows = [(m.scene.name, name, value) for m in measured for (of, name), value in m.limits.items() if of == code]
-    return Table(f"{code}'s own limits in contact", ("scene", "limit", "known to"), tuple(rows))
+        known = [value for (of, _), value in m.limits.items() if of == code]
+        ends = (min(known), max(known)) if known else (None, None)
+        rows.append((m.scene.name, second, m.agreement, *ends))
+    columns = ("scene", "second code", "differs from ours by", f"{code}'s limits known to", "at worst")
+    return Table(f"References beside {code}", columns, tuple(rows))
 
 
 def requirement(m: Measured, code: str = "MuJoCo") -> Requirement:

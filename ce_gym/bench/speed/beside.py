@@ -8,7 +8,6 @@ equalities, and at the simplest level that MJCF has for it: what most people run
 from __future__ import annotations
 
 import argparse
-import os
 import time
 
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
@@ -39,9 +38,7 @@ def run(arguments: argparse.Namespace) -> Report:
     for name in arguments.robots or [name for name in robots() if not missing(load_robot(name))]:
         rows.append(_row(load_robot(name), arguments, report))
     report.tables.append(Table("A sub-step of one robot, one core, double precision", COLUMNS, tuple(rows)))
-    average = getattr(os, "getloadavg", None)  # Windows does not count
-    load = f" Load: {average()[0]:.1f}." if average else ""
-    report.remarks.append(f"CPU time of one thread, sides in turn, best of {arguments.rounds} rounds.{load}")
+    report.remarks.append(f"CPU time of one thread, sides in turn, best of {arguments.rounds} rounds.")
     return report
 
 

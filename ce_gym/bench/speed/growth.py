@@ -1,4 +1,4 @@
-"""Cost as work grows: joints, contacts, robots in a batch, threads; time to compile, memory.
+"""Cost as work grows: joints, contacts, robots in a batch; time to compile, memory.
 
 Chains of links with geared rotors grow from 2 to 200 joints, beside MuJoCo's `mj_forward` and Pinocchio's `aba` with
 armature; a plate stands on more and more spheres, beside MuJoCo. Competitors of a row take turns; times are those of
@@ -17,7 +17,6 @@ from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import interleaved
 from ce_gym.bench.peers import stand
 from ce_gym.bench.speed import competitors
-from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Pose, Robot, load_robot
 from ce_gym.model.generators import link_and_rotor_chain
@@ -34,7 +33,7 @@ PLATE_MASS = 10.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    parser.add_argument("--robot", default="mini_cheetah", help="name or path of the robot of batches and threads")
+    parser.add_argument("--robot", default="mini_cheetah", help="name or path of the robot of batches")
     parser.add_argument("--joints", type=int, nargs="*", default=JOINTS, help="lengths of the chain")
     parser.add_argument("--contacts", type=int, nargs="*", default=CONTACTS, help="spheres under the plate")
     parser.add_argument("--robots", type=int, nargs="*", default=ROBOTS, help="sizes of batches")
@@ -50,10 +49,9 @@ def run(arguments: argparse.Namespace) -> Report:
         joints(arguments.joints, arguments.rounds, report)
     if arguments.contacts:
         report.tables.append(contacts(arguments.contacts, arguments.dt, arguments.rounds))
-    robot = stand.bare(load_robot(arguments.robot), "foot")
     if arguments.robots:
+        robot = stand.bare(load_robot(arguments.robot), "foot")
         report.tables.append(crowd(robot, arguments.robots, arguments.dt, arguments.rounds))
-    report.tables.append(threads(robot, arguments.dt, arguments.rounds))
     return report
 
 
@@ -106,19 +104,6 @@ def crowd(robot: Robot, sizes: Collection[int], dt: float, rounds: int) -> Table
         rows.append((size, *row))
     columns = ("robots", "float64 [us]", "float64 [MiB]", "float32 [us]", "float32 [MiB]")
     return Table(f"One robot's sub-step against the batch, {robot.name} exact, one core", columns, tuple(rows))
-
-
-def threads(robot: Robot, dt: float, rounds: int) -> Table:
-    """Let the threads grow: robots' sub-steps per second."""
-    model = Model(robot)
-    rows: list[tuple[Cell, ...]] = []
-    numbers = [n for n in (1, 2, 4, 8, 16, 32, 64, 128) if n <= usable_cores()]
-    sides = {str(n): competitors.sub_steps(model, "float64", 4096, n, dt) for n in numbers}
-    timings = interleaved(sides, rounds)
-    for n in numbers:
-        rows.append((n, 1e-6 / timings[str(n)].best, timings["1"].best / timings[str(n)].best))
-    columns = ("threads", "sub-steps [million/s]", "times one")
-    return Table(f"Threads, {robot.name} exact, 4096 robots, float64", columns, tuple(rows))
 
 
 def plate(n: int) -> Robot:

@@ -48,7 +48,6 @@ class Map:
         dt: Time step [s].
         finite: Whether no robot diverged, standing or collapsing.
         chatter: Root mean square speed at rest, every step counted [m/s and rad/s].
-        settled: When that was [s].
         gain: Largest rise of the mechanical energy above its lowest value so far, springs included, while robots
             collapse without motors, as a share of all they lose [-].
         excess: Highest sum of kinetic and potential energy above that at the start, same unit [-].
@@ -57,12 +56,11 @@ class Map:
     dt: float
     finite: Array
     chatter: Array
-    settled: float
     gain: Array
     excess: Array
 
 
-def measure(model: Model, dt: float, patience: float, collapse: float, dtype: str = "float64") -> Map:
+def measure(model: Model, dt: float, patience: float, collapse: float) -> Map:
     """Measure one time step of one robot.
 
     Args:
@@ -70,19 +68,18 @@ def measure(model: Model, dt: float, patience: float, collapse: float, dtype: st
         dt: [s].
         patience: How long robots may take to come to rest [s].
         collapse: How long they are watched while they collapse [s].
-        dtype: "float64" or "float32".
     """
-    upright, chatter, settled = stand(model, dt, patience, dtype)
-    lasting, *energies = fall(model, dt, collapse, dtype)
-    return Map(dt, upright & lasting, chatter, settled, *energies)
+    upright, chatter = stand(model, dt, patience)
+    lasting, *energies = fall(model, dt, collapse)
+    return Map(dt, upright & lasting, chatter, *energies)
 
 
-def stand(model: Model, dt: float, patience: float, dtype: str) -> tuple[Array, Array, float]:
-    """Drop robots that hold their standing pose; return whether they stay finite, their speed at rest, and when [s].
+def stand(model: Model, dt: float, patience: float) -> tuple[Array, Array]:
+    """Drop robots that hold their standing pose; return whether they stay finite, and their speed at rest.
 
     On ground too soft for them humanoids topple; lying robots have to come to rest as well.
     """
-    sim = scene(model, dt, "position", (), dtype)
+    sim = scene(model, dt, "position", ())
     q, v = starts(model, DROP, 0.0)
     sim.set_state(q, v)
     target, time, speed = model.standing_q[7:], 0.0, np.full(sim.num_envs, np.inf)
@@ -91,15 +88,15 @@ def stand(model: Model, dt: float, patience: float, dtype: str) -> tuple[Array, 
         squares = np.zeros(sim.num_envs)
         for _ in range(WATCHED):
             sim.step(target)
-            squares += np.mean(np.square(sim.v, dtype=np.float64), axis=1)
+            squares += np.mean(np.square(sim.v), axis=1)
         speed = np.where(sim.diverged, np.inf, np.sqrt(squares / WATCHED))
         time += max(1.0, (WATCHED + 1) * dt)
-    return worst(sim.diverged) == 0, worst(speed), time
+    return worst(sim.diverged) == 0, worst(speed)
 
 
-def fall(model: Model, dt: float, time: float, dtype: str) -> tuple[Array, Array, Array]:
+def fall(model: Model, dt: float, time: float) -> tuple[Array, Array, Array]:
     """Let robots collapse without motors; return whether they stay finite, gain and excess, see `Map`."""
-    sim = scene(model, dt, "torque", ("energy",), dtype)
+    sim = scene(model, dt, "torque", ("energy",))
     q, v = starts(model, FALL, 0.5)
     sim.set_state(q, v)
     nothing = np.zeros(len(model.joint_links))
@@ -108,7 +105,7 @@ def fall(model: Model, dt: float, time: float, dtype: str) -> tuple[Array, Array
     every = max(1, round(0.01 / dt))
     for i in range(round(time / dt)):
         sim.step(nothing)
-        energy = np.asarray(sim.energy, dtype=np.float64)
+        energy = sim.energy.copy()
         gain = np.maximum(gain, energy - lowest)
         lowest = np.minimum(lowest, energy)
         if i % every == 0:
@@ -118,11 +115,11 @@ def fall(model: Model, dt: float, time: float, dtype: str) -> tuple[Array, Array
     return worst(sim.diverged) == 0, worst(gain / lost + bad), worst(excess / lost + bad)
 
 
-def scene(model: Model, dt: float, control: str, outputs: tuple[str, ...], dtype: str) -> Simulator:
+def scene(model: Model, dt: float, control: str, outputs: tuple[str, ...]) -> Simulator:
     """Return robots of all cells, STARTS of each, on their grounds."""
     own = model.robot.material
     sim = Simulator(
-        model, STARTS * SHAPE[0] * SHAPE[1], dt, dtype, control=control, outputs=outputs,
+        model, STARTS * SHAPE[0] * SHAPE[1], dt, control=control, outputs=outputs,
         parameters=("stiffness", "damping", "slip_speed"),
     )  # fmt: skip
     k, v_s = (grid.ravel() for grid in np.meshgrid(STIFFNESSES, SLIP_SPEEDS, indexing="ij"))

@@ -25,8 +25,9 @@ def draw(maps: dict[str, list[Map]], file: Path) -> None:
         for column, (robot, steps) in enumerate(maps.items()):
             ax = axes[row, column]
             values = np.array([getattr(m, name).max(axis=1) for m in steps]).T  # stiffness by step
-            picture = ax.imshow(np.log10(np.clip(values, low, high)), origin="lower", aspect="auto", cmap="viridis_r",
-                                vmin=np.log10(low), vmax=np.log10(high))  # fmt: skip
+            limits = {"vmin": np.log10(low), "vmax": np.log10(high)}
+            logarithm = np.log10(np.clip(values, low, high))
+            picture = ax.imshow(logarithm, origin="lower", aspect="auto", cmap="viridis_r", **limits)
             for (i, j), value in np.ndenumerate(values):
                 finite = bool(steps[j].finite[i].all())
                 text = ("0" if value <= 0 else f"{value:.0e}".replace("e-0", "e-")) if finite else "lost"

@@ -2,19 +2,23 @@
 """A scene as a diagram of Drake's: the robot at a transmission level, its drives and the ground.
 
 The diagram is Drake's own C++ throughout, so that one call runs a scene: a source that holds targets or torques, the
-plant, and a log of what is recorded at the end of every hold.
+plant, and a log of what is recorded at the end of every hold. Python's Drake has a coupler of two joints but no
+constraint of several, as a parallel belt is; its parsers do, as `drake:tendon_constraint`
+(https://drake.mit.edu/doxygen_cxx/group__multibody__parsing.html). So the tree and its ties go through URDF. Masses
+there are stand-ins, since a parser would refuse published inertias that violate the triangle inequality.
 """
 
 from __future__ import annotations
 
 import logging
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import PdControllerGains, SpatialInertia, UnitInertia
@@ -22,17 +26,21 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from ce_gym.bench.accuracy.drake_peer.description import to_urdf
 from ce_gym.bench.accuracy.scenarios import HOLD, Scene
 from ce_gym.export.joint_ties import Tie, joint_ties
 from ce_gym.export.mjcf import SMALLEST_MASS, mass_properties
 from ce_gym.export.mjcf_equalities import joint_armature
-from ce_gym.model.mechanism import Mechanism, build_mechanism
+from ce_gym.export.mjcf_text import text
+from ce_gym.model.mechanism import Mechanism, MovingBody, build_mechanism
 
 logging.getLogger("drake").setLevel(logging.ERROR)  # half spaces do not touch deformable bodies, TAMSI goes: no news
 
 BEFORE = 1e-9
 """How long before its hold a target is given [s]: steps begin at multiples of a length that rounds."""
+RIGID = 1e30
+"""Stiffness of belts [N m/rad], infinite to the solver, which takes what its step allows; URDF has no infinity."""
+JOINTS = {"revolute": "continuous", "prismatic": "prismatic"}
+"""Types of joints in URDF."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +93,42 @@ def stated(scene: Scene, level: str, dt: float, approximation: str) -> Stated:
     _drive(builder, plant, instance, scene, dt)
     log = LogVectorOutput(plant.get_state_output_port(), builder, HOLD)
     return Stated(builder.Build(), plant, log, mechanism)
+
+
+def to_urdf(mechanism: Mechanism, ties: Mapping[str, Tie]) -> str:
+    """Return the URDF of a mechanism whose rotors, if it has any, are bodies; a joint is called after its body."""
+    root = ET.Element("robot", name=mechanism.robot.name)
+    for moving in mechanism.bodies.values():
+        _add_body(root, moving)
+    for name in mechanism.bodies:
+        if name in ties and len(ties[name].ratios) > 1:
+            _add_belt(root, name, ties[name])
+    return ET.tostring(root, encoding="unicode")
+
+
+def _add_body(root: ET.Element, moving: MovingBody) -> None:
+    link = ET.SubElement(ET.SubElement(root, "link", name=moving.name), "inertial")
+    ET.SubElement(link, "mass", value="1")
+    ET.SubElement(link, "inertia", ixx="1", iyy="1", izz="1", ixy="0", ixz="0", iyz="0")
+    if moving.joint.type == "free":
+        return
+    joint = ET.SubElement(root, "joint", name=moving.name, type=JOINTS[moving.joint.type])
+    ET.SubElement(joint, "parent", link=moving.parent or "world")
+    ET.SubElement(joint, "child", link=moving.name)
+    angles = RollPitchYaw(RotationMatrix(np.asarray(moving.rotation, dtype=float))).vector()
+    ET.SubElement(joint, "origin", xyz=text(moving.position), rpy=text(angles))
+    ET.SubElement(joint, "axis", xyz=text(moving.axis))
+    ET.SubElement(joint, "dynamics", damping=text(moving.joint.damping))
+
+
+def _add_belt(root: ET.Element, name: str, tie: Tie) -> None:
+    """Tie a joint to several others: a tendon that can neither grow nor shrink, as stiff as the solver has it."""
+    tendon = ET.SubElement(root, "drake:tendon_constraint")
+    for joint, ratio in {name: 1.0, **{joint: -ratio for joint, ratio in tie.ratios.items()}}.items():
+        ET.SubElement(tendon, "drake:tendon_constraint_joint", name=joint, a=text(ratio))
+    figures = {"offset": -tie.offset, "lower_limit": 0.0, "upper_limit": 0.0, "stiffness": RIGID, "damping": 0.0}
+    for key, value in figures.items():
+        ET.SubElement(tendon, f"drake:tendon_constraint_{key}", value=str(value))
 
 
 def _add_couplers(plant: MultibodyPlant, mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:

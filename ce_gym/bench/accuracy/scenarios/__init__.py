@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ce_gym.bench.accuracy.scenarios.blocks import BLOCK_FRICTION, GRAVITY, blocks
-from ce_gym.bench.accuracy.scenarios.feet import biped, drop, stairs, trot
 from ce_gym.bench.accuracy.scenarios.flight import belt_leg, elastic_leg, four_bar, humanoid, stiff_leg, tello, tumble
-from ce_gym.bench.accuracy.scenarios.links import shanks
 from ce_gym.bench.accuracy.scenarios.scene import HOLD, SINGLE, Array, Scene, Way
+from ce_gym.bench.accuracy.scenarios.touching import biped, drop, shanks, stairs, trot
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "humanoid": humanoid,

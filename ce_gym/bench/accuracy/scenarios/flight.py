@@ -6,29 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ce_gym.bench.accuracy.scenarios.scene import (
-    APPROXIMATE,
-    HOLD,
-    SMOOTH,
-    Scene,
-    Way,
-    diagonal,
-    driven,
-    unbounded,
-)
+from ce_gym.bench.accuracy.scenarios.scene import APPROXIMATE, HOLD, SMOOTH, Scene, Way, diagonal, driven, unbounded
 from ce_gym.dynamics.model import Model
-from ce_gym.model import (
-    Body,
-    Elasticity,
-    Gains,
-    Inertial,
-    Joint,
-    LoopConstraint,
-    Placement,
-    Pose,
-    Robot,
-    load_robot,
-)
+from ce_gym.model import Body, Elasticity, Gains, Inertial, Joint, LoopConstraint, Placement, Pose, Robot, load_robot
 
 
 def humanoid() -> Scene:
@@ -63,17 +43,8 @@ def four_bar() -> Scene:
     robot = Robot("crank_rocker", bodies, (loop,), ("crank",), pose=pose, assembly=assembly)
     none = np.zeros((round(1.0 / HOLD), 1))
     start, speed = np.array([1.5]), np.array([12.0])
-    return Scene(
-        "four_bar",
-        "Four-bar, a crank and a rocker",
-        robot,
-        start,
-        speed,
-        none,
-        ours=SMOOTH,
-        levels=("exact",),
-        reference=200,
-    )
+    title, levels = "Four-bar, a crank and a rocker", ("exact",)
+    return Scene("four_bar", title, robot, start, speed, none, ours=SMOOTH, levels=levels, reference=200)
 
 
 def tello() -> Scene:

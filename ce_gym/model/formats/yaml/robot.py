@@ -73,8 +73,6 @@ def robot_from_yaml(path: Path) -> Robot:
         source=str(path),
         notes=(*notes, *file.texts("notes")),
     )
-    if "assembly" in file:
-        robot = replace(robot, assembly=file.section("assembly").numbers())
     if "contacts" in file:
         robot = replace(robot, contacts=tuple(read_contacts(file.section("contacts"), links)))
     pairs = read_pairs(file, links)
