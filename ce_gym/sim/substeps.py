@@ -51,7 +51,7 @@ def substeps(
     options = replace(options, dt=None)
     plan, most = METHODS[options.method], iterations_needed(mechanism, options)
     staged = any(min(stage.iterations, most) for stage in plan.stages)
-    measured = {MOVED: 1} | ({OFF: mechanism.robot.layout.nv} if plan.controlled else {})
+    measured = {MOVED: 1} | ({OFF: mechanism.robot.layout.nv + 1} if plan.controlled else {})
     asked = (*outputs, *measured) if plan.single or not staged else tuple(name for name in outputs if name != "error")
     function = (
         iteration_function(mechanism, options, asked, chooses=chooses(options))

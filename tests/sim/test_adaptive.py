@@ -202,16 +202,17 @@ def test_lengths_of_steps():
     def then(**changes):
         return {name: np.array(value).ravel() for name, value in after(**{**numbers, **q, **changes}).items()}
 
-    good = then(tried_off=[1e-12, 0.0])
+    good = then(tried_off=[1e-12, 0.0, 0.0])
     assert good["q_next"].tolist() == [1.0, 2.0]
     assert good["step_length_next"] == pytest.approx(0.1 * GROWTH)
     assert good["left_next"] == pytest.approx(0.9)
-    assert then(tried_off=[1e-12, 0.0], refusing=1.0)["step_length_next"] == pytest.approx(0.1)
-    steady = then(tried_off=[0.0, control.AIM * ALLOWED], step_error=control.AIM * ALLOWED)
+    assert then(tried_off=[1e-12, 0.0, 0.0], refusing=1.0)["step_length_next"] == pytest.approx(0.1)
+    steady = then(tried_off=[0.0, control.AIM * ALLOWED, 0.0], step_error=control.AIM * ALLOWED)
     assert steady["step_length_next"] == pytest.approx(0.1)
     for bad in (
-        {"tried_off": [0.0, -1.01 * ALLOWED]},
-        {"tried_off": [0.0, np.inf]},
+        {"tried_off": [0.0, -1.01 * ALLOWED, 0.0]},
+        {"tried_off": [0.0, np.inf, 0.0]},
+        {"tried_off": [0.0, 0.0, 1.01 * ALLOWED / control.HORIZON]},
         {"tried_diverged": 1.0},
         {"tried_moved": 0.6},
     ):
@@ -220,7 +221,7 @@ def test_lengths_of_steps():
         assert refused["left_next"] == 1.0
         assert 0.009 < refused["step_length_next"] <= 0.05
         assert (refused["retries_next"], refused["steps_taken_next"], refused["unfinished"]) == (1, 0, 1)
-    last = then(trying=SHORTEST, step_length=SHORTEST, tried_off=[1.0, 0.0])
+    last = then(trying=SHORTEST, step_length=SHORTEST, tried_off=[1.0, 0.0, 0.0])
     assert last["q_next"].tolist() == [1.0, 2.0]
     assert (last["steps_taken_next"], last["steps_missed_next"]) == (1, 1)
     through = then(trying=0.0, left=0.0, tried_q=[np.nan, np.nan])

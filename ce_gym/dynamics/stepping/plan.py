@@ -21,7 +21,11 @@ AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "motor_torque", "contact_
 MOVED = "moved"
 """Name of the output that says how far a step moves its fastest joint, at the speed of its end [rad or m]."""
 OFF = "off"
-"""Name of the output that estimates the errors of a step in its positions [rad or m], shape (nv,)."""
+"""Name of the output that estimates the errors of a step, shape (nv + 1,), see `step_errors`."""
+TOUCHES = ("load", "pressed")
+"""Parts of a state that are above 0 where something touches."""
+STOPPED = 0.2
+"""Part of the velocity that a step may change while a contact begins or ends."""
 LOAD = "load"
 """Part of a state that says what contacts carried, unless a stage has another."""
 AFTER = "after"
@@ -147,14 +151,29 @@ def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:
     return ca.norm_2(ends[one].v - ends[other].v)
 
 
-def position_errors(plan: Plan, ends: Mapping[str, State], layout: Layout) -> SX:
-    """Return estimated errors of positions after a step [rad or m], shape (nv,), of a plan that has an estimate.
+def step_errors(plan: Plan, before: State, ends: Mapping[str, State], layout: Layout) -> SX:
+    """Return estimated errors after a step of a plan that has an estimate, shape (nv + 1,).
 
-    Those of orientations are rotation vectors, which come first.
+    Those of positions [rad or m], rotation vectors for orientations, which come first; last, if a contact began or
+    ended in any stage, the largest of velocities, of a floating base those of the base [rad/s or m/s]. Where an impact
+    takes more than `STOPPED` of the velocity at once, a whole step and its halves agree on a wrong end: neither
+    rebounds. All that the velocity changes by counts there.
+
+    Args:
+        plan: The method.
+        before: State before the step.
+        ends: At the ends of stages, by name.
+        layout: Which rows of `q` are what.
     """
     assert isinstance(plan.end, Ends)
-    one, other = (ends[name].q for name in plan.end.error)
+    one, other = (ends[name] for name in plan.end.error)
     turns = {i for i, _ in layout.turns}
-    turned = [between(one[i : i + 4], other[i : i + 4]) for i in sorted(turns)]
-    others = [i for i in range(one.numel()) if not any(start <= i < start + 4 for start in turns)]
-    return ca.vertcat(*turned, (one - other)[others])
+    turned = [between(one.q[i : i + 4], other.q[i : i + 4]) for i in sorted(turns)]
+    others = [i for i in range(one.q.numel()) if not any(start <= i < start + 4 for start in turns)]
+    contacts = [(getattr(before, name) > 0) != (getattr(end, name) > 0) for name in TOUCHES for end in ends.values()]
+    changed = ca.norm_inf(ca.vertcat(SX(0), *contacts)) > 0
+    moving = layout.base_nv or layout.nv
+    v, fine, coarse = (state.v[:moving] for state in (before, one, other))
+    stopped = ca.norm_inf(fine - v)
+    jump = ca.fmax(ca.norm_inf(fine - coarse), ca.if_else(stopped > STOPPED * ca.norm_inf(v), stopped, 0))
+    return ca.vertcat(*turned, (one.q - other.q)[others], ca.if_else(changed, jump, 0))

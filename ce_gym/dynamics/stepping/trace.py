@@ -19,7 +19,7 @@ from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.plan import AFTER, MOVED, OFF, combined, error_estimate, position_errors
+from ce_gym.dynamics.stepping.plan import AFTER, MOVED, OFF, combined, error_estimate, step_errors
 from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, rows_of_near, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
 from ce_gym.model.mechanism import Mechanism
@@ -125,7 +125,7 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
             results[name] = furthest(mechanism, after.v, given["dt"])
             continue
         if name in ("error", OFF):
-            results[name] = error_estimate(plan, ends) if name == "error" else position_errors(plan, ends, layout)
+            results[name] = error_estimate(plan, ends) if name == "error" else step_errors(plan, before, ends, layout)
             continue
         told = {stage: SX.sym(name, size) for stage in plan.shares(name)}
         given |= {f"{stage}_{name}": value for stage, value in told.items()}
@@ -200,9 +200,8 @@ class Given:
             return parts[AFTER].error
         if name == OFF:
             plan = METHODS[self.scene.options.method]
-            return position_errors(
-                plan, {s.name: parts[s.name].state for s in plan.stages}, self.mechanism.robot.layout
-            )
+            ends = {stage.name: parts[stage.name].state for stage in plan.stages}
+            return step_errors(plan, self.state, ends, self.mechanism.robot.layout)
         return ca.vec(weighted(shares, {part: self._of(parts[part], name) for part in shares}))
 
     def _of(self, stepped: Stepped, name: str) -> SX:
