@@ -212,7 +212,7 @@ def test_lengths_of_steps():
     for bad in (
         {"tried_off": [0.0, -1.01 * ALLOWED, 0.0]},
         {"tried_off": [0.0, np.inf, 0.0]},
-        {"tried_off": [0.0, 0.0, 1.01 * ALLOWED / control.HORIZON]},
+        {"tried_off": [0.0, 0.0, 1.01 * ALLOWED]},
         {"tried_diverged": 1.0},
         {"tried_moved": 0.6},
     ):

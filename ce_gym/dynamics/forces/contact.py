@@ -21,11 +21,15 @@ iteration, with a damper `-share (c + dt k) v_n+` in place of the spring, which 
 v_n)` is the part of the step that the point spends in the ground. The prediction knows the velocity but not yet the
 acceleration: a loaded foot that its spring has just lifted would be taken to be gone, fall back, and bounce on the
 steps for ever. So a contact that pushed at the end of the last step stays active as long as it is in the ground.
+
+In the step in which a point lands, damping acts over the whole step, although the point is in the ground only for a
+share of it, and friction has no load yet. Both are errors of first order in the step. Methods with `resolves_landing`
+remove them: damping counts by `share`, and friction starts with the force at the velocity before the landing.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import casadi as ca
@@ -201,6 +205,7 @@ class Contact:
         friction: Law of its friction.
         dt: Step length [s].
         near: 1 where it may act, 0 where it does not; None if it always may.
+        resolves_landing: Whether the step in which the point lands is accurate to second order, see above.
     """
 
     body: str
@@ -210,6 +215,7 @@ class Contact:
     friction: FrictionLaw
     dt: float
     near: SX | None = field(default=None, kw_only=True)
+    resolves_landing: bool = field(default=False, kw_only=True)
 
     size = Iterate.SIZE
 
@@ -228,6 +234,7 @@ class LinearContact:
         active: 1 if it is taken to touch the ground, else 0.
         force: For an unchanged velocity, body axes [N], shape (3,).
         C: Effective damping, body axes [N s/m], shape (3, 3).
+        load: Normal force that limits friction [N].
         slip: Direction in which friction slips, shape (3,); zero while it sticks.
     """
 
@@ -245,6 +252,12 @@ class LinearContact:
         damped = ca.logic_and(self._above, last)
         self.normal_force = ca.if_else(ca.logic_and(self.active, ca.logic_not(damped)), force, 0)
         self.normal_slope = ca.if_else(self.active, ca.if_else(damped, share * slope, slope), 0)
+        self._slope_at_end, self.load = self.normal_slope, t.load
+        if law.resolves_landing:
+            damping = law.compliance.damping * ca.if_else(self._above, share, 1)
+            _, shared = law.normal.force(t, replace(law.compliance, damping=damping), law.dt)
+            self.normal_slope = ca.if_else(ca.logic_and(self.active, ca.logic_not(damped)), shared, self.normal_slope)
+            self.load = ca.if_else(t.load > 0, t.load, ca.fmax(force - shared * before, 0))
         friction, n = law.friction.linearise(self), t.normal
         self.slip, slope = friction.slip, friction.slope
         along = slope * (self.slip @ self.slip.T)
@@ -282,7 +295,7 @@ class LinearContact:
         return cone, slope, x, _length(x)
 
     def _cone(self) -> SX:
-        return ca.if_else(self.normal_slope > 0, self.law.compliance.friction * self.law.touch.load, 0)
+        return ca.if_else(self.normal_slope > 0, self.law.compliance.friction * self.load, 0)
 
     def body_terms(self, gravity: SX) -> BodyTerms:
         """Return what the contact adds to its body before the inward pass.
@@ -326,6 +339,10 @@ class LinearContact:
     def normal_after(self, gain: SX) -> SX:
         """Return the normal force over the step [N], given the gain in velocity."""
         return self.normal_force - self.normal_slope * ca.dot(self.law.touch.normal, self.law.touch.velocity + gain)
+
+    def load_after(self, gain: SX) -> SX:
+        """Return the normal force at the end of the step [N], given the gain in velocity."""
+        return self.normal_force - self._slope_at_end * self._closing(gain)
 
     def anchor_after(self, gain: SX) -> SX:
         """Return the deflection of the bristle at the end of the step, body axes [m], given the gain in velocity."""

@@ -6,12 +6,12 @@ extrapolation removes that part, so that what is left is how much d / h^2 change
 all positions is within `ALLOWED` times the tolerance, or the change of d since the last step is at such a rate that it
 would take `HORIZON` to add up to that: in free flight d does not change. Other steps are refused and tried again
 shorter. Contact needs no search for events: a step in which a contact begins or ends is refused until it is so short
-that the landing does not matter. In such a step the error of velocities counts too, with what it adds up to in
-`HORIZON`: forces jump there, so it is of first order in the step, and the flight after a bounce makes it grow.
+that the landing does not matter. In contact the error of velocities counts too, see `step_errors`: the flight after a
+bounce makes it grow.
 
 Lengths follow Gustafsson's PI controller (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2, 1996;
 Soederlind, Numerical Algorithms 31, 2002). The norm is that of CENIC (Kurtz and Castro 2025, arXiv:2511.08771): the
-largest error of a position, 1 rad counting as 1 m, with no part for velocities while the same contacts act.
+largest error of a position, 1 rad counting as 1 m, with no part for velocities without contact.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ce_gym.model.mechanism import Mechanism
 
 ALLOWED = 0.25
 """Part of the tolerance that one step may be off by: errors of steps add up."""
-SHORTEST = 2.0**-12
+SHORTEST = 2.0**-14
 """Least length of a step as a part of the interval: there it is taken whatever its error."""
 AIM = 0.4
 """Part of what is allowed that the error of the next step should be: few are refused."""
@@ -97,10 +97,10 @@ def control_function(
     given |= {name: SX.sym(name, size) for name, size in carried.items()}
     moved, left, trying, refusing, retries, dt, length, error, change, taken_before, missed, tolerance = given.values()
     given |= {f"tried_{OFF}": SX.sym("off", change.numel() + 1)}
-    errors, jump = given[f"tried_{OFF}"][:-1], given[f"tried_{OFF}"][-1]
+    errors, flown = given[f"tried_{OFF}"][:-1], given[f"tried_{OFF}"][-1]
     changed = errors / (trying * trying)
     off = ca.fmin(ca.norm_inf(errors), HORIZON * trying * ca.norm_inf(changed - change))
-    off = ca.fmax(off, HORIZON * jump)
+    off = ca.fmax(off, flown)
 
     live, allowed = trying > 0, ALLOWED * tolerance
     sane = ca.logic_and(tried["diverged"] < 0.5, moved <= LARGEST_MOVE)

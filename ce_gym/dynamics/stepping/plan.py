@@ -24,8 +24,10 @@ OFF = "off"
 """Name of the output that estimates the errors of a step, shape (nv + 1,), see `step_errors`."""
 TOUCHES = ("load", "pressed")
 """Parts of a state that are above 0 where something touches."""
-STOPPED = 0.2
-"""Part of the velocity that a step may change while a contact begins or ends."""
+LANDING, CONTACT = 0.02, 0.005
+"""What an error of velocity counts as: how far it moves in this time, where a contact begins or ends, and else [s]."""
+STOPPED = 0.1
+"""Part of the velocity that a step may change where a contact begins."""
 LOAD = "load"
 """Part of a state that says what contacts carried, unless a stage has another."""
 AFTER = "after"
@@ -152,12 +154,12 @@ def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:
 
 
 def step_errors(plan: Plan, before: State, ends: Mapping[str, State], layout: Layout) -> SX:
-    """Return estimated errors after a step of a plan that has an estimate, shape (nv + 1,).
+    """Return estimated errors after a step of a plan that has an estimate [rad or m], shape (nv + 1,).
 
-    Those of positions [rad or m], rotation vectors for orientations, which come first; last, if a contact began or
-    ended in any stage, the largest of velocities, of a floating base those of the base [rad/s or m/s]. Where an impact
-    takes more than `STOPPED` of the velocity at once, a whole step and its halves agree on a wrong end: neither
-    rebounds. All that the velocity changes by counts there.
+    Those of positions, rotation vectors for orientations, which come first; last that of velocities while anything
+    touches, of a floating base those of the base, times `LANDING` if a contact begins or ends in any stage, else times
+    `CONTACT`. Where the beginning of a contact takes more than `STOPPED` of the velocity at once, the whole step and
+    its halves may agree on a wrong end, because neither rebounds. The whole change of the velocity counts there.
 
     Args:
         plan: The method.
@@ -170,10 +172,14 @@ def step_errors(plan: Plan, before: State, ends: Mapping[str, State], layout: La
     turns = {i for i, _ in layout.turns}
     turned = [between(one.q[i : i + 4], other.q[i : i + 4]) for i in sorted(turns)]
     others = [i for i in range(one.q.numel()) if not any(start <= i < start + 4 for start in turns)]
-    contacts = [(getattr(before, name) > 0) != (getattr(end, name) > 0) for name in TOUCHES for end in ends.values()]
-    changed = ca.norm_inf(ca.vertcat(SX(0), *contacts)) > 0
+    touches = [[getattr(state, name) > 0 for name in TOUCHES] for state in (before, *ends.values())]
+    first, *others_touch = [ca.vertcat(SX(0), *each) for each in touches]
+    touching = ca.norm_inf(ca.vertcat(first, *others_touch))
+    changes = ca.vertcat(*[each - first for each in others_touch])
+    begins = ca.mmax(changes) > 0
     moving = layout.base_nv or layout.nv
     v, fine, coarse = (state.v[:moving] for state in (before, one, other))
-    stopped = ca.norm_inf(fine - v)
-    jump = ca.fmax(ca.norm_inf(fine - coarse), ca.if_else(stopped > STOPPED * ca.norm_inf(v), stopped, 0))
-    return ca.vertcat(*turned, (one.q - other.q)[others], ca.if_else(changed, jump, 0))
+    difference, change = ca.norm_inf(fine - coarse), ca.norm_inf(fine - v)
+    jump = ca.fmax(difference, ca.if_else(ca.logic_and(begins, change > STOPPED * ca.norm_inf(v)), change, 0))
+    flown = ca.if_else(ca.norm_inf(changes) > 0, LANDING * jump, ca.if_else(touching > 0, CONTACT * difference, 0))
+    return ca.vertcat(*turned, (one.q - other.q)[others], flown)

@@ -234,7 +234,7 @@ def stepped(scene: Scene, state: State, solved: Solved, dt: float, iterate: SX) 
     after = State(
         q=q,
         v=v,
-        load=stacked([where(c.law.near, ca.fmax(c.normal_after(gain), 0)) for _, c, gain in contacts]),
+        load=stacked([where(c.law.near, ca.fmax(c.load_after(gain), 0)) for _, c, gain in contacts]),
         whole_load=state.whole_load,
         anchor=stacked(anchors) if state.anchor.numel() else state.anchor,
         dependent=guessed_coordinates(kinematics, solved.vdot, dt),
@@ -315,6 +315,7 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> l
     """Place every contact sphere of the scene against the ground."""
     contacts, options = [], scene.options
     normal, friction = normal_law(options.normal_law, options.material), FRICTION[options.friction]
+    resolves = METHODS[options.method].controlled
     for i, (sphere, centre) in enumerate(contact_centres(scene)):
         body = kinematics.bodies[sphere.body]
         height, up = SX(0), constant(np.array([0.0, 0.0, 1.0]))
@@ -325,7 +326,8 @@ def touching(scene: Scene, kinematics: Kinematics, state: State, dt: float) -> l
             up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state.anchor[2 * i : 2 * i + 2] if state.anchor.numel() else state.anchor
         touch = touch_ground(body, sphere, centre, height, up, state.load[i], anchor)
-        contacts.append(Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt))
+        law = Contact(sphere.body, touch, scene.figures.compliance, normal, friction, dt, resolves_landing=resolves)
+        contacts.append(law)
     return contacts
 
 
@@ -335,7 +337,8 @@ def meeting_pairs(scene: Scene, kinematics: Kinematics, state: State, dt: float)
     law, pairs = normal_law(options.normal_law, options.material), []
     for i, pair in enumerate(colliding(robot, options.self_collisions)):
         bodies = kinematics.bodies[pair[0].body], kinematics.bodies[pair[1].body]
-        pairs.append(meeting(pair, bodies, state.pressed[i], compliance, law, dt))
+        meeting_pair = meeting(pair, bodies, state.pressed[i], compliance, law, dt)
+        pairs.append(replace(meeting_pair, resolves_landing=METHODS[options.method].controlled))
     return pairs
 
 
