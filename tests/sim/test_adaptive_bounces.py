@@ -124,7 +124,7 @@ def bounces(kind: str) -> Bounces:
 def test_bounces_are_within_thirty_times_the_tolerance(kind: str, dissipation: float | None):
     """Restitution from 0 to 1, by Kelvin and Voigt's law with a jump of force at touch-down and by Hunt and Crossley's.
 
-    Whoever is not within it is counted as missed, and few are.
+    Bodies that are not within it are counted as missed, and few are.
     """
     case = bounces(kind)
     case.dissipation = dissipation
