@@ -20,7 +20,17 @@ from typing import Any
 import gymnasium
 from console import EPISODES, SEED, THREADS, Parser, above_zero, run
 from run_folder import make_folder
-from settings import NETWORK, Settings, SettingsError, config_file, load_env_args, load_settings, make_settings, parsed
+from settings import (
+    NETWORK,
+    Settings,
+    SettingsError,
+    config_file,
+    load_env_args,
+    load_settings,
+    make_settings,
+    parsed,
+    with_named,
+)
 from training_page import TrainingPage
 
 from ce_gym import usable_cores
@@ -200,6 +210,7 @@ def jobs(args: argparse.Namespace, folder: str = "", settings: type = Settings) 
         chosen = load_settings(path, overrides, settings)
     own = {} if record and not args.config else load_env_args(path)  # a policy keeps those that it was trained with
     kwargs = {**record.get("env_kwargs", {}), **own, **env_kwargs_of(args)}
+    chosen = with_named(chosen, dict(args.env_args))
     out = args.out or Path("runs") / (
         "-".join([path.stem, *([args.transmission] if args.transmission else [])]) + folder
     )

@@ -30,7 +30,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from run_folder import make_folder
-from settings import Settings, SettingsError, config_file, load_env_args, load_settings
+from settings import Settings, SettingsError, config_file, load_env_args, load_settings, with_named
 
 import ce_gym  # noqa: F401  (registers the environments in this process)
 from ce_gym.policies import Actor, add_env_arg, keep_map
@@ -169,6 +169,7 @@ def _work(args: argparse.Namespace) -> int:
     kwargs = {"transmission": args.transmission} if args.transmission else {}
     kwargs |= {**load_env_args(path), **dict(args.env_args), "num_threads": args.threads}
     s = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
+    s = with_named(s, dict(args.env_args))
     one = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # says in one line what is wrong, and fills the cache
     ray.init(address=args.address, log_to_driver=False, include_dashboard=False)
     algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **{**kwargs, **s.training})

@@ -27,7 +27,7 @@ from export import to_onnx, write
 from job import Job, acting_environment, env_kwargs_of
 from rsl_rl.runners import OnPolicyRunner
 from run_folder import make_folder
-from settings import Settings, config_file, load_env_args, load_settings
+from settings import Settings, config_file, load_env_args, load_settings, with_named
 
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
 from ce_gym.policies import Actor, add_env_arg, keep_map, load_policy
@@ -126,6 +126,7 @@ def _work(args: argparse.Namespace) -> int:
     kwargs: dict[str, Any] = {"dtype": "float32"} if args.device.startswith("cuda") else {}
     kwargs |= load_env_args(path) | env_kwargs_of(args)
     settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
+    settings = with_named(settings, dict(args.env_args))
     out = args.out or Path("runs") / f"{path.stem}-rsl_rl"
     make_folder(out)
     keep_map(kwargs, out)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -146,6 +146,17 @@ def load_env_args(path: Path) -> dict[str, Any]:
         raise
     except ValueError as error:
         raise SettingsError(f"{path}: {ENV_ARGS}: {error}") from None
+
+
+def with_named(settings: Any, env_args: Mapping[str, Any]) -> Any:
+    """Return settings whose `training` gives way to arguments that a command line names; mappings are merged by key."""
+    training = dict(settings.training)
+    for name, value in env_args.items():
+        if isinstance(value, Mapping) and isinstance(training.get(name), Mapping):
+            training[name] = {**training[name], **value}
+        else:
+            training.pop(name, None)
+    return replace(settings, training=training)
 
 
 def _read(path: Path) -> dict[str, Any]:

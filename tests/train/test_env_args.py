@@ -29,6 +29,15 @@ def arguments_of(*words):
     return job.env_kwargs
 
 
+def test_arguments_of_the_command_line_hold_while_training():
+    """Mappings are merged with those of the settings file, by key; another value takes their place."""
+    words = ["--set", "training={rewards: {near: 2.0, gait: 1.0}, push_period: 2.0, latency: [0, 1]}"]
+    words += ["--env-arg", "rewards={near: 0.5}", "--env-arg", "push_period=0"]
+    (job,) = jobs(parser().parse_args(["--env", ID, *words]))
+    acting = {**job.env_kwargs, **job.settings.training}
+    assert acting == {"rewards": {"near": 0.5, "gait": 1.0}, "push_period": 0, "latency": [0, 1]}
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
