@@ -74,7 +74,7 @@ MJCF = {
     ),
     "mesh of zeros": (mjcf(rest='<asset><mesh name="m" file="/dev/zero"/></asset>'), ["/dev/zero", "not a regular"]),
     "open comments": (HIDDEN + mjcf(), ["root element", "missing"]),
-    "crowd": (mjcf("".join(body(f"b{i}", "<joint/>") for i in range(600))), ["number of bodies", "600", "at most"]),
+    "crowd": (mjcf("".join(body(f"b{i}", "<joint/>") for i in range(600))), ["size", "600 bodies", "at most"]),
     "other comments": (mjcf(f"<!-- a -- b -->{TWO}") + "<", ["malformed XML"]),
 }
 

@@ -178,7 +178,7 @@ def test_parallel_rods_repeat_each_other_within_the_digits_of_a_file(write, tie,
 def test_rods_that_contradict_each_other_leave_no_freedom(write):
     with pytest.warns(LossyImportWarning, match="actuator"):
         robot = load_robot(write(parallel("connect", 1e-3)))
-    with pytest.raises(RobotError, match=r"the loop of .*, rod_1, rod_2, .*no freedom.* agree to 1e-05"):
+    with pytest.raises(RobotError, match=r"the loop of .*, rod_1, rod_2, .*no freedom.* agree to 1e-5"):
         Model(robot)
 
 

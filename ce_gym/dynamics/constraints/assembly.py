@@ -115,7 +115,7 @@ class Assembler:
         q, gap = self._close(start, self.dependent)
         rows = self._independent_rows(q if gap < CLOSED else self._close(start, list(range(self.n)), REDUNDANT)[0])
         if not rows:
-            raise self._error("says nothing that joints and linear constraints do not: expected it left out")
+            raise self._error("is redundant, because joints and linear constraints imply it: expected it left out")
         count = self.n - len(self.A) - len(rows)
         if count == 0:
             raise self._error(
