@@ -273,7 +273,7 @@ YAML_LOOPS = {
     ),
     "no loop": (
         "{name: t, type: loop, joint: ball, first: {body: trunk}, second: {body: thigh}}",
-        ["says nothing that joints", "expected it left out"],
+        ["is redundant", "expected it left out"],
     ),
     "screw joint": ("{name: t, type: loop, joint: screw}", ["constraints[0].joint", "'screw'", "revolute, ball"]),
     "axis of a ball": ("{name: t, type: loop, joint: ball, axis: [0, 0, 1]}", ["constraints[0].axis", "no axis"]),
