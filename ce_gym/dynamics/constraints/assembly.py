@@ -76,6 +76,7 @@ def nonlinear_rows(robot: Robot, cluster: Cluster, q: SX) -> SX:
 
 
 def _rows_by_tie(robot: Robot, cluster: Cluster, q: SX) -> list[tuple[Constraint, SX]]:
+    """Return the constraints of a cluster that are not linear, each with its rows at `q` (n,)."""
     angles = {body: q[i] for i, body in enumerate(cluster.bodies)}
     return [(tie, residual(robot, tie, angles)) for tie in cluster.constraints if not tie.linear]
 
@@ -209,9 +210,8 @@ class Assembler:
     def _jacobians_around(self, q: Array, spread: float, limit: float) -> list[Array]:
         """Return the Jacobian of all rows in configurations near `q` with gaps below `limit`, on the same branch."""
         directions = np.eye(self.n)
-        if (
-            np.abs(self._all(q)[0]).max() >= CLOSED
-        ):  # a rounded loop is only nearly closed, and must not be led to where it closes exactly
+        only_nearly_closed = np.abs(self._all(q)[0]).max() >= CLOSED
+        if only_nearly_closed:  # a rounded loop must not be led to where it closes exactly
             values, directions = np.linalg.svd(self._scaled(self._all(q)[1]))[1:]
             directions = directions[(values > REDUNDANT).sum() :]
         samples = np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, len(directions))) @ directions

@@ -97,10 +97,10 @@ def control_function(
     given |= {name: SX.sym(name, size) for name, size in carried.items()}
     moved, left, trying, refusing, retries, dt, length, error, change, taken_before, missed, tolerance = given.values()
     given |= {f"tried_{OFF}": SX.sym("off", change.numel() + 1)}
-    errors, flown = given[f"tried_{OFF}"][:-1], given[f"tried_{OFF}"][-1]
+    errors, velocity_error = given[f"tried_{OFF}"][:-1], given[f"tried_{OFF}"][-1]
     changed = errors / (trying * trying)
     off = ca.fmin(ca.norm_inf(errors), HORIZON * trying * ca.norm_inf(changed - change))
-    off = ca.fmax(off, flown)
+    off = ca.fmax(off, velocity_error)
 
     live, allowed = trying > 0, ALLOWED * tolerance
     sane = ca.logic_and(tried["diverged"] < 0.5, moved <= LARGEST_MOVE)

@@ -181,5 +181,7 @@ def step_errors(plan: Plan, before: State, ends: Mapping[str, State], layout: La
     v, fine, coarse = (state.v[:moving] for state in (before, one, other))
     difference, change = ca.norm_inf(fine - coarse), ca.norm_inf(fine - v)
     jump = ca.fmax(difference, ca.if_else(ca.logic_and(begins, change > STOPPED * ca.norm_inf(v)), change, 0))
-    flown = ca.if_else(ca.norm_inf(changes) > 0, LANDING * jump, ca.if_else(touching > 0, CONTACT * difference, 0))
-    return ca.vertcat(*turned, (one.q - other.q)[others], flown)
+    velocity_error = ca.if_else(
+        ca.norm_inf(changes) > 0, LANDING * jump, ca.if_else(touching > 0, CONTACT * difference, 0)
+    )
+    return ca.vertcat(*turned, (one.q - other.q)[others], velocity_error)
