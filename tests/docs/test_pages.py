@@ -15,6 +15,7 @@ from pages import ROOT
 import ce_gym
 import ce_gym.model
 import ce_gym.viewer
+from ce_gym.bench.measure.report import read_report
 
 PUBLIC = (ce_gym, ce_gym.model, ce_gym.viewer)
 
@@ -76,3 +77,21 @@ def test_the_reference_imports_what_it_names():
     for module in PUBLIC:
         for name in module.__all__:
             assert getattr(importlib.import_module(module.__name__), name) is not None
+
+
+def test_measured_figures_of_the_readme():
+    reports = {
+        name: read_report(ROOT / "docs" / "results" / f"{name}.json") for name in ("speed", "throughput", "accuracy")
+    }
+    measured = [r.measured.split()[0].rstrip(";") for report in reports.values() for r in report.requirements]
+    text = (ROOT / "README.md").read_text()
+    steps = max(row[3] for row in reports["throughput"].tables[0].rows)
+    compile_s, load_s = (row[2] for row in reports["throughput"].tables[2].rows)
+    sub_step = next(row[2] for row in reports["speed"].tables[0].rows if row[0] == "ce_gym exact float64")
+    ratios = [
+        f"1/{float(r.measured.split()[0]):.0f}" for r in reports["accuracy"].requirements if "equal error" in r.claim
+    ]
+    assert f"{steps / 1e6:.2f} million per second" in text
+    assert f"{sub_step:.2f} us; MuJoCo with these rotors takes {float(measured[1]):.0f} times" in text
+    assert f"{compile_s:.1f} s; {load_s:.2f} s" in text
+    assert ", ".join(ratios) in text
