@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from ce_gym.compile import Buffer
 from ce_gym.dynamics.forces.parameters import parameter_defaults
-from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_laws import output_sizes, state_fields
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.control import control_sizes
 from ce_gym.dynamics.stepping.methods import METHODS
@@ -68,28 +69,20 @@ def physics_rows(
         dt: Length of a sub-step [s].
         tolerance: Of a method with steps of its own [rad or m].
     """
-    joints, contacts, motors = len(model.joint_links), len(options.contacts), len(model.robot.motors)
     start = {"q": model.standing_q, "dependent": model.guess}
-    sizes = state_sizes(model.mechanism, options)
-    explicit = isinstance(METHODS[options.method].end, Rates)
-    for part, why in (
-        ("winding", "torques of motors lag"),
-        ("supply", "motors grow warm or a battery sags"),
-        ("held", "controllers hold"),
-    ):
-        check("method", options.method, not (explicit and part in sizes), f"an implicit one, for {why}")
+    fields = state_fields(model.mechanism, options)
+    if isinstance(METHODS[options.method].end, Rates):
+        for field in fields:
+            check("method", options.method, field.explicit, f"an implicit one, for {field.name}: {field.meaning}")
     check_control_period(options, dt)
     turns = {"q": tuple(i for i, _ in model.robot.layout.turns)}
     rows = [
-        Row(name, size, "physics", start.get(name, 0.0), quaternions=turns.get(name, ()))
-        for name, size in sizes.items()
+        Row(field.name, field.size, "physics", start.get(field.name, 0.0), quaternions=turns.get(field.name, ()))
+        for field in fields
     ]
     rows += [Row("diverged", 1, "physics"), Row("retries", 1, "physics")]
-    lengths = {"torque": joints, "power": joints, "contact_forces": 3 * contacts}
-    lengths |= {"motor_torque": motors, "motor_speed": motors}
-    fed = sizes.get("supply", 0) % 2
-    lengths |= {"winding_temperature": (sizes.get("supply", 0) - fed) // 2, "battery_voltage": fed}
-    rows += [Row(name, size, "physics") for name in outputs if (size := lengths.get(name, 1))]
+    sizes = output_sizes(model.mechanism, options)
+    rows += [Row(name, size, "physics") for name in outputs if (size := sizes.get(name, 1))]
     if options.parameters:
         defaults = parameter_defaults(model.robot, options.material, options.parameters)
         values = np.concatenate(list(defaults.values()))

@@ -18,6 +18,7 @@ from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.normal import NORMAL_LAWS
 from ce_gym.dynamics.forces.parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.forces.scene import Control, StepOptions, target_names
+from ce_gym.dynamics.laws.scene_laws import state_fields
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.parameter_effects import check_effects
 from ce_gym.dynamics.stepping.methods import METHODS
@@ -168,6 +169,8 @@ class Simulator:
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
         self._section = CriticalSection(f"Simulator of {num_envs} {model.robot.name}")
+        fields = state_fields(model.mechanism, self.options)
+        self._memory = [field for field in fields if field.name not in ("q", "v", "dependent")]
         ground = terrain if self.options.ground == "field" else None
         rows = [*physics_rows(model, self.options, asked, dt, self.tolerance), FAILURES]
         self._batch = Batch(rows, num_envs, dtype, self._device, ground)
@@ -206,13 +209,14 @@ class Simulator:
             if not (np.abs(value) <= np.finfo(self.dtype).max).all():
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
         rows["q"] = self._batch.unit("q", rows["q"])
-        begun = ("anchor", "pressed", "carried", "winding", "supply", "held", "diverged", "step_error", "step_change")
-        rows |= {name: np.zeros(self._arrays[name].shape[1]) for name in begun if name in self._arrays}
+        resting = self._resting_load(rows["q"]) if self.contact_names else None
+        for field in self._memory:
+            rows[field.name] = resting if field.reset == "resting_load" else np.zeros(field.size)
+        for name in ("diverged", "step_error", "step_change"):
+            if name in self._arrays:
+                rows[name] = np.zeros(self._arrays[name].shape[1])
         if "step_length" in self._arrays:
             rows["step_length"] = np.atleast_1d(self._batch.schema["step_length"].reset)
-        if self.contact_names:
-            resting = self._resting_load(rows["q"])
-            rows |= {name: resting for name in ("load", "whole_load") if name in self._arrays}
         if "dependent" in self._arrays:
             rows["dependent"] = self.model.dependent_guess(rows["q"])
         with self._section:  # all that can be refused has been

@@ -11,6 +11,7 @@ import casadi as ca
 from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step, While
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_laws import iterations_needed
 from ce_gym.dynamics.stepping.choice import chooses
 from ce_gym.dynamics.stepping.control import beginning_function as beginning_of_interval
 from ce_gym.dynamics.stepping.control import control_function, control_sizes
@@ -24,7 +25,6 @@ from ce_gym.dynamics.stepping.ground_lookup import (
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import beginning_function, judging_function, mending_function
 from ce_gym.dynamics.stepping.plan import LOAD, MOVED, OFF, Plan, Rates, Stage
-from ce_gym.dynamics.stepping.step import iterations_needed
 from ce_gym.dynamics.stepping.trace import NEAR, combination_function, iteration_function, step_function
 from ce_gym.model.mechanism import Mechanism
 

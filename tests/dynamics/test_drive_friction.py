@@ -101,7 +101,7 @@ class Stepper:
         self.reset(0.0, 0.0)
 
     def reset(self, q: float, v: float) -> None:
-        carried = {"carried": ca.DM.zeros(3)} if "carried" in self.function.name_in() else {}
+        carried = {"motor_load": ca.DM.zeros(3)} if "motor_load" in self.function.name_in() else {}
         self.state = {"q": ca.DM(q), "v": ca.DM(v), **carried}
 
     def step(self, torque: float, dt: float) -> None:
@@ -245,12 +245,12 @@ def test_all_levels_and_a_stretching_transmission_carry_the_same_load():
     for level in (*LEVELS, "elastic"):
         model = Model(robot, level)
         function = step_function(model.mechanism, StepOptions(control="torque", motors="limited"))
-        state = {"q": ca.DM.zeros(model.nq), "v": ca.DM.zeros(model.nv), "carried": ca.DM.zeros(3)}
+        state = {"q": ca.DM.zeros(model.nq), "v": ca.DM.zeros(model.nv), "motor_load": ca.DM.zeros(3)}
         for _ in range(400):
             after = function(**state, diverged=0, target=2.0, dt=0.005)
             state = {name: after[f"{name}_next"] for name in state}
         expected = [2.0 / RATIO, -MASS * GRAVITY / RATIO]
-        np.testing.assert_allclose(state["carried"].full().ravel()[:2], expected, rtol=1e-6, err_msg=level)
+        np.testing.assert_allclose(state["motor_load"].full().ravel()[:2], expected, rtol=1e-6, err_msg=level)
 
 
 def test_a_factor_on_it_is_a_parameter():
@@ -260,11 +260,11 @@ def test_a_factor_on_it_is_a_parameter():
     twice = replace(motor, drive_friction=replace(motor.drive_friction, factor=2.0))
     names = StepOptions(control="torque", motors="limited", parameters=("drive_friction",))
     given = {"q": 0.4, "v": 1.5, "diverged": 0, "target": 1.0, "dt": 1e-3}
-    loaded = given | {"carried": [0.05, -0.03, 1.0]}
+    loaded = given | {"motor_load": [0.05, -0.03, 1.0]}
     function = step_function(Model(pendulum(motor, 0.02)).mechanism, names)
     for factor, other in ((0.0, replace(motor, drive_friction=None)), (2.0, twice)):
         stepper = Stepper(pendulum(other, 0.02)).function
-        expected = stepper(**(loaded if "carried" in stepper.name_in() else given))["v_next"]
+        expected = stepper(**(loaded if "motor_load" in stepper.name_in() else given))["v_next"]
         found = function(**loaded, parameters=factor)["v_next"]
         assert float(found) == pytest.approx(float(expected), rel=1e-12)
     assert float(function(**loaded, parameters=1.0)["v_next"]) != pytest.approx(float(found), rel=1e-6)
@@ -279,7 +279,7 @@ def test_gradients_at_rest_are_finite(exponent: float):
     after = ca.vertcat(*function.call(inputs))
     weights = ca.SX.sym("weights", after.numel())
     back = ca.Function("back", [*inputs, weights], [ca.jtimes(after, ca.vertcat(*inputs[:-1]), weights, True)])
-    given = {"q": 0.4, "v": 0.0, "diverged": 0, "carried": [0.05, -0.03, 1.0], "target": 3.0, "dt": 1e-3}
+    given = {"q": 0.4, "v": 0.0, "diverged": 0, "motor_load": [0.05, -0.03, 1.0], "target": 3.0, "dt": 1e-3}
     for row in np.eye(weights.numel()):
         assert np.isfinite(back(*[given[name] for name in function.name_in()], row).full()).all()
 
@@ -307,7 +307,7 @@ def test_it_takes_energy_however_long_the_step(dt: float):
     model = Model(robot)
     function = step_function(model.mechanism, StepOptions(control="torque", motors="limited"), ("energy",))
     q, v = model.standing_q, np.array([3.0, -2.0, 4.0, -6.0, 5.0])
-    state = {"q": q, "v": v, "carried": ca.DM.zeros(11)}
+    state = {"q": q, "v": v, "motor_load": ca.DM.zeros(11)}
     energies = []
     for _ in range(round(1.0 / dt)):
         after = function(**state, diverged=0, target=ca.DM.zeros(5), dt=dt)

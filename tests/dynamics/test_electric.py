@@ -14,7 +14,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_laws import state_sizes
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import Battery, Heat, LinearConstraint, Motor, Robot
 from ce_gym.model.drives import DriveFriction
@@ -64,8 +65,8 @@ def test_a_stuck_motor_warms_along_the_closed_form():
     errors = []
     for dt in (0.1, 0.05, 0.025):
         found = run(table(10.0, heat=HEAT), [torque * RATIO], dt, round(end / dt), ("winding_temperature",))
-        errors.append(np.abs(found["supply"][-1] - expected).max())
-        assert found["winding_temperature"][-1, 0] == pytest.approx(HEAT.ambient + found["supply"][-1, 0], rel=1e-12)
+        errors.append(np.abs(found["motor_warmth"][-1] - expected).max())
+        assert found["winding_temperature"][-1, 0] == pytest.approx(HEAT.ambient + found["motor_warmth"][-1, 0], rel=1e-12)
     assert errors[0] < 0.01 * expected[0]
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 2.0, atol=0.1)
 
@@ -74,7 +75,7 @@ def test_heat_balances_in_every_step():
     """What is lost is in winding and housing or has gone to the air, to rounding."""
     dt, torque = 0.01, 0.3
     found = run(table(heat=HEAT), [torque * RATIO], dt, 400, ("motor_torque",))
-    (w, h), tau = found["supply"].T, found["motor_torque"][:, 0]
+    (w, h), tau = found["motor_warmth"].T, found["motor_torque"][:, 0]
     assert tau.min() < 0.9 * tau.max()  # the motor comes to its torque-speed line
     lost = (tau / K) ** 2 * (1 + COPPER * (HEAT.ambient - 20.0 + w))
     stored = HEAT.winding_capacity * w + HEAT.housing_capacity * h
@@ -92,20 +93,20 @@ def test_a_hot_motor_holds_back_and_comes_to_the_temperature_at_which_it_does():
     w = brentq(excess, 1.0, HEAT.hot - HEAT.ambient)
     assert HEAT.warm < HEAT.ambient + w < HEAT.hot
     found = run(table(10.0, heat=HEAT, stall=3.0), [5 * RATIO], 0.05, 12_000, ("motor_torque",))
-    assert found["supply"][-1, 0] == pytest.approx(w, rel=1e-6)
+    assert found["motor_warmth"][-1, 0] == pytest.approx(w, rel=1e-6)
     share = (HEAT.hot - HEAT.ambient - w) / (HEAT.hot - HEAT.warm)
     assert found["motor_torque"][0, 0] == pytest.approx(1.0)
     assert found["motor_torque"][-1, 0] == pytest.approx(share, rel=1e-6)
-    beyond = run(table(10.0, heat=HEAT), [5 * RATIO], 0.01, 1, ("motor_torque",), supply=[HEAT.hot, 0])
+    beyond = run(table(10.0, heat=HEAT), [5 * RATIO], 0.01, 1, ("motor_torque",), motor_warmth=[HEAT.hot, 0])
     assert beyond["motor_torque"][0, 0] == 0
 
 
 def test_a_warm_winding_has_more_resistance_on_its_line():
     """The voltage drives less current through it at standstill; the no-load speed stays."""
     warm = 1 + COPPER * (HEAT.ambient - 20.0 + 50.0)
-    still = run(table(10.0, heat=HEAT), [5 * RATIO], 1e-6, 1, ("motor_torque",), supply=[50, 0])
+    still = run(table(10.0, heat=HEAT), [5 * RATIO], 1e-6, 1, ("motor_torque",), motor_warmth=[50, 0])
     assert still["motor_torque"][0, 0] == pytest.approx(1 / warm, rel=1e-6)
-    free = run(table(heat=HEAT), [5 * RATIO], 0.01, 2000, ("motor_speed",), supply=[50, 0])
+    free = run(table(heat=HEAT), [5 * RATIO], 0.01, 2000, ("motor_speed",), motor_warmth=[50, 0])
     assert free["motor_speed"][-1, 0] == pytest.approx(100.0, rel=1e-6)
 
 

@@ -38,7 +38,7 @@ def lifted(method: str, dt: float) -> float:
     robot = pendulum(Motor("rotor", friction=0.005, damping=1e-4, drive_friction=DRIVE), 0.02)
     function = step_function(Model(robot).mechanism, StepOptions(control="torque", motors="limited", method=method))
     load = -MASS * GRAVITY * LENGTH * np.sin(0.3) / RATIO
-    state = {"q": ca.DM(0.3), "v": ca.DM(2.0), "carried": ca.DM([4.0 / RATIO, load, 1.0])}
+    state = {"q": ca.DM(0.3), "v": ca.DM(2.0), "motor_load": ca.DM([4.0 / RATIO, load, 1.0])}
     for _ in range(round(0.2 / dt)):
         after = function(**state, diverged=0, target=4.0, dt=dt)
         state = {name: after[f"{name}_next"] for name in state}

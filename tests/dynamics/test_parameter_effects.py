@@ -13,7 +13,8 @@ from tripod import TRIPOD
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.parameters import PARAMETERS, parameter_defaults
-from ce_gym.dynamics.forces.scene import StepOptions, state_sizes, target_names
+from ce_gym.dynamics.forces.scene import StepOptions, target_names
+from ce_gym.dynamics.laws.scene_laws import state_sizes
 from ce_gym.dynamics.parameter_effects import check_effects
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Battery, Elasticity, Heat, Robot, load_robot
@@ -77,8 +78,8 @@ def changing(model: Model, options: StepOptions) -> set[str]:
         q[2] -= 0.004
         state = {name: np.abs(rng.normal(0, 0.3, size)) for name, size in sizes.items()}
         state |= {"q": q, "v": rng.normal(0, 0.5, model.nv), "load": rng.uniform(5, 40, sizes.get("load", 0))}
-        if "supply" in sizes:
-            state["supply"] = np.r_[rng.uniform(20, 60, sizes["supply"] - 1), 0.5]
+        if "motor_warmth" in sizes:
+            state["motor_warmth"] = rng.uniform(20, 60, sizes["motor_warmth"])
         if "dependent" in sizes:
             state["dependent"] = model.dependent_guess(q)
         state = {name: state[name] for name in sizes}

@@ -12,7 +12,8 @@ from scipy.linalg import expm
 
 import ce_gym
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_laws import state_sizes
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import Motor, Robot
 from ce_gym.model.description import Gains

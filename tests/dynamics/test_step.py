@@ -12,7 +12,8 @@ from tripod import TRIPOD
 
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.forces.scene import StepOptions, state_sizes
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_laws import state_sizes
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.model.mechanism import LEVELS

@@ -32,7 +32,7 @@ def run(robot: Robot, target: list[float], dt: float, steps: int, control: str) 
     model = Model(robot)
     options = StepOptions(control=control, motors="limited")  # type: ignore[arg-type]
     function = step_function(model.mechanism, options, ("motor_torque",))
-    state = {"q": ca.DM.zeros(model.nq), "v": ca.DM.zeros(model.nv), "winding": ca.DM.zeros(len(robot.motors))}
+    state = {"q": ca.DM.zeros(model.nq), "v": ca.DM.zeros(model.nv), "lagging_torque": ca.DM.zeros(len(robot.motors))}
     found: dict[str, list[np.ndarray]] = {"q": [], "motor_torque": []}
     for _ in range(steps):
         after = function(**state, diverged=0, target=target, dt=dt)

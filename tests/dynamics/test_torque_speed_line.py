@@ -48,7 +48,7 @@ def test_a_battery_goes_by_the_line_that_a_motor_is_on(side):
         voltage = BATTERY.voltage - sag
         share = voltage / BATTERY.nominal
         start = side * FREE * (share - rng.choice([0.001, 0.01, 0.1, 0.3]) * rng.uniform(0.5, 1.0))
-        state = {"q": 0, "v": start / RATIO, "supply": sag}
+        state = {"q": 0, "v": start / RATIO, "battery_sag": sag}
         after = function(**state, diverged=0, target=side * 3.0 * TORQUE * RATIO, dt=DT)
         tau, speed = float(after["motor_torque"]), float(after["motor_speed"])
         assert tau == pytest.approx(torque(voltage, speed, side), abs=1e-12)
@@ -57,7 +57,7 @@ def test_a_battery_goes_by_the_line_that_a_motor_is_on(side):
         assert rise == pytest.approx(side * STALL / BATTERY.nominal, rel=1e-8)
         power, answer = tau * speed + (tau / K) ** 2, (speed + 2 * tau / K**2) * rise
         expected = newton(sag, power, answer)
-        assert float(ca.DM(after["supply_next"])) == pytest.approx(expected, rel=1e-6)
+        assert float(ca.DM(after["battery_sag_next"])) == pytest.approx(expected, rel=1e-6)
         opposite += tau * side < -1e-3
         wrong = max(wrong, abs(newton(sag, power, -answer) - expected))
     assert opposite > 10

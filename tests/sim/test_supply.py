@@ -40,14 +40,15 @@ def test_kernels_do_what_the_traced_step_does(dtype, close):
     target = sim.model.standing_q[: len(sim.model.joint_links)] + 0.4
     options = StepOptions(motors="limited")
     function = step_function(sim.model.mechanism, options)
-    state = {"q": ca.DM(sim.q[0].astype(float)), "v": ca.DM(sim.v[0].astype(float)), "supply": ca.DM.zeros(11)}
+    state = {"q": ca.DM(sim.q[0].astype(float)), "v": ca.DM(sim.v[0].astype(float))}
+    state |= {"motor_warmth": ca.DM.zeros(10), "battery_sag": ca.DM.zeros(1)}
     for _ in range(50):
         sim.step(target)
         after = function(**state, diverged=0, target=target, dt=0.002)
         state = {name: after[f"{name}_next"] for name in state}
-    supply = state["supply"].full().ravel()
-    np.testing.assert_allclose(sim.winding_temperature[0], 25.0 + supply[:5], rtol=close)
-    np.testing.assert_allclose(sim.battery_voltage[0], 24.0 - supply[-1], rtol=close)
+    warmth, sag = state["motor_warmth"].full().ravel(), float(state["battery_sag"])
+    np.testing.assert_allclose(sim.winding_temperature[0], 25.0 + warmth[:5], rtol=close)
+    np.testing.assert_allclose(sim.battery_voltage[0], 24.0 - sag, rtol=close)
     assert sim.winding_temperature.max() > 25.5
     assert sim.battery_voltage.max() < 23.9
     assert (sim.q == sim.q[0]).all()

@@ -18,27 +18,30 @@ it takes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.electric.supply import Work
+from ce_gym.dynamics.electric.supply import Supply, Work
 from ce_gym.dynamics.forces.actuation import Actuated, actuated_clusters, effort_matrix
-from ce_gym.dynamics.forces.law import Motion
-from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors, supply_of
+from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors
 from ce_gym.dynamics.forces.saturation import SaturatedForce
-from ce_gym.dynamics.forces.scene import Scene, State
+from ce_gym.dynamics.forces.scene import Scene
+from ce_gym.dynamics.laws.law import Motion
 from ce_gym.dynamics.recursion.kinematics import Kinematics
+from ce_gym.model.mechanism import Mechanism
 
 
-def carried_now(state: State, iterate: SX) -> SX:
-    """Return what friction goes by in an iteration, given what it went by in that before; as `State.carried` is."""
-    return ca.if_else(iterate[-1] > 0, iterate, state.carried) if iterate.numel() else state.carried
+def carried_now(before: SX, iterate: SX) -> SX:
+    """Return the field `motor_load` for an iteration, given the field at the start and that of the iteration before."""
+    return ca.if_else(iterate[-1] > 0, iterate, before) if iterate.numel() else before
 
 
 def carried_after(
     scene: Scene, kinematics: Kinematics, motors: SaturatedForce, inertia: dict[int, SX], motion: Motion
 ) -> SX:
-    """Return what is carried over a step whose acceleration is known, as `State.carried` is.
+    """Return the field `motor_load` after a step whose acceleration is known.
 
     Args:
         scene: The robot and what surrounds it.
@@ -60,36 +63,45 @@ def carried_after(
 
 
 def windings_after(scene: Scene, motors: SaturatedForce, motion: Motion) -> SX:
-    """Return torques of motors at the end of a step whose acceleration is known, as `State.winding` is."""
+    """Return the field `lagging_torque` after a step whose acceleration is known."""
     lagging = [motors.windings[i] for i in lagging_motors(scene.mechanism.robot, scene.options.motors)]
     return ca.vertcat(SX(0, 1), *[winding.tau - winding.slope @ motion.ydd for winding in lagging])
 
 
-def supply_after(
-    scene: Scene, kinematics: Kinematics, motors: SaturatedForce, motion: Motion, before: SX, yd: SX, dt: float
-) -> SX:
-    """Return temperatures and voltage after a step whose acceleration is known, as `State.supply` is.
+def motor_work(
+    clusters: Sequence[Actuated], motors: SaturatedForce, supply: Supply, strength: SX, yd: SX, motion: Motion
+) -> dict[int, Work]:
+    """Return the work of each motor over a step, by its place.
 
     Args:
-        scene: The robot and what surrounds it.
-        kinematics: At the start of the step.
+        clusters: With motors.
         motors: What the motors deliver.
+        supply: Temperatures and voltage at the start of the step.
+        strength: Factor on the torques of all motors [-].
+        yd: Velocities of the independent joints at the end of the step, shape (nj,).
         motion: The acceleration.
-        before: As `State.supply` was.
-        yd: Velocities of the independent joints at the start, shape (n,).
-        dt: Length of the step [s].
     """
-    robot, model = scene.mechanism.robot, scene.options.motors
-    supply = supply_of(robot, model, before)
-    clusters = actuated_clusters(scene.mechanism, kinematics) if before.numel() else ()
     work = {}
     for cluster in clusters:
-        speed = cluster.W @ (yd + dt * motion.ydd)[cluster.rows]
+        speed = cluster.W @ yd[cluster.rows]
         for i, (place, motor) in enumerate(zip(cluster.places, cluster.motors, strict=True)):
             torque = motors.windings[place].tau - motors.windings[place].slope @ motion.ydd
-            full = scene.figures.strength * supply.line(place, motor)
+            full = strength * supply.line(place, motor)
             work[place] = Work(torque, speed[i], motors.on_line.get(place, SX(0)) * full)
-    return ca.vertcat(SX(0, 1), *supply.after(robot.motors, work, dt))
+    return work
+
+
+def winding_torques(
+    mechanism: Mechanism, kinematics: Kinematics, motors: SaturatedForce, torque: SX, motion: Motion
+) -> SX:
+    """Return the torque of each motor [N m], shape (n_motors,); of ideal ones that which gives `torque` at joints."""
+    found = SX(len(mechanism.robot.motors), 1)
+    for cluster in actuated_clusters(mechanism, kinematics):
+        shares = effort_matrix(cluster.W[:, : len(cluster.joints)]) @ torque[cluster.joints]
+        for i, place in enumerate(cluster.places):
+            winding = motors.windings.get(place)
+            found[place] = shares[i] if winding is None else winding.tau - winding.slope @ motion.ydd
+    return found
 
 
 def _external(cluster: Actuated, motors: SaturatedForce, inertia: SX, motion: Motion) -> SX:

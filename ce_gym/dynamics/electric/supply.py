@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import casadi as ca
+
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.electric.battery import sagged
 from ce_gym.dynamics.electric.heat import allowed, copper_loss, resistance, warmed
@@ -72,14 +74,15 @@ class Supply:
             return motor.line
         return motor.line / resistance(motor.heat, self.windings[place])
 
-    def after(self, motors: tuple[Motor, ...], work: Mapping[int, Work], dt: SX | float) -> list[SX]:
-        """Return temperatures and sag after a step of the mechanics, as `State.supply` has them."""
+    def after(self, motors: tuple[Motor, ...], work: Mapping[int, Work], dt: SX | float) -> tuple[SX, SX]:
+        """Return temperatures of windings, then housings, above the air [K], and the sag [V], after a step."""
         warmth = [
             warmed(motors[i], motors[i].heat, self.windings[i], self.housings[i], work[i].torque, dt)  # type: ignore[arg-type]
             for i in self.windings
         ]
-        column = [winding for winding, _ in warmth] + [housing for _, housing in warmth]
-        return column if self.battery is None else [*column, self._sag_after(self.battery, motors, work)]
+        rises = [winding for winding, _ in warmth] + [housing for _, housing in warmth]
+        sag = SX(0, 1) if self.battery is None else self._sag_after(self.battery, motors, work)
+        return ca.vertcat(SX(0, 1), *rises), sag
 
     def _sag_after(self, battery: Battery, motors: tuple[Motor, ...], work: Mapping[int, Work]) -> SX:
         power, answer = SX(0), SX(0)

@@ -25,7 +25,6 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.electric.cogging import cogging
 from ce_gym.dynamics.electric.supply import Supply
 from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction, rubs
-from ce_gym.dynamics.forces.law import JointForce, is_moment
 from ce_gym.dynamics.forces.motors import (
     MOTORS,
     MotorModel,
@@ -37,8 +36,10 @@ from ce_gym.dynamics.forces.motors import (
 )
 from ce_gym.dynamics.forces.parameters import rubbing_as_declared
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation, Stick
-from ce_gym.dynamics.forces.scene import Scene, State, StepOptions
+from ce_gym.dynamics.forces.scene import Scene, StepOptions
+from ce_gym.dynamics.laws.law import JointForce, is_moment
 from ce_gym.dynamics.recursion.kinematics import Kinematics
+from ce_gym.dynamics.state import State
 from ce_gym.model.drives import Motor
 from ce_gym.model.mechanism import Mechanism
 
@@ -102,7 +103,7 @@ class Before:
         carried: What friction under load goes by.
         windings: Torques at its end [N m], of those that lag.
         supply: Temperatures and voltage at its end.
-        held: What a sampled controller holds, as `State.held` is.
+        held: What a sampled controller holds, as the field `held_torque` is.
     """
 
     carried: Carried
@@ -112,12 +113,12 @@ class Before:
 
     @staticmethod
     def of(mechanism: Mechanism, options: StepOptions, carried: SX, state: State) -> Before:
-        """Return it, given the state before and a column as `State.carried` is."""
+        """Return it, given the state before and a column as the field `motor_load` is."""
         robot, model = mechanism.robot, options.motors
         loaded, lagging = loaded_motors(robot, model), lagging_motors(robot, model)
         torques = {place: (carried[i], carried[len(loaded) + i], carried[-1]) for i, place in enumerate(loaded)}
-        windings = {place: state.winding[i] for i, place in enumerate(lagging)}
-        return Before(torques, windings, supply_of(robot, model, state.supply), state.held)
+        windings = {place: state["lagging_torque"][i] for i, place in enumerate(lagging)}
+        return Before(torques, windings, supply_of(robot, model, state), state["held_torque"])
 
 
 def motor_forces(

@@ -12,6 +12,7 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.electric.supply import Supply
+from ce_gym.dynamics.state import State
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import DriveFriction, Motor
 
@@ -129,22 +130,18 @@ def _endless(figure: float | SX) -> bool:
     return not isinstance(figure, SX) and math.isinf(figure)
 
 
-def supply_size(robot: Robot, model: str) -> int:
-    """Return how many temperatures and voltages there are, by the name of the model of the motors."""
-    return 2 * len(_heated(robot, model)) + (robot.battery is not None and MOTORS[model].at_motors)
-
-
-def supply_of(robot: Robot, model: str, column: SX) -> Supply:
-    """Return temperatures and voltage, given a column as `State.supply` is and the name of the model of the motors."""
-    heated = _heated(robot, model)
-    windings = {place: column[i] for i, place in enumerate(heated)}
-    housings = {place: column[len(heated) + i] for i, place in enumerate(heated)}
-    battery = robot.battery if MOTORS[model].at_motors else None
-    return Supply(windings, housings, battery, SX(0) if battery is None else column[-1])
-
-
-def _heated(robot: Robot, model: str) -> list[int]:
+def warm_motors(robot: Robot, model: str) -> list[int]:
+    """Return the places of the motors that grow warm, by the name of the model of the motors."""
     return [i for i, motor in enumerate(robot.motors) if motor.heat is not None and MOTORS[model].at_motors]
+
+
+def supply_of(robot: Robot, model: str, state: State) -> Supply:
+    """Return temperatures and voltage in a state, given the name of the model of the motors."""
+    warm, warmth = warm_motors(robot, model), state["motor_warmth"]
+    windings = {place: warmth[i] for i, place in enumerate(warm)}
+    housings = {place: warmth[len(warm) + i] for i, place in enumerate(warm)}
+    battery = robot.battery if MOTORS[model].at_motors else None
+    return Supply(windings, housings, battery, SX(0) if battery is None else state["battery_sag"])
 
 
 def loaded_motors(robot: Robot, model: str) -> list[int]:

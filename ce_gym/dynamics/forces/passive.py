@@ -11,7 +11,7 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX, mirrored
-from ce_gym.dynamics.forces.law import JointForce
+from ce_gym.dynamics.laws.law import JointForce
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.dynamics.standing import standing_pose
 from ce_gym.model.description import Body, Joint
@@ -102,6 +102,15 @@ def yielding_forces(mechanism: Mechanism, kinematics: Kinematics, dt: float) -> 
             tau, slope = tau + push, slope + more
         found.append(JointForce(tau * way.T, slope * (way.T @ way)))
     return found
+
+
+def stop_energy(mechanism: Mechanism, name: str, angle: SX) -> SX:
+    """Return the energy of the stops of a joint with one coordinate, at an angle [rad] or a displacement [m], in J."""
+    (low, high), beyond = mechanism.robot.body(name).joint.position, SX(0)
+    for bound, side in ((low, 1.0), (high, -1.0)):
+        if math.isfinite(bound):
+            beyond += ca.fmax(side * (bound - angle), 0)
+    return stop_springs(mechanism)[name][0] * beyond**2 / 2
 
 
 @lru_cache(maxsize=4)

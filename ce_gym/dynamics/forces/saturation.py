@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.law import JointForce, Motion
+from ce_gym.dynamics.laws.law import JointForce, Motion
 
 ITERATIONS = 4
 """How many iterations of a step saturation may ask for after the first."""
@@ -106,7 +106,7 @@ class SaturatedForce(JointForce):
         frictions: What dry friction there is.
         windings: Torques of motors, by their places, before what they lose.
         on_line: On which torque-speed line each is, likewise: 1 forwards, -1 backwards, 0 where it is on none.
-        sampled: What a sampled controller holds after the step, as `State.held` is.
+        sampled: What a sampled controller holds after the step, as the field `held_torque` is.
         count: Above 0, which says that there is an iterate.
     """
 

@@ -1,28 +1,23 @@
-"""What a scene consists of, and the state of one robot in it."""
+"""What a scene consists of."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.constraints.closure import reference_guess
-from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors, supply_size
 from ce_gym.dynamics.forces.normal import HuntCrossley, normal_law
 from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
 from ce_gym.dynamics.hulls import Hull, poles_of
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant
-from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import ContactMaterial, ContactSphere
 from ce_gym.model.mechanism import Mechanism
 
 Control = Literal["position", "torque", "motor_position", "motor_torque"]
 Ground = Literal["flat", "field"]
-TWO_LOADS = ("extrapolated", "adaptive")
-"""Methods that remember what contacts carried in whole steps apart from what they did in halves, see `methods.py`."""
 
 
 @dataclass(frozen=True)
@@ -114,45 +109,6 @@ def make_scene(mechanism: Mechanism, options: StepOptions, parameters: SX, groun
     return Scene(named, options, figures(mechanism.robot, options.material, options.parameters, parameters), ground)
 
 
-@dataclass
-class State:
-    """What one robot carries from step to step.
-
-    Attributes:
-        q: Positions, shape (nq,).
-        v: Velocities, shape (nv,).
-        load: Normal force of each of the options' `touches` over the last step [N], shape (n_touches,).
-        whole_load: The same of the step in a whole, of `TWO_LOADS`, shape (n_touches,); empty for others.
-        anchor: Horizontal deflections of the contacts' bristles, world axes [m], shape (2 n_touches,); empty without.
-        dependent: Where the dependent coordinates that no formula gives will be, roughly, shape (n_guess,).
-        pressed: Force between each pair of capsules over the last step [N], shape (n_pairs,).
-        carried: Over the last step, of parts or stages the last, the torque of each motor whose friction depends
-            on it, then what all else did to each of their rotors [N m], and 1; zeros where there was no step before,
-            shape (2 n_loaded + 1,).
-        winding: Torque at the end of the last step of each motor whose torque lags [N m], shape (n_lagging,).
-        supply: How much the winding of each motor that grows warm is warmer than the air, then each of their housings
-            [K], and how far the battery's voltage is below that without load [V], if there is one.
-        held: What a sampled controller asks for until it looks again [N m or N], one for each target, and how long that
-            still is [s].
-    """
-
-    q: SX
-    v: SX
-    load: SX
-    whole_load: SX
-    anchor: SX
-    dependent: SX
-    pressed: SX
-    carried: SX
-    winding: SX
-    supply: SX
-    held: SX
-
-    def items(self) -> list[tuple[str, SX]]:
-        """Return the parts that are there, by name."""
-        return [(f.name, getattr(self, f.name)) for f in fields(self) if getattr(self, f.name).numel()]
-
-
 def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:
     """Return what each entry of a step's target is for, by the name of the body that it moves.
 
@@ -167,27 +123,6 @@ def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:
         name for cluster in mechanism.tree.clusters if set(rotors) & set(cluster.bodies) for name in cluster.bodies
     }
     return rotors + tuple(name for name in robot.commanded if name not in driven)
-
-
-def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
-    """Return the sizes of the parts of a state that are there."""
-    layout, n = mechanism.robot.layout, len(options.touches)
-    sizes = {"q": layout.nq, "v": layout.nv, "load": n}
-    sizes["whole_load"] = n if options.method in TWO_LOADS else 0
-    sizes |= {"anchor": 2 * n if options.material.bristle > 0 else 0, "dependent": len(reference_guess(mechanism))}
-    sizes["pressed"] = len(colliding(mechanism.robot, options.self_collisions))
-    loaded = loaded_motors(mechanism.robot, options.motors)
-    sizes["carried"] = 2 * len(loaded) + 1 if loaded else 0
-    sizes["winding"] = len(lagging_motors(mechanism.robot, options.motors))
-    sizes["supply"] = supply_size(mechanism.robot, options.motors)
-    sizes["held"] = len(target_names(mechanism, options.control)) + 1 if options.sampled else 0
-    return {name: size for name, size in sizes.items() if size}
-
-
-def symbolic_state(mechanism: Mechanism, options: StepOptions) -> State:
-    """Return a state of fresh symbols."""
-    sizes = state_sizes(mechanism, options)
-    return State(**{f.name: SX.sym(f.name, sizes.get(f.name, 0)) for f in fields(State)})
 
 
 def contact_spheres(mechanism: Mechanism, options: StepOptions) -> list[ContactSphere]:

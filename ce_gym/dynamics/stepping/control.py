@@ -22,7 +22,8 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
-from ce_gym.dynamics.forces.scene import StepOptions, symbolic_state
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_laws import symbolic_state
 from ce_gym.dynamics.stepping.parts import LARGEST_MOVE, reported
 from ce_gym.dynamics.stepping.plan import MOVED, OFF
 from ce_gym.model.coordinates import Layout

@@ -20,10 +20,12 @@ from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_to_rotation, s
 from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.forces.contact import LinearContact
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.contacts import with_contacts
+from ce_gym.dynamics.laws.scene_laws import iterate_size
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms, inward_inertia_pass
 from ce_gym.dynamics.recursion.ce_rnea import force_on_coordinates, inward_force_pass, net_forces, outward_acceleration
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, turning_momentum
-from ce_gym.dynamics.stepping.step import acting_forces, iterate_size, on_bodies, stacked, stepped
+from ce_gym.dynamics.stepping.step import finish_step, linearise, no_loads, stacked
 from ce_gym.dynamics.stepping.trace import Given
 from ce_gym.model.mechanism import Mechanism
 
@@ -58,17 +60,17 @@ class Equation:
         self.mechanism, self.layout = given.scene.mechanism, mechanism.robot.layout
         self.iterate = SX.sym("iterate", iterate_size(mechanism, options))
         self.vdot = SX.sym("vdot", given.state.v.numel())
-        self.acting = acting_forces(given.scene, given.state, given.target, given.dt, self.iterate)
-        self.a, self.qdd = outward_acceleration(self.mechanism, self.acting.kinematics, self.vdot)
-        self.solved = self.acting.solved(self.vdot, self.a)
-        self.local = [self.local_force(contact) for contact in self.acting.contacts]
+        self.system = linearise(given.scene, given.state, given.target, given.dt, self.iterate)
+        self.a, self.qdd = outward_acceleration(self.mechanism, self.system.start.kinematics, self.vdot)
+        self.solved = self.system.solved(self.vdot, self.a)
+        self.local = [self.local_force(contact) for contact in self.system.contacts]
         self.forces = SX.sym("forces", 3, len(self.local))
         self.slopes = [SX.sym("slopes", slope.sparsity()) for _, _, slope in self.local]
-        rows, clusters = self.acting.kinematics.rows, self.mechanism.tree.clusters
+        rows, clusters = self.system.start.kinematics.rows, self.mechanism.tree.clusters
         self.order = [row for k in self.mechanism.tree.base_to_tip() for row in rows[k]]
         self.turned = {k: rows[k] for k in range(len(clusters)) if clusters[k].output_body is not None}
         self.inertia = {k: SX.sym("inertia", len(rows), len(rows)) for k, rows in self.turned.items()}
-        gains = stacked([contact.iterate.gain for contact in self.acting.contacts])
+        gains = stacked([contact.iterate.gain for contact in self.system.contacts])
         every = {**dict(given.state.items()), "target": given.target, "gains": gains}
         self.wrt = {name: value for name, value in every.items() if value.numel()}
         self.remembered: dict[str, int] = {}
@@ -162,12 +164,12 @@ class Equation:
     @cached_property
     def articulated(self) -> dict[int, SX]:
         """Inertias of clusters on the way of the recursion, without what acts on their joints, shape (d, d) each."""
-        return self.inertias(on_bodies(self.acting.contacts, self.acting.gravity, {}))
+        return self.inertias(with_contacts({}, self.system.contacts, self.system.loads.gravity))
 
     def inertias(self, external: dict[str, BodyTerms]) -> dict[int, SX]:
         """Return such inertias where something else acts on bodies."""
         turning = TurningDamping(self.given.state.v, self.given.dt)
-        found = inward_inertia_pass(self.mechanism, self.acting.kinematics, self.acting.joints, external, turning)
+        found = inward_inertia_pass(self.mechanism, self.system.start.kinematics, self.system.joints, external, turning)
         return {k: found.inertia[k] for k in self.turned}
 
     def local_force(self, contact: LinearContact) -> tuple[SX, SX, SX]:
@@ -185,12 +187,12 @@ class Equation:
     @cached_property
     def _motion(self) -> SX:
         """What the equation of motion lacks without contacts, shape (nv,), given inertias of clusters."""
-        acting, kinematics = self.acting, self.acting.kinematics
+        kinematics = self.system.start.kinematics
         f = net_forces(self.mechanism, kinematics, self.a)
-        for name, couple in acting.couples.items():
-            f[name] = f[name] - ca.vertcat(couple, SX(3, 1))
+        for name, terms in no_loads(self.system.start).bodies.items():
+            f[name] = f[name] - terms.force
         left = inward_force_pass(self.mechanism, kinematics, self.a, f, self.qdd)
-        left += acting.joints.slope @ self.vdot - acting.joints.tau
+        left += self.system.joints.slope @ self.vdot - self.system.joints.tau
         momentum = turning_momentum(self.mechanism, self.given.state.v, self.given.dt)
         if momentum is not None:
             left[:3] -= skew(momentum) @ self.vdot[:3]
@@ -201,9 +203,9 @@ class Equation:
     @cached_property
     def _pressed(self) -> SX:
         """What contacts do to it, shape (nv,), given their forces."""
-        kinematics, still = self.acting.kinematics, SX(6, 1)
+        kinematics, still = self.system.start.kinematics, SX(6, 1)
         f = dict.fromkeys(self.mechanism.bodies, still)
-        for i, contact in enumerate(self.acting.contacts):
+        for i, contact in enumerate(self.system.contacts):
             moment = cross(contact.law.touch.point, self.forces[:, i])
             f[contact.body] = f[contact.body] - ca.vertcat(moment, self.forces[:, i])
         return force_on_coordinates(self.mechanism, kinematics, f)
@@ -212,7 +214,7 @@ class Equation:
         """Return the torque that damps the joints of a cluster because its carrier turns, shape (d,)."""
         carrier, rows = self.mechanism.tree.clusters[k].output_body, self.turned[k]
         turning = TurningDamping(self.given.state.v, self.given.dt)
-        more, drag = turning.on(inertia, rows, self.acting.kinematics.bodies[carrier].v[:3])  # type: ignore[index]
+        more, drag = turning.on(inertia, rows, self.system.start.kinematics.bodies[carrier].v[:3])  # type: ignore[index]
         return more @ self.vdot[rows] - drag
 
     @cached_property
@@ -222,9 +224,8 @@ class Equation:
     @cached_property
     def end_values(self) -> SX:
         """The state after the step at the given acceleration."""
-        given = self.given
-        after = stepped(given.scene, given.state, self.solved, given.dt, self.iterate).state
-        return ca.vertcat(after.q, after.v, *[getattr(after, name) for name in self.remembered])
+        after = finish_step(self.solved).state
+        return ca.vertcat(after.q, after.v, *[after[name] for name in self.remembered])
 
     def tangent_after(self, columns: SX) -> SX:
         """Take changes of positions in the state after the step to their tangent space."""

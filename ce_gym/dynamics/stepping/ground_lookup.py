@@ -17,8 +17,9 @@ import numpy as np
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.ground import above_deepest
-from ce_gym.dynamics.forces.scene import StepOptions, contact_spheres, symbolic_state
+from ce_gym.dynamics.forces.scene import StepOptions, contact_spheres
 from ce_gym.dynamics.hulls import pressed
+from ce_gym.dynamics.laws.scene_laws import symbolic_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
 

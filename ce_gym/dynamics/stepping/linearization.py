@@ -31,7 +31,7 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.stepping.derivatives import iterations_of
 from ce_gym.dynamics.stepping.equation import Direction, Equation, acts, packed, there
 from ce_gym.dynamics.stepping.factors import factorised, solved_with
-from ce_gym.dynamics.stepping.step import solve, stepped
+from ce_gym.dynamics.stepping.step import finish_step, solve
 from ce_gym.model.mechanism import Mechanism
 
 REMEMBERED = ("load", "anchor")
@@ -98,7 +98,7 @@ class Linearization(Equation):
         """
         given = self.given
         solved = solve(given.scene, given.state, given.target, given.dt, self.iterate)
-        after = stepped(given.scene, given.state, solved, given.dt, self.iterate)
+        after = finish_step(solved)
         forces, *slopes = [self.force_values, *[slope for _, _, slope in self.local]]
         forces, *slopes = [ca.substitute(x, self.vdot, solved.vdot) for x in (forces, *slopes)]
         left = {"vdot": solved.vdot, "diverged_next": given.guarded(after)["diverged_next"]}
@@ -107,7 +107,7 @@ class Linearization(Equation):
             "factor": packed(factorised(self.implicit(), self.order)),
             "inertia": self.stacked_inertias(self.articulated),
         }
-        left |= {"contact_acts": acts(self.acting.contacts)} if self.local else {}
+        left |= {"contact_acts": acts(self.system.contacts)} if self.local else {}
         left |= {"forces": ca.vec(forces), "slopes": ca.vertcat(SX(0, 1), *map(packed, slopes))}
         return traced("iteration", {name: x for name, x in self.inputs.items() if name != "vdot"}, there(left))
 
@@ -248,7 +248,7 @@ class Linearization(Equation):
 
     @cached_property
     def _gains(self) -> SX:
-        return ca.vertcat(*[contact.gain(self.solved.motion) for contact in self.acting.contacts])
+        return ca.vertcat(*[contact.gain(self.solved.motion) for contact in self.system.contacts])
 
     @cached_property
     def _gained(self) -> SX:

@@ -11,7 +11,8 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
-from ce_gym.dynamics.forces.scene import StepOptions, symbolic_state
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_laws import symbolic_state
 from ce_gym.dynamics.stepping.plan import AT_START, MEANS, MOVED
 from ce_gym.model.mechanism import Mechanism
 

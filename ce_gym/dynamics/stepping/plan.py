@@ -7,13 +7,13 @@ leave the arithmetic of combining stages to this file.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import casadi as ca
 
 from ce_gym.dynamics.algebra.integration import between, turned_by
 from ce_gym.dynamics.algebra.spatial import SX, quaternion_to_rotation
-from ce_gym.dynamics.forces.scene import State
+from ce_gym.dynamics.state import State
 from ce_gym.model.coordinates import Layout
 
 AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "motor_torque", "contact_forces")
@@ -141,8 +141,8 @@ def combined(plan: Plan, ends: Mapping[str, State], layout: Layout) -> State:
     if layout.floating:
         world = [w * (quaternion_to_rotation(ends[s].q[3:7]) @ ends[s].v[3:6]) for s, w in weights.items()]
         v[3:6] = quaternion_to_rotation(q[3:7]).T @ sum(world, SX(0))
-    loads = {stage.load: ends[stage.name].load for stage in plan.stages if stage.load != LOAD}
-    return replace(last, q=q, v=v, **loads)
+    loads = {stage.load: ends[stage.name][LOAD] for stage in plan.stages if stage.load != LOAD}
+    return last.replaced(q=q, v=v, **loads)
 
 
 def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:
@@ -172,7 +172,7 @@ def step_errors(plan: Plan, before: State, ends: Mapping[str, State], layout: La
     turns = {i for i, _ in layout.turns}
     turned = [between(one.q[i : i + 4], other.q[i : i + 4]) for i in sorted(turns)]
     others = [i for i in range(one.q.numel()) if not any(start <= i < start + 4 for start in turns)]
-    touches = [[getattr(state, name) > 0 for name in TOUCHES] for state in (before, *ends.values())]
+    touches = [[state[name] > 0 for name in TOUCHES] for state in (before, *ends.values())]
     first, *others_touch = [ca.vertcat(SX(0), *each) for each in touches]
     touching = ca.norm_inf(ca.vertcat(first, *others_touch))
     changes = ca.vertcat(*[each - first for each in others_touch])

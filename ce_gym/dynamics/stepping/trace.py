@@ -11,16 +11,16 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.drives.stretch import stretching
-from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, seen_joints
-from ce_gym.dynamics.forces.motors import supply_of
 from ce_gym.dynamics.forces.parameters import parameter_defaults
-from ce_gym.dynamics.forces.scene import State, StepOptions, make_scene, symbolic_state, target_names
+from ce_gym.dynamics.forces.scene import StepOptions, make_scene, target_names
+from ce_gym.dynamics.laws.scene_laws import culled_rows, iterate_size, symbolic_state
 from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
+from ce_gym.dynamics.state import State
 from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.plan import AFTER, MOVED, OFF, combined, error_estimate, step_errors
-from ce_gym.dynamics.stepping.step import Stepped, iterate_size, iteration, rows_of_near, stacked
+from ce_gym.dynamics.stepping.step import Stepped, iteration, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
 from ce_gym.model.mechanism import Mechanism
 
@@ -82,7 +82,7 @@ def iteration_function(
         `step_function`; the iterate is zero at first, shape (iterate_size,).
     """
     given, size = Given(mechanism, options, follows), iterate_size(mechanism, options)
-    rows = {"near_iterate": rows_of_near(mechanism, options)} if chooses else {}
+    rows = {"near_iterate": culled_rows(mechanism, options)} if chooses else {}
     always = [i for i in range(size) if i not in rows.get("near_iterate", ())]
     rows |= {"iterate": always} if always or not chooses else {}
     parts, iterate = {name: SX.sym(name, len(of)) for name, of in rows.items()}, SX(size, 1)
@@ -92,7 +92,7 @@ def iteration_function(
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
     told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
     left = {f"{name}_next": stepped.iterate[of] for name, of in rows.items()} | {"unconverged": stepped.unconverged}
-    left |= {} if stepped.solved.near is None else {NEAR: stepped.solved.near}
+    left |= {} if stepped.solved.system.near is None else {NEAR: stepped.solved.system.near}
     return traced("iteration", given.inputs() | parts, given.guarded(stepped) | left | told)
 
 
@@ -117,7 +117,7 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
     layout = mechanism.robot.layout
     after = combined(plan, ends, layout)
     sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
-    results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in before.items()}
+    results = {f"{name}_next": ca.if_else(sane, after[name], value) for name, value in before.items()}
     results["diverged_next"] = ca.if_else(sane, 0, 1)
     for name, size in outputs.items():
         if name == MOVED:
@@ -186,12 +186,12 @@ class Given:
     def guarded(self, stepped: Stepped) -> dict[str, SX]:
         """State after the step, or as it was if the robot has diverged now or before."""
         after = stepped.state
-        size = ca.sumsqr(after.v) + ca.sumsqr(after.anchor)
+        size = ca.sumsqr(after.v) + ca.sumsqr(after["anchor"])
         sane = ca.logic_and(size < SANE_SPEED**2, self.diverged < 0.5)  # false for NaN
         sane = ca.logic_and(sane, ca.sumsqr(after.q) < SANE_DISTANCE**2)  # not all positions act on velocities
         if any(closures(self.mechanism)):
             sane = ca.logic_and(sane, loops_close(self.mechanism, stepped.solved.kinematics, after))
-        results = {f"{name}_next": ca.if_else(sane, getattr(after, name), value) for name, value in self.state.items()}
+        results = {f"{name}_next": ca.if_else(sane, after[name], value) for name, value in self.state.items()}
         return results | {"diverged_next": ca.if_else(sane, 0, 1)}
 
     def output(self, name: str, shares: Mapping[str, float], parts: Mapping[str, Stepped]) -> SX:
@@ -205,37 +205,15 @@ class Given:
         return ca.vec(weighted(shares, {part: self._of(parts[part], name) for part in shares}))
 
     def _of(self, stepped: Stepped, name: str) -> SX:
-        layout = self.mechanism.robot.layout
-        robot, yd = self.scene.mechanism.robot, stepped.state.v[layout.joints_v :]
-        kinematics = stepped.solved.kinematics
         if name == MOVED:
             return furthest(self.mechanism, stepped.state.v, self.dt)
-        if name == "motor_speed":
-            return stacked([c.W @ yd[c.rows] for c in actuated_clusters(self.mechanism, kinematics)])
-        if name == "motor_torque":
-            return winding_torques(self.mechanism, kinematics, stepped)
-        if name in ("winding_temperature", "battery_voltage"):
-            supply = supply_of(robot, self.scene.options.motors, stepped.state.supply)
-            return supply.voltage if name == "battery_voltage" else stacked(supply.temperatures(robot.motors))
-        if name == "power":
-            return stepped.torque * (seen_joints(self.mechanism, kinematics) @ yd)
         if name == "energy":
             return mechanical_energy(self.scene, stepped.state, self.target)
         if name == "loop_gap":
-            return loop_gap(self.mechanism, kinematics)
-        return loop_state(kinematics)[1] if name == "nearness" else getattr(stepped, name)
-
-
-def winding_torques(mechanism: Mechanism, kinematics: Kinematics, stepped: Stepped) -> SX:
-    """Return the torque of each motor [N m], shape (n_motors,); of ideal ones what gives the torque at the joints."""
-    motors, ydd = stepped.solved.motors, stepped.solved.motion.ydd
-    found = SX(len(mechanism.robot.motors), 1)
-    for cluster in actuated_clusters(mechanism, kinematics):
-        shares = effort_matrix(cluster.W[:, : len(cluster.joints)]) @ stepped.torque[cluster.joints]
-        for i, place in enumerate(cluster.places):
-            winding = motors.windings.get(place)
-            found[place] = shares[i] if winding is None else winding.tau - winding.slope @ ydd
-    return found
+            return loop_gap(self.mechanism, stepped.solved.kinematics)
+        if name == "nearness":
+            return loop_state(stepped.solved.kinematics)[1]
+        return stepped.output(name)
 
 
 def weighted(weights: Mapping[str, float], values: Mapping[str, SX]) -> SX:

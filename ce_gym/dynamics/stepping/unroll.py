@@ -12,17 +12,17 @@ from dataclasses import replace
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_product, quaternion_to_rotation
-from ce_gym.dynamics.forces.scene import Scene, State
+from ce_gym.dynamics.forces.scene import Scene
+from ce_gym.dynamics.laws.scene_laws import iterations_needed
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
+from ce_gym.dynamics.state import State
 from ce_gym.dynamics.stepping.plan import AFTER, Plan, Rates, combined, error_estimate
 from ce_gym.dynamics.stepping.step import (
     Solved,
     Stepped,
     first_iterate,
     iteration,
-    iterations_needed,
     looked_up_from,
-    stacked,
 )
 from ce_gym.model.coordinates import Layout
 from ce_gym.model.frames import added
@@ -47,22 +47,16 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
         if isinstance(stage.start, Rates):
             start = _moved(stage.start, before, list(parts.values()), dt, layout)
         else:
-            start = parts[stage.start].state if stage.start else replace(before, load=getattr(before, stage.load))
+            start = parts[stage.start].state if stage.start else before.replaced(load=before[stage.load])
         if parts and stage.start and not scene.looked_up.numel():  # the ground is known as it is around the start
             scene = looked_up_from(scene, parts[plan.stages[0].name].solved.kinematics)
         length = stage.length * dt if stage.length else 0.0  # a number also where dt is a symbol, see `solve`
         parts[stage.name] = iterated(scene, start, target, length, stage.iterations)
     first = parts[plan.stages[0].name]
     if isinstance(plan.end, Rates):
-        after = replace(
-            _moved(plan.end, before, list(parts.values()), dt, layout),
-            load=first.state.load,
-            pressed=first.state.pressed,
-            carried=first.state.carried,
-            winding=first.state.winding,
-            supply=first.state.supply,
-            held=first.state.held,
-        )
+        moved = _moved(plan.end, before, list(parts.values()), dt, layout)
+        integrated = {name: moved[name] for name in ("q", "v", "dependent", *rates_of(first.solved))}
+        after = first.state.replaced(**integrated)
     else:
         after = combined(plan, {name: part.state for name, part in parts.items()}, layout)
     error = error_estimate(plan, {name: part.state for name, part in parts.items()})
@@ -71,16 +65,18 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
 
 def _moved(rates: Rates, before: State, parts: list[Stepped], dt: float, layout: Layout) -> State:
     """Return the state before a step, moved along rates of its stages."""
-    terms = [
-        weight * _rate(part.before, part.solved, layout)
-        for weight, part in zip(rates.weights, parts, strict=False)
-        if weight
-    ]
-    moved = _from_flat(_flat(before, layout) + dt * sum(terms, SX(0)), before, layout)
+    terms = [weight * _rate(part.solved, layout) for weight, part in zip(rates.weights, parts, strict=False) if weight]
+    names = list(rates_of(parts[0].solved)) if parts else []
+    moved = _from_flat(_flat(before, names, layout) + dt * sum(terms, SX(0)), before, names, layout)
     if rates.weights:
         first = parts[0].solved
-        moved.dependent = guessed_coordinates(first.kinematics, first.vdot, dt * added(rates.weights))
+        moved = moved.replaced(dependent=guessed_coordinates(first.kinematics, first.vdot, dt * added(rates.weights)))
     return moved
+
+
+def rates_of(solved: Solved) -> dict[str, SX]:
+    """Return time derivatives of the fields of force laws that explicit methods integrate."""
+    return {name: rate for force in solved.system.forces for name, rate in force.rates().items()}
 
 
 def iterated(scene: Scene, state: State, target: SX, dt: float, most: int) -> Stepped:
@@ -94,34 +90,32 @@ def iterated(scene: Scene, state: State, target: SX, dt: float, most: int) -> St
     return iteration(scene, state, target, dt, iterate)
 
 
-def _flat(state: State, layout: Layout) -> SX:
-    """Stack positions, velocities with the base's linear one in the world, and anchors."""
+def _flat(state: State, names: list[str], layout: Layout) -> SX:
+    """Stack positions, velocities with the base's linear one in the world, and some fields."""
     v = state.v
     if layout.floating:
         v = ca.vertcat(v[:3], quaternion_to_rotation(state.q[3:7]) @ v[3:6], v[6:])
-    return ca.vertcat(state.q, v, state.anchor)
+    return ca.vertcat(state.q, v, *[state[name] for name in names])
 
 
-def _from_flat(flat: SX, like: State, layout: Layout) -> State:
-    q, v, anchor = ca.vertsplit(flat, [0, like.q.numel(), like.q.numel() + like.v.numel(), flat.numel()])
+def _from_flat(flat: SX, like: State, names: list[str], layout: Layout) -> State:
+    sizes = [like.q.numel(), like.v.numel(), *[like[name].numel() for name in names]]
+    q, v, *others = ca.vertsplit(flat, [sum(sizes[:i]) for i in range(len(sizes) + 1)])
     for i, _ in layout.turns:
         q[i : i + 4] = q[i : i + 4] / ca.norm_2(q[i : i + 4])
     if layout.floating:
         v = ca.vertcat(v[:3], quaternion_to_rotation(q[3:7]).T @ v[3:6], v[6:])
-    return replace(like, q=q, v=v, anchor=anchor)
+    return like.replaced(q=q, v=v, **dict(zip(names, others, strict=True)))
 
 
-def _rate(state: State, solved: Solved, layout: Layout) -> SX:
-    """Time derivative of what `_flat` stacks."""
-    q, v, vdot = state.q, state.v, solved.vdot
-    slides = [
-        ca.if_else(c.normal_slope > 0, (solved.kinematics.bodies[c.body].R @ c.sliding)[:2], 0) for c in solved.contacts
-    ]
-    anchor = stacked(slides) if state.anchor.numel() else state.anchor
+def _rate(solved: Solved, layout: Layout) -> SX:
+    """Return the time derivative of what `_flat` stacks."""
+    state, vdot = solved.system.start.state, solved.vdot
+    q, v, others = state.q, state.v, list(rates_of(solved).values())
     turning = [quaternion_product(q[i : i + 4], ca.vertcat(0, v[j : j + 3])) / 2 for i, j in layout.turns]
     joints = ca.vertcat(*turning, v[layout.joints_v :])
     if not layout.floating:
-        return ca.vertcat(joints, vdot, anchor)
+        return ca.vertcat(joints, vdot, *others)
     R, w, u = quaternion_to_rotation(q[3:7]), v[:3], v[3:6]
     u_world = R @ (vdot[3:6] + cross(w, u))
-    return ca.vertcat(R @ u, joints, vdot[:3], u_world, vdot[6:], anchor)
+    return ca.vertcat(R @ u, joints, vdot[:3], u_world, vdot[6:], *others)

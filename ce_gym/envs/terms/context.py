@@ -126,7 +126,10 @@ class TermContext:
     previous_action = _buffer("previous_action", "The action before it, shape (n_joints,).")
     torque = _buffer("torque", "Motor torque at each joint in the last sub-step [N m], shape (n_joints,).")
     motor_torque = _buffer("motor_torque", "Torque of each motor's windings in the last sub-step [N m], (n_motors,).")
-    supply = _buffer("supply", "What motors are fed by, as `State.supply` has it; empty if it is steady.", SX(0, 1))
+    motor_warmth = _buffer(
+        "motor_warmth", "Temperatures of windings, then of housings, above the air [K], shape (2 n_warm,).", SX(0, 1)
+    )
+    battery_sag = _buffer("battery_sag", "Voltage drop of the battery under load [V], shape (1,) or (0,).", SX(0, 1))
     load = _buffer("load", "Normal force on each contact in the last sub-step [N], shape (n_contacts,).", SX(0, 1))
     scaled_parameters = _buffer(
         "scaled_parameters", "The randomised figures of the episode, each in [-1, 1], shape (n,).", SX(0, 1)

@@ -99,13 +99,13 @@ def motor_torques(s: TermContext) -> SX:
 
 def winding_temperatures(s: TermContext) -> SX:
     """How much windings of motors that grow warm are warmer than the air [100 K], shape (n_warm,)."""
-    return s.supply[: s.supply.numel() // 2] / 100  # then their housings, and perhaps a voltage
+    return s.motor_warmth[: s.motor_warmth.numel() // 2] / 100  # windings, then housings
 
 
 def battery_sag(s: TermContext) -> SX:
     """How far the battery's voltage is below that without load, over the nominal one [-], shape (1,); () without."""
     battery = s.mechanism.robot.battery
-    return SX(0, 1) if battery is None or not s.supply.numel() else s.supply[-1] / battery.nominal
+    return SX(0, 1) if battery is None or not s.battery_sag.numel() else s.battery_sag / battery.nominal
 
 
 def _link(s: TermContext, term: str, name: str) -> BodyState:

@@ -1,0 +1,1 @@
+"""The force laws of a scene, one file each."""

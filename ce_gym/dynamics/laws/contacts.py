@@ -1,0 +1,189 @@
+"""Contact of spheres, wheels and convex corners with the ground; `forces/contact.py` has the equations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground, where
+from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.normal import normal_law
+from ce_gym.dynamics.forces.scene import contact_centres
+from ce_gym.dynamics.hulls import with_hulls
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.recursion.ce_aba import BodyTerms
+from ce_gym.dynamics.recursion.kinematics import constant
+from ce_gym.dynamics.state import Field, State
+from ce_gym.dynamics.stepping.methods import METHODS
+
+TWO_LOADS = ("extrapolated", "adaptive")
+"""Methods that remember the normal forces of whole steps apart from those of half steps, see `methods.py`."""
+
+
+class Contacts(ForceLaw):
+    """Contact of a robot with the ground."""
+
+    @property
+    def acts(self) -> bool:
+        """Whether anything can touch the ground."""
+        return bool(self.options.touches)
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """Normal forces, and deflections of bristles if the material has them."""
+        n, bristles = len(self.options.touches), self.options.material.bristle > 0
+        coarse = n if self.options.method in TWO_LOADS else 0
+        return (
+            Field("load", n, "N", "normal force of each contact over the last step", "resting_load"),
+            Field("whole_load", coarse, "N", "normal force over the last whole step, of two loads", "resting_load"),
+            Field("anchor", 2 * n * bristles, "m", "horizontal deflection of each contact's bristle, world axes"),
+        )
+
+    @property
+    def outputs(self) -> dict[str, int]:
+        """Forces of the contacts that have names."""
+        return {"contact_forces": 3 * len(self.options.contacts)}
+
+    @property
+    def size(self) -> int:
+        """Size of the iterate."""
+        return Contact.size * len(self.options.touches)
+
+    @property
+    def iterations(self) -> int:
+        """How many iterations the friction law may need after the first."""
+        return FRICTION[self.options.friction].iterations
+
+    @property
+    def culled_rows(self) -> list[int]:
+        """Rows of the iterate of the contacts that are declared to be seldom near."""
+        seldom = [i for i, name in enumerate(self.options.touches) if name in self.options.seldom]
+        return [Contact.size * i + j for i in seldom for j in range(Contact.size)]
+
+    def place(self, start: Start) -> PlacedContacts:
+        """Place every contact against the ground."""
+        laws = contacts_at(start)
+        named = zip(self.options.touches, laws, strict=True)
+        return PlacedContacts(start, laws, [law for name, law in named if name in self.options.seldom])
+
+    def energy(self, start: Start) -> SX:
+        """Return the energy of the contacts' springs and bristles [J]."""
+        return touch_energy(start, contacts_at(start))
+
+
+@dataclass
+class PlacedContacts(PlacedForce):
+    """The contacts at the start of a step."""
+
+    start: Start
+    laws: list[Contact]
+    culled: list[Contact] = field()
+
+    def linearise(self, iterate: SX) -> ContactForces:
+        """Linearise every contact about its part of the iterate."""
+        parts = ca.vertsplit(iterate, Contact.size)
+        return ContactForces(self.start, [law.linearise(x) for law, x in zip(self.laws, parts, strict=True)], parts)
+
+
+@dataclass
+class ContactForces(LinearForce):
+    """The forces of all contacts, linear in the accelerations."""
+
+    start: Start
+    contacts: list[LinearContact] = field()
+    iterates: list[SX]
+
+    def add_to(self, loads: Loads) -> None:
+        """Add the contacts to their bodies."""
+        loads.bodies.update(with_contacts(loads.bodies, self.contacts, loads.gravity))
+
+    def check(self, motion: Motion) -> SX:
+        """Return 1 if the active set of a contact has changed, else 0."""
+        return any_changed(self.contacts, motion)
+
+    def next_iterate(self, motion: Motion, unconverged: SX) -> SX:
+        """Return the iterates of all contacts; converged robots keep theirs, so that they repeat their result."""
+        return iterates_after(self.contacts, self.iterates, motion, unconverged)
+
+    def advance(self, motion: Motion) -> dict[str, SX]:
+        """Return normal forces and deflections at the end of the step."""
+        loads = [where(c.law.near, ca.fmax(c.load_after(c.gain(motion)), 0)) for c in self.contacts]
+        after = {"load": ca.vertcat(*loads)}
+        if self.start.state["anchor"].numel():
+            turned = [(self._rotation(c) @ c.anchor_after(c.gain(motion)))[:2] for c in self.contacts]
+            after["anchor"] = ca.vertcat(*[where(c.law.near, x) for c, x in zip(self.contacts, turned, strict=True)])
+        return after
+
+    def rates(self) -> dict[str, SX]:
+        """Return the rates of the bristles' deflections."""
+        if not self.start.state["anchor"].numel():
+            return {}
+        slides = [ca.if_else(c.normal_slope > 0, (self._rotation(c) @ c.sliding)[:2], 0) for c in self.contacts]
+        return {"anchor": ca.vertcat(*slides)}
+
+    def output(self, name: str, motion: Motion, after: State) -> SX:
+        """Return the mean force on each contact over the step, world axes [N], shape (3, n_contacts)."""
+        forces = [where(c.law.near, self._rotation(c) @ c.force_after(c.gain(motion))) for c in self.contacts]
+        return with_hulls(ca.horzcat(SX(3, 0), *forces), self.start.scene.options.hulls)
+
+    def _rotation(self, contact: LinearContact) -> SX:
+        return self.start.kinematics.bodies[contact.body].R
+
+
+def contacts_at(start: Start) -> list[Contact]:
+    """Place every contact of the scene against the plane that the ground is nearby."""
+    scene, state, options = start.scene, start.state, start.scene.options
+    normal, friction = normal_law(options.normal_law, options.material), FRICTION[options.friction]
+    resolves = METHODS[options.method].controlled
+    contacts = []
+    for i, (sphere, centre) in enumerate(contact_centres(scene)):
+        body = start.kinematics.bodies[sphere.body]
+        height, up = SX(0), constant(np.array([0.0, 0.0, 1.0]))
+        if options.ground == "field":
+            height, slope = scene.ground[0, i], scene.ground[1:, i]
+            if scene.looked_up.numel():
+                height += ca.dot(slope, body.point_position(centre)[:2] - scene.looked_up[:, i])
+            up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
+        anchor = state["anchor"][2 * i : 2 * i + 2] if state["anchor"].numel() else state["anchor"]
+        touch = touch_ground(body, sphere, centre, height, up, state["load"][i], anchor)
+        compliance = scene.figures.compliance
+        contacts.append(Contact(sphere.body, touch, compliance, normal, friction, start.dt, resolves_landing=resolves))
+    return contacts
+
+
+def with_contacts(
+    bodies: dict[str, BodyTerms], contacts: Sequence[LinearContact], gravity: dict[str, SX]
+) -> dict[str, BodyTerms]:
+    """Return the terms of bodies with contacts added, given the acceleration of free fall in the axes of each body."""
+    terms = dict(bodies)
+    for contact in contacts:
+        new, old = contact.body_terms(gravity[contact.body]), terms.get(contact.body)
+        total, near = BodyTerms(old.inertia + new.inertia, old.force + new.force) if old else new, contact.law.near
+        none = old or BodyTerms(SX(6, 6), SX(6, 1))
+        terms[contact.body] = BodyTerms(where(near, total.inertia, none.inertia), where(near, total.force, none.force))
+    return terms
+
+
+def any_changed(contacts: Sequence[LinearContact], motion: Motion) -> SX:
+    """Return 1 if the active set of a contact differs from the assumed one, else 0."""
+    return ca.sum1(ca.vertcat(*[contact.check(motion) for contact in contacts])) > 0
+
+
+def iterates_after(contacts: Sequence[LinearContact], iterates: list[SX], motion: Motion, unconverged: SX) -> SX:
+    """Return the iterates of contacts for another iteration, and the given ones where none is needed."""
+    parts = [
+        where(c.law.near, ca.if_else(unconverged, c.next_iterate(motion), part), part)
+        for c, part in zip(contacts, iterates, strict=True)
+    ]
+    return ca.vertcat(*parts)
+
+
+def touch_energy(start: Start, contacts: Sequence[Contact]) -> SX:
+    """Return the energy of the springs and bristles of contacts [J]."""
+    k, bristle = start.scene.figures.compliance.stiffness, start.scene.figures.compliance.bristle
+    touches = [contact.touch for contact in contacts]
+    return sum((k * ca.fmax(t.depth, 0) ** 2 + bristle * ca.sumsqr(t.anchor) for t in touches), SX(0)) / 2

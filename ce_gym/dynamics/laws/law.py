@@ -1,0 +1,245 @@
+"""What a force law declares and computes: its memory, its iterate, and a force that is linear in the accelerations.
+
+A contact acts or not, sticks or slips, a motor is at a limit or not: an active set. A law linearises its force about an
+iterate, which assumes an active set. Given the resulting accelerations, the linear force checks that assumption and
+returns the next iterate. This is Newton's method on the implicit step.
+
+    placed = law.place(start)            what the force depends on at the start of the step
+    force = placed.linearise(iterate)    the force for an assumed active set, linear in the accelerations
+    force.add_to(loads)                  its part in the equations of motion
+    force.check(motion)                  whether the accelerations contradict the assumption
+    force.next_iterate(motion, ...)      the next assumption
+    force.advance(motion)                the law's memory at the end of the step
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.recursion.ce_aba import Articulation, BodyTerms
+from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
+from ce_gym.dynamics.state import Field, State
+from ce_gym.model.mechanism import Mechanism
+
+if TYPE_CHECKING:
+    from ce_gym.dynamics.forces.contact import Contact, LinearContact
+    from ce_gym.dynamics.forces.saturation import Stick
+    from ce_gym.dynamics.forces.scene import Scene, StepOptions
+    from ce_gym.dynamics.forces.self_collision import LinearPair
+
+
+def is_moment(dt: SX | float) -> bool:
+    """Whether a step has no length: the acceleration of the moment is wanted."""
+    return isinstance(dt, float) and dt == 0
+
+
+@dataclass
+class JointForce:
+    """A force on coordinates, `tau - slope @ ydd` over the step.
+
+    Attributes:
+        tau: At zero acceleration [N m or N], shape (n,).
+        slope: Symmetric [kg m^2 or kg], shape (n, n).
+    """
+
+    tau: SX
+    slope: SX
+
+    def __add__(self, other: JointForce) -> JointForce:
+        """Return the sum of both."""
+        return JointForce(self.tau + other.tau, self.slope + other.slope)
+
+
+@dataclass
+class Motion:
+    """The accelerations over a step.
+
+    Attributes:
+        ydd: Of the independent joints, shape (nj,).
+        a: Of each body minus gravity, body coordinates, shape (6,) each.
+        gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
+        articulation: Inertias of the recursion that found them; None if it is unknown.
+    """
+
+    ydd: SX
+    a: dict[str, SX]
+    gravity: dict[str, SX]
+    articulation: Articulation | None = None
+
+
+@dataclass
+class Start:
+    """A robot at the start of a step.
+
+    Attributes:
+        scene: The robot and its surroundings.
+        state: Of the robot.
+        target: Targets or torques in the order of `target_names`, shape (n_targets,).
+        dt: Length of the step [s]; the number 0 for the acceleration of the moment.
+    """
+
+    scene: Scene
+    state: State
+    target: SX
+    dt: float
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """Transforms and velocities of all bodies."""
+        return outward_velocity_pass(self.scene.mechanism, self.state.q, self.state.v, self.state.dependent)
+
+    @property
+    def y(self) -> SX:
+        """Positions of the independent joints and stretches [rad or m], shape (nj,)."""
+        return self.state.q[self.scene.mechanism.robot.layout.joints_q :]
+
+    @property
+    def yd(self) -> SX:
+        """Velocities of the independent joints and stretches, shape (nj,)."""
+        return self.state.v[self.scene.mechanism.robot.layout.joints_v :]
+
+
+@dataclass
+class Loads:
+    """Forces in the equations of motion, linear in the accelerations.
+
+    Attributes:
+        bodies: Terms of bodies by name.
+        balls: Forces on ball joints.
+        joints: Forces on joints with one coordinate.
+        gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
+        pairs: Forces between two bodies, unknown until the recursion has run.
+    """
+
+    bodies: dict[str, BodyTerms]
+    balls: JointForce
+    joints: JointForce
+    gravity: dict[str, SX]
+    pairs: list[LinearPair] = field(default_factory=list)
+
+
+class LinearForce:
+    """A force that is linear in the accelerations, for one active set.
+
+    Attributes:
+        contacts: Forces on points of bodies in it.
+        sticks: Dry friction of joints and rotors in it.
+    """
+
+    contacts: Sequence[LinearContact] = ()
+    sticks: Sequence[Stick] = ()
+
+    def add_to(self, loads: Loads) -> None:
+        """Add the force to the equations of motion, in place."""
+        raise NotImplementedError
+
+    def check(self, motion: Motion) -> SX | None:
+        """Return 1 if the active set differs from the assumed one, else 0; None for a force without active set."""
+        return None
+
+    def next_iterate(self, motion: Motion, unconverged: SX) -> SX:
+        """Return the iterate for another iteration, shape (size,); a fixed point where `unconverged` is 0."""
+        return SX(0, 1)
+
+    def advance(self, motion: Motion) -> dict[str, SX]:
+        """Return the law's fields at the end of the step."""
+        return {}
+
+    def rates(self) -> dict[str, SX]:
+        """Return time derivatives of fields that explicit methods integrate."""
+        return {}
+
+    def output(self, name: str, motion: Motion, after: State) -> SX:
+        """Return an output of the law, given the state at the end of the step."""
+        raise NotImplementedError(name)
+
+
+class PlacedForce:
+    """A force law at the start of a step.
+
+    Attributes:
+        culled: Contacts that act only where one of them is near.
+    """
+
+    culled: Sequence[Contact] = ()
+
+    def linearise(self, iterate: SX) -> LinearForce:
+        """Linearise about an iterate, shape (size,)."""
+        raise NotImplementedError
+
+
+@dataclass
+class PassiveForces(LinearForce, PlacedForce):
+    """Forces on joints without memory or active set.
+
+    Attributes:
+        joints: On joints with one coordinate.
+        balls: On ball joints.
+    """
+
+    joints: Sequence[JointForce] = ()
+    balls: JointForce | None = None
+
+    def linearise(self, iterate: SX) -> PassiveForces:
+        """Return the forces, whatever the iterate."""
+        return self
+
+    def add_to(self, loads: Loads) -> None:
+        """Add the forces to the joints."""
+        loads.joints = sum(self.joints, loads.joints)
+        loads.balls = self.balls or loads.balls
+
+
+@dataclass(frozen=True)
+class ForceLaw:
+    """A force law in a scene: by default one without memory and without active set.
+
+    Attributes:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+    """
+
+    mechanism: Mechanism
+    options: StepOptions
+
+    @property
+    def acts(self) -> bool:
+        """Whether the scene has such a force."""
+        return True
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """The law's memory."""
+        return ()
+
+    @property
+    def outputs(self) -> dict[str, int]:
+        """Sizes of the outputs that a step can report."""
+        return {}
+
+    @property
+    def size(self) -> int:
+        """Size of the iterate; all zero at first."""
+        return 0
+
+    @property
+    def iterations(self) -> int:
+        """How many iterations of a step may follow the first."""
+        return 0
+
+    @property
+    def culled_rows(self) -> list[int]:
+        """Rows of the iterate that belong to contacts that act only where one of them is near."""
+        return []
+
+    def place(self, start: Start) -> PlacedForce:
+        """Return the law at the start of a step."""
+        raise NotImplementedError
+
+    def energy(self, start: Start) -> SX:
+        """Return the potential energy of the force in a state [J]."""
+        return SX(0)

@@ -1,0 +1,108 @@
+"""Contact between the links of a robot; `forces/self_collision.py` has the equations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.contact import Contact, where
+from ce_gym.dynamics.forces.normal import normal_law
+from ce_gym.dynamics.forces.self_collision import Frictionless, LinearPair, Pair, meeting
+from ce_gym.dynamics.laws.contacts import any_changed, iterates_after, touch_energy
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.state import Field
+from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.model.checks.collisions import colliding
+from ce_gym.model.description import Capsule
+
+
+class LinkPairs(ForceLaw):
+    """Pairs of capsules on links that push each other apart."""
+
+    @property
+    def capsules(self) -> list[tuple[Capsule, Capsule]]:
+        """The capsules of each pair."""
+        return colliding(self.mechanism.robot, self.options.self_collisions)
+
+    @property
+    def acts(self) -> bool:
+        """Whether any pair of links is declared."""
+        return bool(self.options.self_collisions)
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """Forces between the pairs."""
+        return (Field("pressed", len(self.capsules), "N", "force between each pair of capsules over the last step"),)
+
+    @property
+    def size(self) -> int:
+        """Size of the iterate."""
+        return Contact.size * len(self.capsules)
+
+    @property
+    def iterations(self) -> int:
+        """How many iterations pairs may need after the first."""
+        return Frictionless.iterations
+
+    @property
+    def culled_rows(self) -> list[int]:
+        """All rows: pairs act only where they are near."""
+        return list(range(self.size))
+
+    def place(self, start: Start) -> PlacedPairs:
+        """Place the capsules of every pair against each other."""
+        laws = self._pairs_at(start)
+        return PlacedPairs(laws, laws)
+
+    def energy(self, start: Start) -> SX:
+        """Return the energy of the springs between links [J]."""
+        return touch_energy(start, self._pairs_at(start))
+
+    def _pairs_at(self, start: Start) -> list[Pair]:
+        options, compliance, pairs = self.options, start.scene.figures.compliance, []
+        law = normal_law(options.normal_law, options.material)
+        for i, pair in enumerate(self.capsules):
+            bodies = start.kinematics.bodies[pair[0].body], start.kinematics.bodies[pair[1].body]
+            meeting_pair = meeting(pair, bodies, start.state["pressed"][i], compliance, law, start.dt)
+            pairs.append(replace(meeting_pair, resolves_landing=METHODS[options.method].controlled))
+        return pairs
+
+
+@dataclass
+class PlacedPairs(PlacedForce):
+    """The pairs at the start of a step."""
+
+    laws: list[Pair]
+    culled: list[Pair] = field()
+
+    def linearise(self, iterate: SX) -> PairForces:
+        """Linearise every pair about its part of the iterate."""
+        parts = ca.vertsplit(iterate, Contact.size)
+        return PairForces([law.linearise(x) for law, x in zip(self.laws, parts, strict=True)], parts)
+
+
+@dataclass
+class PairForces(LinearForce):
+    """The forces between links, linear in the accelerations of both."""
+
+    pairs: list[LinearPair]
+    iterates: list[SX]
+
+    def add_to(self, loads: Loads) -> None:
+        """Add the pairs, whose forces the recursion finds."""
+        loads.pairs += self.pairs
+
+    def check(self, motion: Motion) -> SX:
+        """Return 1 if a pair acts that was assumed not to, or the reverse; else 0."""
+        return any_changed(self.pairs, motion)
+
+    def next_iterate(self, motion: Motion, unconverged: SX) -> SX:
+        """Return the iterates of all pairs."""
+        return iterates_after(self.pairs, self.iterates, motion, unconverged)
+
+    def advance(self, motion: Motion) -> dict[str, SX]:
+        """Return the forces at the end of the step."""
+        forces = [where(p.law.near, ca.fmax(p.normal_after(p.gain(motion)), 0)) for p in self.pairs]
+        return {"pressed": ca.vertcat(*forces)}

@@ -1,0 +1,185 @@
+"""Motors: control, limits, losses, heat, battery and sampling; `forces/actuation.py` has the equations.
+
+The memory of motors belongs to five effects, each with fields of its own: friction that depends on the load, torque
+that lags behind the command, temperature, the voltage of a battery, and the torques that a sampled controller holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.drives.load import carried_after, carried_now, motor_work, winding_torques, windings_after
+from ce_gym.dynamics.electric.cogging import cogging_energy
+from ce_gym.dynamics.forces.actuation import Before, actuated_clusters, limit_count, seen_joints
+from ce_gym.dynamics.forces.motor_control import Motors, motor_springs
+from ce_gym.dynamics.forces.motors import MOTORS, lagging_motors, loaded_motors, supply_of, warm_motors
+from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
+from ce_gym.dynamics.forces.scene import target_names
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.state import Field, State
+from ce_gym.dynamics.stepping.methods import METHODS
+
+
+class MotorDrives(ForceLaw):
+    """All motors of a robot and the controllers that command them."""
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """The memory of the motors' effects."""
+        robot, model = self.mechanism.robot, self.options.motors
+        loaded, warm = len(loaded_motors(robot, model)), len(warm_motors(robot, model))
+        battery = robot.battery is not None and MOTORS[model].at_motors
+        held = len(target_names(self.mechanism, self.options.control)) + 1 if self.options.sampled else 0
+        return (
+            Field("motor_load", 2 * loaded + (loaded > 0), "N m", LOAD),
+            Field("lagging_torque", len(lagging_motors(robot, model)), "N m", LAG, explicit=False),
+            Field("motor_warmth", 2 * warm, "K", WARMTH, explicit=False),
+            Field("battery_sag", int(battery), "V", SAG, explicit=False),
+            Field("held_torque", held, "N m or N; last s", HELD, explicit=False),
+        )
+
+    @property
+    def outputs(self) -> dict[str, int]:
+        """Torques, speeds, powers, temperatures and the voltage."""
+        robot, model = self.mechanism.robot, self.options.motors
+        joints, motors = len(robot.commanded), len(robot.motors)
+        sizes = {"torque": joints, "motor_torque": motors, "motor_speed": motors, "power": joints}
+        battery = robot.battery is not None and MOTORS[model].at_motors
+        return sizes | {"winding_temperature": len(warm_motors(robot, model)), "battery_voltage": int(battery)}
+
+    @property
+    def size(self) -> int:
+        """Size of the iterate: of the limits, then what friction under load depends on."""
+        return limit_count(self.mechanism, self.options) + self.fields[0].size
+
+    @property
+    def iterations(self) -> int:
+        """How many iterations limits may need after the first."""
+        return ITERATIONS if limit_count(self.mechanism, self.options) else 0
+
+    def place(self, start: Start) -> PlacedMotors:
+        """Return the motors at the start of a step."""
+        return PlacedMotors(start)
+
+    def energy(self, start: Start) -> SX:
+        """Return the energy of cogging, and of position control as if motors had no limits [J]."""
+        scene, total, options = start.scene, SX(0), self.options
+        if options.control == "position":
+            at = seen_joints(scene.mechanism, start.kinematics) @ start.y
+            total += ca.sum1(scene.figures.strength * scene.figures.kp * (start.target - at) ** 2) / 2
+        if options.control == "motor_position":
+            stiffness, stretch = motor_springs(scene, start.kinematics, start.y, start.target)
+            total += ca.sum1(scene.figures.strength * stiffness * stretch**2) / 2
+        if MOTORS[options.motors].at_motors:
+            for cluster in actuated_clusters(scene.mechanism, start.kinematics):
+                for i, motor in enumerate(cluster.motors):
+                    total += cogging_energy(motor.cogging, cluster.angles[i])
+        return total
+
+
+LOAD = "for each motor with load-dependent friction its torque, then the torque of all else on its rotor, then 1"
+LAG = "torque of each motor with a finite bandwidth at the end of the last step"
+WARMTH = "temperature above the air of each winding, then of each housing"
+SAG = "difference of the battery's voltage from that without load"
+HELD = "torques that a sampled controller holds, then the time until its next sample"
+
+
+@dataclass
+class PlacedMotors(PlacedForce):
+    """The motors at the start of a step."""
+
+    start: Start
+
+    def linearise(self, iterate: SX) -> MotorForces:
+        """Linearise about an iterate."""
+        start, scene = self.start, self.start.scene
+        limits = iterate.numel() - start.state["motor_load"].numel()
+        load = carried_now(start.state["motor_load"], iterate[limits:])
+        before = Before.of(scene.mechanism, scene.options, load, start.state)
+        motors = Motors(scene, start.kinematics, start.y, start.yd, start.target, start.dt, before)
+        return MotorForces(start, motors.linearise(iterate[:limits]), load, iterate[limits:])
+
+
+@dataclass
+class MotorForces(LinearForce):
+    """What motors deliver to the joints, linear in the accelerations.
+
+    Attributes:
+        start: The robot at the start of the step.
+        force: On the joints.
+        load: What friction under load is computed from, as the field `motor_load`.
+        iterate: That of the iteration before; zero in the first.
+    """
+
+    start: Start
+    force: SaturatedForce
+    load: SX
+    iterate: SX
+
+    def __post_init__(self) -> None:
+        self.sticks = self.force.frictions
+
+    def add_to(self, loads: Loads) -> None:
+        """Add the torques to the joints."""
+        loads.joints = loads.joints + self.force
+
+    def check(self, motion: Motion) -> SX:
+        """Return 1 if a torque is beyond a limit that was not assumed, or its load is not known yet; else 0."""
+        changed = self.force.check(motion)
+        if self.load.numel():
+            extrapolates = METHODS[self.start.scene.options.method].estimates
+            changed = ca.logic_or(changed, (self.iterate if extrapolates else self.load)[-1] < 0.5)
+        return changed
+
+    def next_iterate(self, motion: Motion, unconverged: SX) -> SX:
+        """Return expected torques and loads; loads only of iterations in which no rotor was stopped wrongly."""
+        sound = ca.logic_and(unconverged, ca.logic_not(self.force.check(motion)))
+        load = ca.if_else(sound, self._load_after(motion), self.load) if self.load.numel() else self.load
+        return ca.vertcat(self.force.next_iterate(motion), load)
+
+    def advance(self, motion: Motion) -> dict[str, SX]:
+        """Return the memory of all effects at the end of the step."""
+        start, scene = self.start, self.start.scene
+        warmth, sag = SX(0, 1), SX(0, 1)
+        if start.state["motor_warmth"].numel() or start.state["battery_sag"].numel():
+            supply = supply_of(scene.mechanism.robot, scene.options.motors, start.state)
+            clusters = actuated_clusters(scene.mechanism, start.kinematics)
+            work = motor_work(
+                clusters, self.force, supply, scene.figures.strength, start.yd + start.dt * motion.ydd, motion
+            )
+            warmth, sag = supply.after(scene.mechanism.robot.motors, work, start.dt)
+        return {
+            "motor_load": self._load_after(motion),
+            "lagging_torque": windings_after(scene, self.force, motion),
+            "motor_warmth": warmth,
+            "battery_sag": sag,
+            "held_torque": self.force.sampled,
+        }
+
+    def _load_after(self, motion: Motion) -> SX:
+        if motion.articulation is None:
+            return self.load
+        return carried_after(self.start.scene, self.start.kinematics, self.force, motion.articulation.inertia, motion)
+
+    def output(self, name: str, motion: Motion, after: State) -> SX:
+        """Return an output of the motors, given the state at the end of the step."""
+        mechanism, kinematics = self.start.scene.mechanism, self.start.kinematics
+        yd, robot = after.v[mechanism.robot.layout.joints_v :], mechanism.robot
+        torque = (self.force.tau - self.force.slope @ motion.ydd)[: len(robot.commanded)]
+        if name == "motor_speed":
+            return ca.vertcat(SX(0, 1), *[c.W @ yd[c.rows] for c in actuated_clusters(mechanism, kinematics)])
+        if name == "motor_torque":
+            return winding_torques(mechanism, kinematics, self.force, torque, motion)
+        if name == "power":
+            return torque * (seen_joints(mechanism, kinematics) @ yd)
+        if name in ("winding_temperature", "battery_voltage"):
+            supply = supply_of(robot, self.start.scene.options.motors, after)
+            return (
+                supply.voltage
+                if name == "battery_voltage"
+                else ca.vertcat(SX(0, 1), *supply.temperatures(robot.motors))
+            )
+        return torque

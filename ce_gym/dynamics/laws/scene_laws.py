@@ -1,0 +1,79 @@
+"""The force laws of a scene, in the order in which they are added, and what follows from their declarations."""
+
+from __future__ import annotations
+
+from ce_gym.dynamics.constraints.closure import reference_guess
+from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.contacts import Contacts
+from ce_gym.dynamics.laws.drive_meshes import DriveMeshes
+from ce_gym.dynamics.laws.joint_friction import DryJointFriction
+from ce_gym.dynamics.laws.joint_springs import JointSprings
+from ce_gym.dynamics.laws.joint_stops import JointStops
+from ce_gym.dynamics.laws.law import ForceLaw
+from ce_gym.dynamics.laws.link_pairs import LinkPairs
+from ce_gym.dynamics.laws.motor_drives import MotorDrives
+from ce_gym.dynamics.state import Field, State
+from ce_gym.model.mechanism import Mechanism
+
+LAWS: tuple[type[ForceLaw], ...] = (
+    Contacts,
+    LinkPairs,
+    MotorDrives,
+    JointStops,
+    DryJointFriction,
+    JointSprings,
+    DriveMeshes,
+)
+"""All force laws. Sums of forces follow this order."""
+
+
+def scene_laws(mechanism: Mechanism, options: StepOptions) -> list[ForceLaw]:
+    """Return the laws of the forces that a scene has."""
+    laws = [law(mechanism, options) for law in LAWS]
+    return [law for law in laws if law.acts]
+
+
+def state_fields(mechanism: Mechanism, options: StepOptions) -> tuple[Field, ...]:
+    """Return the parts of the state of a robot in a scene, those that are empty left out."""
+    layout = mechanism.robot.layout
+    fields = [
+        Field("q", layout.nq, "rad or m", "positions"),
+        Field("v", layout.nv, "rad/s or m/s", "velocities"),
+        Field("dependent", len(reference_guess(mechanism)), "rad or m", "guess of coordinates found by iteration"),
+    ]
+    fields += [field for law in scene_laws(mechanism, options) for field in law.fields]
+    return tuple(field for field in fields if field.size)
+
+
+def state_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
+    """Return the sizes of the parts of the state by name."""
+    return {field.name: field.size for field in state_fields(mechanism, options)}
+
+
+def symbolic_state(mechanism: Mechanism, options: StepOptions) -> State:
+    """Return a state of fresh symbols."""
+    return State.symbolic(state_fields(mechanism, options))
+
+
+def output_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
+    """Return the sizes of the outputs of all laws by name, for a scene with or without their forces."""
+    return {name: size for law in LAWS for name, size in law(mechanism, options).outputs.items()}
+
+
+def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:
+    """Return the size of the iterate of a step: the iterates of all laws, stacked."""
+    return sum(law.size for law in scene_laws(mechanism, options))
+
+
+def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
+    """Return how many iterations of a step may follow the first."""
+    return max((law.iterations for law in scene_laws(mechanism, options)), default=0)
+
+
+def culled_rows(mechanism: Mechanism, options: StepOptions) -> list[int]:
+    """Return the rows of the iterate that belong to contacts that act only where one of them is near."""
+    rows, first = [], 0
+    for law in scene_laws(mechanism, options):
+        rows += [first + row for row in law.culled_rows]
+        first += law.size
+    return rows
