@@ -24,9 +24,9 @@ from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.normal import KelvinVoigt, normal_law
-from ce_gym.dynamics.forces.parameters import PARAMETERS
-from ce_gym.dynamics.forces.scene import StepOptions, make_scene
+from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.laws.scene_laws import symbolic_state
+from ce_gym.dynamics.laws.scene_parameters import PARAMETERS, make_scene
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.step import solve

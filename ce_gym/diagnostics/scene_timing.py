@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ce_gym.compile import Buffer, Call, Kernel, Program, Repeat, load_kernel, source_fingerprint
 from ce_gym.diagnostics.scene import SceneReport, SubStep
-from ce_gym.dynamics.forces.parameters import parameter_defaults
+from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.sim.devices import device_named

@@ -23,8 +23,9 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, quaternion_product, quaternion_to_rotation
 from ce_gym.dynamics.algebra.tracing import traced
-from ce_gym.dynamics.forces.parameters import parameter_defaults, with_parameters
 from ce_gym.dynamics.functions import FUNCTIONS
+from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
+from ce_gym.dynamics.parameters import with_parameters
 from ce_gym.model.coordinates import Layout
 from ce_gym.model.errors import check_names, listed_names
 from ce_gym.model.mechanism import Mechanism
@@ -98,7 +99,7 @@ def make_quantity(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> Quan
     check_names(f"derivatives of {name}: wrt", wrt, [*given, *known], "some of", listed=f"{listed}, BODY being a link")
     defaults = parameter_defaults(mechanism.robot, mechanism.robot.material, figures)
     symbols = {x: SX.sym("figure", len(value)) for x, value in defaults.items()}
-    named = with_parameters(mechanism, figures, ca.vertcat(*symbols.values())) if figures else mechanism
+    named = with_parameters(mechanism, symbols) if figures else mechanism
     function = FUNCTIONS[name](named)
     inputs = {x: SX.sym(x, function.numel_in(i)) for i, x in enumerate(function.name_in())}
     outputs = dict(zip(function.name_out(), function.call(list(inputs.values())), strict=True))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.dynamics.forces.parameters import parameter_defaults
+from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.identify.figures import NO_PARAMETERS, OF_ENCODERS, Figure
 from ce_gym.identify.log import Log, LogError

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ce_gym.compile import Buffer
-from ce_gym.dynamics.forces.parameters import parameter_defaults
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.laws.scene_laws import output_sizes, state_fields
+from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.control import control_sizes
 from ce_gym.dynamics.stepping.methods import METHODS

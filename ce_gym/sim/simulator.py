@@ -16,9 +16,9 @@ from ce_gym.compile import CriticalSection
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.normal import NORMAL_LAWS
-from ce_gym.dynamics.forces.parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.forces.scene import Control, StepOptions, target_names
 from ce_gym.dynamics.laws.scene_laws import state_fields
+from ce_gym.dynamics.laws.scene_parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.parameter_effects import check_effects
 from ce_gym.dynamics.stepping.methods import METHODS
@@ -209,7 +209,7 @@ class Simulator:
             if not (np.abs(value) <= np.finfo(self.dtype).max).all():
                 raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
         rows["q"] = self._batch.unit("q", rows["q"])
-        resting = self._resting_load(rows["q"]) if self.contact_names else None
+        resting = self._resting_load(rows["q"]) if self.contact_names else np.zeros(0)
         for field in self._memory:
             rows[field.name] = resting if field.reset == "resting_load" else np.zeros(field.size)
         for name in ("diverged", "step_error", "step_change"):
@@ -268,7 +268,7 @@ class Simulator:
         Args:
             name: "gravity", "friction", "slip_speed", "stiffness", "damping", "kp", "kd", "motor_strength",
                 "rotor_inertia", "ratio", "added_mass:BODY" or "com_shift:BODY"; sizes and units are in
-                `ce_gym.dynamics.forces.parameters.PARAMETERS`.
+                `ce_gym.dynamics.laws.scene_parameters.PARAMETERS`.
             value: Shape (num_envs, size) or (size,) or ().
             mask: Which robots, bool, shape (num_envs,); all of them if None.
 

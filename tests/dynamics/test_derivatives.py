@@ -99,15 +99,16 @@ def test_figures_against_changed_robots(name: str, figure: str, size: int):
     """Gravity enters linearly, rotors through J r^2: what a robot with another figure does, by Richardson's rule."""
     import casadi as ca
 
-    from ce_gym.dynamics.forces.parameters import parameter_defaults, with_parameters
     from ce_gym.dynamics.functions import FUNCTIONS
+    from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
+    from ce_gym.dynamics.parameters import with_parameters
 
     model = Model(name)
     q, v, tau = (x[0] for x in near_standing(model))
     (default,) = parameter_defaults(model.robot, model.robot.material, (figure,)).values()
 
     def at(value: np.ndarray) -> np.ndarray:
-        changed = with_parameters(model.mechanism, (figure,), ca.SX(ca.DM(value)))
+        changed = with_parameters(model.mechanism, {figure: ca.SX(ca.DM(value))})
         return FUNCTIONS["forward_dynamics"](changed)(q, v, tau).full()[:, 0]
 
     columns = []

@@ -66,7 +66,9 @@ def test_a_stuck_motor_warms_along_the_closed_form():
     for dt in (0.1, 0.05, 0.025):
         found = run(table(10.0, heat=HEAT), [torque * RATIO], dt, round(end / dt), ("winding_temperature",))
         errors.append(np.abs(found["motor_warmth"][-1] - expected).max())
-        assert found["winding_temperature"][-1, 0] == pytest.approx(HEAT.ambient + found["motor_warmth"][-1, 0], rel=1e-12)
+        assert found["winding_temperature"][-1, 0] == pytest.approx(
+            HEAT.ambient + found["motor_warmth"][-1, 0], rel=1e-12
+        )
     assert errors[0] < 0.01 * expected[0]
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 2.0, atol=0.1)
 

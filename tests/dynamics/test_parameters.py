@@ -12,10 +12,11 @@ from tripod import TRIPOD
 
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.forces.parameters import ELASTIC_FACTORS, PARAMETERS, parameter_defaults
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_parameters import PARAMETERS, parameter_defaults
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import Body, Elasticity, Inertial, Joint, LinearConstraint, Motor, Placement, Robot, load_robot
+from ce_gym.model.drives import ELASTIC_FACTORS
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")

@@ -22,9 +22,9 @@ def mesh_figures(scene: Scene, elastic: Elasticity) -> tuple[SX, SX, SX]:
 
     Those of a belt's strand are half of the belt's.
     """
-    figures, share = scene.figures, 1.0 if elastic.linear or elastic.backlash else 0.5
-    k, d = share * elastic.stiffness * figures.drive_stiffness, share * elastic.damping * figures.drive_damping
-    return k, d, elastic.backlash * elastic.play * figures.backlash
+    values, share = scene.values, 1.0 if elastic.linear or elastic.backlash else 0.5
+    k, d = share * elastic.stiffness * values["drive_stiffness"], share * elastic.damping * values["drive_damping"]
+    return k, d, elastic.backlash * elastic.play * values["backlash"]
 
 
 def gap_of(elastic: Elasticity, k: SX, backlash: SX) -> SX:

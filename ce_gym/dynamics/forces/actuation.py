@@ -34,10 +34,10 @@ from ce_gym.dynamics.forces.motors import (
     most_friction,
     supply_of,
 )
-from ce_gym.dynamics.forces.parameters import rubbing_as_declared
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation, Stick
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
 from ce_gym.dynamics.laws.law import JointForce, is_moment
+from ce_gym.dynamics.parameters import rubbing_as_declared
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.dynamics.state import State
 from ce_gym.model.drives import Motor
@@ -68,7 +68,7 @@ def controller(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce
     works = SX(ca.DM([float(name not in robot.passive) for name in robot.commanded]))
     if scene.options.control == "torque":
         return JointForce(works * target, SX(target.shape[0], target.shape[0]))
-    kp, damping = works * scene.figures.kp, works * (scene.figures.kd + dt * scene.figures.kp)
+    kp, damping = works * scene.values["kp"], works * (scene.values["kd"] + dt * scene.values["kp"])
     return JointForce(kp * (target - y) - damping * yd, ca.diag(dt * damping))
 
 
@@ -132,7 +132,7 @@ def motor_forces(
     before: Before,
 ) -> SaturatedForce:
     """Return what the motors deliver of what they are asked for at the joints, which they see as `seen` has it."""
-    strength = scene.figures.strength
+    strength = scene.values["motor_strength"]
     at_joints = SaturatedForce(strength * asked.tau, strength * asked.slope, iterate.numel())
     joints = list(range(seen.shape[0]))
     model = MOTORS[scene.options.motors]
@@ -155,7 +155,7 @@ def _lifted(force: SaturatedForce, seen: SX) -> SaturatedForce:
 
 def within_joint_limits(scene: Scene, force: SaturatedForce, rows: list[int], iterate: SX, seen: SX) -> SaturatedForce:
     """Return a force of the motors that the joints `rows` limit, which it acts on by `seen`; it is changed in place."""
-    robot, strength = scene.mechanism.robot, scene.figures.strength
+    robot, strength = scene.mechanism.robot, scene.values["motor_strength"]
     for row in rows:
         limit = robot.body(robot.independent[row]).joint.torque
         if not (math.isinf(limit) or robot.independent[row] in robot.passive):

@@ -117,12 +117,12 @@ class Motors:
         for cluster in actuated_clusters(scene.mechanism, self.kinematics):
             own = self.target[[names.index(motor.rotor) for motor in cluster.motors]]
             asked, model = self._at_motors(cluster, own), MOTORS[scene.options.motors]
-            deliver(model, force, asked, cluster, yd, scene.figures.strength, dt, iterate, self.before)
+            deliver(model, force, asked, cluster, yd, scene.values["motor_strength"], dt, iterate, self.before)
         return within_joint_limits(scene, force, undriven, iterate, SX.eye(y.numel()))
 
     def _at_motors(self, cluster: Actuated, own: SX) -> JointForce:
         """Return what the motors of a cluster are asked for, given their targets, shape (n_motors,) both."""
-        strength = self.scene.figures.strength
+        strength = self.scene.values["motor_strength"]
         if self.scene.options.control == "motor_torque":
             asked = JointForce(own, SX(own.numel(), 1))
         elif self.scene.options.sampled:
@@ -142,7 +142,7 @@ class Motors:
 
     def _at_joints(self, names: tuple[str, ...], rows: list[int], size: int) -> SaturatedForce:
         """Return what is asked of the joints that no motor drives, and nothing of the others."""
-        n, strength, joints = self.y.numel(), self.scene.figures.strength, self.scene.mechanism.robot.commanded
+        n, strength, joints = self.y.numel(), self.scene.values["motor_strength"], self.scene.mechanism.robot.commanded
         force = SaturatedForce(SX(n, 1), SX(n, n), size)
         asked = self._joints_ask(names, rows, self.dt)
         if self.scene.options.sampled:
@@ -176,7 +176,7 @@ def motor_springs(scene: Scene, kinematics: Kinematics, y: SX, target: SX) -> tu
     stiffness, at = SX.zeros(len(names)), SX.zeros(len(names))
     for row, name in enumerate(joints):
         if name in names:
-            stiffness[names.index(name)], at[names.index(name)] = scene.figures.kp[row], y[row]
+            stiffness[names.index(name)], at[names.index(name)] = scene.values["kp"][row], y[row]
     for cluster in actuated_clusters(scene.mechanism, kinematics):
         entries = [names.index(motor.rotor) for motor in cluster.motors]
         stiffness[entries], at[entries] = _gains(scene, cluster)[0], cluster.angles
@@ -206,4 +206,4 @@ def _gains(scene: Scene, cluster: Actuated) -> tuple[SX, SX]:
     """Return position [N m/rad] and velocity gains [N m s/rad] of a cluster's motors, shape (n_motors,) each."""
     known = standing_motors(scene.mechanism)
     squares = SX(ca.sparsify(ca.DM(np.array([known[motor.rotor][2] for motor in cluster.motors]) ** 2)))
-    return squares @ scene.figures.kp[cluster.joints], squares @ scene.figures.kd[cluster.joints]
+    return squares @ scene.values["kp"][cluster.joints], squares @ scene.values["kd"][cluster.joints]

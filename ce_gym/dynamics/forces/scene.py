@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -9,8 +10,6 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.normal import HuntCrossley, normal_law
-from ce_gym.dynamics.forces.parameters import Figures, figures, with_parameters
 from ce_gym.dynamics.hulls import Hull, poles_of
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant
 from ce_gym.model.description import ContactMaterial, ContactSphere
@@ -73,12 +72,12 @@ class StepOptions:
 
 @dataclass
 class Scene:
-    """A robot in a scene, with numbers or symbols for its figures.
+    """A robot in a scene, with numbers or symbols for its parameters.
 
     Attributes:
         mechanism: The robot at a transmission level.
         options: What the scene consists of.
-        figures: Contact, gains and motor strength.
+        values: Parameters of the force laws by name.
         ground: Height [m] and slopes dz/dx, dz/dy of the ground under each of the options' `touches`, shape
             (3, n_touches); not used on flat ground.
         region_points: Where on their bodies the regions of hulls touch the ground [m], shape (3, n_regions).
@@ -89,24 +88,11 @@ class Scene:
 
     mechanism: Mechanism
     options: StepOptions
-    figures: Figures
+    values: Mapping[str, SX]
     ground: SX
     region_points: SX = field(default_factory=lambda: SX(3, 0))
     looked_up: SX = field(default_factory=SX)
     choosing: bool = False
-
-
-def make_scene(mechanism: Mechanism, options: StepOptions, parameters: SX, ground: SX) -> Scene:
-    """Return a scene whose declared parameters, stacked in the order of the options, are `parameters`.
-
-    Raises:
-        ValueError: The damping of contacts is a parameter, under a law that has none.
-    """
-    law = normal_law(options.normal_law, options.material)
-    if "damping" in options.parameters and isinstance(law, HuntCrossley):
-        raise ValueError("parameters='damping'; expected a material without dissipation, which takes its place")
-    named = with_parameters(mechanism, options.parameters, parameters)
-    return Scene(named, options, figures(mechanism.robot, options.material, options.parameters, parameters), ground)
 
 
 def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:

@@ -9,12 +9,13 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.contact import Contact, LinearContact, touch_ground, where
+from ce_gym.dynamics.forces.contact import Compliance, Contact, LinearContact, touch_ground, where
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.normal import normal_law
-from ce_gym.dynamics.forces.scene import contact_centres
+from ce_gym.dynamics.forces.scene import Scene, contact_centres
 from ce_gym.dynamics.hulls import with_hulls
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.recursion.kinematics import constant
 from ce_gym.dynamics.state import Field, State
@@ -23,9 +24,19 @@ from ce_gym.dynamics.stepping.methods import METHODS
 TWO_LOADS = ("extrapolated", "adaptive")
 """Methods that remember the normal forces of whole steps apart from those of half steps, see `methods.py`."""
 
+SLIP_SPEED = "speed at which the damping of friction alone carries its full force"
+DAMPING = "normal damping of the contacts under Kelvin and Voigt's law"
+
 
 class Contacts(ForceLaw):
     """Contact of a robot with the ground."""
+
+    parameters = (
+        Parameter("friction", "Coulomb coefficient of the contacts", "-", "1", lambda _, x: [x.friction]),
+        Parameter("slip_speed", SLIP_SPEED, "m/s", "1", lambda _, x: [x.slip_speed], "positive"),
+        Parameter("stiffness", "normal stiffness of the contacts", "N/m", "1", lambda _, x: [x.stiffness]),
+        Parameter("damping", DAMPING, "N s/m", "1", lambda _, x: [x.damping]),
+    )
 
     @property
     def acts(self) -> bool:
@@ -134,6 +145,14 @@ class ContactForces(LinearForce):
         return self.start.kinematics.bodies[contact.body].R
 
 
+def compliance_of(scene: Scene) -> Compliance:
+    """Return the compliance of the contacts of a scene."""
+    values, material = scene.values, scene.options.material
+    dissipation = None if material.dissipation is None else SX(material.dissipation)
+    names = ("stiffness", "damping", "friction", "slip_speed")
+    return Compliance(dissipation=dissipation, bristle=SX(material.bristle), **{name: values[name] for name in names})
+
+
 def contacts_at(start: Start) -> list[Contact]:
     """Place every contact of the scene against the plane that the ground is nearby."""
     scene, state, options = start.scene, start.state, start.scene.options
@@ -150,7 +169,7 @@ def contacts_at(start: Start) -> list[Contact]:
             up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state["anchor"][2 * i : 2 * i + 2] if state["anchor"].numel() else state["anchor"]
         touch = touch_ground(body, sphere, centre, height, up, state["load"][i], anchor)
-        compliance = scene.figures.compliance
+        compliance = compliance_of(scene)
         contacts.append(Contact(sphere.body, touch, compliance, normal, friction, start.dt, resolves_landing=resolves))
     return contacts
 
@@ -184,6 +203,7 @@ def iterates_after(contacts: Sequence[LinearContact], iterates: list[SX], motion
 
 def touch_energy(start: Start, contacts: Sequence[Contact]) -> SX:
     """Return the energy of the springs and bristles of contacts [J]."""
-    k, bristle = start.scene.figures.compliance.stiffness, start.scene.figures.compliance.bristle
+    compliance = compliance_of(start.scene)
+    k, bristle = compliance.stiffness, compliance.bristle
     touches = [contact.touch for contact in contacts]
     return sum((k * ca.fmax(t.depth, 0) ** 2 + bristle * ca.sumsqr(t.anchor) for t in touches), SX(0)) / 2

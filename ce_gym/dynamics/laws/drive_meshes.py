@@ -10,10 +10,23 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretch_resistances
 from ce_gym.dynamics.drives.stretch import mesh_energy, stretching
 from ce_gym.dynamics.laws.law import ForceLaw, JointForce, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.parameters import Parameter
+from ce_gym.model.description import ContactMaterial, Robot
+
+
+def ONE(robot: Robot, material: ContactMaterial) -> list[float]:
+    """Return the factor that changes nothing."""
+    return [1.0]
 
 
 class DriveMeshes(ForceLaw):
     """The elastic transmissions of a robot."""
+
+    parameters = (
+        Parameter("drive_stiffness", "factor on the stiffness of elastic transmissions", "-", "1", ONE, "positive"),
+        Parameter("drive_damping", "factor on the damping of elastic transmissions", "-", "1", ONE),
+        Parameter("backlash", "factor on the backlash of elastic transmissions", "-", "1", ONE),
+    )
 
     @property
     def acts(self) -> bool:

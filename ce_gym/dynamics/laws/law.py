@@ -17,9 +17,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.recursion.ce_aba import Articulation, BodyTerms
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.state import Field, State
@@ -205,6 +206,9 @@ class ForceLaw:
 
     mechanism: Mechanism
     options: StepOptions
+
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    """Parameters of the law; their values are in `Scene.values`."""
 
     @property
     def acts(self) -> bool:

@@ -10,7 +10,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.contact import Contact, where
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.self_collision import Frictionless, LinearPair, Pair, meeting
-from ce_gym.dynamics.laws.contacts import any_changed, iterates_after, touch_energy
+from ce_gym.dynamics.laws.contacts import any_changed, compliance_of, iterates_after, touch_energy
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
 from ce_gym.dynamics.state import Field
 from ce_gym.dynamics.stepping.methods import METHODS
@@ -22,7 +22,7 @@ class LinkPairs(ForceLaw):
     """Pairs of capsules on links that push each other apart."""
 
     @property
-    def capsules(self) -> list[tuple[Capsule, Capsule]]:
+    def capsules(self) -> tuple[tuple[Capsule, Capsule], ...]:
         """The capsules of each pair."""
         return colliding(self.mechanism.robot, self.options.self_collisions)
 
@@ -61,7 +61,7 @@ class LinkPairs(ForceLaw):
         return touch_energy(start, self._pairs_at(start))
 
     def _pairs_at(self, start: Start) -> list[Pair]:
-        options, compliance, pairs = self.options, start.scene.figures.compliance, []
+        options, compliance, pairs = self.options, compliance_of(start.scene), []
         law = normal_law(options.normal_law, options.material)
         for i, pair in enumerate(self.capsules):
             bodies = start.kinematics.bodies[pair[0].body], start.kinematics.bodies[pair[1].body]

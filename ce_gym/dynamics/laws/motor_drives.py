@@ -19,12 +19,29 @@ from ce_gym.dynamics.forces.motors import MOTORS, lagging_motors, loaded_motors,
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import target_names
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.state import Field, State
 from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.model.description import Robot
+
+KD_UNIT = "N m s/rad or N s/m"
+
+
+def gains(robot: Robot, name: str) -> list[float]:
+    """Return the gains "kp" or "kd" of all joints; 0 for joints without."""
+    return [dict(getattr(robot.gains, name)).get(joint, 0.0) for joint in robot.commanded]
 
 
 class MotorDrives(ForceLaw):
     """All motors of a robot and the controllers that command them."""
+
+    parameters = (
+        Parameter(
+            "kp", "position gains of the joints", "N m/rad or N/m", "n_joints", lambda robot, _: gains(robot, "kp")
+        ),
+        Parameter("kd", "velocity gains of the joints", KD_UNIT, "n_joints", lambda robot, _: gains(robot, "kd")),
+        Parameter("motor_strength", "factor on motor torques and their limits", "-", "1", lambda robot, _: [1.0]),
+    )
 
     @property
     def fields(self) -> tuple[Field, ...]:
@@ -69,10 +86,10 @@ class MotorDrives(ForceLaw):
         scene, total, options = start.scene, SX(0), self.options
         if options.control == "position":
             at = seen_joints(scene.mechanism, start.kinematics) @ start.y
-            total += ca.sum1(scene.figures.strength * scene.figures.kp * (start.target - at) ** 2) / 2
+            total += ca.sum1(scene.values["motor_strength"] * scene.values["kp"] * (start.target - at) ** 2) / 2
         if options.control == "motor_position":
             stiffness, stretch = motor_springs(scene, start.kinematics, start.y, start.target)
-            total += ca.sum1(scene.figures.strength * stiffness * stretch**2) / 2
+            total += ca.sum1(scene.values["motor_strength"] * stiffness * stretch**2) / 2
         if MOTORS[options.motors].at_motors:
             for cluster in actuated_clusters(scene.mechanism, start.kinematics):
                 for i, motor in enumerate(cluster.motors):
@@ -148,7 +165,7 @@ class MotorForces(LinearForce):
             supply = supply_of(scene.mechanism.robot, scene.options.motors, start.state)
             clusters = actuated_clusters(scene.mechanism, start.kinematics)
             work = motor_work(
-                clusters, self.force, supply, scene.figures.strength, start.yd + start.dt * motion.ydd, motion
+                clusters, self.force, supply, scene.values["motor_strength"], start.yd + start.dt * motion.ydd, motion
             )
             warmth, sag = supply.after(scene.mechanism.robot.motors, work, start.dt)
         return {

@@ -11,9 +11,9 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.drives.stretch import stretching
-from ce_gym.dynamics.forces.parameters import parameter_defaults
-from ce_gym.dynamics.forces.scene import StepOptions, make_scene, target_names
+from ce_gym.dynamics.forces.scene import StepOptions, target_names
 from ce_gym.dynamics.laws.scene_laws import culled_rows, iterate_size, symbolic_state
+from ce_gym.dynamics.laws.scene_parameters import make_scene, parameter_defaults
 from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.state import State

@@ -15,9 +15,9 @@ from ce_gym.compile import Buffer, Call, Lookup, Step
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.ground import above, lift, reach
-from ce_gym.dynamics.forces.parameters import figures
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.hulls import Hull
+from ce_gym.dynamics.laws.scene_parameters import law_values
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.envs.task.curriculum import Curriculum
 from ce_gym.envs.task.sampling import Sampler
@@ -117,7 +117,7 @@ def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str,
         seen: The buffer `SEEN`; None on flat ground.
     """
     parameters = state.get("parameters", SX(0, 1))
-    stiffness = figures(mechanism.robot, options.material, options.parameters, parameters).compliance.stiffness
+    stiffness = law_values(mechanism.robot, options.material, options.parameters, parameters)["stiffness"]
     centres, axes, load = sphere_centres(mechanism, state), sphere_axes(mechanism, state), []
     for i, sphere in enumerate(mechanism.robot.contacts):
         if sphere.name in options.contacts:

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.parameters import check_parameter, parameter_defaults
+from ce_gym.dynamics.laws.scene_parameters import check_parameter, parameter_defaults
 from ce_gym.envs.task.tasks import RANDOMISED, Range
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import listed_names

@@ -1,0 +1,95 @@
+"""The parameters of a robot in a scene: those of its model and those that force laws declare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.normal import HuntCrossley, normal_law
+from ce_gym.dynamics.forces.scene import Scene, StepOptions
+from ce_gym.dynamics.laws.scene_laws import LAWS
+from ce_gym.dynamics.parameters import MODEL_PARAMETERS, Parameter, check_ratios, least_value, with_parameters
+from ce_gym.model.description import ContactMaterial, Robot
+from ce_gym.model.errors import check_names
+from ce_gym.model.mechanism import Mechanism
+
+LAW_PARAMETERS: tuple[Parameter, ...] = tuple(parameter for law in LAWS for parameter in law.parameters)
+PARAMETERS: dict[str, Parameter] = {parameter.name: parameter for parameter in (*LAW_PARAMETERS, *MODEL_PARAMETERS)}
+"""All parameters by name; BODY stands for the name of a link, ROTOR for that of a rotor."""
+
+
+def parameter_defaults(
+    robot: Robot, material: ContactMaterial, names: Sequence[str], argument: str = "parameters"
+) -> dict[str, NDArray]:
+    """Return the value that leaves the robot unchanged, for each declared parameter, shape (size,).
+
+    Args:
+        robot: The robot.
+        material: Of its contacts.
+        names: The declared parameters.
+        argument: What an error calls them.
+
+    Raises:
+        ValueError: If a name is not a parameter of the robot, or is listed twice.
+    """
+    known = {name: parameter for parameter in PARAMETERS.values() for name in parameter.names(robot)}
+    check_names(argument, names, known, "one of", listed=f"{', '.join(PARAMETERS)}, BODY being a link, ROTOR a rotor")
+    if "ratio" in names:
+        check_ratios(robot)
+    return {name: np.array(known[name].default(robot, material), dtype=float) for name in names}
+
+
+def check_parameter(robot: Robot, name: str, values: ArrayLike) -> None:
+    """Check the values of a parameter.
+
+    Args:
+        robot: The robot.
+        name: Of one of its parameters.
+        values: Of some robots, any shape.
+
+    Raises:
+        ValueError: If a value is not finite or out of range; one line.
+    """
+    numbers, kind = np.asarray(values, dtype=float), name.split(":")[0]
+    allowed = next(parameter.allowed for parameter in PARAMETERS.values() if parameter.kind == kind)
+    least, expected = least_value(robot, name)
+    if kind == "added_mass":
+        good = numbers > least
+    elif allowed == "0 or more":
+        good, expected = numbers >= least, expected or allowed
+    else:
+        good = np.isfinite(numbers) if allowed == "finite" else numbers > 0
+        expected = "finite numbers" if allowed == "finite" else "more than 0"
+    if wrong := numbers[~(good & np.isfinite(numbers))].tolist():
+        raise ValueError(f"{name}={wrong[0]:g}; expected {expected}")
+
+
+def split_parameters(robot: Robot, material: ContactMaterial, names: Sequence[str], values: SX) -> dict[str, SX]:
+    """Return the declared parameters by name, given their values stacked in that order."""
+    sizes = [len(default) for default in parameter_defaults(robot, material, names).values()]
+    return dict(zip(names, ca.vertsplit(values, np.cumsum([0, *sizes]).tolist()), strict=True)) if names else {}
+
+
+def law_values(robot: Robot, material: ContactMaterial, names: Sequence[str], values: SX) -> dict[str, SX]:
+    """Return the values of the force laws' parameters, those of `names` taken from `values`, stacked in that order."""
+    given = split_parameters(robot, material, names, values)
+    defaults = parameter_defaults(robot, material, [parameter.name for parameter in LAW_PARAMETERS])
+    return {name: given.get(name, SX(default)) for name, default in defaults.items()}
+
+
+def make_scene(mechanism: Mechanism, options: StepOptions, parameters: SX, ground: SX) -> Scene:
+    """Return a scene whose declared parameters, stacked in the order of the options, are `parameters`.
+
+    Raises:
+        ValueError: The damping of contacts is a parameter, under a law that has none.
+    """
+    law = normal_law(options.normal_law, options.material)
+    if "damping" in options.parameters and isinstance(law, HuntCrossley):
+        raise ValueError("parameters='damping'; expected a material without dissipation, which takes its place")
+    robot, material = mechanism.robot, options.material
+    named = with_parameters(mechanism, split_parameters(robot, material, options.parameters, parameters))
+    return Scene(named, options, law_values(robot, material, options.parameters, parameters), ground)
