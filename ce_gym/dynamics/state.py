@@ -1,4 +1,4 @@
-"""The state of one robot from step to step, as named parts that force laws declare."""
+"""The state of one robot from step to step, as named parts that force laws declare; and the outputs of a step."""
 
 from __future__ import annotations
 
@@ -28,6 +28,27 @@ class Field:
     meaning: str
     reset: Literal["zero", "resting_load"] = "zero"
     explicit: bool = True
+
+
+@dataclass(frozen=True)
+class Output:
+    """A quantity that a step can report.
+
+    Attributes:
+        name: Of the output, and of its buffer.
+        unit: Of each number.
+        meaning: One line for readers.
+        of: The moment that it belongs to: the start of the step, its end, or the mean over it.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    of: Literal["start", "end", "mean"] = "end"
+
+    def __str__(self) -> str:
+        """Return meaning and unit."""
+        return f"{self.meaning} [{self.unit}]"
 
 
 class State:

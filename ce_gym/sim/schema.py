@@ -73,7 +73,7 @@ def physics_rows(
     fields = state_fields(model.mechanism, options)
     if isinstance(METHODS[options.method].end, Rates):
         for field in fields:
-            check("method", options.method, field.explicit, f"an implicit one, for {field.name}: {field.meaning}")
+            check("method", options.method, field.explicit, f"an implicit one: the state has the {field.meaning}")
     check_control_period(options, dt)
     turns = {"q": tuple(i for i, _ in model.robot.layout.turns)}
     rows = [

@@ -258,8 +258,8 @@ def test_a_gear_that_turns_backwards_mirrors_its_motor(asked):
     outputs = ("motor_torque", "motor_speed", "energy")
     one, other = (run(it, [asked], 0.002, 100, outputs, q=[0.2], v=[3.0]) for it in (robot, turned))
     for name, values in one.items():
-        sign = -1 if name in ("motor_torque", "motor_speed", "winding") else 1
-        expected = values * [-1, -1, 1] if name == "carried" else sign * values
+        sign = -1 if name in ("motor_torque", "motor_speed", "lagging_torque") else 1
+        expected = values * [-1, -1, 1] if name == "motor_load" else sign * values
         np.testing.assert_array_equal(other[name], expected, err_msg=name)
 
 

@@ -26,11 +26,11 @@ def test_a_first_step_from_motion_is_no_blow(method: str):
     v = np.array([1.0, -1.0, 1.5, -2.0, 1.5])
     target = model.bias_force(model.standing_q, np.zeros(5)) + np.array([1.0, 1.0, 1.0, -3.0, 1.0])
     given = {"q": model.standing_q, "v": v, "diverged": 0, "target": target, "dt": 1e-5}
-    first = function(**given, carried=np.zeros(11))
-    known = function(**given, carried=first["carried_next"])
+    first = function(**given, motor_load=np.zeros(11))
+    known = function(**given, motor_load=first["motor_load_next"])
     assert np.abs(first["v_next"].full().ravel() - v).max() < 2e-3
     np.testing.assert_allclose(first["v_next"], known["v_next"], atol=1e-5)
-    np.testing.assert_allclose(first["carried_next"], known["carried_next"], atol=0.05)
+    np.testing.assert_allclose(first["motor_load_next"], known["motor_load_next"], atol=0.05)
 
 
 def lifted(method: str, dt: float) -> float:

@@ -410,7 +410,7 @@ def test_errors_name_what_was_expected(tripod: Robot):
         sim.set_parameter("friction", np.nan)
     with pytest.raises(ValueError, match=r"mask has shape \(3,\); expected \(2,\)"):
         sim.set_parameter("friction", 0.5, np.ones(3, bool))
-    with pytest.raises(ValueError, match=r"parameters='colour'; expected one of gravity, .*, BODY being a link"):
+    with pytest.raises(ValueError, match=r"parameters='colour'; expected one of friction, .*, BODY being a link"):
         Simulator(model, parameters=("colour",))
     with pytest.raises(ValueError, match=r"parameters='added_mass:elbow_rotor'"):
         Simulator(model, parameters=("added_mass:elbow_rotor",))

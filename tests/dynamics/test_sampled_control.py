@@ -136,7 +136,10 @@ def test_kernels_do_the_same(method):
         ({"control_period": -0.001}, "control_period=-0.001; expected 0, or a multiple"),
         ({"control_period": 0.002, "control": "torque"}, "expected 0, but for control of positions"),
         ({"control_period": 0.002, "method": "adaptive"}, "expected 0, but for control of positions"),
-        ({"control_period": 0.002, "method": "rk4"}, "expected an implicit one, for controllers hold"),
+        (
+            {"control_period": 0.002, "method": "rk4"},
+            "the state has the torques that a sampled controller holds",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(arguments, said):

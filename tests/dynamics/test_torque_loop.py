@@ -81,12 +81,12 @@ def test_what_it_follows_is_asked_for_at_the_end_of_the_step():
     options = StepOptions(control="position", motors="limited")
     function = step_function(model.mechanism, options, ("motor_torque",))
     before, target, dt = -0.3, 0.4, 0.05
-    after = function(q=0.1, v=-2.0, winding=before, diverged=0, target=target, dt=dt)
+    after = function(q=0.1, v=-2.0, lagging_torque=before, diverged=0, target=target, dt=dt)
     q, v = float(after["q_next"]), float(after["v_next"])
     part = dt / (1 / (2 * np.pi * BANDWIDTH) + dt)
     expected = before + part * ((KP * (target - q) - KD * v) / RATIO - before)
     assert float(after["motor_torque"]) == pytest.approx(expected, rel=1e-10)
-    assert float(after["winding_next"]) == float(after["motor_torque"])
+    assert float(after["lagging_torque_next"]) == float(after["motor_torque"])
 
 
 def test_motors_of_a_differential_lag_each_by_itself():

@@ -68,7 +68,7 @@ def test_robots_differ_by_air_and_battery():
 
 
 def test_explicit_methods_are_refused():
-    with pytest.raises(ValueError, match="motors grow warm or a battery sags"):
+    with pytest.raises(ValueError, match="an implicit one: the state has the temperature above the air"):
         simulator(method="rk4")
 
 

@@ -18,7 +18,7 @@ from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, Place
 from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.recursion.kinematics import constant
-from ce_gym.dynamics.state import Field, State
+from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.dynamics.stepping.methods import METHODS
 
 TWO_LOADS = ("extrapolated", "adaptive")
@@ -37,6 +37,7 @@ class Contacts(ForceLaw):
         Parameter("stiffness", "normal stiffness of the contacts", "N/m", "1", lambda _, x: [x.stiffness]),
         Parameter("damping", DAMPING, "N s/m", "1", lambda _, x: [x.damping]),
     )
+    outputs = (Output("contact_forces", "N", "force on each contact, world axes", "mean"),)
 
     @property
     def acts(self) -> bool:
@@ -55,8 +56,8 @@ class Contacts(ForceLaw):
         )
 
     @property
-    def outputs(self) -> dict[str, int]:
-        """Forces of the contacts that have names."""
+    def output_sizes(self) -> dict[str, int]:
+        """Sizes of the outputs by name."""
         return {"contact_forces": 3 * len(self.options.contacts)}
 
     @property

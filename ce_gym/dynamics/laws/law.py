@@ -23,7 +23,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.recursion.ce_aba import Articulation, BodyTerms
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
-from ce_gym.dynamics.state import Field, State
+from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.model.mechanism import Mechanism
 
 if TYPE_CHECKING:
@@ -209,6 +209,8 @@ class ForceLaw:
 
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     """Parameters of the law; their values are in `Scene.values`."""
+    outputs: ClassVar[tuple[Output, ...]] = ()
+    """Quantities of the law that a step can report."""
 
     @property
     def acts(self) -> bool:
@@ -221,8 +223,8 @@ class ForceLaw:
         return ()
 
     @property
-    def outputs(self) -> dict[str, int]:
-        """Sizes of the outputs that a step can report."""
+    def output_sizes(self) -> dict[str, int]:
+        """Sizes of the outputs by name."""
         return {}
 
     @property

@@ -20,7 +20,7 @@ from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import target_names
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
 from ce_gym.dynamics.parameters import Parameter
-from ce_gym.dynamics.state import Field, State
+from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.model.description import Robot
 
@@ -42,6 +42,14 @@ class MotorDrives(ForceLaw):
         Parameter("kd", "velocity gains of the joints", KD_UNIT, "n_joints", lambda robot, _: gains(robot, "kd")),
         Parameter("motor_strength", "factor on motor torques and their limits", "-", "1", lambda robot, _: [1.0]),
     )
+    outputs = (
+        Output("torque", "N m or N", "motor torque at each joint", "mean"),
+        Output("motor_torque", "N m", "torque of each motor's windings, before losses", "mean"),
+        Output("motor_speed", "rad/s", "speed of each motor's rotor"),
+        Output("power", "W", "mechanical power of the motors at each joint"),
+        Output("winding_temperature", "deg C", "temperature of the winding of each motor that grows warm"),
+        Output("battery_voltage", "V", "voltage of the battery that feeds the motors, if there is one"),
+    )
 
     @property
     def fields(self) -> tuple[Field, ...]:
@@ -59,8 +67,8 @@ class MotorDrives(ForceLaw):
         )
 
     @property
-    def outputs(self) -> dict[str, int]:
-        """Torques, speeds, powers, temperatures and the voltage."""
+    def output_sizes(self) -> dict[str, int]:
+        """Sizes of the outputs by name."""
         robot, model = self.mechanism.robot, self.options.motors
         joints, motors = len(robot.commanded), len(robot.motors)
         sizes = {"torque": joints, "motor_torque": motors, "motor_speed": motors, "power": joints}

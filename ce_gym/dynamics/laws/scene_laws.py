@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from ce_gym.dynamics.constraints.closure import reference_guess
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.laws.contacts import Contacts
@@ -12,7 +14,7 @@ from ce_gym.dynamics.laws.joint_stops import JointStops
 from ce_gym.dynamics.laws.law import ForceLaw
 from ce_gym.dynamics.laws.link_pairs import LinkPairs
 from ce_gym.dynamics.laws.motor_drives import MotorDrives
-from ce_gym.dynamics.state import Field, State
+from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.model.mechanism import Mechanism
 
 LAWS: tuple[type[ForceLaw], ...] = (
@@ -25,6 +27,18 @@ LAWS: tuple[type[ForceLaw], ...] = (
     DriveMeshes,
 )
 """All force laws. Sums of forces follow this order."""
+
+
+STEP_OUTPUTS = (
+    Output("energy", "J", "kinetic, potential and elastic energy, see `mechanical_energy`"),
+    Output("error", "rad/s or m/s", "estimated error of the step in the velocities, of methods that have one"),
+    Output("loop_gap", "m or -", "norm of the residuals of the closed loops", "start"),
+    Output("nearness", "-", "distance from a singularity, see `Model.nearness`", "start"),
+)
+OUTPUTS: dict[str, Output] = {
+    output.name: output for output in (*(output for law in LAWS for output in law.outputs), *STEP_OUTPUTS)
+}
+"""All outputs that a step can report on request, by name."""
 
 
 def scene_laws(mechanism: Mechanism, options: StepOptions) -> list[ForceLaw]:
@@ -57,7 +71,12 @@ def symbolic_state(mechanism: Mechanism, options: StepOptions) -> State:
 
 def output_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
     """Return the sizes of the outputs of all laws by name, for a scene with or without their forces."""
-    return {name: size for law in LAWS for name, size in law(mechanism, options).outputs.items()}
+    return {name: size for law in LAWS for name, size in law(mechanism, options).output_sizes.items()}
+
+
+def moment_of(name: str) -> Literal["start", "end", "mean"]:
+    """Return the moment that an output belongs to; the end of the step for results that are no outputs."""
+    return OUTPUTS[name].of if name in OUTPUTS else "end"
 
 
 def iterate_size(mechanism: Mechanism, options: StepOptions) -> int:

@@ -12,8 +12,8 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.laws.scene_laws import symbolic_state
-from ce_gym.dynamics.stepping.plan import AT_START, MEANS, MOVED
+from ce_gym.dynamics.laws.scene_laws import moment_of, symbolic_state
+from ce_gym.dynamics.stepping.plan import MOVED
 from ce_gym.model.mechanism import Mechanism
 
 LARGEST_MOVE = 0.5
@@ -107,8 +107,8 @@ def reported(
     """
     results = dict(tried)
     for name in outputs:
-        if name in MEANS:
+        if moment_of(name) == "mean":
             results[name] = ca.if_else(first, 0, old[name]) + part * tried[name]
-        elif name in AT_START:
+        elif moment_of(name) == "start":
             results[name] = ca.if_else(first, tried[name], old[name])
     return results

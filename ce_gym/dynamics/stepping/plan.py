@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import casadi as ca
 
@@ -16,8 +17,6 @@ from ce_gym.dynamics.algebra.spatial import SX, quaternion_to_rotation
 from ce_gym.dynamics.state import State
 from ce_gym.model.coordinates import Layout
 
-AT_START, MEANS = ("loop_gap", "nearness"), ("torque", "motor_torque", "contact_forces")
-"""Outputs that belong to the start of a step, or are means over it; the others belong to its end."""
 MOVED = "moved"
 """Name of the output that says how far a step moves its fastest joint, at the speed of its end [rad or m]."""
 OFF = "off"
@@ -117,13 +116,13 @@ class Plan:
         """Whether it estimates its error."""
         return isinstance(self.end, Ends) and bool(self.end.error)
 
-    def shares(self, output: str) -> Mapping[str, float]:
-        """Return the weight of each stage in an output."""
+    def shares(self, moment: Literal["start", "end", "mean"]) -> Mapping[str, float]:
+        """Return the weight of each stage in an output that belongs to a moment of the step, or is a mean over it."""
         if isinstance(self.end, Rates):
             return {AFTER: 1.0}
-        if output in AT_START:
+        if moment == "start":
             return {self.stages[0].name: 1.0}
-        return self.end.means if output in MEANS else self.end.weights
+        return self.end.means if moment == "mean" else self.end.weights
 
 
 def combined(plan: Plan, ends: Mapping[str, State], layout: Layout) -> State:

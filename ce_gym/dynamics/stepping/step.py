@@ -129,7 +129,7 @@ class Stepped:
     def _sources(self) -> dict[str, LinearForce]:
         system = self.solved.system
         pairs = zip(system.laws, system.forces, strict=True)
-        return {name: force for law, force in pairs for name in law.outputs}
+        return {output.name: force for law, force in pairs for output in law.outputs}
 
     def output(self, name: str) -> SX:
         """Return an output of one of the laws; a column of no entries if the scene does not have the law."""

@@ -12,7 +12,7 @@ from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.drives.stretch import stretching
 from ce_gym.dynamics.forces.scene import StepOptions, target_names
-from ce_gym.dynamics.laws.scene_laws import culled_rows, iterate_size, symbolic_state
+from ce_gym.dynamics.laws.scene_laws import culled_rows, iterate_size, moment_of, symbolic_state
 from ce_gym.dynamics.laws.scene_parameters import make_scene, parameter_defaults
 from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
@@ -56,7 +56,7 @@ def step_function(
     """
     given, plan = Given(mechanism, options, follows), METHODS[options.method]
     parts = unrolled(plan, given.scene, given.state, given.target, given.dt)
-    told = {name: given.output(name, plan.shares(name), parts) for name in outputs}
+    told = {name: given.output(name, plan.shares(moment_of(name)), parts) for name in outputs}
     return traced("step", given.inputs(), given.guarded(parts[AFTER]) | told)
 
 
@@ -127,9 +127,9 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
         if name in ("error", OFF):
             results[name] = error_estimate(plan, ends) if name == "error" else step_errors(plan, before, ends, layout)
             continue
-        told = {stage: SX.sym(name, size) for stage in plan.shares(name)}
+        told = {stage: SX.sym(name, size) for stage in plan.shares(moment_of(name))}
         given |= {f"{stage}_{name}": value for stage, value in told.items()}
-        results[name] = weighted(plan.shares(name), told)
+        results[name] = weighted(plan.shares(moment_of(name)), told)
     return traced("combination", _needed(given, results), results)
 
 
@@ -137,22 +137,6 @@ def _needed(given: dict[str, SX], results: dict[str, SX]) -> dict[str, SX]:
     """Return those symbols that results depend on."""
     everything = ca.veccat(*results.values())
     return {name: value for name, value in given.items() if ca.depends_on(everything, value)}
-
-
-OUTPUTS = {
-    "torque": "motor torque at each joint, mean over the step [N m or N]",
-    "motor_torque": "torque of each motor's windings, before what it loses, mean over the step [N m]",
-    "motor_speed": "speed of each motor's rotor at the end of the step [rad/s]",
-    "power": "mechanical power of the motors at each joint, end of the step [W]",
-    "winding_temperature": "temperature of the winding of each motor that grows warm, end of the step [deg C]",
-    "battery_voltage": "voltage of the battery that feeds the motors, if there is one, end of the step [V]",
-    "contact_forces": "force on each contact, mean over the step, world axes [N]",
-    "energy": "kinetic, potential and elastic energy at the end of the step, see `mechanical_energy` [J]",
-    "error": "estimated error of the step in the velocities, of methods that have one [rad/s or m/s]",
-    "loop_gap": "norm of the residuals of the closed loops, start of the step [m or -]",
-    "nearness": "distance from a singularity, see `Model.nearness`, start of the step",
-}
-"""What a step can report, if asked."""
 
 
 class Given:
