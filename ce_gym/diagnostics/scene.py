@@ -25,8 +25,8 @@ from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.normal import KelvinVoigt, normal_law
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.laws.scene_laws import OUTPUTS, symbolic_state
-from ce_gym.dynamics.laws.scene_parameters import PARAMETERS, make_scene
+from ce_gym.dynamics.laws.scene_laws import OUTPUTS, PARAMETERS, symbolic_state
+from ce_gym.dynamics.laws.scene_parameters import make_scene
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.step import solve

@@ -129,7 +129,7 @@ class Evaluator:
         Args:
             name: Of a quantity, see `casadi_function`.
             wrt: Its inputs by name, and figures of the robot: "gravity", "rotor_inertia", "ratio", "added_mass:BODY" or
-                "com_shift:BODY", see `ce_gym.dynamics.laws.scene_parameters.PARAMETERS`.
+                "com_shift:BODY", see `ce_gym.dynamics.laws.scene_laws.PARAMETERS`.
 
         Raises:
             ValueError: If there is no such quantity, or it depends on no such thing.

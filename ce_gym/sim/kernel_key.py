@@ -10,6 +10,7 @@ from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws.scene_laws import scene_laws
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import iteration_function
@@ -30,6 +31,7 @@ def model_key(model: Model) -> str:
 def laws_key(mechanism: Mechanism, options: StepOptions) -> str:
     """Return a text that is equal for equal methods and laws, for cache keys; laws of others by what they trace to."""
     laws = normal_law(options.normal_law, options.material), FRICTION[options.friction], MOTORS[options.motors]
+    laws = *laws, *scene_laws(mechanism, options)
     ours = all(type(law).__module__.startswith("ce_gym.") for law in laws)
     traced_laws = "" if ours else iteration_function(mechanism, options).serialize()
     return f"{METHODS[options.method]!r} {traced_laws}"

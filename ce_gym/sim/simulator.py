@@ -267,7 +267,7 @@ class Simulator:
         Args:
             name: "gravity", "friction", "slip_speed", "stiffness", "damping", "kp", "kd", "motor_strength",
                 "rotor_inertia", "ratio", "added_mass:BODY" or "com_shift:BODY"; sizes and units are in
-                `ce_gym.dynamics.laws.scene_parameters.PARAMETERS`.
+                `ce_gym.dynamics.laws.scene_laws.PARAMETERS`.
             value: Shape (num_envs, size) or (size,) or ().
             mask: Which robots, bool, shape (num_envs,); all of them if None.
 
@@ -368,6 +368,14 @@ class Simulator:
         if not self.contact_names:
             return self._device.rows(np.zeros((self.num_envs, 0, 3)), self.dtype)
         return self._read("contact_forces").reshape(self.num_envs, -1, 3)
+
+    def output(self, name: str) -> Array:
+        """Return one of the requested outputs, a copy, shape (num_envs, size); 0 for robots that have diverged.
+
+        Raises:
+            ValueError: If the output was not requested.
+        """
+        return self._read(name)
 
     def _chosen(self, mask: ArrayLike | None) -> NDArray[np.bool_] | None:
         chosen = None if mask is None else to_numpy(mask).astype(bool)

@@ -292,9 +292,7 @@ def test_torques_go_to_the_rotors_of_a_differential():
     model = Model(replace(robot, motors=motors))
     function = step_function(model.mechanism, StepOptions(control="torque", motors="limited"))
     torque = np.array([0.7, -0.4])
-    carried = function(q=[0, 0], v=[0, 0], motor_load=ca.DM.zeros(5), diverged=0, target=torque, dt=0.005)[
-        "motor_load_next"
-    ]
+    after = function(q=[0, 0], v=[0, 0], motor_load=ca.DM.zeros(5), diverged=0, target=torque, dt=0.005)
     W = np.array([[3.0, 4.0], [3.0, -4.0]])
     shares = np.linalg.solve(W.T, torque)
     np.testing.assert_allclose(after["motor_load_next"].full().ravel(), [*shares, 0.0, 0.0, 1.0], atol=1e-5)

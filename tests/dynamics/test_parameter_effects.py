@@ -13,8 +13,8 @@ from tripod import TRIPOD
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.scene import StepOptions, target_names
-from ce_gym.dynamics.laws.scene_laws import state_sizes
-from ce_gym.dynamics.laws.scene_parameters import PARAMETERS, parameter_defaults
+from ce_gym.dynamics.laws.scene_laws import PARAMETERS, state_sizes
+from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.parameter_effects import check_effects
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Battery, Elasticity, Heat, Robot, load_robot

@@ -13,7 +13,8 @@ from tripod import TRIPOD
 from ce_gym import Simulator
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.laws.scene_parameters import PARAMETERS, parameter_defaults
+from ce_gym.dynamics.laws.scene_laws import PARAMETERS
+from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import Body, Elasticity, Inertial, Joint, LinearConstraint, Motor, Placement, Robot, load_robot
 from ce_gym.model.drives import ELASTIC_FACTORS
@@ -410,7 +411,7 @@ def test_errors_name_what_was_expected(tripod: Robot):
         sim.set_parameter("friction", np.nan)
     with pytest.raises(ValueError, match=r"mask has shape \(3,\); expected \(2,\)"):
         sim.set_parameter("friction", 0.5, np.ones(3, bool))
-    with pytest.raises(ValueError, match=r"parameters='colour'; expected one of friction, .*, BODY being a link"):
+    with pytest.raises(ValueError, match=r"parameters='colour'; expected one of gravity, .*, BODY being a link"):
         Simulator(model, parameters=("colour",))
     with pytest.raises(ValueError, match=r"parameters='added_mass:elbow_rotor'"):
         Simulator(model, parameters=("added_mass:elbow_rotor",))

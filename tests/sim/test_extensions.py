@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -15,6 +17,11 @@ from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS, Line
 from ce_gym.dynamics.forces.normal import NORMAL_LAWS
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.laws import scene_laws
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.parameters import Parameter
+from ce_gym.dynamics.recursion.ce_aba import BodyTerms
+from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.plan import Ends, Plan, Stage
 from ce_gym.envs.task.checks import checked_value
@@ -162,3 +169,92 @@ def test_a_changed_law_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
         options = StepOptions(DT, control="torque", motors="windage")
         keys.append(laws_key(wheel().mechanism, options))
     assert keys[0] == keys[2] != keys[1]
+
+
+class Damper(ForceLaw):
+    """A damper on the base whose force follows its speed with a lag: a law with memory, a parameter and an output."""
+
+    parameters = (Parameter("drag", "damping of the base along x", "N s/m", "1", lambda robot, _: [0.0]),)
+    outputs = (Output("drag_force", "N", "force on the base along x"),)
+
+    @property
+    def acts(self) -> bool:
+        """Whether the scene has it."""
+        return "drag" in self.options.parameters
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """The lagging speed."""
+        return (Field("lagging_speed", 1, "m/s", "speed of the base along x, with a lag"),)
+
+    @property
+    def output_sizes(self) -> dict[str, int]:
+        """One force."""
+        return {"drag_force": 1}
+
+    def place(self, start: Start) -> LaggingDamper:
+        """Return the force at the start of a step."""
+        return LaggingDamper(start)
+
+
+@dataclass
+class LaggingDamper(LinearForce, PlacedForce):
+    """The force of the damper."""
+
+    start: Start
+
+    def linearise(self, iterate: SX) -> LaggingDamper:
+        """Return the force, whatever the iterate."""
+        return self
+
+    @property
+    def force(self) -> SX:
+        """Force along x [N]."""
+        return -self.start.scene.values["drag"] * self.start.state["lagging_speed"]
+
+    def add_to(self, loads: Loads) -> None:
+        """Add the force to the base, which does not turn."""
+        old = loads.bodies.get("block", BodyTerms(SX(6, 6), SX(6, 1)))
+        loads.bodies["block"] = BodyTerms(old.inertia, old.force + ca.vertcat(SX(3, 1), self.force, SX(2, 1)))
+
+    def advance(self, motion: Motion) -> dict[str, SX]:
+        """Follow the speed with a time constant of 0.1 s."""
+        speed, lagging = self.start.state.v[3], self.start.state["lagging_speed"]
+        return {"lagging_speed": lagging + self.start.dt / 0.1 * (speed - lagging)}
+
+    def output(self, name: str, motion: Motion, after: State) -> SX:
+        """Return the force."""
+        return self.force
+
+
+@pytest.fixture
+def damped() -> Iterator[None]:
+    scene_laws.add_law(Damper)
+    yield
+    scene_laws.LAWS.remove(Damper)
+    del scene_laws.OUTPUTS["drag_force"], scene_laws.PARAMETERS["drag"]
+
+
+@pytest.mark.usefixtures("damped")
+def test_a_force_law_with_memory_a_parameter_and_an_output():
+    """Explicit Euler of `m v' = -d s`, `0.1 s' = v - s`, with another d for each robot; resets and snapshots know s."""
+    robot = replace(block(), gravity=(0.0, 0.0, 0.0))
+    sim = Simulator(Model(robot), 2, DT, contacts=(), parameters=("drag",), outputs=("drag_force",))
+    drag = np.array([3.0, 20.0])
+    sim.set_parameter("drag", drag[:, None])
+    start = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
+    for _ in range(2):
+        sim.set_state(*start)
+        speed, lagging = np.ones(2), np.zeros(2)
+        for _ in range(30):
+            snapshot = sim.snapshot()
+            sim.step(np.zeros(0))
+            speed, lagging = speed - DT * drag * lagging / MASS, lagging + DT / 0.1 * (speed - lagging)
+            np.testing.assert_allclose(sim.v[:, 3], speed, rtol=1e-12)
+        assert snapshot["lagging_speed"].shape == (2, 1)
+    sim.restore(snapshot)
+    sim.step(np.zeros(0))
+    np.testing.assert_allclose(sim.v[:, 3], speed, rtol=1e-12)
+    np.testing.assert_allclose(sim.output("drag_force")[:, 0], -drag * snapshot["lagging_speed"][:, 0], rtol=1e-12)
+    with pytest.raises(ValueError, match="drag=-1; expected 0 or more"):
+        sim.set_parameter("drag", -1.0)

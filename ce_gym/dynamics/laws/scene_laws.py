@@ -14,19 +14,12 @@ from ce_gym.dynamics.laws.joint_stops import JointStops
 from ce_gym.dynamics.laws.law import ForceLaw
 from ce_gym.dynamics.laws.link_pairs import LinkPairs
 from ce_gym.dynamics.laws.motor_drives import MotorDrives
+from ce_gym.dynamics.parameters import MODEL_PARAMETERS, Parameter
 from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.model.mechanism import Mechanism
 
-LAWS: tuple[type[ForceLaw], ...] = (
-    Contacts,
-    LinkPairs,
-    MotorDrives,
-    JointStops,
-    DryJointFriction,
-    JointSprings,
-    DriveMeshes,
-)
-"""All force laws. Sums of forces follow this order."""
+LAWS: list[type[ForceLaw]] = []
+"""All force laws. Sums of forces follow this order; `DriveMeshes` needs the sum of all others and is the last."""
 
 
 STEP_OUTPUTS = (
@@ -35,10 +28,21 @@ STEP_OUTPUTS = (
     Output("loop_gap", "m or -", "norm of the residuals of the closed loops", "start"),
     Output("nearness", "-", "distance from a singularity, see `Model.nearness`", "start"),
 )
-OUTPUTS: dict[str, Output] = {
-    output.name: output for output in (*(output for law in LAWS for output in law.outputs), *STEP_OUTPUTS)
-}
+OUTPUTS: dict[str, Output] = {output.name: output for output in STEP_OUTPUTS}
 """All outputs that a step can report on request, by name."""
+PARAMETERS: dict[str, Parameter] = {parameter.name: parameter for parameter in MODEL_PARAMETERS}
+"""All parameters by name; BODY stands for the name of a link, ROTOR for that of a rotor."""
+
+
+def add_law(law: type[ForceLaw]) -> None:
+    """Add a force law, with its outputs and parameters, to all scenes in which it acts."""
+    LAWS.insert(len(LAWS) - (DriveMeshes in LAWS), law)
+    OUTPUTS.update({output.name: output for output in law.outputs})
+    PARAMETERS.update({parameter.name: parameter for parameter in law.parameters})
+
+
+for _law in (Contacts, LinkPairs, MotorDrives, JointStops, DryJointFriction, JointSprings, DriveMeshes):
+    add_law(_law)
 
 
 def scene_laws(mechanism: Mechanism, options: StepOptions) -> list[ForceLaw]:

@@ -11,15 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.normal import HuntCrossley, normal_law
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
-from ce_gym.dynamics.laws.scene_laws import LAWS
-from ce_gym.dynamics.parameters import MODEL_PARAMETERS, Parameter, check_ratios, least_value, with_parameters
+from ce_gym.dynamics.laws.scene_laws import LAWS, PARAMETERS
+from ce_gym.dynamics.parameters import check_ratios, least_value, with_parameters
 from ce_gym.model.description import ContactMaterial, Robot
 from ce_gym.model.errors import check_names
 from ce_gym.model.mechanism import Mechanism
-
-LAW_PARAMETERS: tuple[Parameter, ...] = tuple(parameter for law in LAWS for parameter in law.parameters)
-PARAMETERS: dict[str, Parameter] = {parameter.name: parameter for parameter in (*LAW_PARAMETERS, *MODEL_PARAMETERS)}
-"""All parameters by name; BODY stands for the name of a link, ROTOR for that of a rotor."""
 
 
 def parameter_defaults(
@@ -77,7 +73,8 @@ def split_parameters(robot: Robot, material: ContactMaterial, names: Sequence[st
 def law_values(robot: Robot, material: ContactMaterial, names: Sequence[str], values: SX) -> dict[str, SX]:
     """Return the values of the force laws' parameters, those of `names` taken from `values`, stacked in that order."""
     given = split_parameters(robot, material, names, values)
-    defaults = parameter_defaults(robot, material, [parameter.name for parameter in LAW_PARAMETERS])
+    of_laws = [parameter.name for law in LAWS for parameter in law.parameters]
+    defaults = parameter_defaults(robot, material, of_laws)
     return {name: given.get(name, SX(default)) for name, default in defaults.items()}
 
 
