@@ -25,11 +25,11 @@ from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.normal import KelvinVoigt, normal_law
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.scene_laws import OUTPUTS, PARAMETERS, symbolic_state
 from ce_gym.dynamics.laws.scene_parameters import make_scene
 from ce_gym.dynamics.model import Model
-from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.step import solve
+from ce_gym.dynamics.stepping.step import first_iterate, solve
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.task.tasks import Task
@@ -270,7 +270,8 @@ def _parts_of_dynamics(step: SubStep) -> tuple[ca.Function, ca.Function]:
     mechanism, options = step.model.mechanism, step.options
     state, dt = symbolic_state(mechanism, options), cast(Any, SX.sym("dt"))
     target = SX.sym("target", len(mechanism.robot.commanded))
-    solved = solve(make_scene(mechanism, options, SX(0, 1), SX(3, 0)), state, target, dt, SX(6, 0))
+    scene = make_scene(mechanism, options, SX(0, 1), SX(3, 0))
+    solved = solve(scene, state, target, dt, first_iterate(scene))
     found = [x for body in solved.kinematics.bodies.values() for x in (body.X.E, body.X.p, body.c, body.v[:3])]
     found += [x for c in solved.kinematics.coordinates if c is not None for x in (c.G, c.g)]
     results = {f"x{i}": ca.vec(x) for i, x in enumerate(found)}

@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import aligned_copy
 from ce_gym.dynamics.algebra.batched import evaluate
+from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.integrators.plan import MOVED
 from ce_gym.dynamics.stepping.derivatives import primal_function, state_parts
 from ce_gym.dynamics.stepping.linearization import REMEMBERED
-from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import mending_function
-from ce_gym.dynamics.stepping.plan import MOVED
 from ce_gym.sim.derivative_kernels import load_gradient_kernel, load_linearization_kernel
 from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.simulator import Simulator

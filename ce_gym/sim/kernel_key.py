@@ -10,9 +10,9 @@ from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.scene_laws import scene_laws
 from ce_gym.dynamics.model import Model
-from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import iteration_function
 from ce_gym.model import FunctionConstraint, Robot
 from ce_gym.model.mechanism import Mechanism

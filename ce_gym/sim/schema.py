@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 
 from ce_gym.compile import Buffer
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.integrators.plan import Rates
 from ce_gym.dynamics.laws.scene_laws import output_sizes, state_fields
 from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.control import control_sizes
-from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.plan import Rates
 from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.devices import Array
 from ce_gym.sim.substeps import DT, FRAME

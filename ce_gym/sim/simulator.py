@@ -17,11 +17,11 @@ from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.normal import NORMAL_LAWS
 from ce_gym.dynamics.forces.scene import Control, StepOptions, target_names
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.scene_laws import OUTPUTS, state_fields
 from ce_gym.dynamics.laws.scene_parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.parameter_effects import check_effects
-from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.model import ContactMaterial
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.errors import check_names, listed_names

@@ -11,6 +11,8 @@ import casadi as ca
 from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step, While
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.integrators.plan import LOAD, MOVED, OFF, Plan, Rates, Stage
 from ce_gym.dynamics.laws.scene_laws import iterations_needed
 from ce_gym.dynamics.stepping.choice import chooses
 from ce_gym.dynamics.stepping.control import beginning_function as beginning_of_interval
@@ -22,9 +24,7 @@ from ce_gym.dynamics.stepping.ground_lookup import (
     planes_function,
     touching_function,
 )
-from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.parts import beginning_function, judging_function, mending_function
-from ce_gym.dynamics.stepping.plan import LOAD, MOVED, OFF, Plan, Rates, Stage
 from ce_gym.dynamics.stepping.trace import NEAR, combination_function, iteration_function, step_function
 from ce_gym.model.mechanism import Mechanism
 

@@ -9,8 +9,8 @@ import pytest
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.contact import Compliance, Contact, Iterate, LinearContact, Touch
 from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.normal import KelvinVoigt
-from ce_gym.dynamics.laws.law import Motion
 
 DT, MU, LOAD, BRISTLE, SLIP_SPEED = 0.005, 0.5, 20.0, 1e4, 0.01
 CONE = MU * LOAD

@@ -10,8 +10,8 @@ import pytest
 
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.contacts import TWO_LOADS
-from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, LinearConstraint, Placement, Robot
 

@@ -14,8 +14,8 @@ from ce_gym.diagnostics.scene import SceneReport, SubStep, layers, left_out, rep
 from ce_gym.diagnostics.scene_text import as_text
 from ce_gym.diagnostics.scene_timing import SceneTimes
 from ce_gym.dynamics import Model
+from ce_gym.dynamics.integrators.plan import MOVED
 from ce_gym.dynamics.laws.scene_laws import iterate_size
-from ce_gym.dynamics.stepping.plan import MOVED
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.tasks import VELOCITY

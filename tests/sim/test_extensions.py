@@ -14,16 +14,17 @@ from ce_gym import Model, Simulator
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.contact import Compliance, LinearContact, TangentialForce, Touch
 from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.motors import MOTORS, Line
 from ce_gym.dynamics.forces.normal import NORMAL_LAWS
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.integrators.plan import Ends, Plan, Stage
 from ce_gym.dynamics.laws import scene_laws
-from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.state import Field, Output, State
-from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.plan import Ends, Plan, Stage
 from ce_gym.envs.task.checks import checked_value
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Motor, Placement, Robot
 from ce_gym.sim.kernel_key import laws_key

@@ -8,9 +8,9 @@ import pytest
 from ce_gym import Model, Simulator, Terrain
 from ce_gym.compile import Call, Lookup, calls_of
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.integrators.plan import Rates
 from ce_gym.dynamics.laws.scene_laws import iterations_needed
-from ce_gym.dynamics.stepping.methods import METHODS
-from ce_gym.dynamics.stepping.plan import Rates
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Gains, Inertial, Joint, Motor, Placement, Robot
 from ce_gym.sim.substeps import substeps

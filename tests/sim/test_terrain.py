@@ -10,7 +10,7 @@ from tripod import TRIPOD
 
 from ce_gym import Model, Simulator, Terrain
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.sim.substeps import substeps

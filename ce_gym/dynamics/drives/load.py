@@ -25,10 +25,10 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.electric.supply import Supply, Work
 from ce_gym.dynamics.forces.actuation import Actuated, actuated_clusters, effort_matrix
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.motors import lagging_motors, loaded_motors
 from ce_gym.dynamics.forces.saturation import SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene
-from ce_gym.dynamics.laws.law import Motion
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.mechanism import Mechanism
 

@@ -31,8 +31,8 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX, solve_positive_definite
 from ce_gym.dynamics.drives.stretch import gap_of, mesh_figures, stretching
+from ce_gym.dynamics.forces.linear import JointForce, Motion, is_moment
 from ce_gym.dynamics.forces.scene import Scene
-from ce_gym.dynamics.laws.law import JointForce, Motion, is_moment
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.drives import Elasticity
 from ce_gym.model.mechanism import Mechanism

@@ -25,6 +25,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.electric.cogging import cogging
 from ce_gym.dynamics.electric.supply import Supply
 from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction, rubs
+from ce_gym.dynamics.forces.linear import JointForce, is_moment
 from ce_gym.dynamics.forces.motors import (
     MOTORS,
     MotorModel,
@@ -36,7 +37,6 @@ from ce_gym.dynamics.forces.motors import (
 )
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation, Stick
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
-from ce_gym.dynamics.laws.law import JointForce, is_moment
 from ce_gym.dynamics.parameters import rubbing_as_declared
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.dynamics.state import State

@@ -37,7 +37,7 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, cross, mirrored, skew, symmetric_blocks
 from ce_gym.dynamics.forces.ground import above_deepest, sine
-from ce_gym.dynamics.laws.law import Motion
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.recursion.kinematics import BodyState, constant
 from ce_gym.model.description import ContactSphere

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.linear import JointForce, is_moment
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation, Stick
-from ce_gym.dynamics.laws.law import JointForce, is_moment
 from ce_gym.dynamics.parameters import rubbing_as_declared
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.mechanism import Mechanism

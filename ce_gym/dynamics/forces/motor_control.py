@@ -38,10 +38,10 @@ from ce_gym.dynamics.forces.actuation import (
     seen_joints,
     within_joint_limits,
 )
+from ce_gym.dynamics.forces.linear import JointForce, is_moment
 from ce_gym.dynamics.forces.motors import MOTORS
 from ce_gym.dynamics.forces.saturation import SaturatedForce
 from ce_gym.dynamics.forces.scene import Scene, target_names
-from ce_gym.dynamics.laws.law import JointForce, is_moment
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
 

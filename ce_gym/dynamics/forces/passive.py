@@ -11,7 +11,7 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.integration import rotation_vector
 from ce_gym.dynamics.algebra.spatial import SX, mirrored
-from ce_gym.dynamics.laws.law import JointForce
+from ce_gym.dynamics.forces.linear import JointForce
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.dynamics.standing import standing_pose
 from ce_gym.model.description import Body, Joint

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.laws.law import JointForce, Motion
+from ce_gym.dynamics.forces.linear import JointForce, Motion
 
 ITERATIONS = 4
 """How many iterations of a step saturation may ask for after the first."""

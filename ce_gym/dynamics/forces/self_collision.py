@@ -30,7 +30,7 @@ from ce_gym.dynamics.forces.contact import (
     Touch,
     where,
 )
-from ce_gym.dynamics.laws.law import Motion
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.recursion.ce_aba import (
     Articulation,
     BodyTerms,

@@ -11,15 +11,16 @@ import numpy as np
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.contact import Compliance, Contact, LinearContact, touch_ground, where
 from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.scene import Scene, contact_centres
 from ce_gym.dynamics.hulls import with_hulls
-from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.recursion.kinematics import constant
 from ce_gym.dynamics.state import Field, Output, State
-from ce_gym.dynamics.stepping.methods import METHODS
 
 TWO_LOADS = ("extrapolated", "adaptive")
 """Methods that remember the normal forces of whole steps apart from those of half steps, see `methods.py`."""

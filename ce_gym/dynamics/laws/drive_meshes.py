@@ -9,7 +9,8 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.drives.mesh import MESH_ITERATIONS, Meshes, MeshForce, mesh_count, stretch_resistances
 from ce_gym.dynamics.drives.stretch import mesh_energy, stretching
-from ce_gym.dynamics.laws.law import ForceLaw, JointForce, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.forces.linear import JointForce, Motion
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.parameters import Parameter
 from ce_gym.model.description import ContactMaterial, Robot
 

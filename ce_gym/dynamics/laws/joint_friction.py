@@ -8,8 +8,9 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.saturation import SaturatedForce
-from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 
 
 class DryJointFriction(ForceLaw):

@@ -20,8 +20,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.linear import JointForce, Motion
 from ce_gym.dynamics.parameters import Parameter
-from ce_gym.dynamics.recursion.ce_aba import Articulation, BodyTerms
+from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.model.mechanism import Mechanism
@@ -31,45 +32,6 @@ if TYPE_CHECKING:
     from ce_gym.dynamics.forces.saturation import Stick
     from ce_gym.dynamics.forces.scene import Scene, StepOptions
     from ce_gym.dynamics.forces.self_collision import LinearPair
-
-
-def is_moment(dt: SX | float) -> bool:
-    """Whether a step has no length: the acceleration of the moment is wanted."""
-    return isinstance(dt, float) and dt == 0
-
-
-@dataclass
-class JointForce:
-    """A force on coordinates, `tau - slope @ ydd` over the step.
-
-    Attributes:
-        tau: At zero acceleration [N m or N], shape (n,).
-        slope: Symmetric [kg m^2 or kg], shape (n, n).
-    """
-
-    tau: SX
-    slope: SX
-
-    def __add__(self, other: JointForce) -> JointForce:
-        """Return the sum of both."""
-        return JointForce(self.tau + other.tau, self.slope + other.slope)
-
-
-@dataclass
-class Motion:
-    """The accelerations over a step.
-
-    Attributes:
-        ydd: Of the independent joints, shape (nj,).
-        a: Of each body minus gravity, body coordinates, shape (6,) each.
-        gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
-        articulation: Inertias of the recursion that found them; None if it is unknown.
-    """
-
-    ydd: SX
-    a: dict[str, SX]
-    gravity: dict[str, SX]
-    articulation: Articulation | None = None
 
 
 @dataclass

@@ -8,12 +8,13 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.contact import Contact, where
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.normal import normal_law
 from ce_gym.dynamics.forces.self_collision import Frictionless, LinearPair, Pair, meeting
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.contacts import any_changed, compliance_of, iterates_after, touch_energy
-from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.state import Field
-from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.description import Capsule
 

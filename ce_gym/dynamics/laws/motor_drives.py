@@ -14,14 +14,15 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.drives.load import carried_after, carried_now, motor_work, winding_torques, windings_after
 from ce_gym.dynamics.electric.cogging import cogging_energy
 from ce_gym.dynamics.forces.actuation import Before, actuated_clusters, limit_count, seen_joints
+from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.motor_control import Motors, motor_springs
 from ce_gym.dynamics.forces.motors import MOTORS, lagging_motors, loaded_motors, supply_of, warm_motors
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import target_names
-from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, Motion, PlacedForce, Start
+from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.state import Field, Output, State
-from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.model.description import Robot
 
 KD_UNIT = "N m s/rad or N s/m"

@@ -23,9 +23,9 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.plan import MOVED, OFF
 from ce_gym.dynamics.laws.scene_laws import symbolic_state
 from ce_gym.dynamics.stepping.parts import LARGEST_MOVE, reported
-from ce_gym.dynamics.stepping.plan import MOVED, OFF
 from ce_gym.model.coordinates import Layout
 from ce_gym.model.mechanism import Mechanism
 

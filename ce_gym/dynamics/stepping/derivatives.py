@@ -14,8 +14,8 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.scene_laws import iterate_size, iterations_needed
-from ce_gym.dynamics.stepping.methods import METHODS
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model.coordinates import Layout
 from ce_gym.model.mechanism import Mechanism

@@ -12,8 +12,8 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.plan import MOVED
 from ce_gym.dynamics.laws.scene_laws import moment_of, symbolic_state
-from ce_gym.dynamics.stepping.plan import MOVED
 from ce_gym.model.mechanism import Mechanism
 
 LARGEST_MOVE = 0.5

@@ -26,9 +26,10 @@ from ce_gym.dynamics.algebra.integration import advance
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.contact import LinearContact
 from ce_gym.dynamics.forces.dry_friction import stand_still
+from ce_gym.dynamics.forces.linear import JointForce, Motion, is_moment
 from ce_gym.dynamics.forces.scene import Scene, contact_places
 from ce_gym.dynamics.forces.self_collision import pressed_on, settled
-from ce_gym.dynamics.laws.law import ForceLaw, JointForce, LinearForce, Loads, Motion, PlacedForce, Start, is_moment
+from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.laws.scene_laws import iterate_size, scene_laws
 from ce_gym.dynamics.recursion.ce_aba import (
     Articulation,

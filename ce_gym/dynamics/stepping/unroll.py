@@ -13,10 +13,10 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_product, quaternion_to_rotation
 from ce_gym.dynamics.forces.scene import Scene
+from ce_gym.dynamics.integrators.plan import AFTER, Plan, Rates, combined, error_estimate
 from ce_gym.dynamics.laws.scene_laws import iterations_needed
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.state import State
-from ce_gym.dynamics.stepping.plan import AFTER, Plan, Rates, combined, error_estimate
 from ce_gym.dynamics.stepping.step import (
     Solved,
     Stepped,

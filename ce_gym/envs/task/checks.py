@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.motors import MOTORS
-from ce_gym.dynamics.stepping.methods import METHODS
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.envs.task.tasks import STARTS, Actions
 from ce_gym.envs.task.terrain_tiles import checked_terrain
 from ce_gym.envs.terms.registry import terms_of

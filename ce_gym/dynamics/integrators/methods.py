@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import sqrt
 
-from ce_gym.dynamics.stepping.plan import Ends, Plan, Rates, Stage
+from ce_gym.dynamics.integrators.plan import Ends, Plan, Rates, Stage
 
 EULER = Plan(1, (Stage("whole"),), Ends({"whole": 1.0}, {"whole": 1.0}))
 

@@ -1,0 +1,1 @@
+"""Time-stepping methods: data that says how a step is made of stages."""
