@@ -8,14 +8,13 @@ one degree of freedom is one, `sum |W_i| f_i`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.linear import JointForce, is_moment
-from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation, Stick
-from ce_gym.dynamics.parameters import rubbing_as_declared
+from ce_gym.dynamics.forces.saturation import Saturation, Stick
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.mechanism import Mechanism
 
@@ -30,117 +29,11 @@ its cluster, which single precision has few of; a cluster with one degree of fre
 """
 INDEPENDENT = 1e-6
 """Least determinant of directions for them to be independent."""
-STICK_ITERATIONS = 8
-"""How many iterations of a step joints may ask for after the first until which of them stick is settled.
-
-If it is not by then, as in one step of a thousand of long chains, each has the torque that was expected, up to its own.
-"""
-TINY = 1e-18
-"""Of the square of how far a joint moves for a unit of the independent ones; one that does not move rubs nothing."""
-
-
-@dataclass
-class Rubbing:
-    """A cluster with dry friction.
-
-    Attributes:
-        index: Of the cluster.
-        rows: Its rows of `y`, d of them.
-        friction: Of its joints, by the name of the body that each moves [N m or N].
-    """
-
-    index: int
-    rows: list[int]
-    friction: dict[str, float]
-
-    @property
-    def declared(self) -> bool:
-        """Whether some of it is a parameter, which may turn out to be 0: no friction holds nothing."""
-        return any(isinstance(friction, SX) for friction in self.friction.values())
-
-    @property
-    def count(self) -> int:
-        """How many torques its friction has."""
-        return 1 if len(self.rows) == 1 else len(self.friction)
-
-
-def rubbing_clusters(mechanism: Mechanism) -> list[Rubbing]:
-    """Return the clusters with dry friction."""
-    robot, found = mechanism.robot, []
-    for k, cluster in enumerate(mechanism.tree.clusters):
-        joints = {name: robot.body(name).joint for name in cluster.bodies}
-        friction = {n: joint.friction for n, joint in joints.items() if joint.type != "free" and rubs(joint.friction)}
-        if friction:
-            found.append(Rubbing(k, [robot.independent.index(name) for name in cluster.independent], friction))
-    return found
 
 
 def rubs(friction: float | SX) -> bool:
     """Return whether something has dry friction: a number that is not 0, or a symbol that may not be."""
     return isinstance(friction, SX) or bool(friction)
-
-
-def friction_count(mechanism: Mechanism, declared: tuple[str, ...] = ()) -> int:
-    """Return the size of the iterate of the joints' dry friction: its torques, and 1 once there is an iterate.
-
-    Args:
-        mechanism: The robot.
-        declared: Names of the scene's parameters, of which the joints' friction may be one.
-    """
-    mechanism = rubbing_as_declared(mechanism, declared)
-    count = sum(rubbing.count for rubbing in rubbing_clusters(mechanism))
-    return count + 1 if count else 0
-
-
-@dataclass
-class JointFriction:
-    """What the dry friction of all joints does over one step: a `ForceLaw`.
-
-    Attributes:
-        mechanism: The robot.
-        kinematics: Of it.
-        yd: Velocities of the independent joints [rad/s or m/s], shape (nj,).
-        dt: Length of the step [s].
-    """
-
-    mechanism: Mechanism
-    kinematics: Kinematics
-    yd: SX
-    dt: float
-
-    @property
-    def size(self) -> int:
-        """How many numbers its iterate has."""
-        return friction_count(self.mechanism)
-
-    def linearise(self, iterate: SX) -> SaturatedForce:
-        """Linearise about an iterate, shape (size,)."""
-        n, last = self.yd.numel(), iterate[-1] > STICK_ITERATIONS - 0.5
-        force = SaturatedForce(SX(n, 1), SX(n, n), iterate.numel(), count=iterate[-1] + 1)
-        for cluster in rubbing_clusters(self.mechanism):
-            for friction, own in self._torques(cluster).values():
-                way, place = SX(1, n), len(force.limited)
-                way[cluster.rows] = own
-                alone = len(cluster.rows) == 1
-                one, rests, damping = dry_friction(friction, way @ self.yd, way, self.dt, iterate, place, alone)
-                force.limited[place] = one
-                acts = one.free if not cluster.declared else ca.logic_and(one.free, friction > 0)
-                sticks = ca.logic_and(acts, ca.logic_not(last))
-                force.tau += way.T @ ca.if_else(last, ca.fmax(-friction, ca.fmin(friction, one.expected)), one.given)
-                force.slope += way.T @ ca.if_else(sticks, self.dt * damping, 0) @ way
-                force.frictions.append(Stick(way, sticks, rests))
-        return force
-
-    def _torques(self, cluster: Rubbing) -> dict[str, tuple[SX, SX]]:
-        """Return what a cluster's friction has, along which unit vector of its independent joints, shape (1, d)."""
-        coordinates = self.kinematics.coordinates[cluster.index]
-        assert coordinates is not None
-        ways = {name: ca.sparsify(coordinates.G[coordinates.index[name], :]) for name in cluster.friction}
-        if len(cluster.rows) == 1:
-            whole = sum((SX(friction) * ca.fabs(ways[name]) for name, friction in cluster.friction.items()), SX(0))
-            return {self.mechanism.robot.independent[cluster.rows[0]]: (whole, SX(1))}
-        lengths = {name: ca.sqrt(ca.sumsqr(way) + TINY) for name, way in ways.items()}
-        return {name: (lengths[name] * f, ways[name] / lengths[name]) for name, f in cluster.friction.items()}
 
 
 def dry_friction(

@@ -40,42 +40,21 @@ class Contacts(ForceLaw):
     )
     outputs = (Output("contact_forces", "N", "force on each contact, world axes", "mean"),)
 
-    @property
-    def acts(self) -> bool:
-        """Whether anything can touch the ground."""
-        return bool(self.options.touches)
-
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """Normal forces, and deflections of bristles if the material has them."""
-        n, bristles = len(self.options.touches), self.options.material.bristle > 0
-        coarse = n if self.options.method in TWO_LOADS else 0
-        return (
+    def declare(self) -> None:
+        """Remember normal forces, and deflections of bristles if the material has them."""
+        options, n = self.options, len(self.options.touches)
+        coarse = n if options.method in TWO_LOADS else 0
+        bristles = 2 * n if options.material.bristle > 0 else 0
+        self.acts = n > 0
+        self.fields = (
             Field("load", n, "N", "normal force of each contact over the last step", "resting_load"),
             Field("whole_load", coarse, "N", "normal force over the last whole step, of two loads", "resting_load"),
-            Field("anchor", 2 * n * bristles, "m", "horizontal deflection of each contact's bristle, world axes"),
+            Field("anchor", bristles, "m", "horizontal deflection of each contact's bristle, world axes"),
         )
-
-    @property
-    def output_sizes(self) -> dict[str, int]:
-        """Sizes of the outputs by name."""
-        return {"contact_forces": 3 * len(self.options.contacts)}
-
-    @property
-    def size(self) -> int:
-        """Size of the iterate."""
-        return Contact.size * len(self.options.touches)
-
-    @property
-    def iterations(self) -> int:
-        """How many iterations the friction law may need after the first."""
-        return FRICTION[self.options.friction].iterations
-
-    @property
-    def culled_rows(self) -> list[int]:
-        """Rows of the iterate of the contacts that are declared to be seldom near."""
-        seldom = [i for i, name in enumerate(self.options.touches) if name in self.options.seldom]
-        return [Contact.size * i + j for i in seldom for j in range(Contact.size)]
+        self.output_sizes = {"contact_forces": 3 * len(options.contacts)}
+        self.size, self.iterations = Contact.size * n, FRICTION[options.friction].iterations
+        seldom = [i for i, name in enumerate(options.touches) if name in options.seldom]
+        self.culled_rows = [Contact.size * i + j for i in seldom for j in range(Contact.size)]
 
     def place(self, start: Start) -> PlacedContacts:
         """Place every contact against the ground."""

@@ -1,4 +1,4 @@
-"""Dry friction of the joints; `forces/dry_friction.py` has the equations."""
+"""Dry friction of the joints: it sticks or slips; `forces/dry_friction.py` has the torque of one joint."""
 
 from __future__ import annotations
 
@@ -7,44 +7,106 @@ from dataclasses import dataclass
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.dry_friction import STICK_ITERATIONS, JointFriction, friction_count
+from ce_gym.dynamics.forces.dry_friction import dry_friction, rubs
 from ce_gym.dynamics.forces.linear import Motion
-from ce_gym.dynamics.forces.saturation import SaturatedForce
+from ce_gym.dynamics.forces.saturation import SaturatedForce, Stick
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
+from ce_gym.dynamics.parameters import rubbing_as_declared
+from ce_gym.model.mechanism import Mechanism
+
+STICK_ITERATIONS = 8
+"""How many iterations of a step joints may need after the first until it is settled which of them stick.
+
+If it is not settled by then, as in one step of a thousand of long chains, each has the expected torque, up to its own.
+"""
+TINY = 1e-18
+"""Added to the square of a joint's motion for unit motion of independent joints; a joint at rest rubs nothing."""
 
 
 class DryJointFriction(ForceLaw):
     """Dry friction of all joints, dependent ones included."""
 
-    @property
-    def acts(self) -> bool:
-        """Whether a joint has dry friction."""
-        return self.size > 0
+    def declare(self) -> None:
+        """Iterate over the torques; the last entry counts the iterations."""
+        rubbing = rubbing_clusters(rubbing_as_declared(self.mechanism, self.options.parameters))
+        self.acts = bool(rubbing)
+        self.size, self.iterations = sum(cluster.count for cluster in rubbing) + 1, STICK_ITERATIONS
 
-    @property
-    def size(self) -> int:
-        """Size of the iterate: the torques, and the number of iterations so far."""
-        return friction_count(self.mechanism, self.options.parameters)
-
-    @property
-    def iterations(self) -> int:
-        """How many iterations joints may need until it is settled which of them stick."""
-        return STICK_ITERATIONS
-
-    def place(self, start: Start) -> PlacedFriction:
+    def place(self, start: Start) -> JointFriction:
         """Return the friction at the start of a step."""
-        return PlacedFriction(JointFriction(start.scene.mechanism, start.kinematics, start.yd, start.dt))
+        return JointFriction(start)
 
 
 @dataclass
-class PlacedFriction(PlacedForce):
-    """The friction at the start of a step."""
+class Rubbing:
+    """A cluster with dry friction.
 
-    friction: JointFriction
+    Attributes:
+        index: Of the cluster.
+        rows: Its rows of `y`, d of them.
+        friction: Of its joints, by the name of the body that each moves [N m or N].
+    """
+
+    index: int
+    rows: list[int]
+    friction: dict[str, float]
+
+    @property
+    def declared(self) -> bool:
+        """Whether some of it is a parameter, which may turn out to be 0: no friction holds nothing."""
+        return any(isinstance(friction, SX) for friction in self.friction.values())
+
+    @property
+    def count(self) -> int:
+        """How many torques its friction has."""
+        return 1 if len(self.rows) == 1 else len(self.friction)
+
+
+def rubbing_clusters(mechanism: Mechanism) -> list[Rubbing]:
+    """Return the clusters with dry friction."""
+    robot, found = mechanism.robot, []
+    for k, cluster in enumerate(mechanism.tree.clusters):
+        joints = {name: robot.body(name).joint for name in cluster.bodies}
+        friction = {n: joint.friction for n, joint in joints.items() if joint.type != "free" and rubs(joint.friction)}
+        if friction:
+            found.append(Rubbing(k, [robot.independent.index(name) for name in cluster.independent], friction))
+    return found
+
+
+@dataclass
+class JointFriction(PlacedForce):
+    """The dry friction of all joints at the start of a step."""
+
+    start: Start
 
     def linearise(self, iterate: SX) -> FrictionForces:
-        """Linearise about an iterate."""
-        return FrictionForces(self.friction.linearise(iterate), iterate)
+        """Linearise about an iterate, shape (size,)."""
+        start, n, last = self.start, self.start.yd.numel(), iterate[-1] > STICK_ITERATIONS - 0.5
+        force = SaturatedForce(SX(n, 1), SX(n, n), iterate.numel(), count=iterate[-1] + 1)
+        for cluster in rubbing_clusters(start.scene.mechanism):
+            for friction, own in self._torques(cluster).values():
+                way, place = SX(1, n), len(force.limited)
+                way[cluster.rows] = own
+                alone = len(cluster.rows) == 1
+                one, rests, damping = dry_friction(friction, way @ start.yd, way, start.dt, iterate, place, alone)
+                force.limited[place] = one
+                acts = one.free if not cluster.declared else ca.logic_and(one.free, friction > 0)
+                sticks = ca.logic_and(acts, ca.logic_not(last))
+                force.tau += way.T @ ca.if_else(last, ca.fmax(-friction, ca.fmin(friction, one.expected)), one.given)
+                force.slope += way.T @ ca.if_else(sticks, start.dt * damping, 0) @ way
+                force.frictions.append(Stick(way, sticks, rests))
+        return FrictionForces(force, iterate)
+
+    def _torques(self, cluster: Rubbing) -> dict[str, tuple[SX, SX]]:
+        """Return what a cluster's friction has, along which unit vector of its independent joints, shape (1, d)."""
+        coordinates = self.start.kinematics.coordinates[cluster.index]
+        assert coordinates is not None
+        ways = {name: ca.sparsify(coordinates.G[coordinates.index[name], :]) for name in cluster.friction}
+        if len(cluster.rows) == 1:
+            whole = sum((SX(friction) * ca.fabs(ways[name]) for name, friction in cluster.friction.items()), SX(0))
+            return {self.start.scene.mechanism.robot.independent[cluster.rows[0]]: (whole, SX(1))}
+        lengths = {name: ca.sqrt(ca.sumsqr(way) + TINY) for name, way in ways.items()}
+        return {name: (lengths[name] * f, ways[name] / lengths[name]) for name, f in cluster.friction.items()}
 
 
 @dataclass

@@ -10,10 +10,9 @@ from ce_gym.dynamics.laws.law import ForceLaw, PassiveForces, Start
 class JointSprings(ForceLaw):
     """Springs of joints with one coordinate, and viscous friction and stops of dependent joints."""
 
-    @property
-    def acts(self) -> bool:
-        """Whether the robot has such joints."""
-        return bool(yielding_joints(self.mechanism))
+    def declare(self) -> None:
+        """Act if the robot has such joints."""
+        self.acts = bool(yielding_joints(self.mechanism))
 
     def place(self, start: Start) -> PassiveForces:
         """Return the forces at the start of a step."""

@@ -14,7 +14,7 @@ returns the next iterate. This is Newton's method on the implicit step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
@@ -157,52 +157,42 @@ class PassiveForces(LinearForce, PlacedForce):
         loads.balls = self.balls or loads.balls
 
 
-@dataclass(frozen=True)
+@dataclass
 class ForceLaw:
     """A force law in a scene: by default one without memory and without active set.
+
+    Subclasses set the attributes that differ from these defaults in `declare`.
 
     Attributes:
         mechanism: The robot at a transmission level.
         options: The scene.
+        acts: Whether the scene has such a force.
+        fields: The law's memory.
+        output_sizes: Sizes of the outputs by name.
+        size: Size of the iterate; all zero at first.
+        iterations: How many iterations of a step may follow the first.
+        culled_rows: Rows of the iterate that belong to contacts that act only where one of them is near.
     """
 
     mechanism: Mechanism
     options: StepOptions
+    acts: bool = True
+    fields: Sequence[Field] = ()
+    output_sizes: Mapping[str, int] = field(default_factory=dict)
+    size: int = 0
+    iterations: int = 0
+    culled_rows: Sequence[int] = ()
 
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     """Parameters of the law; their values are in `Scene.values`."""
     outputs: ClassVar[tuple[Output, ...]] = ()
     """Quantities of the law that a step can report."""
 
-    @property
-    def acts(self) -> bool:
-        """Whether the scene has such a force."""
-        return True
+    def __post_init__(self) -> None:
+        self.declare()
 
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """The law's memory."""
-        return ()
-
-    @property
-    def output_sizes(self) -> dict[str, int]:
-        """Sizes of the outputs by name."""
-        return {}
-
-    @property
-    def size(self) -> int:
-        """Size of the iterate; all zero at first."""
-        return 0
-
-    @property
-    def iterations(self) -> int:
-        """How many iterations of a step may follow the first."""
-        return 0
-
-    @property
-    def culled_rows(self) -> list[int]:
-        """Rows of the iterate that belong to contacts that act only where one of them is near."""
-        return []
+    def declare(self) -> None:
+        """Set the attributes of the law in its scene."""
 
     def place(self, start: Start) -> PlacedForce:
         """Return the law at the start of a step."""

@@ -16,41 +16,19 @@ from ce_gym.dynamics.laws.contacts import any_changed, compliance_of, iterates_a
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.state import Field
 from ce_gym.model.checks.collisions import colliding
-from ce_gym.model.description import Capsule
 
 
 class LinkPairs(ForceLaw):
     """Pairs of capsules on links that push each other apart."""
 
-    @property
-    def capsules(self) -> tuple[tuple[Capsule, Capsule], ...]:
-        """The capsules of each pair."""
-        return colliding(self.mechanism.robot, self.options.self_collisions)
-
-    @property
-    def acts(self) -> bool:
-        """Whether any pair of links is declared."""
-        return bool(self.options.self_collisions)
-
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """Forces between the pairs."""
-        return (Field("pressed", len(self.capsules), "N", "force between each pair of capsules over the last step"),)
-
-    @property
-    def size(self) -> int:
-        """Size of the iterate."""
-        return Contact.size * len(self.capsules)
-
-    @property
-    def iterations(self) -> int:
-        """How many iterations pairs may need after the first."""
-        return Frictionless.iterations
-
-    @property
-    def culled_rows(self) -> list[int]:
-        """All rows: pairs act only where they are near."""
-        return list(range(self.size))
+    def declare(self) -> None:
+        """Remember the force of each pair; pairs act only where they are near."""
+        self.capsules = colliding(self.mechanism.robot, self.options.self_collisions)
+        n = len(self.capsules)
+        self.acts = n > 0
+        self.fields = (Field("pressed", n, "N", "force between each pair of capsules over the last step"),)
+        self.size, self.iterations = Contact.size * n, Frictionless.iterations
+        self.culled_rows = range(self.size)
 
     def place(self, start: Start) -> PlacedPairs:
         """Place the capsules of every pair against each other."""

@@ -52,39 +52,25 @@ class MotorDrives(ForceLaw):
         Output("battery_voltage", "V", "voltage of the battery that feeds the motors, if there is one"),
     )
 
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """The memory of the motors' effects."""
-        robot, model = self.mechanism.robot, self.options.motors
+    def declare(self) -> None:
+        """Remember loads, lagging torques, temperatures, the battery's voltage and sampled torques."""
+        robot, model, options = self.mechanism.robot, self.options.motors, self.options
+        joints, motors = len(robot.commanded), len(robot.motors)
         loaded, warm = len(loaded_motors(robot, model)), len(warm_motors(robot, model))
-        battery = robot.battery is not None and MOTORS[model].at_motors
-        held = len(target_names(self.mechanism, self.options.control)) + 1 if self.options.sampled else 0
-        return (
-            Field("motor_load", 2 * loaded + (loaded > 0), "N m", LOAD),
+        battery = int(robot.battery is not None and MOTORS[model].at_motors)
+        load = 2 * loaded + 1 if loaded else 0
+        held = len(target_names(self.mechanism, options.control)) + 1 if options.sampled else 0
+        self.fields = (
+            Field("motor_load", load, "N m", LOAD),
             Field("lagging_torque", len(lagging_motors(robot, model)), "N m", LAG, explicit=False),
             Field("motor_warmth", 2 * warm, "K", WARMTH, explicit=False),
-            Field("battery_sag", int(battery), "V", SAG, explicit=False),
+            Field("battery_sag", battery, "V", SAG, explicit=False),
             Field("held_torque", held, "N m or N; last s", HELD, explicit=False),
         )
-
-    @property
-    def output_sizes(self) -> dict[str, int]:
-        """Sizes of the outputs by name."""
-        robot, model = self.mechanism.robot, self.options.motors
-        joints, motors = len(robot.commanded), len(robot.motors)
-        sizes = {"torque": joints, "motor_torque": motors, "motor_speed": motors, "power": joints}
-        battery = robot.battery is not None and MOTORS[model].at_motors
-        return sizes | {"winding_temperature": len(warm_motors(robot, model)), "battery_voltage": int(battery)}
-
-    @property
-    def size(self) -> int:
-        """Size of the iterate: of the limits, then what friction under load depends on."""
-        return limit_count(self.mechanism, self.options) + self.fields[0].size
-
-    @property
-    def iterations(self) -> int:
-        """How many iterations limits may need after the first."""
-        return ITERATIONS if limit_count(self.mechanism, self.options) else 0
+        self.output_sizes = {"torque": joints, "motor_torque": motors, "motor_speed": motors, "power": joints}
+        self.output_sizes |= {"winding_temperature": warm, "battery_voltage": battery}
+        limits = limit_count(self.mechanism, options)
+        self.size, self.iterations = limits + load, ITERATIONS if limits else 0
 
     def place(self, start: Start) -> PlacedMotors:
         """Return the motors at the start of a step."""
