@@ -241,7 +241,7 @@ def with_drives(robot: Robot, given: Mapping[str, SX]) -> Robot:
     return replace(robot, **changed) if changed else robot
 
 
-def rubbing_as_declared(mechanism: Mechanism, names: tuple[str, ...]) -> Mechanism:
+def with_declared_friction(mechanism: Mechanism, names: tuple[str, ...]) -> Mechanism:
     """Return a mechanism in which whatever has dry friction by declared parameters has some."""
     n = {"motor_friction": len(mechanism.robot.motors), "joint_friction": len(mechanism.robot.commanded)}
     given = {name: SX.ones(n[name]) for name in names if name in n}

@@ -46,7 +46,7 @@ def carried_after(
     Args:
         scene: The robot and what surrounds it.
         kinematics: At the start of the step.
-        motors: What the motors deliver.
+        motors: Torques of the motors.
         inertia: Of clusters, without what acts on their coordinates, shape (d, d) each.
         motion: The acceleration.
     """
@@ -75,7 +75,7 @@ def motor_work(
 
     Args:
         clusters: With motors.
-        motors: What the motors deliver.
+        motors: Torques of the motors.
         supply: Temperatures and voltage at the start of the step.
         strength: Factor on the torques of all motors [-].
         yd: Velocities of the independent joints at the end of the step, shape (nj,).

@@ -31,7 +31,7 @@ INDEPENDENT = 1e-6
 """Least determinant of directions for them to be independent."""
 
 
-def rubs(friction: float | SX) -> bool:
+def has_dry_friction(friction: float | SX) -> bool:
     """Return whether something has dry friction: a number that is not 0, or a symbol that may not be."""
     return isinstance(friction, SX) or bool(friction)
 

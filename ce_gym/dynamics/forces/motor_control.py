@@ -1,20 +1,20 @@
-"""Control of a robot at its joints or at its motors, up to what the motors deliver to the joints.
+"""Control of a robot at its joints or at its motors, and the torques that the motors give for it.
 
-At the motors, a target is an angle or a torque of a rotor, whatever lies between it and the joints: with theta the
-rotors' angles and `W` their speeds for unit joint velocities,
+At the motors, a target is an angle or a torque of a rotor, whatever transmission lies between rotor and joints. With
+theta the rotors' angles and `W` their speeds for unit joint velocities,
 
     tau_m = kp_m (target - theta) - kd_m thetad        tau = W^T tau_m
 
-each within the motor's own limits. Every motor has a loop of its own, so that where belts, differentials or rods tie
-motors and joints together the gains at the joints are `W^T diag(kp_m) W`, and couple. The gains of a motor are those of
-its joints as it feels them alone, the other motors of the cluster at rest, in the standing pose:
+each within the motor's own limits. Every motor has its own loop. Where belts, differentials or rods tie motors and
+joints together, the gains at the joints `W^T diag(kp_m) W` couple the joints. The gains of a motor follow from the
+gains of its joints with the other motors of the cluster at rest, in the standing pose:
 
     kp_m,i = e_i^T W^-T diag(kp) W^-1 e_i        kp / N^2 behind a gear of ratio N, where both controls are the same
 
-As in actuation.py forces are taken one step ahead: what a controller that is much faster than the steps does. One that
-is slower looks at positions and speeds at the start of the step in which its time has come, and holds what it asks for
-until it looks again; nothing of that is implicit, and gains that are too large for its period are unstable, as they are
-in hardware.
+As in actuation.py torques are taken one step ahead, as a controller much faster than the steps would give them. A
+sampled controller reads positions and speeds at the start of the step in which its period ends, and holds its torques
+until the next sample. These torques are not implicit: gains that are too large for the period are unstable, as on
+hardware.
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.actuation import (
     Actuated,
-    Before,
+    MotorState,
     actuated_clusters,
-    controller,
-    deliver,
-    limit_count,
-    motor_forces,
-    seen_joints,
+    add_motor_torques,
+    encoder_map,
+    joint_command,
+    torques_of_joint_command,
     within_joint_limits,
 )
 from ce_gym.dynamics.forces.linear import JointForce, is_moment
@@ -47,17 +46,17 @@ from ce_gym.model.mechanism import Mechanism
 
 
 @dataclass
-class Motors:
-    """What the motors of a robot do over one step: a `ForceLaw`.
+class MotorControl:
+    """The motors of a robot over one step, and their controllers.
 
     Attributes:
-        scene: The robot and what surrounds it.
+        scene: The robot and its surroundings.
         kinematics: Of the robot.
         y: Independent joint positions [rad or m], shape (nj,).
         yd: Their velocities, shape (nj,).
         target: See `target_names`, shape (n_targets,).
         dt: Length of the step [s].
-        before: What motors go by of the step before.
+        memory: Of the motors at the start of the step.
     """
 
     scene: Scene
@@ -66,106 +65,111 @@ class Motors:
     yd: SX
     target: SX
     dt: float
-    before: Before
-
-    @property
-    def size(self) -> int:
-        """How many numbers its iterate has."""
-        return limit_count(self.scene.mechanism, self.scene.options)
+    memory: MotorState
 
     def linearise(self, iterate: SX) -> SaturatedForce:
-        """Linearise about an iterate, shape (size,)."""
-        force = self._delivered(iterate)
+        """Return the torques at the joints, linearised about an iterate, shape (limit_count,)."""
+        at_joints = self.scene.options.control in ("position", "torque")
+        force = self._torques_at_joints(iterate) if at_joints else self._torques_at_motors(iterate)
         if self.scene.options.sampled:
-            period, left = self.scene.options.control_period, self.before.held[-1]
-            force.sampled = ca.vertcat(self._sampled, ca.if_else(self._due, period, left) - self.dt)
+            period, remaining = self.scene.options.control_period, self.memory.held[-1]
+            force.sampled = ca.vertcat(self._sampled, ca.if_else(self._due, period, remaining) - self.dt)
         return force
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Names of the targets."""
+        return target_names(self.scene.mechanism, self.scene.options.control)
 
     @property
     def _due(self) -> SX:
-        """1 if a sampled controller looks now; steps and samples need not be the same numbers to rounding."""
-        return SX(1) if is_moment(self.dt) else self.before.held[-1] < self.dt / 2
+        """1 if a sampled controller reads now; multiples of the step may differ from the period by rounding."""
+        return SX(1) if is_moment(self.dt) else self.memory.held[-1] < self.dt / 2
 
     @property
     def _sampled(self) -> SX:
-        """What a sampled controller asks for over the step [N m or N], shape (n_targets,)."""
-        scene = self.scene
+        """Torques commanded by a sampled controller over the step [N m or N], shape (n_targets,)."""
+        scene, mechanism = self.scene, self.scene.mechanism
         if scene.options.control == "position":
-            seen = seen_joints(scene.mechanism, self.kinematics)
-            now = controller(scene, seen @ self.y, seen @ self.yd, self.target, 0.0).tau
+            encoders = encoder_map(mechanism, self.kinematics)
+            command = joint_command(scene, encoders @ self.y, encoders @ self.yd, self.target, 0.0).tau
         else:
-            names, now = target_names(scene.mechanism, scene.options.control), SX.zeros(self.target.numel())
-            for row, name in enumerate(scene.mechanism.robot.commanded):
+            names, command = self._names, SX.zeros(self.target.numel())
+            for row, name in enumerate(mechanism.robot.commanded):
                 if name in names:
-                    now[names.index(name)] = self._joints_ask(names, [row], 0.0).tau[row]
-            for cluster in actuated_clusters(scene.mechanism, self.kinematics):
+                    command[names.index(name)] = self._undriven_command(names, [row], 0.0).tau[row]
+            for cluster in actuated_clusters(mechanism, self.kinematics):
                 places = [names.index(motor.rotor) for motor in cluster.motors]
-                now[places] = self._motors_ask(cluster, self.target[places], 0.0).tau
-        return ca.densify(ca.if_else(self._due, now, self.before.held[:-1]))
+                command[places] = self._position_command(cluster, self.target[places], 0.0).tau
+        return ca.densify(ca.if_else(self._due, command, self.memory.held[:-1]))
 
-    def _delivered(self, iterate: SX) -> SaturatedForce:
-        scene, y, yd, dt = self.scene, self.y, self.yd, self.dt
-        if scene.options.control in ("position", "torque"):
-            seen = seen_joints(scene.mechanism, self.kinematics)
-            asked = controller(scene, seen @ y, seen @ yd, self.target, dt)
-            if scene.options.sampled:
-                asked = unanswering(self._sampled)
-            return motor_forces(scene, self.kinematics, asked, yd, dt, iterate, seen, self.before)
-        names, joints = target_names(scene.mechanism, scene.options.control), scene.mechanism.robot.commanded
+    def _torques_at_joints(self, iterate: SX) -> SaturatedForce:
+        """Return the torques for targets of the joints."""
+        encoders = encoder_map(self.scene.mechanism, self.kinematics)
+        command = joint_command(self.scene, encoders @ self.y, encoders @ self.yd, self.target, self.dt)
+        if self.scene.options.sampled:
+            command = constant_torque(self._sampled)
+        return torques_of_joint_command(
+            self.scene, self.kinematics, command, self.yd, self.dt, iterate, encoders, self.memory
+        )
+
+    def _torques_at_motors(self, iterate: SX) -> SaturatedForce:
+        """Return the torques for targets of the motors, and of the joints that no motor drives."""
+        scene, names, joints = self.scene, self._names, self.scene.mechanism.robot.commanded
         undriven = [row for row, name in enumerate(joints) if name in names]
-        force = self._at_joints(names, undriven, iterate.numel())
+        force = self._undriven_torques(names, undriven, iterate.numel())
+        model, strength = MOTORS[scene.options.motors], scene.values["motor_strength"]
         for cluster in actuated_clusters(scene.mechanism, self.kinematics):
-            own = self.target[[names.index(motor.rotor) for motor in cluster.motors]]
-            asked, model = self._at_motors(cluster, own), MOTORS[scene.options.motors]
-            deliver(model, force, asked, cluster, yd, scene.values["motor_strength"], dt, iterate, self.before)
-        return within_joint_limits(scene, force, undriven, iterate, SX.eye(y.numel()))
+            targets = self.target[[names.index(motor.rotor) for motor in cluster.motors]]
+            command = self._motor_command(cluster, targets)
+            add_motor_torques(model, force, command, cluster, self.yd, strength, self.dt, iterate, self.memory)
+        return within_joint_limits(scene, force, undriven, iterate, SX.eye(self.y.numel()))
 
-    def _at_motors(self, cluster: Actuated, own: SX) -> JointForce:
-        """Return what the motors of a cluster are asked for, given their targets, shape (n_motors,) both."""
-        strength = self.scene.values["motor_strength"]
+    def _motor_command(self, cluster: Actuated, targets: SX) -> JointForce:
+        """Return the torques commanded at the motors of a cluster, given their targets, shape (n_motors,) both."""
+        strength, n = self.scene.values["motor_strength"], targets.numel()
         if self.scene.options.control == "motor_torque":
-            asked = JointForce(own, SX(own.numel(), 1))
+            command = JointForce(targets, SX(n, 1))
         elif self.scene.options.sampled:
-            names = target_names(self.scene.mechanism, self.scene.options.control)
-            places = [names.index(motor.rotor) for motor in cluster.motors]
-            asked = JointForce(self._sampled[places], SX(own.numel(), 1))
+            places = [self._names.index(motor.rotor) for motor in cluster.motors]
+            command = JointForce(self._sampled[places], SX(n, 1))
         else:
-            asked = self._motors_ask(cluster, own, self.dt)
-        return JointForce(strength * asked.tau, ca.diag(strength * asked.slope))
+            command = self._position_command(cluster, targets, self.dt)
+        return JointForce(strength * command.tau, ca.diag(strength * command.slope))
 
-    def _motors_ask(self, cluster: Actuated, own: SX, dt: float) -> JointForce:
-        """Return what position control asks the motors of a cluster for, slopes as a column."""
+    def _position_command(self, cluster: Actuated, targets: SX, dt: float) -> JointForce:
+        """Return the torques of position control at the motors of a cluster, slopes as a column."""
         kp, kd = _gains(self.scene, cluster)
         damping = kd + dt * kp
-        tau = kp * (own - cluster.angles) - damping * (cluster.W @ self.yd[cluster.rows])
+        tau = kp * (targets - cluster.angles) - damping * (cluster.W @ self.yd[cluster.rows])
         return JointForce(tau, dt * damping)
 
-    def _at_joints(self, names: tuple[str, ...], rows: list[int], size: int) -> SaturatedForce:
-        """Return what is asked of the joints that no motor drives, and nothing of the others."""
+    def _undriven_torques(self, names: tuple[str, ...], rows: list[int], size: int) -> SaturatedForce:
+        """Return the torques of the joints that no motor drives, and none of the others."""
         n, strength, joints = self.y.numel(), self.scene.values["motor_strength"], self.scene.mechanism.robot.commanded
         force = SaturatedForce(SX(n, 1), SX(n, n), size)
-        asked = self._joints_ask(names, rows, self.dt)
+        command = self._undriven_command(names, rows, self.dt)
         if self.scene.options.sampled:
-            held, full = self._sampled, SX.zeros(len(joints))
+            held, tau = self._sampled, SX.zeros(len(joints))
             for row in rows:
-                full[row] = held[names.index(joints[row])]
-            asked = unanswering(full)
+                tau[row] = held[names.index(joints[row])]
+            command = constant_torque(tau)
         for row in rows:
-            force.tau[row], force.slope[row, row] = strength * asked.tau[row], strength * asked.slope[row, row]
+            force.tau[row], force.slope[row, row] = strength * command.tau[row], strength * command.slope[row, row]
         return force
 
-    def _joints_ask(self, names: tuple[str, ...], rows: list[int], dt: float) -> JointForce:
-        """Return what control asks for at the joints that no motor drives, their own targets being followed."""
+    def _undriven_command(self, names: tuple[str, ...], rows: list[int], dt: float) -> JointForce:
+        """Return the command at the joints that no motor drives, for their own targets."""
         scene, joints = self.scene, self.scene.mechanism.robot.commanded
         control = "position" if scene.options.control == "motor_position" else "torque"
-        full = SX.zeros(len(joints))
+        targets = SX.zeros(len(joints))
         for row in rows:
-            full[row] = self.target[names.index(joints[row])]
+            targets[row] = self.target[names.index(joints[row])]
         scene = replace(scene, options=replace(scene.options, control=control))
-        return controller(scene, self.y[: len(joints)], self.yd[: len(joints)], full, dt)
+        return joint_command(scene, self.y[: len(joints)], self.yd[: len(joints)], targets, dt)
 
 
-def unanswering(tau: SX) -> JointForce:
+def constant_torque(tau: SX) -> JointForce:
     """Return torques that do not depend on accelerations."""
     return JointForce(tau, SX(tau.numel(), tau.numel()))
 
@@ -185,21 +189,21 @@ def motor_springs(scene: Scene, kinematics: Kinematics, y: SX, target: SX) -> tu
 
 @lru_cache(maxsize=64)
 def standing_motors(mechanism: Mechanism) -> dict[str, tuple[float, NDArray[np.float64], NDArray[np.float64]]]:
-    """Return what motors do in the standing pose of a robot that is as it should be.
+    """Return the motion of motors in the standing pose of a robot, with nominal ratios and without stretches.
 
     Returns:
-        For each rotor with a motor its angle [rad], its speed for unit velocities of the joints of its cluster, shape
-        (d,), and the speeds of those joints for unit speed of it alone, shape (d,); nothing stretches.
+        For each rotor with a motor: its angle [rad]; its speed for unit velocities of the joints of its cluster, shape
+        (d,); the speeds of these joints for unit speed of this rotor alone, shape (d,).
     """
     q, still = SX(ca.DM(mechanism.robot.standing_q)), SX(mechanism.robot.layout.nv, 1)
     mechanism = replace(mechanism, ratio=None)
     kinematics = outward_velocity_pass(mechanism, q, still)
-    found = {}
+    motions = {}
     for cluster in actuated_clusters(mechanism, kinematics):
         W, angles = np.array(ca.evalf(cluster.W[:, : len(cluster.joints)])), np.array(ca.evalf(cluster.angles))[:, 0]
         for i, (motor, back) in enumerate(zip(cluster.motors, np.linalg.pinv(W).T, strict=True)):
-            found[motor.rotor] = float(angles[i]), W[i], back
-    return found
+            motions[motor.rotor] = float(angles[i]), W[i], back
+    return motions
 
 
 def _gains(scene: Scene, cluster: Actuated) -> tuple[SX, SX]:

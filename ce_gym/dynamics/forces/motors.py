@@ -54,7 +54,7 @@ class MotorModel(Protocol):
 
 
 class Ideal:
-    """Motors that deliver what joints are asked for up to the joints' limits, at any speed and without loss."""
+    """Motors without loss that give the commanded torque up to the limits of the joints, at any speed."""
 
     at_motors = False
 

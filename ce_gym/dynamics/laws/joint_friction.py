@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.dry_friction import dry_friction, rubs
+from ce_gym.dynamics.forces.dry_friction import dry_friction, has_dry_friction
 from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Stick
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
-from ce_gym.dynamics.parameters import rubbing_as_declared
+from ce_gym.dynamics.parameters import with_declared_friction
 from ce_gym.model.mechanism import Mechanism
 
 STICK_ITERATIONS = 8
@@ -20,7 +20,7 @@ STICK_ITERATIONS = 8
 If it is not settled by then, as in one step of a thousand of long chains, each has the expected torque, up to its own.
 """
 TINY = 1e-18
-"""Added to the square of a joint's motion for unit motion of independent joints; a joint at rest rubs nothing."""
+"""Added to the square of a joint's motion for unit motion of independent joints; a fixed joint has none."""
 
 
 class DryJointFriction(ForceLaw):
@@ -28,7 +28,7 @@ class DryJointFriction(ForceLaw):
 
     def declare(self) -> None:
         """Iterate over the torques; the last entry counts the iterations."""
-        rubbing = rubbing_clusters(rubbing_as_declared(self.mechanism, self.options.parameters))
+        rubbing = rubbing_clusters(with_declared_friction(self.mechanism, self.options.parameters))
         self.acts = bool(rubbing)
         self.size, self.iterations = sum(cluster.count for cluster in rubbing) + 1, STICK_ITERATIONS
 
@@ -67,7 +67,11 @@ def rubbing_clusters(mechanism: Mechanism) -> list[Rubbing]:
     robot, found = mechanism.robot, []
     for k, cluster in enumerate(mechanism.tree.clusters):
         joints = {name: robot.body(name).joint for name in cluster.bodies}
-        friction = {n: joint.friction for n, joint in joints.items() if joint.type != "free" and rubs(joint.friction)}
+        friction = {
+            n: joint.friction
+            for n, joint in joints.items()
+            if joint.type != "free" and has_dry_friction(joint.friction)
+        }
         if friction:
             found.append(Rubbing(k, [robot.independent.index(name) for name in cluster.independent], friction))
     return found

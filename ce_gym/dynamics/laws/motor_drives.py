@@ -13,9 +13,9 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.drives.load import carried_after, carried_now, motor_work, winding_torques, windings_after
 from ce_gym.dynamics.electric.cogging import cogging_energy
-from ce_gym.dynamics.forces.actuation import Before, actuated_clusters, limit_count, seen_joints
+from ce_gym.dynamics.forces.actuation import MotorState, actuated_clusters, encoder_map, limit_count
 from ce_gym.dynamics.forces.linear import Motion
-from ce_gym.dynamics.forces.motor_control import Motors, motor_springs
+from ce_gym.dynamics.forces.motor_control import MotorControl, motor_springs
 from ce_gym.dynamics.forces.motors import MOTORS, lagging_motors, loaded_motors, supply_of, warm_motors
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import target_names
@@ -80,7 +80,7 @@ class MotorDrives(ForceLaw):
         """Return the energy of cogging, and of position control as if motors had no limits [J]."""
         scene, total, options = start.scene, SX(0), self.options
         if options.control == "position":
-            at = seen_joints(scene.mechanism, start.kinematics) @ start.y
+            at = encoder_map(scene.mechanism, start.kinematics) @ start.y
             total += ca.sum1(scene.values["motor_strength"] * scene.values["kp"] * (start.target - at) ** 2) / 2
         if options.control == "motor_position":
             stiffness, stretch = motor_springs(scene, start.kinematics, start.y, start.target)
@@ -110,14 +110,14 @@ class PlacedMotors(PlacedForce):
         start, scene = self.start, self.start.scene
         limits = iterate.numel() - start.state["motor_load"].numel()
         load = carried_now(start.state["motor_load"], iterate[limits:])
-        before = Before.of(scene.mechanism, scene.options, load, start.state)
-        motors = Motors(scene, start.kinematics, start.y, start.yd, start.target, start.dt, before)
+        before = MotorState.of(scene.mechanism, scene.options, load, start.state)
+        motors = MotorControl(scene, start.kinematics, start.y, start.yd, start.target, start.dt, before)
         return MotorForces(start, motors.linearise(iterate[:limits]), load, iterate[limits:])
 
 
 @dataclass
 class MotorForces(LinearForce):
-    """What motors deliver to the joints, linear in the accelerations.
+    """The torques of motors at the joints, linear in the accelerations.
 
     Attributes:
         start: The robot at the start of the step.
@@ -186,7 +186,7 @@ class MotorForces(LinearForce):
         if name == "motor_torque":
             return winding_torques(mechanism, kinematics, self.force, torque, motion)
         if name == "power":
-            return torque * (seen_joints(mechanism, kinematics) @ yd)
+            return torque * (encoder_map(mechanism, kinematics) @ yd)
         if name in ("winding_temperature", "battery_voltage"):
             supply = supply_of(robot, self.start.scene.options.motors, after)
             return (

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, seen_joints
+from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, encoder_map
 from ce_gym.dynamics.recursion.kinematics import BodyState, constant
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.model.errors import listed_names
@@ -78,7 +78,7 @@ def joint_encoders(s: TermContext, counts: float = 4096, bias: float = 0.0) -> S
     if not (isinstance(counts, int | float) and 1 <= counts < np.inf):
         raise ValueError(f"observation term 'joint_encoders': counts={counts!r}; expected 1 or more of a turn")
     robot, step = s.mechanism.robot, 2 * np.pi / counts
-    told = seen_joints(s.mechanism, s.kinematics) @ s.q[robot.layout.joints_q :]
+    told = encoder_map(s.mechanism, s.kinematics) @ s.q[robot.layout.joints_q :]
     for cluster in actuated_clusters(s.mechanism, s.kinematics):
         off = step * ca.floor(cluster.angles / step + 0.5) - cluster.angles
         told[cluster.joints] += effort_matrix(cluster.W[:, : len(cluster.joints)]).T @ off
