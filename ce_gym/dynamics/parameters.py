@@ -1,6 +1,6 @@
 """Parameters of a robot and its scene that may differ from robot to robot: constants, or inputs if they are declared.
 
-Force laws declare their own parameters; here are those of inertia, gravity, gears, motors and joints.
+Force laws declare their own parameters. This file declares inertia, gravity, gears, motors and joints.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ class Parameter:
         return [self.name] if self.owners is None else [f"{self.kind}:{owner}" for owner in self.owners(robot)]
 
 
-def _factor(robot: Robot, material: ContactMaterial) -> ArrayLike:
+def unit_factor(robot: Robot, material: ContactMaterial) -> ArrayLike:
+    """Return the factor 1, which changes nothing."""
     return np.ones(1)
 
 
@@ -90,24 +91,24 @@ MODEL_PARAMETERS = (
     Parameter(
         "gravity", "acceleration of free fall in the world", "m/s^2", "3", lambda robot, _: robot.gravity, "finite"
     ),
-    Parameter("rotor_inertia", "factor on the spin inertia of rotors", "-", "1", _factor),
+    Parameter("rotor_inertia", "factor on the spin inertia of rotors", "-", "1", unit_factor),
     Parameter(
         "rotor_inertia:ROTOR",
         "factor on the spin inertia of one rotor",
         "-",
         "1",
-        _factor,
+        unit_factor,
         owners=lambda robot: [rotor.name for rotor in robot.rotors()],
     ),
     Parameter(
-        "ratio", "factor on the gear ratios: rotor angles for a motion of the joints", "-", "1", _factor, "positive"
+        "ratio", "factor on the gear ratios: rotor angles for a motion of the joints", "-", "1", unit_factor, "positive"
     ),
     Parameter(
         "drive_stiffness:ROTOR",
         "factor on the stiffness of the elastic transmission of one rotor",
         "-",
         "1",
-        _factor,
+        unit_factor,
         "positive",
         _elastic_rotors,
     ),
@@ -116,7 +117,7 @@ MODEL_PARAMETERS = (
         "factor on the damping of the elastic transmission of one rotor",
         "-",
         "1",
-        _factor,
+        unit_factor,
         owners=_elastic_rotors,
     ),
     Parameter(
@@ -124,7 +125,7 @@ MODEL_PARAMETERS = (
         "factor on the backlash of the elastic transmission of one rotor",
         "-",
         "1",
-        _factor,
+        unit_factor,
         owners=_elastic_rotors,
     ),
     Parameter(
@@ -137,8 +138,10 @@ MODEL_PARAMETERS = (
     Parameter(
         "motor_friction", "dry friction of the rotors of limited motors", "N m", "n_motors", _of_motors("friction")
     ),
-    Parameter("drive_friction", "factor on the friction of limited motors at rest and under load", "-", "1", _factor),
-    Parameter("cogging", "factor on the cogging of limited motors", "-", "1", _factor),
+    Parameter(
+        "drive_friction", "factor on the friction of limited motors at rest and under load", "-", "1", unit_factor
+    ),
+    Parameter("cogging", "factor on the cogging of limited motors", "-", "1", unit_factor),
     Parameter(
         "ambient", "temperature of the air around limited motors that grow warm", "deg C", "1", _ambient, "finite"
     ),
@@ -162,7 +165,7 @@ MODEL_PARAMETERS = (
         "factor on the moments of inertia of a body about its centre of mass",
         "-",
         "1",
-        _factor,
+        unit_factor,
         owners=_links,
     ),
     Parameter(
@@ -201,7 +204,7 @@ def least_value(robot: Robot, name: str) -> tuple[float, str]:
 
 
 def with_parameters(mechanism: Mechanism, given: Mapping[str, SX]) -> Mechanism:
-    """Return a mechanism with symbols in place of parameters; those of force laws are ignored.
+    """Return a mechanism with symbols in place of its parameters; parameters of force laws are ignored.
 
     Args:
         mechanism: The robot at a transmission level.
@@ -220,7 +223,7 @@ def with_drives(robot: Robot, given: Mapping[str, SX]) -> Robot:
 
     Args:
         robot: The robot.
-        given: Parameters by name; those of other kinds are passed over.
+        given: Parameters by name; other parameters are ignored.
     """
     changed: dict[str, Any] = {}
     if motors := _each(robot.motors, given, {"motor_damping": "damping", "motor_friction": "friction"}):
@@ -249,7 +252,7 @@ def with_declared_friction(mechanism: Mechanism, names: tuple[str, ...]) -> Mech
 
 
 def check_ratios(robot: Robot) -> None:
-    """Check that the angles of all rotors follow from those of links by linear ties, so that a factor scales them.
+    """Check that the angles of all rotors depend linearly on joint angles, so that a factor scales them.
 
     Raises:
         ValueError: A rotor is an independent joint, or is tied by something else than gears and belts.
@@ -301,7 +304,7 @@ def _spin_factors(rotor: str, given: Mapping[str, SX]) -> list[SX]:
 
 
 def _scale_spins(bodies: dict[str, MovingBody], robot: Robot, given: Mapping[str, SX]) -> None:
-    """Scale the spin inertia of rotors that are bodies, in place; as a load of the carrier it stays what it is."""
+    """Scale the spin inertia of rotors that are bodies, in place; the inertia of their carriers is unchanged."""
     for rotor in robot.rotors():
         factors = _spin_factors(rotor.name, given)
         if not factors or rotor.name not in bodies:

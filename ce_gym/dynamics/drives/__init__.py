@@ -1,1 +1,1 @@
-"""What is between rotors and joints at the elastic level: forces of meshes, belts and springs that stretch."""
+"""Transmissions between rotors and joints: stretches at the elastic level, and loads of motors."""

@@ -1,19 +1,19 @@
-"""What transmissions carry: the torque of a motor, and what all else does to its rotor.
+"""Loads of motors: the torque of each motor, and the torque of the rest of the robot on its rotor.
 
-The rest of the robot does to the coordinates of a cluster what its motion takes less what its motors give,
+The rest of the robot acts on the coordinates of a cluster with the inertia forces less the torques of the motors,
 
-    external = D ydd - tau,    D = G^T H G of the articulated bodies beyond it, see ce_aba.py,
+    external = D ydd - tau,    D = G^T H G of the articulated bodies beyond it, see ce_aba.py:
 
-gravity, contacts, springs and the motion of what carries the cluster, but not its own inertia: of a pendulum gravity
-alone. It goes to the rotors as torques do. Where a transmission stretches it is the torque of its mesh.
+gravity, contacts, springs and the motion of the carrier, but not the cluster's own inertia. For a pendulum this is
+gravity alone. These forces act on rotors as joint torques do. Where a transmission stretches, the load is the torque of
+its mesh.
 
-Friction under load goes by means over the last step: of one made in parts over the last part, of one made in stages
-over its last stage, and within it over the stage before; what was refused leaves nothing. In further iterations, where
-something asks for any, it goes by those of the last iteration in which motors stuck, slipped and were limited as they
-were taken to be: a rotor that is wrongly taken to stick is stopped by a blow. That can be a step late, an error of
-first order; so methods that extrapolate ask for a second iteration in every stage. Friction always takes energy,
-whatever it goes by. Where there was no step before, rotors at rest are held in the first iteration, which tells what
-it takes.
+Friction under load is computed from mean loads over the last step: over the last part of a step made in parts, over
+the last stage of a step made in stages, and within a step over the stage before. Refused steps leave no load. Further
+iterations use the loads of the last iteration whose active set of the motors was right, because a rotor that is wrongly
+assumed to stick is stopped by a large torque. The load can be late by a step, an error of first order; so methods that
+extrapolate need a second iteration in every stage. Friction always removes energy, whatever its load. Where there was
+no step before, rotors at rest are held in the first iteration, which gives the load.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ce_gym.model.mechanism import Mechanism
 
 
 def carried_now(before: SX, iterate: SX) -> SX:
-    """Return the field `motor_load` for an iteration, given the field at the start and that of the iteration before."""
+    """Return the field `motor_load` for an iteration, given the field before the step and the last iterate."""
     return ca.if_else(iterate[-1] > 0, iterate, before) if iterate.numel() else before
 
 
@@ -44,7 +44,7 @@ def carried_after(
     """Return the field `motor_load` after a step whose acceleration is known.
 
     Args:
-        scene: The robot and what surrounds it.
+        scene: The robot and its surroundings.
         kinematics: At the start of the step.
         motors: Torques of the motors.
         inertia: Of clusters, without what acts on their coordinates, shape (d, d) each.
@@ -94,18 +94,18 @@ def motor_work(
 def winding_torques(
     mechanism: Mechanism, kinematics: Kinematics, motors: SaturatedForce, torque: SX, motion: Motion
 ) -> SX:
-    """Return the torque of each motor [N m], shape (n_motors,); of ideal ones that which gives `torque` at joints."""
-    found = SX(len(mechanism.robot.motors), 1)
+    """Return the torque of each motor [N m], shape (n_motors,); of ideal motors the share of the joint torque."""
+    torques = SX(len(mechanism.robot.motors), 1)
     for cluster in actuated_clusters(mechanism, kinematics):
         shares = effort_matrix(cluster.W[:, : len(cluster.joints)]) @ torque[cluster.joints]
         for i, place in enumerate(cluster.places):
             winding = motors.windings.get(place)
-            found[place] = shares[i] if winding is None else winding.tau - winding.slope @ motion.ydd
-    return found
+            torques[place] = shares[i] if winding is None else winding.tau - winding.slope @ motion.ydd
+    return torques
 
 
 def _external(cluster: Actuated, motors: SaturatedForce, inertia: SX, motion: Motion) -> SX:
-    """Return what all else does to the rotors of a cluster [N m], shape (n_motors,)."""
+    """Return the torques of the rest of the robot on the rotors of a cluster [N m], shape (n_motors,)."""
     rows, d = cluster.rows, len(cluster.joints)
     ydd = motion.ydd[rows]
     on_rows = inertia @ ydd - (motors.tau[rows] - motors.slope[rows, rows] @ ydd)

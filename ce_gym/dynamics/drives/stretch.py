@@ -1,4 +1,4 @@
-"""Transmissions that stretch: which there are, their figures, and the energy that is in them."""
+"""Transmissions that stretch: their stiffness, damping, backlash and energy."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def stretching(mechanism: Mechanism) -> list[tuple[int, Elasticity]]:
     return [(rows[elastic.stretch], elastic) for elastic in robot.elastic if elastic.stretch in rows]
 
 
-def mesh_figures(scene: Scene, elastic: Elasticity) -> tuple[SX, SX, SX]:
-    """Return stiffness [N m/rad] and damping [N m s/rad] of a side, or of all where there are none, and backlash [rad].
+def mesh_parameters(scene: Scene, elastic: Elasticity) -> tuple[SX, SX, SX]:
+    """Return stiffness [N m/rad] and damping [N m s/rad] of a side, and backlash [rad].
 
-    Those of a belt's strand are half of the belt's.
+    A transmission without sides has one spring and damper. A strand has half the stiffness and damping of its belt.
     """
     values, share = scene.values, 1.0 if elastic.linear or elastic.backlash else 0.5
     k, d = share * elastic.stiffness * values["drive_stiffness"], share * elastic.damping * values["drive_damping"]
@@ -36,7 +36,7 @@ def mesh_energy(scene: Scene, y: SX) -> SX:
     """Return the elastic energy of all transmissions at positions of joints and stretches (n,) [J]."""
     total = SX(0)
     for row, elastic in stretching(scene.mechanism):
-        k, _, backlash = mesh_figures(scene, elastic)
+        k, _, backlash = mesh_parameters(scene, elastic)
         if elastic.linear:
             total += k * y[row] ** 2 / 2
             continue

@@ -1,10 +1,10 @@
-"""Voltage of a battery that feeds all motors: what is left of it behind a resistance.
+"""Voltage of a battery that feeds all motors, behind a resistance.
 
     V = V_0 - R I(V),    I = (P + idle) / V,    P = sum of tau omega + (tau / K)^2 R_w over the motors
 
-V limits torques and they draw I, within one step: so V is a state, and a step of it one of Newton's method on this
-circuit at the speeds of the end of the step. It counts how the torques on their torque-speed lines answer to V. Without
-that, V would swing from step to step wherever motors together draw more than the battery can give.
+V limits torques, and torques draw I within the same step. So V is a state, and each step makes one Newton iteration on
+this circuit at the speeds of the end of the step. The iteration includes the derivative of the torques on torque-speed
+lines with respect to V. Without it, V would oscillate where motors draw more than the battery can give.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.model.drives import Battery
 
 LEAST = 0.5
-"""Of the voltage without load: where a battery gives the most it can; below, more current is less power."""
+"""Share of the voltage without load at which a battery gives its largest power."""
 GENTLE = 0.2
 """Least slope of the circuit's equation; near the most that a battery can give it vanishes."""
 
@@ -26,8 +26,8 @@ def sagged(battery: Battery, sag: SX, power: SX, answer: SX) -> SX:
     Args:
         battery: The battery.
         sag: The same before [V].
-        power: What the motors draw [W].
-        answer: How that rises with the voltage, by motors on their torque-speed lines [W/V].
+        power: Power that the motors draw [W].
+        answer: Derivative of this power with respect to the voltage [W/V].
     """
     voltage = battery.voltage - sag
     current = (power + battery.idle) / voltage

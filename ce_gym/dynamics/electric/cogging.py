@@ -1,10 +1,10 @@
 """Cogging: torque of a motor's magnets on its teeth, by the angle of its rotor, without any current.
 
-It is that of a potential, a sum of harmonics `-(A / n) cos(n theta + phase)`, so it gives nothing over a turn. A step
-takes its mean over the way that the rotor goes in it, which is what the potential falls by over that way: where a step
-is longer than a tooth the mean vanishes, as cogging at speed does, instead of being any value of it. Where teeth hold
-the rotor back they count by where they will be at the end of the step, twice the slope of the mean: then they never
-throw it over the place where they hold it, however stiff they are.
+Cogging has a potential, a sum of harmonics `-(A / n) cos(n theta + phase)`, so its mean over a turn is zero. A step
+uses the mean torque over the angle that the rotor turns in it: the fall of the potential over that angle. Where a step
+is longer than a tooth the mean vanishes, as cogging at speed does. Where teeth hold the rotor back, their torque is
+taken at the end of the step, with twice the slope of the mean. So teeth of any stiffness never push the rotor beyond
+their stable angle.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 Harmonic = tuple[int, SX | float, float]
 """Order in a turn of the rotor, torque [N m], phase [rad]."""
 NEARBY = 1e-3
-"""Of half the angle that a harmonic turns by: up to here its mean goes by a series."""
+"""Half the angle that a harmonic turns by [rad] up to which a series gives its mean."""
 
 
 def cogging(harmonics: Iterable[Harmonic], angle: SX, speed: SX, dt: SX | float) -> tuple[SX, SX]:

@@ -3,9 +3,9 @@
     C_w dw/dt = (tau / K)^2 R(w) - (w - h) / R_wh        C_h dh/dt = (w - h) / R_wh - h / R_ha
 
 with w and h above the air, K the motor constant and R the winding's resistance over that at 20 deg C, which rises with
-the winding. The model is that of data sheets (maxon, "Technology - short and to the point", chapter 7). A step of it
-is linearly implicit, so that it cannot overshoot, and comes after that of the mechanics, whose torque it is given: in a
-sub-step temperatures hardly change, and what it costs is some twenty instructions a motor.
+the winding. The model is the one of data sheets (maxon, "Technology - short and to the point", chapter 7). Its step is
+linearly implicit and cannot overshoot. It follows the step of the mechanics and uses the torque of that step, because
+temperatures hardly change in a sub-step. It costs some twenty instructions for each motor.
 """
 
 from __future__ import annotations
@@ -53,6 +53,6 @@ def warmed(motor: Motor, heat: Heat, winding: SX, housing: SX, torque: SX, dt: S
 
 
 def copper_loss(motor: Motor, torque: SX) -> SX:
-    """Return what a winding at 20 deg C loses for a torque [W]."""
+    """Return the loss of a winding at 20 deg C for a torque [W]."""
     assert motor.motor_constant is not None
     return (torque / motor.motor_constant) ** 2

@@ -1,4 +1,4 @@
-"""What temperature and voltage leave of motors over a step, and what the step makes of both."""
+"""Temperatures and supply voltage of motors: how they limit torques, and how a step changes them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from ce_gym.model.drives import Battery, Motor
 
 @dataclass(frozen=True)
 class Work:
-    """What a motor did over a step.
+    """Torque and speed of a motor over a step.
 
     Attributes:
-        torque: Of its winding, at the end of the step [N m].
-        speed: Of its rotor, likewise [rad/s].
-        answer: How its torque at that speed rises with its share of the nominal voltage [N m]: on the line forwards,
-            `stall (share - speed / velocity)`, by `stall`, also where the torque is the other way; on that backwards by
-            `-stall`; else not.
+        torque: Of the winding, at the end of the step [N m].
+        speed: Of the rotor, at the end of the step [rad/s].
+        answer: Derivative of the torque with respect to the share of the nominal voltage, at that speed [N m]: `stall`
+            on the torque-speed line forwards, `-stall` on the line backwards, else 0.
     """
 
     torque: SX

@@ -1,9 +1,9 @@
 """Dry friction of joints and rotors, linearly implicit in the step: it sticks or slips.
 
-Which of the two it is follows from the state at the end of the step, see saturation.py, so that friction never takes
-more than it has, however long the step. Dependent joints rub, too: with `W` its row of the constraint Jacobian, a joint
-moves at `W yd`, and its friction is `W^T tau` to the independent joints of its cluster. All friction of a cluster with
-one degree of freedom is one, `sum |W_i| f_i`.
+The state at the end of the step decides which, see saturation.py. So friction never exceeds its torque at any step
+length. Dependent joints have friction, too. With `W` the row of the constraint Jacobian, a dependent joint moves at
+`W yd`, and its friction tau acts as `W^T tau` on the independent joints of its cluster. In a cluster with one degree of
+freedom all frictions add up to one, `sum |W_i| f_i`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.model.mechanism import Mechanism
 
 STICK_SPEED = 1e-4
-"""Speed at which dry friction that stops a joint or rotor carries its full torque; one that is slower, and sticks, is
-at rest [rad/s or m/s]."""
+"""Speed at which dry friction reaches its full torque; a joint or rotor that sticks and is slower is at rest [rad/s or
+m/s]."""
 STICK_ACCELERATION, STICK_ACCELERATION_ALONE = 2e-3, 1e-5
 """That speed at rest is this times the step, in a cluster with several degrees of freedom and with one [rad/s^2].
 
@@ -39,20 +39,20 @@ def has_dry_friction(friction: float | SX) -> bool:
 def dry_friction(
     friction: SX | float, speed: SX, turning: SX, dt: float, iterate: SX, place: int, alone: bool
 ) -> tuple[Saturation, SX, SX]:
-    """Return the dry friction of a joint or a rotor: what would stop it, up to what friction has.
+    """Return the dry friction of a joint or a rotor: the torque that stops it, within the limits of the friction.
 
-    It sticks by a damping so large that it is at rest at the end of the step but for `STICK_SPEED`; where that
-    would take more than it has it slips, and is a constant torque against the motion at the end of the step. At rest
-    the damping is larger still, and what is left of the speed is taken away, see `stand_still`.
+    A joint sticks by a damping that leaves at most `STICK_SPEED` at the end of the step. Where this damping would need
+    more than the friction, the joint slips, against a constant torque. At rest the damping is larger, and `stand_still`
+    removes the remaining speed.
 
     Args:
-        friction: What it has [N m or N].
+        friction: Largest torque or force [N m or N].
         speed: Of the joint or rotor [rad/s or m/s].
-        turning: The same for unit velocities of all independent joints, shape (1, nj).
+        turning: Speed of the joint or rotor for unit velocities of all independent joints, shape (1, nj).
         dt: Length of the step [s].
         iterate: From the iteration before, shape (limit_count,).
-        place: Of this torque in it.
-        alone: Whether its cluster has one degree of freedom.
+        place: Row of this torque in the iterate.
+        alone: Whether the cluster of the joint has one degree of freedom.
 
     Returns:
         The torque; whether the joint or rotor is at rest at the start of the step, 1 or 0; the damping [N m s/rad].
@@ -71,19 +71,19 @@ def dry_friction(
 def stand_still(
     mechanism: Mechanism, kinematics: Kinematics, frictions: list[Stick], before: SX, q: SX, v: SX, dt: float
 ) -> None:
-    """Let stand what dry friction holds, in positions and velocities (nq,) and (nv,) after a step; changed in place.
+    """Keep joints that dry friction holds at rest, in place, in positions (nq,) and velocities (nv,) after a step.
 
-    Joints of a cluster do not move if friction sticks along as many independent directions as the cluster has degrees
-    of freedom, nor does a joint that is independent and sticks by itself. A rotor that sticks behind a transmission
-    that stretches does not turn: the stretch takes up what its joints move.
+    A cluster does not move if friction sticks along as many independent directions as the cluster has degrees of
+    freedom. An independent joint that sticks does not move. A rotor that sticks behind an elastic transmission does not
+    turn: the stretch takes up the motion of its joints.
 
     Args:
         mechanism: The robot.
         kinematics: At the start of the step.
-        frictions: What dry friction there is.
+        frictions: Dry friction of joints and rotors.
         before: Positions at the start of the step.
-        q: After it.
-        v: Velocities after it.
+        q: Positions after the step.
+        v: Velocities after the step.
         dt: Length of the step [s].
     """
     layout, stretches = mechanism.robot.layout, len(mechanism.robot.independent) - len(mechanism.robot.commanded)

@@ -1,6 +1,6 @@
 """Models of motors, one class each; `MOTORS` names them.
 
-A model says between which limits a motor's torque can be, taken one step ahead, and what the motor takes for itself.
+A model has the limits of a motor's torque, taken one step ahead, and the losses of the motor.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class MotorModel(Protocol):
     """A model of motors.
 
     Attributes:
-        at_motors: Whether torques that are asked for at joints are shared out to the motors and limited there; if not,
-            the joints' own limits hold.
+        at_motors: Whether torques commanded at joints are distributed to the motors and limited there; if not, the
+            limits of the joints hold.
     """
 
     at_motors: bool
@@ -45,11 +45,11 @@ class MotorModel(Protocol):
         ...
 
     def drive_friction(self, motor: Motor) -> DriveFriction | None:
-        """Return what it has more of it at rest and under load; None if it has none."""
+        """Return the friction that a motor has at rest and under load besides; None if it has none."""
         ...
 
     def bandwidth(self, motor: Motor) -> float:
-        """Return the bandwidth of its torque loop [Hz]; infinite if it gives at once what it is asked for."""
+        """Return the bandwidth of its torque loop [Hz]; infinite if its torque follows the command at once."""
         ...
 
 
@@ -156,7 +156,7 @@ def lagging_motors(robot: Robot, model: str) -> list[int]:
 
 
 def caught_up(bandwidth: float, dt: float) -> SX:
-    """Return which share of the distance to what it is asked for a torque goes in a step, taken one step ahead."""
+    """Return the share of the way to the commanded torque that a torque covers in a step, taken one step ahead."""
     return SX(dt / (1 / (2 * math.pi * bandwidth) + dt))
 
 
@@ -164,10 +164,10 @@ def most_friction(constant: float | SX, drive: DriveFriction | None, speed: SX, 
     """Return the largest dry friction of a motor [N m], see `DriveFriction`.
 
     Args:
-        constant: What it has at any speed and load [N m].
-        drive: What it has besides.
+        constant: Friction at any speed and load [N m].
+        drive: Friction at rest and under load.
         speed: Of the rotor [rad/s].
-        carried: Torque of the motor and what all else does to the rotor [N m]; empty if no friction depends on them.
+        carried: Torque of the motor and torque of all else on the rotor [N m]; empty if no friction depends on them.
     """
     if drive is None:
         return constant

@@ -25,7 +25,7 @@ class Saturation:
 
     Attributes:
         asked: The commanded torque `tau - slope @ ydd` [N m or N], linear in the acceleration.
-        high, low: Limits likewise; those of a torque-speed line depend on the acceleration, too.
+        high, low: Limits, linear in the acceleration; the slopes of constant limits are 0.
         expected: The torque [N m or N] whose place among the limits is the active set.
     """
 
@@ -62,14 +62,14 @@ class Saturation:
 
     @property
     def given(self) -> SX:
-        """What is given at zero acceleration [N m or N]."""
+        """The torque at zero acceleration [N m or N]."""
         return ca.if_else(self.at_high, self.high.tau, ca.if_else(self.at_low, self.low.tau, self.asked.tau))
 
     def after(self, ydd: SX) -> Saturation:
         """Return it with the active set at the end of the step, given the accelerations.
 
         The predicted end-of-step torque keeps its violation of a limit as the next guess. It never goes from beyond one
-        limit to beyond the other: what is between has not been tried then.
+        limit to beyond the other, because the range between has not been tried then.
         """
         asked = self.asked.tau - self.asked.slope @ ydd
         if ca.sparsify(self.high.slope).nnz() or ca.sparsify(self.low.slope).nnz():
@@ -98,16 +98,16 @@ class Stick:
 
 @dataclass
 class SaturatedForce(JointForce):
-    """A force on joints that is made of torques kept within limits: a `LinearForce`.
+    """A force on joints made of torques within limits.
 
     Attributes:
-        size: Of its iterate: the expected torques, and last `count`.
-        limited: The torques that are kept within limits, at their places in the iterate.
-        frictions: What dry friction there is.
-        windings: Torques of motors, by their places, before what they lose.
-        on_line: On which torque-speed line each is, likewise: 1 forwards, -1 backwards, 0 where it is on none.
-        sampled: What a sampled controller holds after the step, as the field `held_torque` is.
-        count: Above 0, which says that there is an iterate.
+        size: Size of the iterate: the expected torques, then `count`.
+        limited: The torques within limits, by their rows in the iterate.
+        frictions: Dry friction of joints or rotors.
+        windings: Torques of motors before losses, by the places of the motors.
+        on_line: Torque-speed line of each motor, by its place: 1 forwards, -1 backwards, 0 for none.
+        sampled: The field `held_torque` after the step.
+        count: Last entry of the next iterate; above 0, because there has been an iteration.
     """
 
     size: int
@@ -119,7 +119,7 @@ class SaturatedForce(JointForce):
     count: SX | int = 1
 
     def check(self, motion: Motion) -> SX:
-        """Return 1 if a torque is not where it was taken to be among its limits; else 0."""
+        """Return 1 if a torque is at another limit than was assumed; else 0."""
         changed = SX(0)
         for one in self.limited.values():
             if one.answers:

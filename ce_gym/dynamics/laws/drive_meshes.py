@@ -1,26 +1,27 @@
 """Torque of a transmission that stretches, implicit in the step: two flanks of a gear, or two strands of a belt.
 
-With x the stretch, how far the rotor is ahead of where the joints would have it, a mesh is two one-sided springs,
+Let x be the stretch: how far the rotor is ahead of the angle that follows from the joints. A mesh is two one-sided
+springs with dampers,
 
-    torque = push(x) - push(-x),    push(x) = max(0, k z + d zd),  z = max(0, x - gap)  what the side is pressed in by
+    torque = push(x) - push(-x),    push(x) = max(0, k z + d zd),    z = max(0, x - gap) the compression of a side.
 
 A backlash of b is a gap of b / 2 on both sides. A belt with the preload p is two strands of half the stiffness and
-damping with a gap of -p / k, which overlap: together they have the whole stiffness until one of them is slack. What
-pulls and pushes alike has no sides and is one spring and damper.
+damping with a gap of -p / k, which overlap: together they have the whole stiffness until one of them is slack. A
+transmission without backlash and preload has no sides and is one spring and damper.
 
-One step ahead the side is pressed in by z+ = max(0, x + dt xd+ - gap), at the rate (z+ - z) / dt, so that
+One step ahead the compression is z+ = max(0, x + dt xd+ - gap), at the rate (z+ - z) / dt. The force
 
-    push+ = max(0, k (x - gap) + (dt k + d) xd+ - d max(0, gap - x) / dt) = max(0, pull - high)
+    push+ = max(0, k (x - gap) + (dt k + d) xd+ - d max(0, gap - x) / dt) = max(0, pull - high),
 
-with `pull` what a spring without sides would do, is a rising function of xd+ with one kink, at which it acts or not: an
-active set. Its implicit step never gives energy: the spring's is convex, the damper's work is d (z+ - z)^2 / dt, and a
-side that lets go early loses what it had.
+with the force `pull` of a spring without sides, rises with xd+ and has one kink, at which the side begins to act: an
+active set. The implicit step never adds energy: the energy of the spring is convex, the damper dissipates
+d (z+ - z)^2 / dt, and a side that opens early loses its energy.
 
-Which sides act is said by the acceleration that a stretch is expected to have, at first none, then that which the
-iteration before says it would have if the mesh let go of it and all but its own cluster moved on as it does. Is that
-beyond the kink of a side, the side acts, which is right for a drive on its own and nearly so for others. What is still
-wrong in the second iteration counts only if it is more than the motor could do: less changes a step by less than its
-own error, and takes energy, or gives what the next step takes (docs/explanation/numerics.md).
+The expected acceleration of a stretch decides which sides act. It is zero in the first iteration. After that it is the
+acceleration of the last iteration, without the mesh, while only the stretch's own cluster responds. If it is beyond the
+kink of a side, the side acts. For a single drive this is exact, for others nearly. From the second iteration on, an
+error counts only if it exceeds the torque of the motor: a smaller one changes a step by less than its own error
+(docs/explanation/numerics.md).
 """
 
 from __future__ import annotations
@@ -30,31 +31,27 @@ from dataclasses import dataclass, field
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX, solve_positive_definite
-from ce_gym.dynamics.drives.stretch import gap_of, mesh_energy, mesh_figures, stretching
+from ce_gym.dynamics.drives.stretch import gap_of, mesh_energy, mesh_parameters, stretching
 from ce_gym.dynamics.forces.linear import JointForce, Motion, is_moment
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
-from ce_gym.dynamics.parameters import Parameter
+from ce_gym.dynamics.parameters import Parameter, unit_factor
 from ce_gym.dynamics.recursion.kinematics import Kinematics
-from ce_gym.model.description import ContactMaterial, Robot
 from ce_gym.model.drives import Elasticity
 from ce_gym.model.mechanism import Mechanism
 
 MESH_ITERATIONS = 5
-"""How many iterations of a step meshes may ask for after the first until which of their sides act is settled."""
-
-
-def ONE(robot: Robot, material: ContactMaterial) -> list[float]:
-    """Return the factor that changes nothing."""
-    return [1.0]
+"""How many iterations of a step meshes may need after the first until it is settled which of their sides act."""
 
 
 class DriveMeshes(ForceLaw):
     """The elastic transmissions of a robot."""
 
     parameters = (
-        Parameter("drive_stiffness", "factor on the stiffness of elastic transmissions", "-", "1", ONE, "positive"),
-        Parameter("drive_damping", "factor on the damping of elastic transmissions", "-", "1", ONE),
-        Parameter("backlash", "factor on the backlash of elastic transmissions", "-", "1", ONE),
+        Parameter(
+            "drive_stiffness", "factor on the stiffness of elastic transmissions", "-", "1", unit_factor, "positive"
+        ),
+        Parameter("drive_damping", "factor on the damping of elastic transmissions", "-", "1", unit_factor),
+        Parameter("backlash", "factor on the backlash of elastic transmissions", "-", "1", unit_factor),
     )
 
     def declare(self) -> None:
@@ -79,13 +76,13 @@ class Mesh:
 
     Attributes:
         row: Of the stretch among the joints' coordinates.
-        pull: What a spring and damper without sides would do at zero acceleration [N m].
-        slope: By how much that grows for a unit acceleration of the stretch [kg m^2].
-        high, low: The side ahead acts where that is above the first, with as much as it is above it; the other one
-            where it is below the second [N m].
-        ahead, behind: Whether they are taken to act.
-        harmless: By how much a side may be wrong after the first iteration [N m].
-        overlaps: Whether both can act.
+        pull: Torque of a spring and damper without sides at zero acceleration [N m].
+        slope: By how much `pull` grows for a unit acceleration of the stretch [kg m^2].
+        high, low: The side ahead gives `pull - high` where `pull` is above `high`; the side behind gives `pull - low`
+            where `pull` is below `low` [N m].
+        ahead, behind: Whether the sides are assumed to act.
+        harmless: Error of a side's torque that is accepted after the first iteration [N m].
+        overlaps: Whether both sides can act at the same time.
     """
 
     row: int
@@ -100,25 +97,25 @@ class Mesh:
 
     @property
     def force(self) -> tuple[SX, SX]:
-        """What it does to the joints' rotor at zero acceleration [N m], and by how much that falls [kg m^2]."""
+        """Torque on the stretch at zero acceleration [N m], and by how much it falls with the acceleration [kg m^2]."""
         tau = -ca.if_else(self.ahead, self.pull - self.high, 0) - ca.if_else(self.behind, self.pull - self.low, 0)
         if self.overlaps:
             return tau, ca.if_else(self.ahead, self.slope, 0) + ca.if_else(self.behind, self.slope, 0)
         return tau, ca.if_else(ca.logic_or(self.ahead, self.behind), self.slope, 0)
 
     def beyond(self, motion: Motion) -> tuple[SX, SX]:
-        """Return by how much a step ends beyond where the side ahead acts, and short of the other's [N m]."""
+        """Return the torques of both sides at the end of the step, negative where a side does not act [N m]."""
         after = self.pull + self.slope * motion.ydd[self.row]
         return after - self.high, self.low - after
 
     def wrong(self, motion: Motion, again: SX) -> SX:
-        """Return 1 if a side acts that should not or the other way round, and it matters; else 0."""
+        """Return 1 if the assumption about a side is wrong by more than the accepted error, else 0."""
         (over, under), most = self.beyond(motion), ca.if_else(again > 0, self.harmless, 0)
         one = ca.if_else(self.ahead, -over, over) > most
         return ca.logic_or(one, ca.if_else(self.behind, -under, under) > most)
 
-    def let_go(self, motion: Motion, resistance: SX) -> SX:
-        """Return the acceleration that the stretch would have without the mesh, or as it is where sides overlap."""
+    def free_acceleration(self, motion: Motion, resistance: SX) -> SX:
+        """Return the acceleration of the stretch without the mesh; where sides overlap, with it."""
         ydd, (over, under) = motion.ydd[self.row], self.beyond(motion)
         pushes = ca.if_else(self.ahead, over, 0) - ca.if_else(self.behind, under, 0)
         return ydd if self.overlaps else ydd + pushes / resistance
@@ -136,7 +133,7 @@ class Meshes(PlacedForce):
         n, y, yd = start.y.numel(), start.y, start.yd
         force, meshes = JointForce(SX(n, 1), SX(n, n)), []
         for row, elastic in stretching(start.scene.mechanism):
-            k, d, backlash = mesh_figures(start.scene, elastic)
+            k, d, backlash = mesh_parameters(start.scene, elastic)
             pull, slope = k * y[row] + (dt * k + d) * yd[row], dt * (dt * k + d)
             if elastic.linear:
                 force.tau[row], force.slope[row, row] = -pull, slope
@@ -151,12 +148,12 @@ class Meshes(PlacedForce):
 
     def _kinks(self, x: SX, pull: SX, k: SX, d: SX, gap: SX) -> tuple[SX, SX]:
         """Return `Mesh.high` and `Mesh.low`."""
-        if is_moment(self.start.dt):  # a side that is not pressed does nothing, however fast
+        if is_moment(self.start.dt):  # a side that is not compressed gives no force at any speed
             return ca.if_else(x > gap, k * gap, pull), ca.if_else(x < -gap, -k * gap, pull)
         return k * gap + d / self.start.dt * ca.fmax(gap - x, 0), d / self.start.dt * ca.fmin(-gap - x, 0) - k * gap
 
     def _harmless(self, elastic: Elasticity) -> float:
-        """Return what the motor of a transmission can do at most [N m]; 0 if that is not known."""
+        """Return the largest torque of the motor of a transmission [N m]; 0 if it is unknown."""
         most = [motor.torque for motor in self.start.scene.mechanism.robot.motors if motor.rotor == elastic.rotor]
         return next((torque for torque in most if torque < float("inf")), 0.0)
 
@@ -198,21 +195,21 @@ class MeshForces(LinearForce):
             return self.iterate
         mechanism, kinematics = self.start.scene.mechanism, self.start.kinematics
         resistances = stretch_resistances(mechanism, kinematics, found.D, found.inertia, self.others.slope)
-        expected = [mesh.let_go(motion, resistances[mesh.row]) for mesh in self.meshes]
+        expected = [mesh.free_acceleration(motion, resistances[mesh.row]) for mesh in self.meshes]
         return ca.if_else(unconverged, ca.vertcat(*expected, 1), self.iterate)
 
 
 def stretch_resistances(
     mechanism: Mechanism, kinematics: Kinematics, whole: dict[int, SX], bare: dict[int, SX], slope: SX
 ) -> dict[int, SX]:
-    """Return the inertia that stretches with sides have if nothing but their own clusters answers, without the mesh.
+    """Return the inertia of stretches with sides without their mesh, while only their own clusters respond.
 
     Args:
         mechanism: The robot.
         kinematics: At the start of the step.
-        whole: Inertias of clusters with all that acts on their coordinates, shape (d, d) each.
-        bare: The same without what acts on them.
-        slope: What acts on coordinates but for meshes, shape (n, n) [kg m^2].
+        whole: Inertias of clusters with the slopes of all forces on their coordinates, shape (d, d) each.
+        bare: Inertias of clusters without these slopes, shape (d, d) each.
+        slope: Slopes of all forces on coordinates but those of meshes, shape (n, n) [kg m^2].
 
     Returns:
         Inertias, by the stretch's row among the joints' coordinates [kg m^2].
@@ -221,7 +218,7 @@ def stretch_resistances(
     with_sides, found = {row for row, elastic in stretching(mechanism) if not elastic.linear}, {}
     for k, D in whole.items():
         for i, row in enumerate(row - base for row in kinematics.rows[k]):
-            if row in with_sides:  # what a stiff mesh adds is not taken away again, for rounding
+            if row in with_sides:  # subtracting the slope of a stiff mesh would lose digits
                 own, others = bare[k][i, i] + slope[row, row], [j for j in range(D.shape[0]) if j != i]
                 found[row] = own - D[i, others] @ solve_positive_definite(D[others, others], D[others, i])
     return found

@@ -21,7 +21,7 @@ from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import target_names
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
-from ce_gym.dynamics.parameters import Parameter
+from ce_gym.dynamics.parameters import Parameter, unit_factor
 from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.model.description import Robot
 
@@ -41,7 +41,7 @@ class MotorDrives(ForceLaw):
             "kp", "position gains of the joints", "N m/rad or N/m", "n_joints", lambda robot, _: gains(robot, "kp")
         ),
         Parameter("kd", "velocity gains of the joints", KD_UNIT, "n_joints", lambda robot, _: gains(robot, "kd")),
-        Parameter("motor_strength", "factor on motor torques and their limits", "-", "1", lambda robot, _: [1.0]),
+        Parameter("motor_strength", "factor on motor torques and their limits", "-", "1", unit_factor),
     )
     outputs = (
         Output("torque", "N m or N", "motor torque at each joint", "mean"),
