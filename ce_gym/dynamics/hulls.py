@@ -148,7 +148,7 @@ def _faces(points: Array, rank: int, scale: float) -> list[list[int]]:
 
 
 def _around(points: Array, members: list[int], normal: Array, tolerance: float) -> list[int]:
-    """Return those of points in a plane that are corners of their hull, in order around it."""
+    """Return the points in a plane that are corners of their hull, in order."""
     u = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     axes = np.stack([u / np.linalg.norm(u), np.cross(normal, u) / np.linalg.norm(u)])
     flat = {i: axes @ points[i] for i in members}
@@ -211,7 +211,7 @@ def pressed(hull: Hull, up: SX, z: SX, under: SX, corners: SX) -> list[tuple[SX,
         hull: The hull.
         up: The world's upward direction in the body frame, shape (3,).
         z: Heights of its points [m], shape (n,).
-        under: Height [m] and slopes of the ground under each of them, shape (3, n).
+        under: Height [m] and slopes of the ground under each point, shape (3, n).
         corners: Height of the ground under the contacts of the scene [m], shape (n_contacts,).
     """
     depths, normals = [], []

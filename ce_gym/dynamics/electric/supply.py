@@ -35,10 +35,10 @@ class Supply:
     """Temperatures of motors and the voltage that feeds them.
 
     Attributes:
-        windings: How much windings are warmer than the air, by the places of the motors that grow warm [K].
-        housings: The same of housings.
-        battery: What feeds them all; None for a steady voltage.
-        sag: How far its voltage is below that without load [V]; not used without a battery.
+        windings: Temperatures of windings above the air, by the places of the motors that grow warm [K].
+        housings: Temperatures of housings above the air, by the same places [K].
+        battery: The battery; None for a constant voltage.
+        sag: Difference of the battery's voltage from its voltage without load [V].
     """
 
     windings: Mapping[int, SX]
@@ -48,7 +48,7 @@ class Supply:
 
     @property
     def voltage(self) -> SX:
-        """Of the battery [V]; of none without one."""
+        """Voltage of the battery [V]; no entries without a battery."""
         return SX(0, 1) if self.battery is None else SX(self.battery.voltage - self.sag)
 
     def temperatures(self, motors: tuple[Motor, ...]) -> list[SX]:
@@ -68,7 +68,7 @@ class Supply:
         return replace(motor, **figures) if figures else motor
 
     def line(self, place: int, motor: Motor) -> SX | float:
-        """Return what the nominal voltage allows a motor at standstill [N m]: less, as its winding is warm."""
+        """Return the torque of a motor at standstill and nominal voltage [N m]; warm windings give less."""
         if place not in self.windings or motor.heat is None:
             return motor.line
         return motor.line / resistance(motor.heat, self.windings[place])

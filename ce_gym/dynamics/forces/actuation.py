@@ -61,7 +61,7 @@ def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
 
 
 def joint_command(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce:
-    """Return the torque commanded at the joints: the target, or that of proportional-derivative position control."""
+    """Return the torque commanded at the joints: the target, or a proportional-derivative control's."""
     robot = scene.mechanism.robot
     works = SX(ca.DM([float(name not in robot.passive) for name in robot.commanded]))
     if scene.options.control == "torque":
@@ -172,7 +172,7 @@ class Actuated:
 
     Attributes:
         index: Of the cluster.
-        rows: Rows of `y` that belong to the cluster, d of them.
+        rows: Rows of `y` that belong to the cluster, d rows.
         joints: The rows among them that are joints, which come before stretches.
         motors: Motors of the cluster.
         places: Places of these motors among all motors of the robot.

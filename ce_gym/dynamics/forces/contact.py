@@ -11,8 +11,8 @@ the recursion stays linear in the number of bodies. This is Newton's method on b
 with frozen normal, lever arm and Jacobian: the velocity product `drift` has no part in `v+`, or the force would do work
 on the motion it is meant to stop. C is positive semidefinite: no step length makes a lasting contact unstable.
 
-The laws of the normal force and of friction are in `normal.py` and `friction.py`. This file says where a contact is,
-when it is active, and what it adds to the recursion.
+The laws of the normal force and of friction are in `normal.py` and `friction.py`. This file has the place of a contact,
+when it is active, and its terms in the recursion.
 
 A contact becomes active if it *will* be in the ground by the end of the step, `d - dt v_n > 0`, and pushes. A corner
 that its velocity does not take there, but the velocity it has after another one hit the ground, becomes active in the
@@ -50,7 +50,7 @@ TINY_SPEED = 1e-9
 
 @dataclass(frozen=True)
 class Compliance:
-    """Figures of a contact, numbers or symbols.
+    """Parameters of a contact, numbers or symbols.
 
     Attributes:
         stiffness: Normal stiffness `k` [N/m].
@@ -137,7 +137,7 @@ class TangentialForce:
         force: At the iterate, against the motion, body axes [N], shape (3,).
         slope: In the tangent plane, but none along the slip [N s/m].
         slip: Direction in which it slips, shape (3,); zero while it sticks.
-        gain: Of the iterate: what the velocity gains in the step, body axes [m/s], shape (3,).
+        gain: Change of the velocity in the step at the iterate, body axes [m/s], shape (3,).
     """
 
     force: SX
@@ -166,12 +166,12 @@ class FrictionLaw(Protocol):
 
 @dataclass
 class Iterate:
-    """What the iteration before has found of a contact; all zero for the first.
+    """Result of the iteration before for one contact; zero in the first iteration.
 
     Attributes:
-        gain: What its velocity gained in the step, body axes [m/s], shape (3,).
-        slip: Direction of its slip, shape (3,); zero if it stuck.
-        active: 1 if it was active, else 0.
+        gain: Change of the point's velocity in the step, body axes [m/s], shape (3,).
+        slip: Direction of the slip, shape (3,); zero if the contact stuck.
+        active: 1 if the contact was active, else 0.
         count: How many iterations have been made.
     """
 
@@ -195,12 +195,12 @@ class Iterate:
 
 @dataclass
 class Contact:
-    """A sphere that may be touching the ground, for the length of one step: a `ForceLaw`.
+    """A sphere that may be touching the ground, for the length of one step.
 
     Attributes:
         body: Name of the body that carries it.
         touch: Where it is.
-        compliance: What it is made of.
+        compliance: Of the contact.
         normal: Law of its normal force.
         friction: Law of its friction.
         dt: Step length [s].
@@ -225,10 +225,10 @@ class Contact:
 
 
 class LinearContact:
-    """A contact about an iterate: its force is `force - C gain`, body axes, with what the point's velocity gains.
+    """A contact about an iterate: its force is `force - C gain`, with `gain` the change of the point's velocity.
 
     Attributes:
-        law: Where it is and what it follows.
+        law: The contact.
         body: Name of the body that carries it.
         iterate: From the iteration before.
         active: 1 if it is taken to touch the ground, else 0.
@@ -265,7 +265,7 @@ class LinearContact:
         self.force = self.normal_after(friction.gain) * n - friction.force + self.C @ friction.gain
 
     def _closing(self, gain: SX) -> SX:
-        """Return the normal velocity [m/s], given what the velocity gains; negative towards the ground."""
+        """Return the normal velocity [m/s] for a change of the velocity; negative towards the ground."""
         return ca.dot(self.law.touch.normal, self.law.touch.velocity + gain)
 
     def _share(self, before: SX, after: SX) -> SX:
@@ -298,7 +298,7 @@ class LinearContact:
         return ca.if_else(self.normal_slope > 0, self.law.compliance.friction * self.load, 0)
 
     def body_terms(self, gravity: SX) -> BodyTerms:
-        """Return what the contact adds to its body before the inward pass.
+        """Return the terms of the contact on its body in the inward pass.
 
         Args:
             gravity: Acceleration of free fall in body axes, shape (3,); the recursion's `a` does not contain it.
@@ -311,7 +311,7 @@ class LinearContact:
         return BodyTerms(inertia, ca.vertcat(cross(touch.point, force), force))
 
     def gain(self, motion: Motion) -> SX:
-        """Return what the point's velocity gains in the step, body axes [m/s], shape (3,)."""
+        """Return the change of the point's velocity in the step, body axes [m/s], shape (3,)."""
         touch, a = self.law.touch, motion.a[self.body]
         return self.law.dt * (a[3:] + cross(a[:3], touch.point) + motion.gravity[self.body] - touch.drift)
 

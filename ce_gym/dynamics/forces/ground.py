@@ -1,7 +1,7 @@
 """Contacts over the plane that the ground is nearby: for SX and numpy arrays alike.
 
 A contact that rolls is a sphere whose centre moves on a circle about an axis to where it is deepest in the ground: a
-rim, which is what a wheel meets a plane with. With the sine `s` of the angle between axis and normal, its deepest point
+rim, like a wheel on a plane. With the sine `s` of the angle between axis and normal, its deepest point
 is a radius times `s` below the centre of the circle, in the direction of `n - (n . a) a`, which has none left where the
 disc lies flat. There `s` is taken as `sqrt(s^2 + FLAT^2)`, in the direction and in the depth alike, so that force and
 depth are still those of one potential: the point goes smoothly to the centre of the disc.
@@ -40,7 +40,7 @@ def reach(radius: Any, rim: Any, axis: Any, slope_x: Any = 0.0, slope_y: Any = 0
         rim: Radius of the circle on which it moves [m]; 0 for a sphere that does not.
         axis: Of the circle, in the world, shape (3, ...).
         slope_x: dz/dx of the ground.
-        slope_y: dz/dy of it.
+        slope_y: dz/dy of the ground.
     """
     return radius + rim * sine(_cosine(slope_x, slope_y) * (axis[2] - slope_x * axis[0] - slope_y * axis[1]))
 

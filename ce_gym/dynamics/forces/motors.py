@@ -81,7 +81,7 @@ class Ideal:
 
 
 class Limited:
-    """Motors as they are: limits of current and voltage, and friction, at their rotors.
+    """Motors with limits of current and voltage, and friction, at their rotors.
 
     The current allows `torque`; the voltage `stall (1 - speed / velocity)` forwards and `stall (1 + speed / velocity)`
     backwards, the torque-speed line, but never makes a motor brake. A motor on the line is taken along it to the speed

@@ -46,5 +46,5 @@ NORMAL_LAWS: dict[str, NormalLaw] = {"kelvin_voigt": KelvinVoigt(), "hunt_crossl
 
 
 def normal_law(name: str | None, material: ContactMaterial) -> NormalLaw:
-    """Return a law by name; for None, that of the material: Hunt and Crossley's if it has a dissipation."""
+    """Return a law by name; for None, Hunt and Crossley's law if the material has a dissipation."""
     return NORMAL_LAWS[name or ("kelvin_voigt" if material.dissipation is None else "hunt_crossley")]

@@ -135,12 +135,12 @@ def stop_springs(mechanism: Mechanism) -> dict[str, tuple[SX | float, SX | float
 
 @dataclass
 class _Burden:
-    """What a joint may have to hold up and to move, in whichever pose.
+    """Load and inertia of a joint in its worst pose.
 
     Attributes:
         load: Torque or force of weight [N m or N].
         inertia: About or along the axis [kg m^2 or kg].
-        contact: Largest lever of a contact sphere [m], or 1 along an axis; 0 if there is none.
+        contact: Largest lever of a contact sphere [m], or 1 along an axis; 0 without contact sphere.
     """
 
     load: SX | float = 0.0
@@ -149,7 +149,7 @@ class _Burden:
 
 
 def _tied_burdens(mechanism: Mechanism) -> dict[str, _Burden]:
-    """Return what each joint carries, what gears and loops pass on by the ratios of the standing pose included."""
+    """Return load and inertia of each joint, including those that gears and loops transmit in the standing pose."""
     robot, of_tree = mechanism.robot, _tree_burdens(mechanism)
     burdens = {name: of_tree[name] for name in robot.balls}
     ratios = {
@@ -172,7 +172,7 @@ def _tied_burdens(mechanism: Mechanism) -> dict[str, _Burden]:
 
 
 def _tree_burdens(mechanism: Mechanism) -> dict[str, _Burden]:
-    """Return what each joint carries without constraints, outstretched.
+    """Return load and inertia of each joint without constraints, with the robot outstretched.
 
     The weight of the whole robot may rest on the farthest contact sphere beyond a joint. A joint without contact
     spheres beyond it carries the bodies beyond it.
@@ -255,9 +255,9 @@ def _stop(
 ) -> tuple[SX, SX]:
     """One-sided springs and dampers at the ends of a joint's range, taken one step ahead.
 
-    A joint beyond its range is held while its stop pushes, `k d - c v > 0`, which is also what the stop pushed with at
-    the end of the last step: a joint that its stop has just turned back stays held, or its load would throw it
-    back into the stop at every other step. A joint within its range is held if it will be beyond it after the step.
+    The stop of a joint beyond its range acts while it pushes, `k d - c v > 0`, the force at the end of the last step.
+    So the stop still acts on a joint that it has just turned back; otherwise the load would push the joint into the
+    stop at every other step. The stop of a joint within its range acts if the joint is beyond it after the step.
     """
     tau, total, slope = SX(0), SX(0), damping + dt * stiffness
     for bound, side in ((limits[0], 1.0), (limits[1], -1.0)):

@@ -36,7 +36,7 @@ class Saturation:
 
     @staticmethod
     def about(iterate: SX, place: int, asked: JointForce, high: JointForce, low: JointForce) -> Saturation:
-        """Return a torque as an iterate has it at a place; in the first iteration as it is at zero acceleration."""
+        """Return a torque with its expected value in an iterate; in the first iteration at zero acceleration."""
         one = Saturation(asked, high, low, asked.tau)
         return replace(one, expected=ca.if_else(iterate[-1] > 0, iterate[place], asked.tau)) if one.answers else one
 

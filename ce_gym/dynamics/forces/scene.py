@@ -1,4 +1,4 @@
-"""What a scene consists of."""
+"""The contents of a scene."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Ground = Literal["flat", "field"]
 
 @dataclass(frozen=True)
 class StepOptions:
-    """What a scene consists of and how it is stepped.
+    """The contents of a scene and its time stepping.
 
     Attributes:
         dt: Length of the step [s], a constant of the traced step; None makes it an input, which kernels have.
@@ -29,7 +29,7 @@ class StepOptions:
             "motor_position" and "motor_torque" for angles and torques of the motors' rotors instead.
         contacts: Names of the contact spheres that can touch the ground.
         material: Compliance and friction of the contacts.
-        normal_law: Name among `NORMAL_LAWS` of the contacts' normal force; None for that of the material.
+        normal_law: Name among `NORMAL_LAWS` of the contacts' normal force; None for the law of the material.
         friction: Name among `FRICTION` of the contacts' friction law.
         method: Name among `METHODS` of a time-stepping method.
         motors: Name among `MOTORS` of the model of the motors.
@@ -66,7 +66,7 @@ class StepOptions:
 
     @property
     def sampled(self) -> bool:
-        """Whether torques that are asked for are held between the samples of a controller."""
+        """Whether commanded torques are held between the samples of a controller."""
         return self.control_period > 0 and self.control.endswith("position")
 
 
@@ -76,14 +76,14 @@ class Scene:
 
     Attributes:
         mechanism: The robot at a transmission level.
-        options: What the scene consists of.
+        options: The contents of the scene.
         values: Parameters of the force laws by name.
         ground: Height [m] and slopes dz/dx, dz/dy of the ground under each of the options' `touches`, shape
             (3, n_touches); not used on flat ground.
         region_points: Where on their bodies the regions of hulls touch the ground [m], shape (3, n_regions).
         looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_touches);
             empty if that is where they are.
-        choosing: Whether what is seldom near is left out where it is not; else all acts always.
+        choosing: Whether contacts that are seldom near are skipped where none is near; else all contacts always act.
     """
 
     mechanism: Mechanism
@@ -96,7 +96,7 @@ class Scene:
 
 
 def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:
-    """Return what each entry of a step's target is for, by the name of the body that it moves.
+    """Return the name of the body that each entry of a target moves.
 
     The independent joints, without stretches of transmissions; or, for control at the motors, the motors' rotors and
     then the joints that no motor drives, which are controlled as joints.

@@ -1,8 +1,8 @@
 """Contact between links of a robot, as capsules: a spring and a damper along the line between their axes.
 
 The implicit force of a pair depends on the accelerations of two branches, which the recursion cannot take into one
-body's inertia. But accelerations are linear in the forces `lam` of pairs. So the recursion runs with these as unknowns,
-and what the pairs' normal velocities gain, `g = g0 + W lam`, is put into the law `lam = f - D (v_n + g)` of each:
+body's inertia. But accelerations are linear in the forces `lam` of pairs. So the recursion runs with these as unknowns.
+The change of the pairs' normal velocities, `g = g0 + W lam`, enters the law `lam = f - D (v_n + g)` of each pair:
 
     (1 + D W) lam = f - D (v_n + g0),
 
@@ -90,7 +90,7 @@ class Ends:
 
 @dataclass
 class Pair(Contact):
-    """Two capsules of a robot that may touch, for the length of one step: a `ForceLaw`.
+    """Two capsules of a robot that may touch, for the length of one step.
 
     Its touch is in axes of its own, whose first is the normal.
 
@@ -111,7 +111,7 @@ class LinearPair(LinearContact):
     law: Pair
 
     def gain(self, motion: Motion) -> SX:
-        """Return what the normal velocity gains in the step [m/s], as the first of (3,)."""
+        """Return the change of the normal velocity in the step [m/s], as the first of (3,)."""
         first, second = (end.along(motion.a[end.name] - end.body.drift) for end in self.law.ends)
         return _normal(self.law.dt * (first + second))
 
@@ -130,7 +130,7 @@ def meeting(
         capsules: Both.
         bodies: Kinematics of the bodies that carry them.
         load: Force between them over the last step [N].
-        compliance: What they are made of; friction is left out.
+        compliance: Of the contact; its friction is not used.
         normal: Law of the force.
         dt: Step length [s].
     """
@@ -197,10 +197,10 @@ def settled(
 ) -> tuple[SX, dict[str, SX]]:
     """Find the accelerations with the forces of pairs, as `outward_acceleration_pass` returns them.
 
-    With `Y` what a unit force of each pair leaves at a cluster or the base on its way inwards, `u` what is left there
-    of all other forces, `d` the acceleration of what carries a cluster while all of vdot is zero, and `J` the Jacobian
-    of the pairs' distances, `J A^-1 J^T = sum Y^T D^-1 Y` and `J vdot = sum Y^T D^-1 (u - U^T d)`: the factorisation
-    that the recursion is.
+    Let `Y` be the generalised force that a unit force of each pair leaves at a cluster or the base in the inward pass,
+    `u` that of all other forces, `d` the acceleration of the carrier of a cluster while vdot is zero, and `J` the
+    Jacobian of the pairs' distances. Then `J A^-1 J^T = sum Y^T D^-1 Y` and `J vdot = sum Y^T D^-1 (u - U^T d)`,
+    because the recursion is a factorisation of `A`.
 
     Args:
         mechanism: The mechanism.
@@ -234,7 +234,7 @@ def settled(
 
 
 def _apart(u: SX, forces: SX) -> tuple[SX, SX]:
-    """Return what is linear in forces of pairs as their factor, and the rest."""
+    """Return the factor of the pairs' forces in a linear expression, and the rest."""
     return ca.sparsify(ca.jacobian(u, forces)), ca.substitute(u, forces, SX(ca.DM.zeros(forces.numel())))
 
 

@@ -174,7 +174,7 @@ def any_changed(contacts: Sequence[LinearContact], motion: Motion) -> SX:
 
 
 def iterates_after(contacts: Sequence[LinearContact], iterates: list[SX], motion: Motion, unconverged: SX) -> SX:
-    """Return the iterates of contacts for another iteration, and the given ones where none is needed."""
+    """Return the iterates of contacts for another iteration; robots that need no other keep theirs."""
     parts = [
         where(c.law.near, ca.if_else(unconverged, c.next_iterate(motion), part), part)
         for c, part in zip(contacts, iterates, strict=True)

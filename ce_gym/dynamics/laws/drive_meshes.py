@@ -209,7 +209,7 @@ def stretch_resistances(
         kinematics: At the start of the step.
         whole: Inertias of clusters with the slopes of all forces on their coordinates, shape (d, d) each.
         bare: Inertias of clusters without these slopes, shape (d, d) each.
-        slope: Slopes of all forces on coordinates but those of meshes, shape (n, n) [kg m^2].
+        slope: Slopes of all forces on coordinates except meshes, shape (n, n) [kg m^2].
 
     Returns:
         Inertias, by the stretch's row among the joints' coordinates [kg m^2].

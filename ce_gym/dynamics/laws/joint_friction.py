@@ -43,7 +43,7 @@ class Rubbing:
 
     Attributes:
         index: Of the cluster.
-        rows: Its rows of `y`, d of them.
+        rows: Rows of `y` that belong to the cluster, d rows.
         friction: Of its joints, by the name of the body that each moves [N m or N].
     """
 
@@ -53,7 +53,7 @@ class Rubbing:
 
     @property
     def declared(self) -> bool:
-        """Whether some of it is a parameter, which may turn out to be 0: no friction holds nothing."""
+        """Whether a friction is a parameter, which may be 0."""
         return any(isinstance(friction, SX) for friction in self.friction.values())
 
     @property
@@ -102,7 +102,7 @@ class JointFriction(PlacedForce):
         return FrictionForces(force, iterate)
 
     def _torques(self, cluster: Rubbing) -> dict[str, tuple[SX, SX]]:
-        """Return what a cluster's friction has, along which unit vector of its independent joints, shape (1, d)."""
+        """Return the friction of a cluster and its direction, a unit vector of the independent joints, shape (1, d)."""
         coordinates = self.start.kinematics.coordinates[cluster.index]
         assert coordinates is not None
         ways = {name: ca.sparsify(coordinates.G[coordinates.index[name], :]) for name in cluster.friction}

@@ -1,15 +1,15 @@
-"""What a force law declares and computes: its memory, its iterate, and a force that is linear in the accelerations.
+"""The protocol of force laws: memory, iterate, and a force that is linear in the accelerations.
 
 A contact acts or not, sticks or slips, a motor is at a limit or not: an active set. A law linearises its force about an
 iterate, which assumes an active set. Given the resulting accelerations, the linear force checks that assumption and
 returns the next iterate. This is Newton's method on the implicit step.
 
-    placed = law.place(start)            what the force depends on at the start of the step
-    force = placed.linearise(iterate)    the force for an assumed active set, linear in the accelerations
-    force.add_to(loads)                  its part in the equations of motion
-    force.check(motion)                  whether the accelerations contradict the assumption
-    force.next_iterate(motion, ...)      the next assumption
-    force.advance(motion)                the law's memory at the end of the step
+    placed = law.place(start)            evaluate depths, distances and speeds at the start of the step
+    force = placed.linearise(iterate)    assume an active set
+    force.add_to(loads)                  add the force to the equations of motion
+    force.check(motion)                  compare the assumption with the accelerations
+    force.next_iterate(motion, ...)      return the next assumption
+    force.advance(motion)                return the memory at the end of the step
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class PlacedForce:
     """A force law at the start of a step.
 
     Attributes:
-        culled: Contacts that act only where one of them is near.
+        culled: Contacts that act only where some contact is near.
     """
 
     culled: Sequence[Contact] = ()
@@ -171,7 +171,7 @@ class ForceLaw:
         output_sizes: Sizes of the outputs by name.
         size: Size of the iterate; all zero at first.
         iterations: How many iterations of a step may follow the first.
-        culled_rows: Rows of the iterate that belong to contacts that act only where one of them is near.
+        culled_rows: Rows of the iterate of contacts that act only where some contact is near.
     """
 
     mechanism: Mechanism

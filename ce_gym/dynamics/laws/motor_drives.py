@@ -123,7 +123,7 @@ class MotorForces(LinearForce):
         start: The robot at the start of the step.
         force: On the joints.
         load: What friction under load is computed from, as the field `motor_load`.
-        iterate: That of the iteration before; zero in the first.
+        iterate: Of the iteration before; zero in the first iteration.
     """
 
     start: Start

@@ -94,7 +94,7 @@ def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
 
 
 def culled_rows(mechanism: Mechanism, options: StepOptions) -> list[int]:
-    """Return the rows of the iterate that belong to contacts that act only where one of them is near."""
+    """Return the rows of the iterate of contacts that act only where some contact is near."""
     rows, first = [], 0
     for law in scene_laws(mechanism, options):
         rows += [first + row for row in law.culled_rows]

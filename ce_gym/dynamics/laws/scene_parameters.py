@@ -1,4 +1,4 @@
-"""The parameters of a robot in a scene: those of its model and those that force laws declare."""
+"""The parameters of a robot in a scene: of its model and of the force laws."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def parameter_defaults(
         robot: The robot.
         material: Of its contacts.
         names: The declared parameters.
-        argument: What an error calls them.
+        argument: Name of `names` in error messages.
 
     Raises:
         ValueError: If a name is not a parameter of the robot, or is listed twice.
@@ -71,7 +71,7 @@ def split_parameters(robot: Robot, material: ContactMaterial, names: Sequence[st
 
 
 def law_values(robot: Robot, material: ContactMaterial, names: Sequence[str], values: SX) -> dict[str, SX]:
-    """Return the values of the force laws' parameters, those of `names` taken from `values`, stacked in that order."""
+    """Return the force laws' parameters by name; `values` stacks the declared ones in the order of `names`."""
     given = split_parameters(robot, material, names, values)
     of_laws = [parameter.name for law in LAWS for parameter in law.parameters]
     defaults = parameter_defaults(robot, material, of_laws)

@@ -29,7 +29,7 @@ def iterations_of(mechanism: Mechanism, options: StepOptions) -> int:
 
 
 def primal_function(mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...] = ()) -> ca.Function:
-    """Trace what is differentiated: an iteration of the step, or the step itself if that is one expression.
+    """Trace the function to differentiate: an iteration of the step, or the step itself if it is one expression.
 
     Raises:
         ValueError: If steps choose their lengths: these would have to be differentiated too.
@@ -50,7 +50,7 @@ def adjoint_function(
         mechanism: The robot at a transmission level.
         options: The scene.
         outputs: Names among `OUTPUTS` that something depends on besides the state; each has weights `w_{name}`.
-        leads_on: Whether to return, too, what the iteration itself hands on: `iterate` and `unconverged`.
+        leads_on: Whether to return also the results of the iteration itself, `iterate` and `unconverged`.
 
     Returns:
         Function (*inputs of `primal_function`, `w_{part}` of the state after the step, `sums`, `pending`, `active`,
@@ -95,10 +95,10 @@ def adjoint_function(
 
 
 def first_adjoint_function(adjoint: ca.Function) -> ca.Function:
-    """Return the reverse mode of a first iteration that is the last, too: a tenth less than that of any iteration.
+    """Return the reverse mode of a first iteration that is the last, too: a tenth less than for any iteration.
 
     Returns:
-        Function of those inputs of `adjoint` that are not known then -> (`sums`, and what it leads on to).
+        Function of those inputs of `adjoint` that are not known then -> (`sums`, and the results of the iteration).
     """
     known = {"iterate": 0, "sums": 0, "owed": 0, "pending": 1, "active": 1}
     sizes = {name: adjoint.numel_in(name) for name in adjoint.name_in()}
@@ -119,7 +119,7 @@ def _ambient(name: str, after: dict[str, SX], weights: SX, layout: Layout) -> SX
     """Return weights of coordinates that give the same for every motion as weights of their tangent."""
     if name != "q" or not layout.turns:
         return weights
-    scale = SX.ones(layout.nv)  # a rotation moves the quaternion by half of it
+    scale = SX.ones(layout.nv)  # a rotation moves the quaternion by half its angle
     for _, row in layout.turns:
         scale[row : row + 3] = 4
     return tangent_basis(after["q_next"], layout) @ (scale * weights)

@@ -1,11 +1,11 @@
 """The equation of motion over one step, and what changes in it along directions: expressions.
 
-What must vanish is inverse dynamics less the forces of motors and joints, and less what contacts do, at a given
-acceleration. Of a contact the derivatives of its force with respect to where it is and how it moves come first, and are
-shared by all directions. The damping of joints on turning bodies contains inertias that clusters have on the way of the
-recursion; how these change is found in reverse mode.
+The residual is inverse dynamics less the forces of motors, joints and contacts, at a given acceleration. The
+derivatives of a contact's force with respect to its place and velocity are computed first, and all directions share
+them. The damping of joints on turning bodies contains inertias of clusters from the recursion; reverse mode finds their
+changes.
 
-Directions are changes of a part of what a step is given, by its name and place; positions in their tangent space.
+A direction is a change of one entry of an input of the step; of positions in their tangent space.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ce_gym.model.mechanism import Mechanism
 GAIN = 3
 """Of the iterate of a contact, what its force depends on smoothly: the gain in velocity. The rest only decides."""
 Direction: TypeAlias = tuple[str, int]
-"""A part of what a step is given, and a place in it."""
+"""Name of an input of the step, and a place in it."""
 
 
 class Equation:
@@ -43,16 +43,16 @@ class Equation:
         options: The scene.
 
     Attributes:
-        given: Symbols of what a step is given.
+        given: Symbols of the inputs of a step.
         iterate: Symbols of the iterate.
         vdot: Symbols of the acceleration, shape (nv,).
         local: Of each contact, what its force depends on, the force (3,), and its derivative with respect to that.
         forces: Symbols of the forces of contacts, shape (3, n_contacts).
         slopes: Symbols of those derivatives.
         inertia: Symbols of the inertias of clusters whose joints are damped, shape (d, d) each.
-        order: Rows of `v`, those of a body before those of what it carries.
-        wrt: What directions are changes of, by name; "gains" are those of velocities in the iteration before.
-        remembered: Sizes of what the state after the step has besides positions and velocities, by name.
+        order: Rows of `v`, from the base to the tips.
+        wrt: Inputs that directions change, by name; "gains" are changes of velocities in the iteration before.
+        remembered: Sizes of the memory in the state after the step, by name.
     """
 
     def __init__(self, mechanism: Mechanism, options: StepOptions) -> None:
@@ -82,17 +82,17 @@ class Equation:
 
     @property
     def x(self) -> SX:
-        """What directions are changes of, stacked."""
+        """Inputs that directions change, stacked."""
         return ca.vertcat(*self.wrt.values())
 
     @property
     def inputs(self) -> dict[str, SX]:
-        """What an iteration is given, and its acceleration."""
+        """Inputs of an iteration, and its acceleration."""
         return there(self.given.inputs() | {"iterate": self.iterate, "vdot": self.vdot})
 
     @property
     def frozen(self) -> dict[str, SX]:
-        """That and what all directions share."""
+        """Inputs of an iteration, and quantities that all directions share."""
         more = {"inertia": self.stacked_inertias(self.inertia), "forces": ca.vec(self.forces)}
         more |= {"slopes": ca.vertcat(SX(0, 1), *map(packed, self.slopes))}
         return self.inputs | there(more | {"drift": packed(self.drift)})
@@ -104,14 +104,14 @@ class Equation:
         return columns
 
     def change(self, seeds: SX) -> SX:
-        """Return what directions change in the equation of motion without contacts, for an unchanged acceleration."""
+        """Return the changes of the equation without contacts along directions, for an unchanged acceleration."""
         change = ca.jtimes(self._motion, self.x, seeds)
         damped = [row for rows in self.turned.values() for row in rows]
         change[damped, :] += self.drift @ seeds
         return ca.sparsify(change)
 
     def pressing(self, seeds: SX) -> SX:
-        """Return what they change in what contacts do to it."""
+        """Return the changes of the contacts' part along directions."""
         x = self.x
         forces = [slope @ ca.jtimes(at, x, seeds) for slope, (at, _, _) in zip(self.slopes, self.local, strict=True)]
         return ca.sparsify(ca.jtimes(self._pressed, ca.vertcat(x, ca.vec(self.forces)), ca.vertcat(seeds, *forces)))
@@ -148,7 +148,7 @@ class Equation:
 
     @cached_property
     def drift(self) -> SX:
-        """Symbol of what `drift_function` returns."""
+        """Symbol of the result of `drift_function`."""
         return SX.sym("drift", self.drift_of(self.articulated).sparsity())
 
     def drift_of(self, articulated: dict[int, SX]) -> SX:
@@ -173,7 +173,7 @@ class Equation:
         return {k: found.inertia[k] for k in self.turned}
 
     def local_force(self, contact: LinearContact) -> tuple[SX, SX, SX]:
-        """Return what the force of a contact depends on; the force (3,); and its derivative with respect to that."""
+        """Return the arguments of a contact's force, the force (3,), and its derivative."""
         law, touch, iterate = contact.law, contact.law.touch, contact.iterate
         names = [f.name for f in fields(touch) if f.name not in ("point", "drift") and getattr(touch, f.name).numel()]
         symbols = {name: SX.sym(name, *getattr(touch, name).shape) for name in names}
@@ -186,7 +186,7 @@ class Equation:
 
     @cached_property
     def _motion(self) -> SX:
-        """What the equation of motion lacks without contacts, shape (nv,), given inertias of clusters."""
+        """Residual of the equation without contacts, shape (nv,), given inertias of clusters."""
         kinematics = self.system.start.kinematics
         f = net_forces(self.mechanism, kinematics, self.a)
         for name, terms in no_loads(self.system.start).bodies.items():
@@ -202,7 +202,7 @@ class Equation:
 
     @cached_property
     def _pressed(self) -> SX:
-        """What contacts do to it, shape (nv,), given their forces."""
+        """Contacts' part of the residual, shape (nv,), given their forces."""
         kinematics, still = self.system.start.kinematics, SX(6, 1)
         f = dict.fromkeys(self.mechanism.bodies, still)
         for i, contact in enumerate(self.system.contacts):
@@ -247,5 +247,5 @@ def packed(x: SX) -> SX:
 
 
 def there(named: dict[str, SX]) -> dict[str, SX]:
-    """Return what is not empty."""
+    """Return the entries that are not empty."""
     return {name: value for name, value in named.items() if value.numel()}

@@ -1,4 +1,4 @@
-"""Matrices as sparse as a tree of joints: factors without pivoting, and what is solved with them, in place."""
+"""Matrices as sparse as a tree of joints: factorisation without pivoting, and solves in place."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def factorised(A: SX, order: list[int]) -> SX:
 
     Args:
         A: Shape (n, n).
-        order: Its rows, those of a body before those of what it carries.
+        order: Rows of the matrix, from the base to the tips.
 
     Returns:
         Shape (n, n): reciprocals of the pivots on the diagonal, and `U`, whose diagonal is 1, and `L`, whose are those

@@ -37,7 +37,7 @@ from ce_gym.model.mechanism import Mechanism
 REMEMBERED = ("load", "anchor")
 """Parts of a state besides positions and velocities whose derivatives are not zero: what contacts remember."""
 Block: TypeAlias = tuple[str, int, int]
-"""Directions one after the other: what they are changes of, the first place in it, and how many."""
+"""Consecutive directions: name of the input, first place, and count."""
 
 
 class Linearization(Equation):
@@ -50,7 +50,7 @@ class Linearization(Equation):
             not only positions and velocities.
 
     Attributes:
-        remembered: Sizes of what the state has besides positions and velocities, by name.
+        remembered: Sizes of the memory in the state, by name.
         chained: Whether iterations pass something smooth on.
     """
 
@@ -77,7 +77,7 @@ class Linearization(Equation):
 
     @cached_property
     def places(self) -> dict[str, int]:
-        """Where the directions of each part of the state, and the target, begin among all of them."""
+        """First direction of each part of the state and of the target."""
         sizes = {"q": self.nv, "v": self.nv, **self.remembered, "target": self.given.target.numel()}
         return dict(zip((*sizes, "end"), accumulate(sizes.values(), initial=0), strict=True))
 
@@ -90,11 +90,11 @@ class Linearization(Equation):
         return self.implicit().sparsity()
 
     def iteration_function(self) -> ca.Function:
-        """Trace an iteration, and of its derivative what all directions share.
+        """Trace an iteration, and the part of its derivative that all directions share.
 
         Returns:
             Function (*state, diverged, *given, iterate) -> (vdot, diverged, iterate, unconverged, factor, inertia,
-            forces, slopes); what is empty is left out here and below.
+            forces, slopes); empty outputs are left out here and below.
         """
         given = self.given
         solved = solve(given.scene, given.state, given.target, given.dt, self.iterate)
@@ -183,7 +183,7 @@ class Linearization(Equation):
 
         Returns:
             Function (slope, column, still, diverged, gains) -> that, positions in their tangent space, (size,); 0 for a
-            robot that has diverged. Only loads depend on gains, those of the iteration before the last.
+            robot that has diverged. Only loads depend on gains, of the iteration before the last.
         """
         slope, column = SX.sym("slope", self._slope.nnz()), SX.sym("column", self.nv)
         given, end = {"slope": slope, "column": column}, SX(self._slope.sparsity(), slope) @ column
@@ -206,7 +206,7 @@ class Linearization(Equation):
         return traced("still", self.inputs, in_blocks("still", group, self.tangent_after(columns)))
 
     def gains_function(self) -> ca.Function:
-        """Trace what an iteration passes on to the next: how the gains in velocity change.
+        """Trace the changes of the gains in velocity, which an iteration passes to the next.
 
         Returns:
             Function (*inputs of the one before, slopes, drift) -> (how gains change with accelerations, how the
@@ -219,7 +219,7 @@ class Linearization(Equation):
         return traced("gains", self.frozen, left)
 
     def pass_on_function(self) -> ca.Function:
-        """Trace what the iteration before does to the equation of motion along one direction.
+        """Trace the effect of the iteration before on the equation of motion along one direction.
 
         Returns:
             Function (gained, into, direct, column, change) -> change (nv,), given the column of the one before; if
@@ -263,13 +263,13 @@ class Linearization(Equation):
 
 
 def blocks(group: list[Direction]) -> list[Block]:
-    """Return a group of directions as blocks: of each part of what a step is given, those one after the other."""
+    """Return a group of directions as blocks of consecutive places in one input."""
     parts = [(name, [i for _, i in some]) for name, some in groupby(group, lambda direction: direction[0])]
     return [(name, places[0], len(places)) for name, places in parts]
 
 
 def in_blocks(name: str, group: list[Direction], columns: SX) -> dict[str, SX]:
-    """Return columns of a group of directions, those of each block one below the other; names tell sizes, too."""
+    """Return the columns of a group of directions, stacked for each block; names contain the sizes."""
     counts = [count for _, _, count in blocks(group)]
     split = ca.horzsplit(ca.densify(columns), list(accumulate(counts, initial=0)))
     return {f"{name}{j}_{count}": ca.vec(x) for j, (x, count) in enumerate(zip(split, counts, strict=True))}

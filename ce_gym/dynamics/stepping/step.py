@@ -1,4 +1,4 @@
-"""One time step of one robot: the page that says what the physics is.
+"""One time step of one robot: all physics on one page.
 
 The step is linearly implicit: stiff forces (contact, friction, joint stops, damping, position control) are taken one
 step ahead, which adds to inertias and leaves the recursion unchanged. A step of length 0 gives the acceleration of the
@@ -160,7 +160,7 @@ def linearise(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
 
 
 def cull(placed: Sequence[PlacedForce], dt: float) -> SX:
-    """Let contacts that are seldom near act only where one of them is; return whether one is, 1 or 0."""
+    """Let seldom-near contacts act only where one of these contacts is near; return 1 if one is near, else 0."""
     seldom = [contact for force in placed for contact in force.culled]
     near = anything_near([contact.touch for contact in seldom], dt)
     for contact in seldom:

@@ -44,7 +44,7 @@ def step_function(
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
-        outputs: Names among `OUTPUTS`, or `MOVED` or `OFF`; what is not asked for costs nothing.
+        outputs: Names among `OUTPUTS`, or `MOVED` or `OFF`; others cost nothing.
         follows: Whether contacts that move find the plane of the ground higher or lower there; for derivatives on a
             field. `places`, where the centres of contacts are, is one more of what is given then.
 
@@ -106,7 +106,7 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
 
     Returns:
         Function (*state, diverged, *of the stages) -> (*state, diverged, *outputs). Of the stages it is given those
-        parts it needs, by names such as `coarse_q`, `fine_v` and `half_torque`. A robot that diverges in one of them
+        parts it needs, by names such as `coarse_q`, `fine_v` and `half_torque`. A robot that diverges in a stage
         stays where it was.
     """
     plan, before = METHODS[options.method], symbolic_state(mechanism, options)
@@ -140,7 +140,7 @@ def _needed(given: dict[str, SX], results: dict[str, SX]) -> dict[str, SX]:
 
 
 class Given:
-    """Symbols of one robot before a step, and what becomes of them."""
+    """Symbols of one robot before a step, and expressions for its state after the step."""
 
     def __init__(self, mechanism: Mechanism, options: StepOptions, follows: bool = False) -> None:
         robot, n = mechanism.robot, len(options.touches)

@@ -39,7 +39,7 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
         dt: Length of the step [s].
 
     Returns:
-        What each stage left, by its name, and the step as a whole as `AFTER`.
+        The result of each stage by name, and of the whole step as `AFTER`.
     """
     parts: dict[str, Stepped] = {}
     layout = scene.mechanism.robot.layout
@@ -48,7 +48,7 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
             start = _moved(stage.start, before, list(parts.values()), dt, layout)
         else:
             start = parts[stage.start].state if stage.start else before.replaced(load=before[stage.load])
-        if parts and stage.start and not scene.looked_up.numel():  # the ground is known as it is around the start
+        if parts and stage.start and not scene.looked_up.numel():  # the ground is known around the start of the step
             scene = looked_up_from(scene, parts[plan.stages[0].name].solved.kinematics)
         length = stage.length * dt if stage.length else 0.0  # a number also where dt is a symbol, see `solve`
         parts[stage.name] = iterated(scene, start, target, length, stage.iterations)
