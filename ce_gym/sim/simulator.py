@@ -360,7 +360,7 @@ class Simulator:
     @property
     def pair_forces(self) -> Array:
         """Forces that push the capsules of each of `pairs` apart after a step [N], shape (num_envs, n_pairs)."""
-        return self._read("pressed")
+        return self._read("pair_force")
 
     @property
     def contact_forces(self) -> Array:

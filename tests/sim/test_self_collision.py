@@ -95,8 +95,8 @@ def test_two_balls_rebound_as_a_reduced_mass_on_a_spring():
     step = step_function(model.mechanism, options, ("energy",))
     q, v, load, deepest, lasted = np.array([-0.1001, 0.1]), np.array([1.0, 0.0]), 0.0, 0.0, 0
     for _ in range(1200):
-        found = step(q=q, v=v, pressed=load, diverged=0, target=np.zeros(2))
-        q, v, load = (found[f"{name}_next"].full().ravel() for name in ("q", "v", "pressed"))
+        found = step(q=q, v=v, pair_force=load, diverged=0, target=np.zeros(2))
+        q, v, load = (found[f"{name}_next"].full().ravel() for name in ("q", "v", "pair_force"))
         deepest, lasted = max(deepest, 0.2 - (q[1] - q[0])), lasted + (load[0] > 0)
         assert v @ [1.0, 3.0] == pytest.approx(1.0, abs=1e-13)
         assert float(found["energy"]) <= 0.5 + 1e-12
@@ -116,8 +116,8 @@ def test_forces_of_several_pairs_against_a_dense_solve():
     options = StepOptions(dt, control="torque", material=robot.material, self_collisions=PAIR)
     q, k, c = model.standing_q, robot.material.stiffness, robot.material.damping
     step = step_function(model.mechanism, options)
-    found = step(q=q, v=np.zeros(model.nv), pressed=np.zeros(2), diverged=0, target=np.zeros(2))
-    after, lam, turned = (found[name].full().ravel() for name in ("v_next", "pressed_next", "q_next"))
+    found = step(q=q, v=np.zeros(model.nv), pair_force=np.zeros(2), diverged=0, target=np.zeros(2))
+    after, lam, turned = (found[name].full().ravel() for name in ("v_next", "pair_force_next", "q_next"))
     after[3:6] = ca.evalf(quaternion_to_rotation(SX(turned[3:7]))).full() @ after[3:6]  # in the axes of the start
     J = np.zeros((2, model.nv))
     for i in range(2):
@@ -157,8 +157,8 @@ def test_forces_in_motion_and_gravity_against_a_dense_solve():
     for _ in range(20):
         q, v = rng.normal(0, 0.2, 6), rng.normal(0, 1.0, 6)
         J = np.array([(gaps(model, q + e, pairs) - gaps(model, q - e, pairs)) / 2e-6 for e in 1e-6 * np.eye(6)]).T
-        found = step(q=q, v=v, pressed=np.zeros(2), diverged=0, target=np.zeros(6))
-        after, lam = (found[name].full().ravel() for name in ("v_next", "pressed_next"))
+        found = step(q=q, v=v, pair_force=np.zeros(2), diverged=0, target=np.zeros(6))
+        after, lam = (found[name].full().ravel() for name in ("v_next", "pair_force_next"))
         acts, seen = lam > 0, seen + (lam > 0).sum()
         law = -k * gaps(model, q, pairs) - (c + dt * k) * (J @ after)
         np.testing.assert_allclose(lam[acts], law[acts], rtol=1e-4, atol=1e-2)

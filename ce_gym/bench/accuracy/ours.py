@@ -94,7 +94,7 @@ class Ours:
             depth = Placement(model, model.contact_names, scene.terrain).depth(q)
             loads = scene.robot.material.stiffness * depth
             rows |= {name: loads for name in ("load", "whole_load") if name in self.arrays}
-        for name in ("anchor", "pressed"):
+        for name in ("anchor", "pair_force"):
             if name in self.arrays:
                 rows[name] = np.zeros((self.num_envs, self.arrays[name].shape[1]))
         if "dependent" in self.arrays:

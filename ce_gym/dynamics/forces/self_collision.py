@@ -116,7 +116,7 @@ class LinearPair(LinearContact):
         return _normal(self.law.dt * (first + second))
 
 
-def meeting(
+def pair_between(
     capsules: tuple[Capsule, Capsule],
     bodies: tuple[BodyState, BodyState],
     load: SX,
@@ -177,7 +177,7 @@ def nearest(a: SX, b: SX, c: SX, d: SX, long: tuple[bool, ...] = (True, True)) -
     return _clipped((uw * other - ur) / uu), other
 
 
-def pressed_on(external: dict[str, BodyTerms], pairs: Sequence[LinearPair], forces: SX) -> dict[str, BodyTerms]:
+def add_pair_forces(external: dict[str, BodyTerms], pairs: Sequence[LinearPair], forces: SX) -> dict[str, BodyTerms]:
     """Return what acts on bodies with the forces of pairs [N], shape (n_pairs,)."""
     result = dict(external)
     for i, pair in enumerate(pairs):
@@ -187,7 +187,7 @@ def pressed_on(external: dict[str, BodyTerms], pairs: Sequence[LinearPair], forc
     return result
 
 
-def settled(
+def solve_pair_forces(
     mechanism: Mechanism,
     kinematics: Kinematics,
     articulation: Articulation,

@@ -21,7 +21,7 @@ MOVED = "moved"
 """Name of the output that says how far a step moves its fastest joint, at the speed of its end [rad or m]."""
 OFF = "off"
 """Name of the output that estimates the errors of a step, shape (nv + 1,), see `step_errors`."""
-TOUCHES = ("load", "pressed")
+TOUCHES = ("load", "pair_force")
 """Parts of a state that are above 0 where something touches."""
 LANDING, CONTACT = 0.02, 0.005
 """What an error of velocity counts as: how far it moves in this time, where a contact begins or ends, and else [s]."""

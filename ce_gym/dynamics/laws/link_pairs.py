@@ -10,7 +10,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.contact import Contact, where
 from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.normal import normal_law
-from ce_gym.dynamics.forces.self_collision import Frictionless, LinearPair, Pair, meeting
+from ce_gym.dynamics.forces.self_collision import Frictionless, LinearPair, Pair, pair_between
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.contacts import any_changed, compliance_of, iterates_after, touch_energy
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
@@ -26,7 +26,7 @@ class LinkPairs(ForceLaw):
         self.capsules = colliding(self.mechanism.robot, self.options.self_collisions)
         n = len(self.capsules)
         self.acts = n > 0
-        self.fields = (Field("pressed", n, "N", "force between each pair of capsules over the last step"),)
+        self.fields = (Field("pair_force", n, "N", "force between each pair of capsules over the last step"),)
         self.size, self.iterations = Contact.size * n, Frictionless.iterations
         self.culled_rows = range(self.size)
 
@@ -44,8 +44,8 @@ class LinkPairs(ForceLaw):
         law = normal_law(options.normal_law, options.material)
         for i, pair in enumerate(self.capsules):
             bodies = start.kinematics.bodies[pair[0].body], start.kinematics.bodies[pair[1].body]
-            meeting_pair = meeting(pair, bodies, start.state["pressed"][i], compliance, law, start.dt)
-            pairs.append(replace(meeting_pair, resolves_landing=METHODS[options.method].controlled))
+            pair_contact = pair_between(pair, bodies, start.state["pair_force"][i], compliance, law, start.dt)
+            pairs.append(replace(pair_contact, resolves_landing=METHODS[options.method].controlled))
         return pairs
 
 
@@ -84,4 +84,4 @@ class PairForces(LinearForce):
     def advance(self, motion: Motion) -> dict[str, SX]:
         """Return the forces at the end of the step."""
         forces = [where(p.law.near, ca.fmax(p.normal_after(p.gain(motion)), 0)) for p in self.pairs]
-        return {"pressed": ca.vertcat(*forces)}
+        return {"pair_force": ca.vertcat(*forces)}

@@ -28,7 +28,7 @@ from ce_gym.dynamics.forces.contact import LinearContact
 from ce_gym.dynamics.forces.dry_friction import stand_still
 from ce_gym.dynamics.forces.linear import JointForce, Motion, is_moment
 from ce_gym.dynamics.forces.scene import Scene, contact_places
-from ce_gym.dynamics.forces.self_collision import pressed_on, settled
+from ce_gym.dynamics.forces.self_collision import add_pair_forces, solve_pair_forces
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.laws.scene_laws import iterate_size, scene_laws
 from ce_gym.dynamics.recursion.ce_aba import (
@@ -185,10 +185,10 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
     momentum = None if is_moment(dt) else turning_momentum(mechanism, state.v, dt)
     turning = None if is_moment(dt) else TurningDamping(state.v, dt)
     forces = SX.sym("forces", len(loads.pairs))
-    external = pressed_on(loads.bodies, loads.pairs, forces)
+    external = add_pair_forces(loads.bodies, loads.pairs, forces)
     articulation = inward_inertia_pass(mechanism, kinematics, system.joints, external, turning)
     if loads.pairs:
-        vdot, a = settled(mechanism, kinematics, articulation, momentum, loads.pairs, forces)
+        vdot, a = solve_pair_forces(mechanism, kinematics, articulation, momentum, loads.pairs, forces)
     else:
         vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
     return system.solved(vdot, a, articulation)
