@@ -46,7 +46,9 @@ def write_pages(folder: Path) -> None:
         drawn = (folder / "robots" / f"{robot}.png").exists()
         for task in tasks_of(robot):
             _write(folder / "environments" / f"{robot}_{task}.md", environment_page(robot, task, drawn))
-    for name in ("terms", "context", "task_arguments", "settings", "command_line", "policies"):
+    for name in (
+        "terms", "context", "task_arguments", "parameters", "outputs", "settings", "command_line", "policies",
+    ):  # fmt: skip
         _write(folder / f"{name}.inc", getattr(reference_tables, name)())
     for name, text in reference_tables.results().items():
         _write(folder / "results" / f"{name}.inc", text)

@@ -21,6 +21,7 @@ from environment_page import attributes_of, plain, table
 
 from ce_gym.__main__ import _parser
 from ce_gym.bench.measure.report import Report, cell_text, read_report
+from ce_gym.dynamics.laws.scene_laws import OUTPUTS, PARAMETERS
 from ce_gym.envs.task.tasks import RANDOMISED, Task
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.registry import OWN
@@ -72,6 +73,19 @@ def task_arguments() -> str:
         drawn.append((f"`{name}`", unit[1] if unit else "-", re.sub(r" ?\[[^\]]+\]", "", text)))
     parameters = table(("Name", "Unit", "Meaning"), drawn)
     return f"{table(('Argument', 'Default', 'Meaning'), rows)}\n\n## Randomised parameters\n\n{parameters}\n"
+
+
+def parameters() -> str:
+    """Return the table of parameters that can differ from robot to robot."""
+    rows = [(f"`{p.name}`", p.meaning, p.unit, f"`{p.size}`", p.allowed) for p in PARAMETERS.values()]
+    return table(("Parameter", "Meaning", "Unit", "Size", "Allowed values"), rows) + "\n"
+
+
+def outputs() -> str:
+    """Return the table of outputs of a step."""
+    moments = {"start": "start of the step", "end": "end of the step", "mean": "mean over the step"}
+    rows = [(f"`{o.name}`", o.meaning, o.unit, moments[o.of]) for o in OUTPUTS.values()]
+    return table(("Output", "Meaning", "Unit", "Moment"), rows) + "\n"
 
 
 def settings() -> str:

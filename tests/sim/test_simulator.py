@@ -154,7 +154,7 @@ def test_dropped_robots_come_to_rest(robot: str, dt: float, stiffness: float, dt
         ({"control": "velocity"}, "control='velocity'; expected 'position' or 'torque'"),
         ({"contacts": "wing"}, "contacts='wing'; expected 'all', groups or names among"),
         ({"contacts": ["nose"]}, "contacts='nose'; expected 'all', groups or names among"),
-        ({"outputs": ("smell",)}, "outputs='smell'; expected one of torque, motor_torque"),
+        ({"outputs": ("smell",)}, "outputs='smell'; expected one of contact_forces, torque"),
     ],
 )
 def test_bad_arguments(model: Model, arguments: dict, message: str):

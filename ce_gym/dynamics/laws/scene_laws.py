@@ -28,7 +28,7 @@ STEP_OUTPUTS = (
     Output("loop_gap", "m or -", "norm of the residuals of the closed loops", "start"),
     Output("nearness", "-", "distance from a singularity, see `Model.nearness`", "start"),
 )
-OUTPUTS: dict[str, Output] = {output.name: output for output in STEP_OUTPUTS}
+OUTPUTS: dict[str, Output] = {}
 """All outputs that a step can report on request, by name."""
 PARAMETERS: dict[str, Parameter] = {parameter.name: parameter for parameter in MODEL_PARAMETERS}
 """All parameters by name; BODY stands for the name of a link, ROTOR for that of a rotor."""
@@ -43,6 +43,7 @@ def add_law(law: type[ForceLaw]) -> None:
 
 for _law in (Contacts, LinkPairs, MotorDrives, JointStops, DryJointFriction, JointSprings, DriveMeshes):
     add_law(_law)
+OUTPUTS.update({output.name: output for output in STEP_OUTPUTS})
 
 
 def scene_laws(mechanism: Mechanism, options: StepOptions) -> list[ForceLaw]:
