@@ -5,7 +5,7 @@ Data and its checks only.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
@@ -97,6 +97,11 @@ class Lookup:
     slopes: bool = True
     grid: Grid = ()
 
+    def size_of_output(self, size_of_points: int) -> int:
+        """Return the size of the output, given the size of the buffer of points."""
+        n = size_of_points // 2
+        return len(self.grid) * (n - 1) if self.grid else (3 if self.slopes else 1) * n
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Buffers with values per lane that it reads."""
@@ -146,6 +151,18 @@ def calls_of(steps: Sequence[Step | Repeat]) -> Iterator[Call | Lookup]:
             yield from calls_of(step.calls)
         else:
             yield step
+
+
+def scratch_buffers(steps: Sequence[Step | Repeat], known: Collection[str]) -> list[Buffer]:
+    """Return scratch buffers for all values that steps write, as large as at the first write, but for known buffers."""
+    sizes: dict[str, int] = {}
+    for call in calls_of(steps):
+        if isinstance(call, Lookup):
+            sizes.setdefault(call.output, call.size_of_output(sizes[call.points]))
+        else:
+            for i, name in enumerate(call.outputs):
+                sizes.setdefault(name, call.times * call.function.numel_out(i))
+    return [Buffer(name, size, "scratch") for name, size in sizes.items() if name not in known]
 
 
 @dataclass(frozen=True)
@@ -296,9 +313,12 @@ def _check_lookup(place: str, lookup: Lookup, buffers: dict[str, Buffer]) -> Non
         raise ValueError(f"{place}: output {lookup.output!r} is an input too, expected another buffer")
     if lookup.grid and lookup.slopes:
         raise ValueError(f"{place}: slopes of a grid, expected values alone")
-    n, each = buffers[lookup.points].size // 2, len(lookup.grid) or (3 if lookup.slopes else 1)
-    n_found = each * (n - bool(lookup.grid))
-    sizes = (("frame", lookup.frame, 3), ("points", lookup.points, 2 * n), ("output", lookup.output, n_found))
+    points = buffers[lookup.points].size
+    sizes = (
+        ("frame", lookup.frame, 3),
+        ("points", lookup.points, points // 2 * 2),
+        ("output", lookup.output, lookup.size_of_output(points)),
+    )
     for side, name, size in sizes:
         if buffers[name].size != size:
             raise ValueError(f"{place}: {side} buffer {name!r} has size {buffers[name].size}, expected {size}")

@@ -48,7 +48,7 @@ TERMS = {
 }
 """Fields of a `Task` that name terms, in the order in which they are added, and the kind of each."""
 
-AGAIN = {"iteration": "another iteration of a sub-step", "mend": "a sub-step in parts"}
+AGAIN = {"iteration": "another iteration of a sub-step", "subdivide": "a sub-step in parts"}
 """What is done in a sub-step only if some robot of a tile needs it, by name of the function."""
 
 NO_TERMS: dict[str, Any] = {"rewards": {}, "noise": {}, "history": 1} | {f: () for f in TERMS if f != "rewards"}

@@ -18,9 +18,11 @@ from ce_gym.compile import aligned_copy
 from ce_gym.dynamics.algebra.batched import evaluate
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import MOVED
+from ce_gym.dynamics.algebra.tracing import output_names
 from ce_gym.dynamics.stepping.derivatives import primal_function, state_parts
+from ce_gym.dynamics.stepping.halving import PART, subdivide_function
 from ce_gym.dynamics.stepping.linearization import REMEMBERED
-from ce_gym.dynamics.stepping.parts import mending_function
+from ce_gym.dynamics.stepping.variables import LEFT, RETRIES, StepVariables
 from ce_gym.sim.derivative_kernels import load_gradient_kernel, load_linearization_kernel
 from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.simulator import Simulator
@@ -340,7 +342,7 @@ class _Part:
 
 
 def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray) -> list[_Part]:
-    """Make a sub-step of some robots again, as its kernel does (`ce_gym.dynamics.stepping.parts`).
+    """Make a sub-step of some robots again, as its kernel does (`ce_gym.dynamics.stepping.halving`).
 
     Args:
         simulator: Whose robots.
@@ -348,26 +350,24 @@ def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray
         target: Shape (n, n_targets).
     """
     model, options, dtype = simulator.model, simulator.options, simulator.dtype
-    kernel = load_step_kernel(model, replace(options, retry=0), (), dtype)
-    mend, n = mending_function(model.mechanism, options, {}, {}), len(target)
-    dt, known = rows[DT], {**rows, "retries": np.zeros((n, 1))}
-    state = {name: known[name] for name in kernel.buffers if name in known}
-    progress = {"part": np.ones((n, 1)), "left": np.ones((n, 1))}
+    kernel, n = load_step_kernel(model, replace(options, retry=0), (), dtype), len(target)
+    step = StepVariables(model.mechanism, options, {})
+    subdivide = subdivide_function(step, options.retry)
+    arguments = [name for name in kernel.buffers if name in rows] + [RETRIES.name]
+    values = {**rows, RETRIES.name: np.zeros((n, 1)), PART.name: np.ones((n, 1)), LEFT.name: np.ones((n, 1))}
     parts: list[_Part] = []
-    while (progress["part"] > 0).any():
-        length = progress["part"] * dt
-        before = _in_tiles(state | {DT: length}, dtype)
-        after = _in_tiles(state | {DT: length}, dtype)
+    while (values[PART.name] > 0).any():
+        length = values[PART.name] * values[DT]
+        state = {name: values[name] for name in arguments} | {DT: length}
+        before, after = _in_tiles(state, dtype), _in_tiles(state, dtype)
         kernel(after | simulator._batch.tables | {"target": target}, n, {TIMES: 1})
-        tried = {f"tried_{name}": read_rows(array, n) for name, array in after.items()}
-        joints = tried["tried_v"][:, model.robot.layout.base_nv :]
-        tried[f"tried_{MOVED}"] = length * np.abs(joints).max(axis=1, initial=0.0, keepdims=True)
-        given = state | tried | progress | {DT: dt}
-        found = [one[..., 0] for one in evaluate(mend, [given[name] for name in mend.name_in()])]
-        left = dict(zip(mend.name_out(), found, strict=True))
-        parts.append(_Part(before, (left["left_next"] < progress["left"])[:, 0]))
-        state |= {name: left[f"tried_{name}_next"] for name in state if f"tried_{name}_next" in left}
-        progress = {name: left[f"{name}_next"] for name in progress}
+        tried = {step.tried[name].name: read_rows(after[name], n) for name in step.start}
+        joints = tried[step.tried["v"].name][:, model.robot.layout.base_nv :]
+        tried[step.tried[MOVED].name] = length * np.abs(joints).max(axis=1, initial=0.0, keepdims=True)
+        results = evaluate(subdivide, [(values | tried)[name] for name in subdivide.name_in()])
+        updates = {name: rows[..., 0] for name, rows in zip(output_names(subdivide), results, strict=True)}
+        parts.append(_Part(before, (updates[LEFT.name] < values[LEFT.name])[:, 0]))
+        values |= updates | {variable.name: updates[step.tried[part].name] for part, variable in step.start.items()}
     return parts
 
 

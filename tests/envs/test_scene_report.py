@@ -26,7 +26,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 ENVIRONMENT = "ce_gym/MiniCheetahVelocity-v0"
 OUTPUTS = ("torque", MOVED)
 """Of the functions that sub-steps consist of."""
-AROUND = ("begin", "judge", "copy")
+AROUND = ("begin", "accept", "copy")
 """Calls around the physics of a sub-step."""
 
 
@@ -48,7 +48,7 @@ def test_lines_add_up_to_the_kernel(report: SceneReport):
     assert sum(group.instructions for group in report.groups) == counts["act"] + counts["assess"]
     assert {item.name: item.instructions for item in report.sometimes} == {
         "another iteration of a sub-step": counts["iteration"],
-        "a sub-step in parts": counts["mend"],
+        "a sub-step in parts": counts["subdivide"],
         "reset": report.program.reset_program().calls[0].function.n_instructions(),
     }
 

@@ -12,9 +12,10 @@ from tripod import TRIPOD
 
 from ce_gym import Model, Simulator, StepDerivatives
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.stepping import control
-from ce_gym.dynamics.stepping.control import ALLOWED, GROWTH, SHORTEST, control_function, next_length
+from ce_gym.dynamics.stepping import step_size
+from ce_gym.dynamics.stepping.step_size import ALLOWED, GROWTH, SHORTEST, control_function, next_length
 from ce_gym.dynamics.stepping.trace import step_function
+from ce_gym.dynamics.stepping.variables import StepVariables
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.sim.schema import physics_rows
 from ce_gym.sim.substeps import substeps
@@ -193,7 +194,8 @@ def test_lengths_of_steps():
     assert float(share(1.0, 5.0)) == 1.0
 
     model = pendulum()
-    after = control_function(model.mechanism, StepOptions(method="adaptive"), {}, {})
+    step = StepVariables(model.mechanism, StepOptions(method="adaptive"), {})
+    after = control_function(step, model.robot.layout)
     numbers = dict.fromkeys(after.name_in(), 0.0)
     numbers |= {"dt": 1.0, "left": 1.0, "trying": 0.1, "step_length": 0.1, "tolerance": 1.0, "tried_q": [1.0, 2.0]}
     numbers |= {"step_change": np.full(2, 1e3)}  # so that the change allows less than the error itself
@@ -207,7 +209,7 @@ def test_lengths_of_steps():
     assert good["step_length_next"] == pytest.approx(0.1 * GROWTH)
     assert good["left_next"] == pytest.approx(0.9)
     assert then(tried_off=[1e-12, 0.0, 0.0], refusing=1.0)["step_length_next"] == pytest.approx(0.1)
-    steady = then(tried_off=[0.0, control.AIM * ALLOWED, 0.0], step_error=control.AIM * ALLOWED)
+    steady = then(tried_off=[0.0, step_size.AIM * ALLOWED, 0.0], step_error=step_size.AIM * ALLOWED)
     assert steady["step_length_next"] == pytest.approx(0.1)
     for bad in (
         {"tried_off": [0.0, -1.01 * ALLOWED, 0.0]},

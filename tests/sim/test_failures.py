@@ -7,7 +7,7 @@ import pytest
 from tripod import TRIPOD
 
 from ce_gym import Model, Simulator
-from ce_gym.dynamics.stepping.parts import FAST, LARGEST_FAST_MOVE, LARGEST_MOVE
+from ce_gym.dynamics.stepping.halving import FAST, LARGEST_FAST_MOVE, LARGEST_MOVE
 
 BAD, N = 5, 12
 OTHERS = np.arange(N) != BAD

@@ -7,7 +7,7 @@ import numpy as np
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene, Way
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
-from ce_gym.dynamics.stepping.control import control_sizes
+from ce_gym.dynamics.stepping.step_size import control_sizes
 from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.placement import Placement
 from ce_gym.sim.schema import FIRST

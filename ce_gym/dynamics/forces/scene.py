@@ -36,11 +36,11 @@ class StepOptions:
         ground: "flat" for the plane z = 0, "field" for a height and slope under each contact that the caller supplies.
         parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
         self_collisions: Pairs of links that push each other apart.
-        seldom: Contacts that are looked at only where they are near, see `stepping/choice.py`.
+        seldom: Contacts that are looked at only where they are near, see `stepping/broad_phase.py`.
         control_period: Of position control: it looks at joints or motors every so often and holds its torques in
             between [s]; 0 for controllers that never stop, see `forces/motor_control.py`.
         hulls: Convex shapes with further contacts between their corners, on a field.
-        retry: How often a kernel may halve a step for a robot that fails in it, see `stepping/parts.py`.
+        retry: How often a kernel may halve a step for a robot that fails in it, see `stepping/halving.py`.
     """
 
     dt: float | None = None

@@ -93,7 +93,7 @@ class Plan:
         order: Its global error is of this order in the step length, where the motion is smooth.
         stages: In the order in which they are evaluated; the first starts from the state before the step.
         end: How the state after the step follows from them.
-        controlled: Whether kernels make steps as long as the estimate of their error allows, see `control.py`.
+        controlled: Whether kernels make steps as long as the estimate of their error allows, see `step_size.py`.
     """
 
     order: int

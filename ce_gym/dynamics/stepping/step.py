@@ -43,7 +43,7 @@ from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, steadying_couples, turning_momentum
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.dynamics.state import State
-from ce_gym.dynamics.stepping.choice import anything_near
+from ce_gym.dynamics.stepping.broad_phase import any_in_range
 
 
 @dataclass
@@ -162,7 +162,7 @@ def linearise(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
 def cull(placed: Sequence[PlacedForce], dt: float) -> SX:
     """Let seldom-near contacts act only where one of these contacts is near; return 1 if one is near, else 0."""
     seldom = [contact for force in placed for contact in force.culled]
-    near = anything_near([contact.touch for contact in seldom], dt)
+    near = any_in_range([contact.touch for contact in seldom], dt)
     for contact in seldom:
         contact.near = near
     return near

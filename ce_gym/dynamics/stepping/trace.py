@@ -22,6 +22,7 @@ from ce_gym.dynamics.state import State
 from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.step import Stepped, iteration, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
+from ce_gym.dynamics.stepping.variables import StepVariables
 from ce_gym.model.mechanism import Mechanism
 
 LOST_LOOP = 1e-5
@@ -96,30 +97,34 @@ def iteration_function(
     return traced("iteration", given.inputs() | parts, given.guarded(stepped) | left | told)
 
 
-def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> ca.Function:
-    """Trace what follows from the stages of a step, as the plan of its method has it, if there are several.
+def combination_function(mechanism: Mechanism, options: StepOptions, step: StepVariables) -> ca.Function:
+    """Trace the combination of the stages of a step, for plans with several stages.
 
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
-        outputs: Sizes of those among `OUTPUTS` that are to be combined.
+        step: Variables of the step.
 
     Returns:
-        Function (*state, diverged, *of the stages) -> (*state, diverged, *outputs). Of the stages it is given those
-        parts it needs, by names such as `coarse_q`, `fine_v` and `half_torque`. A robot that diverges in a stage
-        stays where it was.
+        Function (*state, diverged, *of the stages) -> (*state, diverged, *outputs), whose inputs have the names of
+        their variables. Only variables of the stages that are needed are inputs. A robot that diverges in one of the
+        stages keeps its state.
     """
     plan, before = METHODS[options.method], symbolic_state(mechanism, options)
     ends = {stage.name: symbolic_state(mechanism, options) for stage in plan.stages}
-    flags = {"diverged": SX.sym("diverged")} | {f"{name}_diverged": SX.sym(name) for name in ends}
+    flags = {"diverged": SX.sym("diverged")}
+    flags |= {step.stages[name]["diverged"].name: SX.sym(name) for name in ends}
     given = dict(before.items()) | flags
-    given |= {f"{stage}_{name}": value for stage, end in ends.items() for name, value in end.items()}
+    for stage, end in ends.items():
+        given |= step.stages[stage].named(dict(end.items()))
     layout = mechanism.robot.layout
     after = combined(plan, ends, layout)
     sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
-    results = {f"{name}_next": ca.if_else(sane, after[name], value) for name, value in before.items()}
-    results["diverged_next"] = ca.if_else(sane, 0, 1)
-    for name, size in outputs.items():
+    results = {name: ca.if_else(sane, after[name], value) for name, value in before.items()}
+    results["diverged"] = ca.if_else(sane, 0, 1)
+    for name in step.tried:
+        if name in results:
+            continue
         if name == MOVED:
             given["dt"] = SX.sym("dt")
             results[name] = furthest(mechanism, after.v, given["dt"])
@@ -127,8 +132,8 @@ def combination_function(mechanism: Mechanism, options: StepOptions, outputs: Ma
         if name in ("error", OFF):
             results[name] = error_estimate(plan, ends) if name == "error" else step_errors(plan, before, ends, layout)
             continue
-        told = {stage: SX.sym(name, size) for stage in plan.shares(moment_of(name))}
-        given |= {f"{stage}_{name}": value for stage, value in told.items()}
+        told = {stage: step.stages[stage][name].symbol() for stage in plan.shares(moment_of(name))}
+        given |= {step.stages[stage][name].name: value for stage, value in told.items()}
         results[name] = weighted(plan.shares(moment_of(name)), told)
     return traced("combination", _needed(given, results), results)
 
