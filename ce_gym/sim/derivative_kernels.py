@@ -279,7 +279,7 @@ class _LinearizationCalls:
             yield call(self.drift, only_if=only_if)
         if self.pressed_drift:
             yield call(self.pressed_drift, only_if=CONTACT_ACTS)
-        if chained:
+        if chained and self.gains:
             yield call(self.gains, {"vdot": VDOT_BEFORE}, only_if=only_if)
         for change, press, group in zip(self.changes, self.presses, self.blocks, strict=True):
             yield call(change, only_if=only_if)
@@ -287,8 +287,10 @@ class _LinearizationCalls:
                 yield call(press, only_if=CONTACT_ACTS)
             for block in group:
                 bound = block.buffers | {"active": _active(k)}
-                for function in ([self.pass_on] if chained else []) + [self.solve if k else self.first]:
-                    yield call(function, bound, bound, only_if=only_if, times=block.count)
+                if chained and self.pass_on:
+                    yield call(self.pass_on, bound, bound, only_if=only_if, times=block.count)
+                solve = self.solve if k else self.first
+                yield call(solve, bound, bound, only_if=only_if, times=block.count)
         if any(self.presses):
             yield assign({CONTACT_ACTS: ca.DM(0)}, only_if=only_if)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ce_gym.compile import Buffer, Call, Program, aligned_zeros, load_kernel
-from ce_gym.compile.lowering.function import parts_of, versions_of
+from ce_gym.compile.lowering.function import split_function, variants_of
 from ce_gym.compile.lowering.graph import (
     FMA,
     FMS,
@@ -137,7 +137,7 @@ CHOICE = 2
 
 def test_what_is_left_where_a_choice_is_zero():
     """Choices are made, what was not chosen is gone, and what was not fused in the whole is not fused now."""
-    says, whole, left = versions_of(choosing(), CHOICE)
+    says, whole, left = variants_of(choosing(), CHOICE)
     assert sorted(operations(says.graph)) == sorted([ca.OP_ADD, ca.OP_LT])
     assert operations(whole.graph) == operations(graph_of(choosing()))
     assert ca.OP_SIN in operations(whole.graph)
@@ -211,27 +211,27 @@ def growing_program(again, short=""):
 
 
 def test_what_does_not_follow_from_an_iterate_is_in_the_first_part():
-    parts = parts_of(growing(), frozenset({2}))
-    (none, second), first = *parts.versions, parts.first.graph
+    parts = split_function(growing(), frozenset({2}))
+    (none, second), first = *parts.variants, parts.prologue.graph
     assert none.is_empty
     assert {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} <= set(operations(first))
     assert not {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} & set(operations(second.graph))
     assert sorted(operations(first) + operations(second.graph)) == sorted(operations(graph_of(growing())))
-    assert parts.first.keeps == {k for k, op in enumerate(second.graph.ops) if op == KEPT} != set()
+    assert parts.prologue.keeps == {k for k, op in enumerate(second.graph.ops) if op == KEPT} != set()
 
 
 def test_what_only_a_choice_asks_for_is_in_parts_of_its_own():
     """The root is, and of what the choice takes what is short is made again; the sine is needed in any case."""
-    parts = parts_of(growing(), frozenset({2}), LEFT.index("choice"))
-    (before, last), (none, left) = parts.versions
-    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_LT} <= set(operations(parts.first.graph))
-    assert ca.OP_SQRT not in operations(parts.first.graph)
+    parts = split_function(growing(), frozenset({2}), LEFT.index("choice"))
+    (before, last), (none, left) = parts.variants
+    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_LT} <= set(operations(parts.prologue.graph))
+    assert ca.OP_SQRT not in operations(parts.prologue.graph)
     assert {ca.OP_SQRT, ca.OP_EXP} <= set(operations(before.graph))
     assert none.is_empty
     assert len(operations(left.graph)) < len(operations(last.graph))
-    assert parts.first.leaves | last.leaves == parts.first.leaves | left.leaves == set(range(len(LEFT)))
+    assert parts.prologue.outputs | last.outputs == parts.prologue.outputs | left.outputs == set(range(len(LEFT)))
     with pytest.raises(ValueError, match="output 2 is a choice; expected one that does not follow"):
-        parts_of(growing(), frozenset({2}), LEFT.index("flag"))
+        split_function(growing(), frozenset({2}), LEFT.index("flag"))
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -260,9 +260,9 @@ def test_a_second_iteration_of_a_step_takes_kinematics_from_the_first():
     model = Model("mini_cheetah")
     options = StepOptions(contacts=tuple(c.name for c in model.robot.contacts if c.group == "foot"))
     function = iteration_function(model.mechanism, options)
-    parts = parts_of(function, frozenset({function.name_in().index("iterate")}))
-    second = parts.versions[0][-1].graph
-    assert operations(parts.first.graph).count(ca.OP_SIN) == 12
+    parts = split_function(function, frozenset({function.name_in().index("iterate")}))
+    second = parts.variants[0][-1].graph
+    assert operations(parts.prologue.graph).count(ca.OP_SIN) == 12
     assert operations(second).count(ca.OP_SIN) == 1
     assert len(operations(second)) < 0.8 * len(operations(graph_of(function)))
 

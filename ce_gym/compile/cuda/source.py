@@ -21,8 +21,8 @@ import numpy as np
 from ce_gym.compile.cuda.prelude import prelude
 from ce_gym.compile.cuda.writer import Writer
 from ce_gym.compile.layout import Layout, layout_of
-from ce_gym.compile.lowering.function import lower_function, versions_of
-from ce_gym.compile.lowering.parted import Part
+from ce_gym.compile.lowering.function import Arguments, lower_function, variants_of
+from ce_gym.compile.lowering.partial_evaluation import Fragment
 from ce_gym.compile.program import Buffer, Call, Grid, Lookup, Program, Repeat, Step, While, check_program
 
 BLOCK, BLOCKS = 128, 2
@@ -100,7 +100,7 @@ class _KernelText:
         self.program, self.layout = program, layout
         self.sizes = {b.name: b.size for b in program.buffers}
         self.names: dict[tuple[casadi.Function, int | None, int], str] = {}
-        self.places: Counter[tuple[casadi.Function, int | None, int]] = Counter()
+        self.n_calls: Counter[tuple[casadi.Function, int | None, int]] = Counter()
         self.grids: dict[Grid, str] = {}
 
     def signature(self) -> str:
@@ -188,7 +188,7 @@ class _KernelText:
     def _calls(self, calls: Sequence[Call]) -> Iterator[str]:
         """Calls of one function with the same buffers, one after the other."""
         first, flag = calls[0], calls[-1].only_if
-        call = self._version(first)
+        call = self._variant(first)
         if len(calls) == 1:
             yield f"if ({flag}_[0] != 0) {call}" if flag else call
             return
@@ -201,14 +201,15 @@ class _KernelText:
         yield f"for (int iteration = 0; iteration < {len(calls)} && ({asked}{flag}_[0] != 0); ++iteration)"
         yield f"    {call}"
 
-    def _version(self, call: Call) -> str:
-        """The call of a whole function, or of its choice and of what that leaves."""
+    def _variant(self, call: Call) -> str:
+        """Return the call of the full function, or of its flag and then of the variant that the flag selects."""
         values, short = ", ".join(f"{name}_" for name in (*call.inputs, *call.outputs)), call.short_if_zero
         if not short:
             return f"{self._function(call.function)}({values});"
-        choice = call.outputs.index(short)
-        says, whole, left = (f"{self._function(call.function, choice, part)}({values});" for part in range(3))
-        return f"{{ {says} if ({short}_[0] != 0) {whole} else {left} }}"
+        flag = call.outputs.index(short)
+        names = (self._function(call.function, flag, variant) for variant in range(3))
+        find_flag, full, reduced = (f"{name}({values});" for name in names)
+        return f"{{ {find_flag} if ({short}_[0] != 0) {full} else {reduced} }}"
 
     def _look_up(self, lookup: Lookup) -> str:
         n, table = self.sizes[lookup.points] // 2, lookup.table
@@ -219,13 +220,13 @@ class _KernelText:
         name = "look_up" if lookup.slopes else "look_up_values"
         return f"{name}<{n}>(all_{table}, rows_{table}, columns_{table}, {lanes});"
 
-    def _function(self, function: casadi.Function, choice: int | None = None, part: int = 1) -> str:
-        """Name of a traced function's own C function, for one more place.
+    def _function(self, function: casadi.Function, flag: int | None = None, variant: int = 1) -> str:
+        """Return the name of the C function of a traced function, and count one more call.
 
-        Of one with a choice, an output, there are three: the choice, all of it, and what is left where that is zero.
+        A function with a flag, the number of an output, has three variants, see `variants_of`.
         """
-        key = function, choice, part
-        self.places[key] += 1
+        key = function, flag, variant
+        self.n_calls[key] += 1
         return self.names.setdefault(key, f"{function.name()}_{len(self.names)}")
 
     def constants(self) -> list[str]:
@@ -237,22 +238,22 @@ class _KernelText:
         return texts
 
     def functions(self) -> list[str]:
-        """The C functions that have been named: inlined, but for a long one that is called from several places."""
+        """Return the C functions that have been named: inlined, except long ones with several calls."""
         texts = []
-        for (function, choice, part), name in self.names.items():
-            called = self.places[function, choice, part] > 1 and function.n_instructions() > LONG
-            inline = "__noinline__" if called else "__forceinline__"
-            taken = None if choice is None else versions_of(function, choice)[part]
-            texts.append(_function_text(name, function, self.layout.dtype, inline, taken))
+        for (function, flag, variant), name in self.names.items():
+            is_called = self.n_calls[function, flag, variant] > 1 and function.n_instructions() > LONG
+            inline = "__noinline__" if is_called else "__forceinline__"
+            fragment = None if flag is None else variants_of(function, flag)[variant]
+            texts.append(_function_text(name, function, self.layout.dtype, inline, fragment))
         return texts
 
 
-def _function_text(name: str, function: casadi.Function, dtype: str, inline: str, part: Part | None) -> str:
-    """A traced function. Loads come before stores in the text, so that an output may be an input's array."""
+def _function_text(name: str, function: casadi.Function, dtype: str, inline: str, fragment: Fragment | None) -> str:
+    """Return a traced function in C. Loads precede stores, so that an output may be the array of an input."""
     inputs = [f"in{i}" for i in range(function.n_in())]
     outputs = [f"out{i}" for i in range(function.n_out())]
-    writer: Any = Writer(dtype)  # stands in for the vector builder
-    lower_function(writer, function, inputs, outputs, part=part)
+    writer: Any = Writer(dtype)  # has the methods of the vector builder
+    lower_function(writer, function, Arguments(inputs, outputs), fragment)
     arguments = [f"const real* {name}" for name in inputs] + [f"real* {name}" for name in outputs]
     head = f"static __device__ {inline} void {name}({', '.join(arguments)})"
     return "\n".join([head, "{", *_indented(writer.lines), "}", ""])

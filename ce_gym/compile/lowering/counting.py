@@ -1,4 +1,4 @@
-"""Floating-point operations of a function, as they are emitted."""
+"""The number of floating-point operations of a function."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections import Counter
 import casadi
 from llvmlite import ir
 
-from ce_gym.compile.lowering.function import lower_function
+from ce_gym.compile.lowering.function import Arguments, lower_function
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 OPERATIONS = {"fadd": 1, "fsub": 1, "fmul": 1, "fdiv": 1, "llvm.fma": 2, "llvm.sqrt": 1}
-"""What counts, and how often; comparisons, minima and sign changes do not."""
+"""Operations that count, and how often each does; comparisons, minima and sign changes do not count."""
 
 
 def floating_point_operations(function: casadi.Function, dtype: str = "float64") -> int:
-    """Return how many operations one lane takes: sums, products, quotients and roots, polynomials of sines included.
+    """Return the number of sums, products, quotients and roots for one lane, also those in polynomials of sines.
 
-    They are counted as emitted, multiply-adds twice, before the optimiser shares what is equal.
+    Operations are counted as emitted, before the optimiser merges equal ones. A multiply-add counts as two.
 
     Args:
         function: An SX function.
@@ -27,15 +27,14 @@ def floating_point_operations(function: casadi.Function, dtype: str = "float64")
     signature = ir.FunctionType(ir.VoidType(), [pointer] * (function.n_in() + function.n_out()))
     body = ir.Function(ir.Module(), signature, "counted")
     block = body.append_basic_block("entry")
-    lower_function(
-        VectorBuilder(ir.IRBuilder(block), dtype), function, body.args[: function.n_in()], body.args[function.n_in() :]
-    )
+    arguments = Arguments(body.args[: function.n_in()], body.args[function.n_in() :])
+    lower_function(VectorBuilder(ir.IRBuilder(block), dtype), function, arguments)
     counts = Counter(_name(instruction) for instruction in block.instructions)
     return sum(times * counts[name] for name, times in OPERATIONS.items())
 
 
 def _name(instruction: Value) -> str:
-    """An operation's name; an intrinsic's without its types."""
+    """Return the name of an operation; for an intrinsic without its types."""
     if isinstance(instruction, ir.CallInstr):
         return ".".join(instruction.callee.name.split(".")[:2])
     return instruction.opname

@@ -1,113 +1,72 @@
 """One CasADi SX function as straight-line vector code.
 
 Every operation of the function's `graph` becomes one value, in the order that `ordering` chooses. Loads are emitted at
-first use and stores at the very end, so outputs may share their memory with inputs; where they do not, they can be
-stored as they come, and are not kept until the end.
+first use and stores at the very end, so an output may share memory with an input. Outputs that share no memory with
+inputs are stored at once, which keeps fewer values alive.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import casadi
 
 from ce_gym.compile.lowering import math as vector_math
 from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, KEPT, SELECT, Graph, graph_of, sources
 from ce_gym.compile.lowering.ordering import ordered
-from ce_gym.compile.lowering.parted import Part, Parts, parted, versions
+from ce_gym.compile.lowering.partial_evaluation import Fragment, Split, split, variants
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 
-def lower_function(
-    v: VectorBuilder,
-    function: casadi.Function,
-    inputs: Sequence[Value],
-    outputs: Sequence[Value],
-    apart: bool = False,
-    same: frozenset[tuple[int, int]] = frozenset(),
-    part: Part | None = None,
-) -> None:
-    """Emit `function` at the builder's position.
+@dataclass(frozen=True)
+class Arguments:
+    """Memory that a lowered function works on; vectors of an input or output follow each other column by column.
 
-    Args:
-        v: builder of the block to append to.
-        function: an SX function; sparse inputs and outputs are laid out densely, column by column.
-        inputs: pointer to the first vector of each function input.
-        outputs: pointer to the first vector of each function output; structural zeros are written as 0.
-        apart: whether no output shares memory with an input.
-        same: inputs and outputs that share their memory; what is only handed on is not stored again.
-        part: which part of it, if not all.
+    Attributes:
+        inputs: Pointer to the first vector of each input of the function.
+        outputs: Pointer to the first vector of each output; structural zeros are written as 0.
+        kept: Pointer to the values that the fragments of a function keep for each other.
+        disjoint: Whether no output shares memory with an input.
+        shared: Pairs of an input and an output that share memory; values that do not change are not stored again.
+    """
+
+    inputs: Sequence[Value]
+    outputs: Sequence[Value]
+    kept: Value | None = None
+    disjoint: bool = False
+    shared: frozenset[tuple[int, int]] = frozenset()
+
+
+def lower_function(
+    v: VectorBuilder, function: casadi.Function, arguments: Arguments, fragment: Fragment | None = None
+) -> None:
+    """Emit an SX function, or a fragment of the function, at the builder's position.
 
     Raises:
-        NotImplementedError: for an operation that has no vector form.
+        NotImplementedError: If an operation has no vector form.
     """
-    part = part or Part(graph_of(function), frozenset(range(function.n_out())))
-    graph = part.graph
-    lowering = _Lowering(v, function.name())
-    loads = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
-    places = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
-    results = [[v.const(0.0)] * function.numel_out(i) for i in range(function.n_out())]
-    loaded: dict[tuple[int, int], Value] = {}
-    values: dict[int, Value] = {}
-
-    def value(k: int) -> Value:
-        """Result of instruction k: done already, or an input or a constant met for the first time."""
-        if k not in values:
-            if k in graph.constants:
-                values[k] = lowering.constant(graph.constants[k])
-            elif graph.ops[k] == KEPT:
-                values[k] = v.load(part.memory, part.places[k])
-            else:
-                which, nonzero = function.instruction_input(k)
-                place = which, loads[which][nonzero]
-                if place not in loaded:
-                    loaded[place] = v.load(inputs[which], place[1])
-                values[k] = loaded[place]
-        return values[k]
-
-    def handed_on(which: int, position: int) -> bool:
-        """Whether an output is what was loaded from where it would be stored."""
-        found = [loaded.get((source, position)) for source, to in same if to == which]
-        return any(place is results[which][position] for place in found)
-
-    leave: dict[int, list[tuple[int, int]]] = defaultdict(list)
-    for k, op in enumerate(graph.ops):
-        if op == casadi.OP_OUTPUT:
-            which, nonzero = function.instruction_output(k)
-            leave[graph.operands[k][0]].append((which, places[which][nonzero]))
-    stored = set[tuple[int, int]]()
-    for k in ordered(graph):
-        values[k] = lowering.operation(graph.ops[k], [value(a) for a in graph.operands[k]])
-        if k in part.keeps:
-            v.store(values[k], part.memory, part.places[k])
-        for which, position in leave[k] if apart else ():
-            v.store(values[k], outputs[which], position)
-            stored.add((which, position))
-    for k, to in leave.items():
-        for which, position in to:
-            results[which][position] = value(k)
-    for which in sorted(part.leaves):
-        pointer = outputs[which]
-        for position, result in enumerate(results[which]):
-            if (which, position) not in stored and not handed_on(which, position):
-                v.store(result, pointer, position)
+    whole = Fragment(graph_of(function), frozenset(range(function.n_out())))
+    lowering = _Lowering(v, function, arguments, fragment or whole)
+    lowering.emit_operations()
+    lowering.emit_stores()
 
 
-def parts_of(function: casadi.Function, changing: frozenset[int], choice: int | None = None) -> Parts:
-    """Take a function apart, given its inputs that change and its output that is a choice, if one is; see `parted`."""
+def split_function(function: casadi.Function, changing: frozenset[int], flag: int | None = None) -> Split:
+    """Split a function, given the numbers of its inputs that change and of its output that is a flag; see `split`."""
     graph = graph_of(function)
-    return parted(graph, _outputs(function, graph), sources(function, graph, changing), choice)
+    return split(graph, _outputs(function, graph), sources(function, graph, changing), flag)
 
 
-def versions_of(function: casadi.Function, choice: int) -> tuple[Part, Part, Part]:
-    """Return a function's choice, all of it, and what is left where the choice is zero, each by itself."""
+def variants_of(function: casadi.Function, flag: int) -> tuple[Fragment, Fragment, Fragment]:
+    """Return the flag of a function, the full function, and the function where the flag is zero; see `variants`."""
     graph = graph_of(function)
-    return versions(graph, _outputs(function, graph), choice)
+    return variants(graph, _outputs(function, graph), flag)
 
 
 def _outputs(function: casadi.Function, graph: Graph) -> list[set[int]]:
-    """Nodes of each output."""
+    """Return the nodes of each output."""
     outputs: list[set[int]] = [set() for _ in range(function.n_out())]
     for k, op in enumerate(graph.ops):
         if op == casadi.OP_OUTPUT:
@@ -116,12 +75,84 @@ def _outputs(function: casadi.Function, graph: Graph) -> list[set[int]]:
 
 
 def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:
-    """Column-major position of each structural nonzero."""
+    """Return the column-major position of each structural nonzero."""
     rows, columns = sparsity.get_triplet()
     return [row + column * sparsity.size1() for row, column in zip(rows, columns, strict=True)]
 
 
 class _Lowering:
+    """Emits a fragment of a function: one value for each operation.
+
+    Attributes:
+        values: Value of each node that has been emitted.
+        loaded: Values that have been loaded, by number of the input and position in the input.
+        stored: Outputs that have been stored, by number and position.
+        destinations: Outputs that each node is written to, by number and position.
+    """
+
+    def __init__(self, v: VectorBuilder, function: casadi.Function, arguments: Arguments, fragment: Fragment) -> None:
+        self.v, self.function, self.arguments, self.fragment = v, function, arguments, fragment
+        self.operations = _Operations(v, function.name())
+        self.positions = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
+        self.values: dict[int, Value] = {}
+        self.loaded: dict[tuple[int, int], Value] = {}
+        self.stored: set[tuple[int, int]] = set()
+        self.destinations: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        positions = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
+        for k, op in enumerate(fragment.graph.ops):
+            if op == casadi.OP_OUTPUT:
+                number, nonzero = function.instruction_output(k)
+                self.destinations[fragment.graph.operands[k][0]].append((number, positions[number][nonzero]))
+
+    def emit_operations(self) -> None:
+        """Emit all operations, and the stores of values that later fragments read or that overwrite no input."""
+        graph, arguments = self.fragment.graph, self.arguments
+        for k in ordered(graph):
+            value = self.operations.emit(graph.ops[k], [self._value(a) for a in graph.operands[k]])
+            self.values[k] = value
+            if k in self.fragment.keeps:
+                self.v.store(value, arguments.kept, self.fragment.slots[k])
+            for number, position in self.destinations.get(k, ()) if arguments.disjoint else ():
+                self.v.store(value, arguments.outputs[number], position)
+                self.stored.add((number, position))
+
+    def emit_stores(self) -> None:
+        """Emit the stores of all outputs that have not been stored yet and may have changed."""
+        zero = self.v.const(0.0)
+        results = [[zero] * self.function.numel_out(i) for i in range(self.function.n_out())]
+        for k, places in self.destinations.items():
+            for number, position in places:
+                results[number][position] = self._value(k)
+        for number in sorted(self.fragment.outputs):
+            for position, result in enumerate(results[number]):
+                if (number, position) not in self.stored and not self._is_unchanged(number, position, result):
+                    self.v.store(result, self.arguments.outputs[number], position)
+
+    def _value(self, k: int) -> Value:
+        """Return the value of a node: computed already, or an input, constant or kept value at its first use."""
+        if k not in self.values:
+            graph = self.fragment.graph
+            if k in graph.constants:
+                self.values[k] = self.operations.constant(graph.constants[k])
+            elif graph.ops[k] == KEPT:
+                self.values[k] = self.v.load(self.arguments.kept, self.fragment.slots[k])
+            else:
+                number, nonzero = self.function.instruction_input(k)
+                self.values[k] = self._loaded(number, self.positions[number][nonzero])
+        return self.values[k]
+
+    def _loaded(self, number: int, position: int) -> Value:
+        if (number, position) not in self.loaded:
+            self.loaded[number, position] = self.v.load(self.arguments.inputs[number], position)
+        return self.loaded[number, position]
+
+    def _is_unchanged(self, number: int, position: int, result: Value) -> bool:
+        """Return whether an output is the value that was loaded from the same memory."""
+        inputs = [source for source, output in self.arguments.shared if output == number]
+        return any(self.loaded.get((source, position)) is result for source in inputs)
+
+
+class _Operations:
     """Emits operations; caches masks, constants and sine-cosine pairs of values already emitted."""
 
     def __init__(self, v: VectorBuilder, name: str):
@@ -137,7 +168,7 @@ class _Lowering:
         self.numbers[value] = number
         return value
 
-    def operation(self, op: int, operands: Sequence[Value]) -> Value:
+    def emit(self, op: int, operands: Sequence[Value]) -> Value:
         """Emit one operation."""
         if op not in OPERATIONS:
             raise NotImplementedError(
@@ -229,7 +260,7 @@ OPERATIONS: dict[int, Operation] = {
     casadi.OP_FMIN: _intrinsic("minnum"),
     casadi.OP_FMAX: _intrinsic("maxnum"),
     casadi.OP_COPYSIGN: _intrinsic("copysign"),
-    casadi.OP_SIGN: _Lowering.sign,
+    casadi.OP_SIGN: _Operations.sign,
     casadi.OP_SIN: lambda s, x: s.sin_cos(x)[0],
     casadi.OP_COS: lambda s, x: s.sin_cos(x)[1],
     casadi.OP_TAN: _elementary("tan"),
@@ -240,15 +271,15 @@ OPERATIONS: dict[int, Operation] = {
     casadi.OP_EXP: _elementary("exp"),
     casadi.OP_LOG: _elementary("log"),
     casadi.OP_TANH: _elementary("tanh"),
-    casadi.OP_POW: _Lowering.power,
-    casadi.OP_CONSTPOW: _Lowering.power,
+    casadi.OP_POW: _Operations.power,
+    casadi.OP_CONSTPOW: _Operations.power,
     casadi.OP_HYPOT: lambda s, x, y: s.v.intrinsic("sqrt", s.v.add(s.v.mul(x, x), s.v.mul(y, y))),
     casadi.OP_FMOD: lambda s, x, y: vector_math.remainder(s.v, x, y, "trunc"),
     casadi.OP_REMAINDER: lambda s, x, y: vector_math.remainder(s.v, x, y, "rint"),
     casadi.OP_LT: _comparison("<"),
     casadi.OP_LE: _comparison("<="),
     casadi.OP_EQ: _comparison("=="),
-    casadi.OP_NE: _Lowering.differ,
+    casadi.OP_NE: _Operations.differ,
     casadi.OP_NOT: lambda s, a: s.truth(s.v.builder.not_(s.mask(a))),
     casadi.OP_AND: lambda s, a, b: s.truth(s.v.builder.and_(s.mask(a), s.mask(b))),
     casadi.OP_OR: lambda s, a, b: s.truth(s.v.builder.or_(s.mask(a), s.mask(b))),

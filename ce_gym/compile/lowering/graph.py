@@ -1,21 +1,21 @@
-"""A traced function as a graph of IEEE 754 operations: what is fused is decided here, not by a compiler.
+"""A traced function as a graph of IEEE 754 operations; operations are fused here and not by a compiler.
 
 Compilers that may fuse multiply-adds and replace divisions by reciprocals choose differently for each target, and the
 last bits differ with them. Both rewritings are done here once for all targets and forbidden to every compiler, so CPUs
-and GPUs that follow IEEE 754 give the same bits. About 70 % of a step's CasADi instructions are left.
+and GPUs that follow IEEE 754 give the same bits. About 70 % of a step's CasADi instructions remain.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import casadi
 
 REMOVED, SELECT, FMA, FMS, FNMA, KEPT = -1, -2, -3, -4, -5, -6
 """Operations that CasADi lacks: removed by a rewriting; of (a, b, c): `b if a else c`, `a b + c`, `a b - c`,
-`c - a b`; and a value that another function has left."""
+`c - a b`; and a value that another fragment has computed."""
 
 NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, REMOVED, KEPT)
 """Nothing is computed for these."""
@@ -36,12 +36,16 @@ class Graph:
     constants: dict[int, float]
 
     def users(self) -> dict[int, list[int]]:
-        """Return the users of each node; a user of it twice is listed twice."""
+        """Return the users of each node; a node that uses another one twice is listed twice."""
         users = defaultdict(list)
         for k, of in enumerate(self.operands):
             for a in of:
                 users[a].append(k)
         return users
+
+    def ancestors(self, nodes: Iterable[int]) -> set[int]:
+        """Return nodes and all nodes that they depend on."""
+        return reached(nodes, dict(enumerate(self.operands)))
 
     def add(self, op: int, *operands: int) -> int:
         """Add a node and return its number."""
@@ -52,6 +56,16 @@ class Graph:
     def replace(self, k: int, op: int, *operands: int) -> None:
         """Replace the operation and the operands of a node."""
         self.ops[k], self.operands[k] = op, operands
+
+
+def reached(nodes: Iterable[int], neighbours: Mapping[int, Iterable[int]]) -> set[int]:
+    """Return nodes and all nodes that can be reached from them over their neighbours."""
+    found, waiting = set(nodes), list(nodes)
+    while waiting:
+        new = set(neighbours.get(waiting.pop(), ())) - found
+        found |= new
+        waiting += new
+    return found
 
 
 def graph_of(function: casadi.Function) -> Graph:
@@ -71,7 +85,7 @@ def sources(function: casadi.Function, graph: Graph, inputs: Collection[int]) ->
 
 
 def _instructions(function: casadi.Function) -> Graph:
-    """The instructions as they are, in SSA form: CasADi's registers are reused."""
+    """Return the instructions in static single assignment form: CasADi reuses registers."""
     registers = [-1] * function.sz_w()
     graph = Graph([], [], {})
     for k in range(function.n_instructions()):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import TypeAlias
 
 import casadi
@@ -12,18 +11,18 @@ from llvmlite import ir
 
 from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.layout import Layout
-from ce_gym.compile.lowering.function import lower_function, parts_of
+from ce_gym.compile.lowering.function import Arguments, lower_function, split_function
 from ce_gym.compile.lowering.lookup import Table, emit_lookup
 from ce_gym.compile.lowering.lookup_grid import emit_grid_lookup
 from ce_gym.compile.lowering.lookup_values import emit_value_lookup
-from ce_gym.compile.lowering.parted import Part, Parts
+from ce_gym.compile.lowering.partial_evaluation import Fragment, Split
 from ce_gym.compile.lowering.random import emit_uniform
 from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
 from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While
 
 INT = ir.IntType(64)
 FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
-Same: TypeAlias = frozenset[tuple[int, int]]
+Pairs: TypeAlias = frozenset[tuple[int, int]]
 MANY = 64
 """Values per environment from which on rows are written block by block."""
 
@@ -64,11 +63,11 @@ class _TileWork:
         remaining = builder.sub(num_envs, self.first_env)
         self.valid_lanes = self._smaller(remaining, INT(self.vectors.lanes))
         self.lanes = {b.name: self._lanes_of(b, scratch, tile) for b in program.buffers if b.kind != "table"}
-        self.bodies: dict[tuple[casadi.Function, Same, Part | None], ir.Function] = {}
+        self.bodies: dict[tuple[casadi.Function, Pairs, Fragment | None], ir.Function] = {}
         repeated = [call for call in program.calls if isinstance(call, Call) and call.again]
-        self.again = {call.function: _changing(call) for call in repeated}
-        self.taken_apart: dict[tuple[casadi.Function, str], Parts] = {}
-        self.memory: dict[casadi.Function, Value] = {}
+        self.changing = {call.function: _changing(call) for call in repeated}
+        self.splits: dict[tuple[casadi.Function, str], Split] = {}
+        self.kept: dict[casadi.Function, Value] = {}
 
     def any_lane(self, name: str) -> Value:
         """Whether a buffer of size 1 is not zero in some lane."""
@@ -220,56 +219,58 @@ class _TileWork:
         emit(self.vectors, table, frame, points, output, n_points)
 
     def _call(self, call: Call) -> None:
-        """Call one lowered function, if it is needed."""
+        """Call one lowered function, if some lane needs the call."""
         if not call.only_if:
-            self._call_version(call)
+            self._call_variant(call)
             return
         with self.builder.if_then(self.any_lane(call.only_if)):
-            self._call_version(call)
+            self._call_variant(call)
 
-    def _call_version(self, call: Call) -> None:
-        """Call the whole function, or those of its parts that are needed."""
-        if (parts := self._parts_of(call)) is None:
+    def _call_variant(self, call: Call) -> None:
+        """Call the full function, or its prologue and the variant of the remainder that some lane needs."""
+        split = self._split(call)
+        if split is None:
             self._call_body(call)
             return
         if not call.again:
-            self._call_part(call, parts.first)
+            self._call_fragment(call, split.prologue)
         if not call.short_if_zero:
-            self._call_rest(call, parts.versions[0])
+            self._call_remainder(call, split.variants[0])
             return
-        with self.builder.if_else(self.any_lane(call.short_if_zero)) as (whole, short):
-            for branch, version in zip((whole, short), parts.versions, strict=True):
+        with self.builder.if_else(self.any_lane(call.short_if_zero)) as branches:
+            for branch, variant in zip(branches, split.variants, strict=True):
                 with branch:
-                    self._call_rest(call, version)
+                    self._call_remainder(call, variant)
 
-    def _parts_of(self, call: Call) -> Parts | None:
-        """How a function is taken apart, if it is."""
-        changing = self.again.get(call.function, frozenset())
+    def _split(self, call: Call) -> Split | None:
+        """Return the fragments of the function; None if the function is called as a whole."""
+        changing = self.changing.get(call.function, frozenset())
         if self.parts > 1 or not (changing or call.short_if_zero):
             return None
         key = call.function, call.short_if_zero
-        if key not in self.taken_apart:
-            choice = call.outputs.index(call.short_if_zero) if call.short_if_zero else None
-            self.taken_apart[key] = parts_of(call.function, changing, choice)
-        return self.taken_apart[key]
+        if key not in self.splits:
+            flag = call.outputs.index(call.short_if_zero) if call.short_if_zero else None
+            self.splits[key] = split_function(call.function, changing, flag)
+        return self.splits[key]
 
-    def _call_rest(self, call: Call, parts: tuple[Part, ...]) -> None:
-        """Call what follows a first part; of a further call what changes."""
-        for part in parts[-1:] if call.again else parts:
-            if not part.is_empty:
-                self._call_part(call, part)
+    def _call_remainder(self, call: Call, variant: tuple[Fragment, Fragment]) -> None:
+        """Call the constant and the changing fragment; of a repeated call the changing one."""
+        for fragment in variant[-1:] if call.again else variant:
+            if not fragment.is_empty:
+                self._call_fragment(call, fragment)
 
-    def _call_part(self, call: Call, part: Part) -> None:
+    def _call_fragment(self, call: Call, fragment: Fragment) -> None:
         pointers = [self.lanes[name] for name in call.inputs + call.outputs]
-        self.builder.call(self._body(call, part), [*pointers, self._memory(call.function, part)])
+        self.builder.call(self._body(call, fragment), [*pointers, self._kept(call.function, fragment)])
 
-    def _memory(self, function: casadi.Function, part: Part) -> Value:
-        """Memory for what the parts of a function leave to each other, of one tile at a time."""
-        if function not in self.memory:
+    def _kept(self, function: casadi.Function, fragment: Fragment) -> Value:
+        """Return the memory for the values that fragments of a function keep for each other, for one tile."""
+        if function not in self.kept:
             with self.builder.goto_entry_block():
-                self.memory[function] = self.builder.alloca(self.vectors.float_type, INT(max(len(part.places), 1)))
-            self.memory[function].align = ALIGNMENT
-        return self.memory[function]
+                size = INT(max(len(fragment.slots), 1))
+                self.kept[function] = self.builder.alloca(self.vectors.float_type, size)
+            self.kept[function].align = ALIGNMENT
+        return self.kept[function]
 
     def _call_body(self, call: Call) -> None:
         """Call it whole, as often as it takes: for every part of the lanes, and of the buffers."""
@@ -286,18 +287,18 @@ class _TileWork:
             first = [b.mul(time, INT(n * parts)) if goes else INT(0) for n, goes in zip(numel, goes_on, strict=True)]
             b.call(body, [b.gep(pointer, [b.add(at, part)]) for pointer, at in zip(narrow, first, strict=True)])
 
-    def _body(self, call: Call, part: Part | None = None) -> ir.Function:
-        """The LLVM function of a function or of a part of it, the first time it is asked for."""
-        same = _same(call) if call.short_if_zero else frozenset()
-        key = call.function, same, part
+    def _body(self, call: Call, fragment: Fragment | None = None) -> ir.Function:
+        """Return the LLVM function of a function or a fragment; it is emitted at its first use."""
+        shared = _shared(call) if call.short_if_zero else frozenset()
+        key = call.function, shared, fragment
         if key not in self.bodies:
-            self.bodies[key] = self._emitted(call.function, same, part)
+            self.bodies[key] = self._emitted(call.function, shared, fragment)
         return self.bodies[key]
 
-    def _emitted(self, function: casadi.Function, same: Same, part: Part | None) -> ir.Function:
-        """A function, or a part of it, as one long block that the optimiser sees alone."""
+    def _emitted(self, function: casadi.Function, shared: Pairs, fragment: Fragment | None) -> ir.Function:
+        """Return a function or a fragment as one long block that the optimiser sees alone."""
         pointer = VectorBuilder(None, self.layout.dtype, self.parts).float_type.as_pointer()
-        count = function.n_in() + function.n_out() + (part is not None)
+        count = function.n_in() + function.n_out() + (fragment is not None)
         signature = ir.FunctionType(ir.VoidType(), [pointer] * count)
         body = ir.Function(self.builder.module, signature, f"call_{len(self.bodies)}")
         body.linkage = "internal"
@@ -305,14 +306,14 @@ class _TileWork:
         body.attributes.alignstack = ALIGNMENT  # else spilled vectors straddle two cache lines each
         vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype, self.parts)
         inputs, outputs = body.args[: function.n_in()], body.args[function.n_in() :][: function.n_out()]
-        apart = self.program.compact and self._is_apart(function)
-        part = part and replace(part, memory=body.args[-1])
-        lower_function(vectors, function, inputs, outputs, apart, same, part)
+        disjoint = self.program.compact and self._is_disjoint(function)
+        kept = body.args[-1] if fragment else None
+        lower_function(vectors, function, Arguments(inputs, outputs, kept, disjoint, shared), fragment)
         vectors.builder.ret_void()
         return body
 
-    def _is_apart(self, function: casadi.Function) -> bool:
-        """Whether no call of a function overwrites what it reads."""
+    def _is_disjoint(self, function: casadi.Function) -> bool:
+        """Return whether no call of a function overwrites its inputs."""
         calls = [call for call in self.program.calls if isinstance(call, Call) and call.function is function]
         roots = {b.name: b.within or b.name for b in self.program.buffers}
         return not any({roots[x] for x in call.inputs} & {roots[x] for x in call.outputs} for call in calls)
@@ -322,12 +323,12 @@ class _TileWork:
 
 
 def _changing(call: Call) -> frozenset[int]:
-    """Inputs that may have changed since the call before."""
+    """Return the numbers of the inputs that may have changed since the previous call."""
     return frozenset(call.inputs.index(name) for name in call.again)
 
 
-def _same(call: Call) -> Same:
-    """Inputs and outputs of a call that are one buffer."""
+def _shared(call: Call) -> Pairs:
+    """Return the pairs of an input and an output of a call that are one buffer."""
     pairs = ((i, j) for i, name in enumerate(call.inputs) for j, to in enumerate(call.outputs) if name == to)
     return frozenset(pairs)
 
