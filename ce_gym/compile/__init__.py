@@ -1,6 +1,6 @@
-"""CasADi SX functions, and look-ups in tables between them, as batched SIMD kernels.
+"""Compiler of CasADi SX functions, with look-ups in tables between them, to batched SIMD kernels.
 
-Importing this package imports none of the heavy ones: `load_kernel` does, when it is called.
+Importing this package imports neither CasADi nor LLVM; `load_kernel` does so when needed.
 """
 
 from ce_gym.compile.arrays import aligned_copy, aligned_zeros, lane_count

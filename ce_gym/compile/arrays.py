@@ -1,4 +1,4 @@
-"""Tiles in memory: how many lanes a tile has, and zeros that start on a cache line."""
+"""Tiles in memory: number of lanes, number of tiles, and arrays that start on a cache line."""
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -8,13 +8,13 @@ ALIGNMENT = 64
 
 
 def lane_count(dtype: DTypeLike) -> int:
-    """Lanes of one tile; one lane is one environment.
+    """Return the lanes of one tile; one lane is one environment.
 
     Args:
         dtype: `float64` or `float32`.
 
     Returns:
-        8 for float64, 16 for float32: what fills 64 bytes.
+        8 for float64, 16 for float32, which fill 64 bytes.
 
     Raises:
         ValueError: for any other dtype.
@@ -26,12 +26,12 @@ def lane_count(dtype: DTypeLike) -> int:
 
 
 def tile_count(num_envs: int, dtype: DTypeLike) -> int:
-    """Tiles that hold `num_envs` lanes; the last one may be padded."""
+    """Return the number of tiles for `num_envs` lanes; the last tile may be padded."""
     return -(-num_envs // lane_count(dtype))
 
 
 def aligned_zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
-    """Zeros of `shape` in C order that start on a multiple of 64 bytes."""
+    """Return zeros of `shape` in C order that start on a multiple of 64 bytes."""
     dtype = np.dtype(dtype)
     n_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
     raw = np.zeros(n_bytes + ALIGNMENT, np.uint8)

@@ -1,7 +1,7 @@
-"""The folder of compiled kernels: one file to a kernel, all that is believed and executed under one digest.
+"""The folder of compiled kernels: one file per kernel, checked by a digest before its code is executed.
 
-The digest guards against damage; against other users, `ce_gym.compile.private_files` does. What cannot be read is
-compiled again, what cannot be written is done without.
+The digest guards against damage, `ce_gym.compile.private_files` guards against other users. A kernel that cannot be
+read is compiled again. A kernel that cannot be written is used without being cached.
 """
 
 import hashlib
@@ -23,14 +23,14 @@ DIGEST_BYTES = 32
 
 
 def cache_folder() -> Path | None:
-    """Where kernels are kept: $CE_GYM_CACHE_DIR, else the user's cache folder; else a temporary one; else nowhere.
+    """Return the folder of kernels: $CE_GYM_CACHE_DIR or the user's cache folder; else a temporary one; else None.
 
-    A folder is passed over, in one line to the user, if it cannot be written or if other users could write it.
+    Folders that cannot be written, or that other users could write, are skipped with one line to the user.
     """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     wanted = os.environ.get(FOLDER_VARIABLE) or os.path.join(home, "ce_gym")
     for place in (wanted, os.path.join(tempfile.gettempdir(), f"ce_gym-{user_number() or 0}")):
-        folder = Path(os.path.realpath(place))  # links are followed once, here; what they lead to is judged
+        folder = Path(os.path.realpath(place))  # links are followed here only; their target is checked
         try:
             prepare_folder(folder)
         except OSError as problem:
@@ -41,7 +41,7 @@ def cache_folder() -> Path | None:
 
 
 def read_entry(folder: Path | None, name: str) -> tuple[dict, bytes] | None:
-    """What `write_entry` kept, or None if it is missing, damaged, or could be someone else's."""
+    """Return an entry of `write_entry`; None if the file is missing, damaged, or may come from another user."""
     if folder is None:
         return None
     try:
@@ -56,12 +56,12 @@ def read_entry(folder: Path | None, name: str) -> tuple[dict, bytes] | None:
 
 
 def write_entry(folder: Path | None, name: str, record: dict, code: bytes) -> None:
-    """Keep a kernel, or tell the user once that there is no room.
+    """Write a kernel, or tell the user once why that failed.
 
     Args:
         folder: of `cache_folder`.
         name: of the kernel.
-        record: plain data, as JSON has it.
+        record: JSON data.
         code: machine code.
     """
     if folder is None:
@@ -78,12 +78,12 @@ def _path(folder: Path, name: str) -> Path:
 
 
 def _digest(name: str, payload: bytes) -> bytes:
-    """Covers the name, so that one kernel's file is not taken for another's."""
+    """Return the digest of name and content: the name, so that no file is mistaken for another kernel."""
     return hashlib.sha256(name.encode() + b"\n" + payload).digest()
 
 
 def _replace(path: Path, content: bytes) -> None:
-    """Write a file as a whole: a reader sees the old content or the new, never half of one; nothing else stays."""
+    """Write a file atomically: a reader sees the old or the new content, and no temporary file stays."""
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem)
     try:
         with os.fdopen(descriptor, "wb") as file:
@@ -102,12 +102,12 @@ def _tell_once(text: str) -> None:
 
 @contextmanager
 def announced(what: str, folder: Path | None, started: float) -> Iterator[None]:
-    """Say on one line why the user waits and, in the end, for how long.
+    """Print that a kernel is being compiled and, in the end, how long that took.
 
     Args:
-        what: is compiled.
+        what: name of the kernel.
         folder: of `cache_folder`.
-        started: time from which to count [s], of `time.perf_counter`.
+        started: start of the measured time [s], of `time.perf_counter`.
     """
     kept = "not kept" if folder is None else f"once; cached in {folder}"
     print(f"ce_gym: compiling {what}, {kept} ...", end="", file=sys.stderr, flush=True)

@@ -1,15 +1,15 @@
-"""`CriticalSection`: work that one thread does at a time and that Ctrl-C does not cut in two.
+"""`CriticalSection`: work of one thread at a time that Ctrl-C does not interrupt.
 
-Python calls the handler of a signal in the main thread, between any two instructions there; that of SIGINT raises
-KeyboardInterrupt. While the main thread is in a section, the handler is one that takes a note; the one before is called
-when the section ends, or earlier where the section says so. A handler of another signal that raises is not held back.
+Python calls signal handlers in the main thread, between any two instructions. The handler of SIGINT raises
+KeyboardInterrupt. While the main thread is in a section, a substitute only records the signal. The original handler is
+called at the end of the section or at an interruption point. Handlers of other signals are not replaced.
 """
 
 from __future__ import annotations
 
 import threading
 
-# The functions of `signal` turn what they take and return into enums, for ten times what the call itself costs.
+# The functions of `signal` convert arguments and results to enums, which takes ten times as long as the call itself.
 from _signal import getsignal, signal  # pyright: ignore[reportMissingImports]
 from collections.abc import Callable
 from signal import SIGINT, raise_signal
@@ -18,19 +18,19 @@ from typing import Any
 from ce_gym.compile.system import at_fork
 
 _noted = False
-"""Whether SIGINT has come since it was held back. This and the next belong to the main thread alone."""
+"""Whether SIGINT has arrived in the section. Only the main thread uses this variable and the next."""
 _handler: Callable[[int, Any], Any] | None = None
-"""What is called for SIGINT outside of all sections."""
+"""The handler of SIGINT outside of all sections."""
 
 
 class CriticalSection:
-    """Entered by `with`, by one thread at a time; SIGINT is held back inside. May be entered inside another one.
+    """A context for one thread at a time in which SIGINT is deferred; sections may be nested.
 
     Args:
-        name: whose section it is, for the error.
+        name: owner of the section, for the error.
 
     Raises:
-        RuntimeError: if it is entered while somebody is inside; one line.
+        RuntimeError: if another thread is in the section; one line.
     """
 
     def __init__(self, name: str) -> None:
@@ -48,16 +48,16 @@ class CriticalSection:
         return self
 
     def __exit__(self, *error: object) -> None:
-        holds = self._holds  # read while nobody else can be inside
+        holds = self._holds  # read before another thread can enter
         self._lock.release()
         if holds:
             _release()
 
     def __reduce__(self) -> tuple[type[CriticalSection], tuple[str]]:
-        return CriticalSection, (self._name,)  # a copy of what it guards has a section of its own
+        return CriticalSection, (self._name,)  # a copy of the guarded object has its own section
 
     def interruption_point(self) -> None:
-        """Call the handler of SIGINT if that has come: where an exception is in order. Not inside another section."""
+        """Call the handler of SIGINT if the signal has arrived; an exception must be safe here. No effect if nested."""
         global _noted
         if self._holds and _noted and _handler is not None:
             _noted = False
@@ -70,15 +70,15 @@ def _note(number: int, frame: object) -> None:
 
 
 def _hold() -> bool:
-    """Hold SIGINT back; whether it was this call that did, and not a section around it.
+    """Defer SIGINT, and return whether this call did so and not an outer section.
 
-    Where an interruption raises, nothing is held back yet.
+    If KeyboardInterrupt is raised in here, SIGINT is not deferred yet.
     """
     global _noted, _handler
     if threading.current_thread() is not threading.main_thread():  # handlers do not run here
         return False
     handler = getsignal(SIGINT)
-    if handler is _note or not callable(handler):  # held back already; ignored, or the end of the process
+    if handler is _note or not callable(handler):  # deferred already; ignored, or fatal
         return False
     _noted, _handler = False, handler
     signal(SIGINT, _note)
@@ -86,14 +86,14 @@ def _hold() -> bool:
 
 
 def _release() -> None:
-    """Have SIGINT handled as before, the one that was held back first."""
+    """Restore the handler of SIGINT, and raise a deferred signal."""
     signal(SIGINT, _handler)
     if _noted:
         raise_signal(SIGINT)
 
 
 def _after_fork() -> None:
-    """A child forked by another thread while the main one was in a section has no section to end."""
+    """Restore the handler in a child that another thread forked while the main thread was in a section."""
     if getsignal(SIGINT) is _note:
         signal(SIGINT, _handler)
 

@@ -1,4 +1,4 @@
-"""A compiled kernel and how it is called: checks of its arguments, addresses, threads."""
+"""A compiled kernel that can be called: checks of its arguments, addresses, threads."""
 
 import weakref
 from collections.abc import Mapping
@@ -14,13 +14,13 @@ KEYS, COUNTERS = np.dtype(np.uint64), np.dtype(np.int64)
 WORD = 8
 """Bytes of an address or a count."""
 LARGEST_TABLE = 2**31 - 1
-"""Most entries of a table: places in it are 32-bit integers."""
+"""Most entries of a table, because indices are 32-bit integers."""
 LONGEST_SIDE = 2**23
-"""Most rows or columns of a table: half places along it are exact in single precision."""
+"""Most rows or columns of a table, so that half indices are exact in single precision."""
 
 
 class Kernel:
-    """Machine code that works through tiles of environments. Several threads may call one at a time.
+    """Machine code that processes tiles of environments. Several threads may call the same kernel at a time.
 
     Attributes:
         name: of the program.
@@ -59,17 +59,16 @@ class Kernel:
         """Run the program on every tile.
 
         Args:
-            arrays: one for each `tiles` buffer, shape (n_tiles, size, lanes), each `rows_*` buffer, shape
-                (num_envs, size), and each table, shape (rows, columns); others are ignored. Those that the program
-                writes are changed in place.
-            num_envs: environments; the last tile may be padded.
+            arrays: by name of the buffer: `tiles`, shape (n_tiles, size, lanes); `rows_*`, shape (num_envs, size);
+                tables, shape (rows, columns). Other arrays are ignored. The program changes its outputs in place.
+            num_envs: number of environments; the last tile may be padded.
             repeats: a number for each of `self.repeats`.
             keys: uint64, shape (num_envs,), if the program draws random numbers.
-            counters: int64, shape (num_envs,), likewise.
-            num_threads: threads that share the tiles; the result does not depend on it.
+            counters: int64, shape (num_envs,), if the program draws random numbers.
+            num_threads: threads that share the tiles; the result does not depend on this number.
 
         Raises:
-            ValueError: one line naming the kernel, the array and what was expected.
+            ValueError: one line with the kernel, the array and the expected shape and dtype.
         """
         if num_envs == 0:
             return
@@ -84,7 +83,7 @@ class Kernel:
         table[: len(words)] = words
         counts = address + WORD * self._n_words
 
-        # The default keeps what is read and written alive for as long as a thread works, whatever becomes of this call.
+        # The default argument keeps the arrays alive as long as a thread works, even if this call is interrupted.
         def work(first_tile: int, end_tile: int, _kept: object = (block, arrays, keys, counters)) -> None:
             scratch = self._scratch.take()
             self._run(address, counts, scratch[1], first_tile, end_tile, num_envs)
@@ -94,7 +93,7 @@ class Kernel:
         self._tables.give(block)
 
     def _addresses(self, arrays: Mapping[str, np.ndarray], num_envs: int, n_tiles: int) -> list[int]:
-        """Addresses of all arrays, then the shapes of tables, in the order of the layout."""
+        """Return the addresses of all arrays, then the shapes of tables, in the order of the layout."""
         addresses, shapes = [], []
         for name, kind, size, dtype, written in self._arguments:
             array = arrays.get(name)
@@ -112,7 +111,7 @@ class Kernel:
         return addresses + shapes
 
     def _table_shape(self, name: str, array: object) -> tuple[int, ...]:
-        """Rows and columns of a table."""
+        """Return the rows and columns of a table."""
         shape = array.shape if isinstance(array, np.ndarray) else ()
         if len(shape) != 2 or not all(3 <= n <= LONGEST_SIDE for n in shape) or np.prod(shape) > LARGEST_TABLE:
             got = shape if isinstance(array, np.ndarray) else "nothing" if array is None else type(array).__name__
@@ -121,8 +120,8 @@ class Kernel:
         return shape
 
     def _address(self, name: str, array: object, shape: tuple[int, ...], dtype: np.dtype) -> int:
-        """Address of an array that is as it should be."""
-        known = self._known.get(name)  # checks and asking numpy take longer, and most arrays come again
+        """Return the address of an array after checks of its shape, dtype and order."""
+        known = self._known.get(name)  # faster than checks, and most arrays have been seen before
         if known is not None and known[0]() is array and array is not None and array.shape == shape:  # type: ignore[attr-defined]
             return known[1]
         if not isinstance(array, np.ndarray):

@@ -1,6 +1,6 @@
 """The calling convention of a kernel: the order of addresses and repeat counts, and offsets of scratch values.
 
-Plain data that is stored beside the machine code, so that a cached kernel needs neither CasADi nor the program.
+The layout is stored beside the machine code, so that a cached kernel needs neither CasADi nor the program.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.program import Buffer, Program, Repeat
 
 MachineCode = Callable[[int, int, int, int, int, int], None]
-"""Takes the addresses of the list of arrays, the repeat counts, scratch memory; first tile, end tile, environments."""
+"""Takes addresses of the list of arrays, the repeat counts and scratch memory; first tile, end tile, environments."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Layout:
         name: of the program.
         dtype: of the lanes.
         buffers: all buffers of the program, in its order.
-        repeats: names of the run-time integers, in the order they are passed.
+        repeats: names of the run-time integers, in order.
         written: buffers that some call writes.
     """
 
@@ -36,33 +36,33 @@ class Layout:
 
     @cached_property
     def arguments(self) -> tuple[Buffer, ...]:
-        """Buffers whose arrays the caller passes, in the order of their addresses; shapes of tables follow them."""
+        """Buffers whose arrays the caller passes, in the order of the addresses; shapes of tables come last."""
         return tuple(b for b in self.buffers if b.kind in ("tiles", "rows_in", "rows_out", "table"))
 
     @cached_property
     def shapes(self) -> dict[str, int]:
-        """Place of the number of rows of each table among the addresses; the number of columns is next to it."""
+        """Position of the number of rows of each table among the addresses; the number of columns comes next."""
         tables = [b.name for b in self.arguments if b.kind == "table"]
         return {name: len(self.arguments) + 2 * i for i, name in enumerate(tables)}
 
     @property
     def keys(self) -> int:
-        """Place of the address of the keys among the addresses; that of the counters is next to it."""
+        """Position of the address of the keys among the addresses; the address of the counters comes next."""
         return len(self.arguments) + 2 * len(self.shapes)
 
     @property
     def counts(self) -> int:
-        """Number of words before the repeat counts."""
+        """Number of 64-bit words before the repeat counts."""
         return self.keys + 2 * self.is_random
 
     @cached_property
     def is_random(self) -> bool:
-        """Whether keys and counters are needed."""
+        """Whether the kernel draws random numbers, which takes keys and counters."""
         return any(b.kind == "random" for b in self.buffers)
 
     @cached_property
     def scratch_offsets(self) -> dict[str, int]:
-        """Byte at which each per-thread buffer starts; one vector is 64 bytes in either dtype."""
+        """First byte of each buffer in the memory of a thread; one vector has 64 bytes in either dtype."""
         offsets, end = {}, 0
         for buffer in self.buffers:
             if buffer.kind != "tiles" and not buffer.within:
@@ -75,18 +75,18 @@ class Layout:
 
     @cached_property
     def scratch_bytes(self) -> int:
-        """Bytes of per-thread memory."""
+        """Bytes of memory for each thread."""
         return ALIGNMENT * sum(b.size for b in self.buffers if b.kind != "tiles" and not b.within)
 
 
 def layout_of(program: Program, dtype: str) -> Layout:
-    """The calling convention that follows from a program."""
+    """Return the calling convention of a program."""
     repeats = dict.fromkeys(step.times for step in program.steps if isinstance(step, Repeat))
     written = dict.fromkeys(name for call in program.calls for name in call.outputs)
     return Layout(program.name, dtype, program.buffers, tuple(repeats), tuple(written))
 
 
 def layout_from(record: dict) -> Layout:
-    """The layout of which `record` is `dataclasses.asdict`, directly or by way of JSON."""
+    """Return a layout from its `dataclasses.asdict`, which may have passed through JSON."""
     buffers = tuple(Buffer(**buffer) for buffer in record["buffers"])
     return Layout(record["name"], record["dtype"], buffers, tuple(record["repeats"]), tuple(record["written"]))

@@ -1,6 +1,6 @@
-"""`load_kernel`: from the cache folder, or built, compiled and put there.
+"""`load_kernel`: read a kernel from the cache folder, or compile and cache it.
 
-LLVM and CasADi are imported when a step needs them.
+LLVM and CasADi are imported only when they are needed.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from ce_gym.compile.system import at_fork
 SOURCES = tuple(
     f"ce_gym.compile.{name}" for name in ("arrays", "layout", "loading", "lowering", "machine_code", "program")
 )
-"""What turns programs into entries of the cache."""
+"""Modules that turn programs into entries of the cache."""
 
 _loaded: dict[tuple[Path | None, str], Kernel] = {}
 _lock = threading.RLock()
 
 
 def load_kernel(key: str, build: Callable[[], Program], dtype: str = "float64") -> Kernel:
-    """A kernel from the cache, or compiled and put there.
+    """Return a kernel from the cache, or compile and cache it.
 
     Args:
-        key: names everything the program depends on, the sources that build it included (`source_fingerprint`); equal
-            keys must mean equal programs.
-        build: makes the program; it is called only when the machine code is not in the cache.
+        key: all that the program depends on, with the sources that build the program (`source_fingerprint`). Equal keys
+            must mean equal programs.
+        build: returns the program; called only if the machine code is not in the cache.
         dtype: `float64` or `float32`.
 
     Returns:
-        The kernel; one and the same within a process.
+        The kernel; always the same object within a process.
 
     Raises:
         ValueError: when the program is not well formed.
-        NotImplementedError: when a function holds an operation that has no vector form.
+        NotImplementedError: when a function has an operation without a vector form.
     """
     dtype = np.dtype(dtype).name
     lane_count(dtype)  # refuses other dtypes
@@ -57,7 +57,7 @@ def load_kernel(key: str, build: Callable[[], Program], dtype: str = "float64") 
 
 
 def kernel_name(key: str, dtype: str) -> str:
-    """The name under which a kernel is cached: what compiles it and the CPU count."""
+    """Return the name of a kernel in the cache, from the key, the dtype, the compiler and the CPU."""
     from ce_gym.compile.machine_code import host_cpu
 
     facts = repr((key, dtype, source_fingerprint(*SOURCES), toolchain(), host_cpu()))
@@ -76,7 +76,7 @@ def _load(folder: Path | None, name: str, build: Callable[[], Program], dtype: s
 
 
 def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> tuple[dict, bytes]:
-    """The calling convention as plain data, and object code."""
+    """Return the calling convention as JSON data, and object code."""
     from ce_gym.compile.lowering.tile import emit_tile
     from ce_gym.compile.machine_code import compile_object, registers_per_vector
 
@@ -92,5 +92,5 @@ def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> t
     return asdict(layout), code
 
 
-# A child could wait for ever for a thread of its parent that compiles.
+# A child could wait forever for a compiling thread of its parent.
 at_fork(before=_lock.acquire, in_parent=_lock.release, in_child=_lock.release)

@@ -1,4 +1,4 @@
-"""LLVM code to object code for this CPU, and object code to a function."""
+"""Compile LLVM code to object code for this CPU, and load object code as a function."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from ce_gym.compile.layout import MachineCode
 from ce_gym.compile.lowering.vector import Builder, Value, loop
 
 Emit = Callable[[Builder, tuple[Value, ...]], None]
-"""Emits the work on one tile: takes the builder and, for `MachineCode`'s arguments, those three addresses, the number
-of the tile and that of environments."""
+"""Emits the work on one tile. Takes the builder, the three addresses of `MachineCode`, the number of the tile and the
+number of environments."""
 
 ENTRY = "run"
 OPTIMISATION = 3
-"""Of LLVM's passes."""
+"""Optimisation level of the passes of LLVM."""
 GENERATION = 1
-"""Of instructions: above it, on some CPUs, LLVM orders them once more when registers are given out. That takes as long
-as all the rest, and makes nothing faster."""
+"""Optimisation level of code generation. At higher levels, LLVM reorders instructions again during register allocation
+on some CPUs, which doubles the compile time and makes no kernel faster."""
 
 
 @cache
 def host_cpu() -> tuple[str, str]:
-    """Name and features of this machine's CPU, as LLVM has them; kernels are compiled for it."""
+    """Return name and features of the CPU of this machine in terms of LLVM; kernels are compiled for this CPU."""
     return binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
 
 
 @cache
 def registers_per_vector() -> int:
-    """Return how many of this CPU's registers 64 bytes take."""
+    """Return the number of registers of this CPU that hold 64 bytes."""
     features = host_cpu()[1].split(",")
     return 1 if "+avx512f" in features else 2 if "+avx" in features else 4
 
@@ -41,9 +41,9 @@ def compile_object(emit: Emit, thorough: bool = True) -> bytes:
     """Compile the loop over tiles.
 
     Args:
-        emit: emits its body.
-        thorough: whether all of LLVM's passes are run, or only the one that simplifies instruction by instruction. In
-            long functions without branches the others find little and take as long as giving out registers.
+        emit: emits the body of the loop.
+        thorough: whether to run all passes of LLVM, or only instruction combining. In long functions without branches
+            the other passes find little and take as long as register allocation.
 
     Returns:
         An object file that defines the one function `run`.
@@ -70,9 +70,9 @@ def _simplify(module: binding.ModuleRef, passes: binding.PassBuilder) -> None:
 
 
 def load_object(code: bytes) -> MachineCode:
-    """Make what `compile_object` returned callable; calls release the GIL.
+    """Return object code of `compile_object` as a function whose calls release the GIL.
 
-    It stays in memory until the process ends: a thread may be running it when everything else is taken down.
+    The code stays in memory until the process ends, because a thread may still run the code at exit.
     """
     jit = binding.create_lljit_compiler(_target_machine(), use_jit_link=True)
     builder = binding.JITLibraryBuilder().add_object_img(code).add_current_process().export_symbol(ENTRY)
@@ -96,12 +96,12 @@ def _loop_over_tiles(emit: Emit) -> ir.Module:
 
 
 def _triple() -> str:
-    """The machine's triple; with ELF objects on Windows too, which LLVM links in memory like those of Linux."""
+    """Return the target triple of this machine; LLVM links ELF objects in memory on Windows, too."""
     return binding.get_process_triple() + ("-elf" if os.name == "nt" else "")
 
 
 def _target_machine() -> binding.TargetMachine:
-    """What compiles for this CPU. Code and constants lie close together: the linker puts them into one block."""
+    """Return the LLVM target of this CPU; the code model is small, as the linker puts code and constants together."""
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     cpu, features = host_cpu()

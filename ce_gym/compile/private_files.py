@@ -1,7 +1,6 @@
-"""Folders and files that nobody but this user, or the administrator, can have written.
+"""Folders and files that only this user or the administrator can have written; the package executes code from them.
 
-Code is run from them. On Windows, where permissions are not mode bits, nothing is checked: the user's profile, in which
-the default folder lies, is the user's own.
+On Windows, where permissions are not mode bits, nothing is checked. The default folder lies in the profile of the user.
 """
 
 import os
@@ -15,15 +14,14 @@ HAS_MODES = user_number() is not None
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make a folder, and those above it that are missing, for this user alone; or see that it is so.
+    """Make a folder and its missing parents for this user alone, or check that an existing folder is safe.
 
     Args:
-        folder: its path has no symbolic links.
+        folder: A path without symbolic links.
 
     Raises:
-        OSError: If it cannot be written, or if other users could put files there: one above it, or itself, belongs to
-            them or lets them write. One above it may let them if its sticky bit is set, as that of /tmp: there they
-            cannot rename or remove what is not theirs.
+        OSError: If the folder cannot be written, or if other users own or may write the folder or one of its parents.
+            They may write a parent whose sticky bit is set, such as /tmp, where they cannot rename foreign files.
     """
     places = (folder, *folder.parents)
     for place in reversed(places):
@@ -48,10 +46,10 @@ def _owned_by_others(status: os.stat_result) -> bool:
 
 
 def read_file(path: Path) -> bytes:
-    """Content of a regular file in a folder of `prepare_folder`.
+    """Return the content of a regular file in a folder of `prepare_folder`.
 
     Raises:
-        OSError: If it cannot be read, is a link or a device, or other users own it or may write it.
+        OSError: If the file cannot be read, is a link or a device, or other users own or may write the file.
     """
     with open(path, "rb", opener=_open_itself) as file:
         status = os.fstat(file.fileno())
@@ -63,5 +61,5 @@ def read_file(path: Path) -> bytes:
 
 
 def _open_itself(path: str, flags: int) -> int:
-    """Follow no link, and wait for nobody at the other end of a pipe."""
+    """Open without following a link or waiting for the other end of a pipe."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))

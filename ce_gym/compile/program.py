@@ -1,7 +1,4 @@
-"""What a kernel is made of: buffers, and steps that read and write them: calls of SX functions and table look-ups.
-
-Data and its checks only.
-"""
+"""Programs of kernels as data: buffers, and steps that read and write them, which are calls and table look-ups."""
 
 from __future__ import annotations
 
@@ -13,31 +10,31 @@ if TYPE_CHECKING:
     import casadi
 
 Grid: TypeAlias = tuple[tuple[float, float], ...]
-"""Places relative to one that is known only at run time: x and y of each."""
+"""x and y of points relative to a place that is known only at run time."""
 BufferKind = Literal["tiles", "rows_in", "rows_out", "scratch", "random", "table"]
 
 
 @dataclass(frozen=True)
 class Buffer:
-    """Where the values of every lane live.
+    """Memory for a vector of values in every lane; one lane is one environment.
 
     Attributes:
-        name: how calls and callers refer to it.
+        name: in calls, and for callers of the kernel.
         size: values per lane; 0 for a table.
-        kind: who owns it and how it is laid out:
+        kind: owner and layout:
 
             * `tiles`: array (n_tiles, size, lanes) of the kernel's dtype, owned by the caller, changed in place.
             * `rows_in`: array (num_envs, size), converted to lanes before the first call of a tile. Padding lanes of
               the last tile repeat its last row.
             * `rows_out`: array (num_envs, size), written from lanes after the last call of a tile.
             * `scratch`: passes values from one call to the next within a tile; the kernel owns it.
-            * `random`: uniform numbers in [0, 1), new in every tile: draw i of a lane is a function of the lane's key,
-              its counter and i, and of nothing else.
-            * `table`: array (rows, columns) of the kernel's dtype, at least 3 by 3, that all lanes share and only a
-              `Lookup` reads; its shape is known when the kernel is called.
-        dtype: of a `rows_*` array, `float32` or `float64`; empty means the kernel's own.
-        within: a buffer, not a `tiles` one, of which this one is a part, if it is one.
-        start: where in that buffer it starts.
+            * `random`: uniform numbers in [0, 1), new in every tile. Draw i of a lane is a function of the lane's key,
+              its counter and i only.
+            * `table`: array (rows, columns) of the kernel's dtype, at least 3 by 3, shared by all lanes and read by
+              `Lookup` only. Its shape is known when the kernel is called.
+        dtype: of a `rows_*` array, `float32` or `float64`; empty means the dtype of the kernel.
+        within: name of the buffer that contains this one; empty for a buffer of its own. `tiles` contain no others.
+        start: first value of this buffer within that one.
     """
 
     name: str
@@ -55,15 +52,15 @@ class Call:
     Attributes:
         function: the SX function. Each input and output fills one whole buffer, column by column.
         inputs: buffer of each function input.
-        outputs: buffer of each function output; it may be an input's too, since all loads come before any store.
-        only_if: a buffer of size 1; the call is skipped where it is zero in all lanes of a tile. To keep lanes
-            independent of their neighbours it must change nothing in a lane where the buffer is zero.
-        times: how often the function is applied, to the next part each time of those buffers that are so many times as
-            large as what it takes or returns.
-        short_if_zero: an output of size 1 by which the function itself chooses; a tile where it is zero in all lanes
-            computes what is left of the rest then, to the same bits.
-        again: inputs; no others have changed since the call before, which is of the same function, and what does not
-            follow from them may be taken from there.
+        outputs: buffer of each function output; may be the buffer of an input, since all loads precede all stores.
+        only_if: a buffer of size 1. Tiles skip the call where the buffer is zero in all lanes. To keep lanes
+            independent of their neighbours, the call must change nothing in a lane where the buffer is zero.
+        times: number of applications of the function. A buffer that is `times` as large as its argument is traversed
+            argument by argument; all others are the same in every application.
+        short_if_zero: an output of size 1 that the function itself chooses by. Tiles where the output is zero in all
+            lanes execute a shorter variant of the function, with the same bits.
+        again: the only inputs that have changed since the previous call, which is of the same function. Operations that
+            depend on no other changes are not repeated.
     """
 
     function: casadi.Function
@@ -77,17 +74,17 @@ class Call:
 
 @dataclass(frozen=True)
 class Lookup:
-    """A smooth surface over a table, looked up at points of every lane; see `compile/lowering/lookup.py`.
+    """Interpolation of a table by a smooth surface at points of every lane; see `compile/lowering/lookup.py`.
 
     Attributes:
-        table: a `table` buffer. Entry (i, j) belongs to the place `x = x0 + i cell`, `y = y0 + j cell`.
-        frame: buffer of size 3 with each lane's `x0`, `y0` and `cell`.
-        points: buffer of size 2 n: x and y of point after point; with a grid of m points, of size 2 + 2 n / m: cosine
-            and sine of the angle by which it is turned, then x and y of every place where it is put.
-        output: buffer of size 3 n, another one: value and its slopes along x and y, point after point; of size n, the
-            values, without slopes.
-        slopes: whether they are asked for; values alone take half the time.
-        grid: points to look at around every place, which takes less than to be told of each; values only.
+        table: a `table` buffer. Entry (i, j) is the value at `x = x0 + i cell`, `y = y0 + j cell`.
+        frame: buffer of size 3 with `x0`, `y0` and `cell` of each lane.
+        points: buffer of size 2 n with x and y of each point. With a grid of m points, buffer of size 2 + 2 n / m with
+            cosine and sine of the angle of the grid, then x and y of each of its places.
+        output: buffer of size 3 n, none of the above, with the value and its slopes along x and y for each point;
+            without slopes of size n.
+        slopes: whether slopes are computed; values alone take half the time.
+        grid: points relative to each place, values only. A grid takes less time than as many points.
     """
 
     table: str
@@ -104,24 +101,25 @@ class Lookup:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Buffers with values per lane that it reads."""
+        """Buffers with values per lane that the look-up reads."""
         return (self.frame, self.points)
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Buffers that it writes."""
+        """Buffers that the look-up writes."""
         return (self.output,)
 
 
 @dataclass(frozen=True)
 class While:
-    """Steps run in order, again and again until a buffer is zero in all lanes of a tile; never if it is at first.
+    """Steps repeated in order while a buffer is nonzero in some lane of a tile.
 
-    To keep lanes independent of their neighbours, what they change in a lane where it is zero must not be read later.
+    To keep lanes independent of their neighbours, values that the steps write in a lane where the buffer is zero must
+    not be read later.
 
     Attributes:
-        flag: a buffer of size 1, which the steps write.
-        calls: what is repeated.
+        flag: the buffer, of size 1, which the steps write.
+        calls: the repeated steps.
     """
 
     flag: str
@@ -133,11 +131,11 @@ Step: TypeAlias = Call | Lookup | While
 
 @dataclass(frozen=True)
 class Repeat:
-    """Steps run in order, repeatedly.
+    """Steps repeated in order a number of times.
 
     Attributes:
         times: name of a run-time integer.
-        calls: what is repeated.
+        calls: the repeated steps.
     """
 
     times: str
@@ -145,7 +143,7 @@ class Repeat:
 
 
 def calls_of(steps: Sequence[Step | Repeat]) -> Iterator[Call | Lookup]:
-    """Yield all calls and look-ups among steps, repeated or not, each once."""
+    """Yield all calls and look-ups of steps, repeated ones once."""
     for step in steps:
         if isinstance(step, Repeat | While):
             yield from calls_of(step.calls)
@@ -154,7 +152,7 @@ def calls_of(steps: Sequence[Step | Repeat]) -> Iterator[Call | Lookup]:
 
 
 def scratch_buffers(steps: Sequence[Step | Repeat], known: Collection[str]) -> list[Buffer]:
-    """Return scratch buffers for all values that steps write, as large as at the first write, but for known buffers."""
+    """Return scratch buffers for all values that steps write, except `known` buffers; the first write sets the size."""
     sizes: dict[str, int] = {}
     for call in calls_of(steps):
         if isinstance(call, Lookup):
@@ -171,12 +169,11 @@ class Program:
 
     Attributes:
         name: for people, `mini_cheetah exact environment`.
-        buffers: all buffers the steps mention.
-        steps: calls, look-ups and repeated ones, in the order of execution.
-        skip_unless: a `tiles` buffer of size 1; a tile whose lanes are all zero there is skipped.
-        compact: whether code is small rather than wide: the lanes of a tile go through a call in as many parts as they
-            take registers, and results are not kept until its end; it is compiled with fewer passes. For what is too
-            large for a level-2 cache.
+        buffers: all buffers of the steps.
+        steps: in the order of execution.
+        skip_unless: a `tiles` buffer of size 1; tiles skip the program where the buffer is zero in all lanes.
+        compact: whether to emit small code: a call processes the lanes of a tile register by register, stores results
+            early, and is compiled with fewer passes. For functions that do not fit into a level-2 cache.
     """
 
     name: str
@@ -187,21 +184,21 @@ class Program:
 
     @property
     def calls(self) -> tuple[Call | Lookup, ...]:
-        """All calls and look-ups, repeated or not, each once."""
+        """All calls and look-ups, repeated ones once."""
         return tuple(calls_of(self.steps))
 
     @property
     def flags(self) -> set[str]:
-        """Buffers that say how often steps are run."""
+        """Flags of all `While` loops."""
         inner = [step for outer in self.steps for step in (outer.calls if isinstance(outer, Repeat) else (outer,))]
         return {step.flag for step in inner if isinstance(step, While)}
 
 
 def check_program(program: Program) -> None:
-    """Refuse a program that cannot be compiled or whose result would depend on what ran before.
+    """Check that a program can be compiled and that its result does not depend on earlier runs.
 
     Raises:
-        ValueError: one line naming the program, the buffer or call, and what was expected.
+        ValueError: one line with the program, the buffer or call, and the expected value.
     """
     buffers = {buffer.name: buffer for buffer in program.buffers}
     if len(buffers) != len(program.buffers):

@@ -1,4 +1,4 @@
-"""What a kernel follows from, beside its program's figures: the sources that trace and compile it, and versions."""
+"""Fingerprints of the sources and tools that trace and compile a kernel, for the keys of the cache."""
 
 import hashlib
 import importlib.util
@@ -12,16 +12,16 @@ COMPILERS = ("casadi", "llvmlite", "numpy")
 
 @cache
 def source_fingerprint(*names: str) -> str:
-    """Hash of sources, for the keys of kernels whose programs they build.
+    """Return a hash of sources, for the keys of kernels whose programs the sources build.
 
     Args:
-        names: importable modules, and packages with everything in them.
+        names: importable modules, and packages with all their modules.
 
     Returns:
         16 hexadecimal digits.
 
     Raises:
-        ValueError: when a name is not that of a module with Python sources.
+        ValueError: when a name is not a module with Python sources.
     """
     digest = hashlib.sha256()
     for name in names:
@@ -31,7 +31,7 @@ def source_fingerprint(*names: str) -> str:
 
 
 def source_files(name: str) -> list[Path]:
-    """The .py files of a module, or of a package with everything in it."""
+    """Return the .py files of a module, or of a package with all its modules."""
     spec = importlib.util.find_spec(name)
     if spec is not None and spec.submodule_search_locations is not None:
         return sorted(path for root in spec.submodule_search_locations for path in Path(root).rglob("*.py"))
@@ -42,5 +42,5 @@ def source_files(name: str) -> list[Path]:
 
 @cache
 def toolchain() -> str:
-    """Versions of what traces and compiles."""
+    """Return the versions of the packages that trace and compile."""
     return ", ".join([f"{name} {version(name)}" for name in COMPILERS] + [f"Python {platform.python_version()}"])

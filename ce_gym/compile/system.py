@@ -1,6 +1,6 @@
-"""What operating systems do not have in common: users, usable cores, names of CPUs, forks.
+"""Differences of operating systems: users, usable cores, names of CPUs, forks.
 
-The only file that may call what some system lacks.
+Only this file calls functions that some system lacks.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 CPUINFO = Path("/proc/cpuinfo")
-"""Where Linux describes the CPU."""
+"""Description of the CPU on Linux."""
 
 
 def _nothing() -> None:
@@ -19,15 +19,15 @@ def _nothing() -> None:
 
 
 def user_number() -> int | None:
-    """Return the number of the user whose rights this process has; None where users have no numbers, as on Windows."""
+    """Return the effective user number of this process; None where users have no numbers, as on Windows."""
     number = getattr(os, "geteuid", None)
     return number() if number else None
 
 
 def usable_cores() -> int:
-    """Return the number of cores this process may use, which is what `num_threads=None` of environments means.
+    """Return the number of cores that this process may use; all cores where the system does not tell.
 
-    All cores there are, where the system does not tell.
+    Environments use as many threads with `num_threads=None`.
     """
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
@@ -43,7 +43,7 @@ def at_fork(
     in_parent: Callable[[], object] = _nothing,
     in_child: Callable[[], object] = _nothing,
 ) -> None:
-    """Have functions called whenever this process is forked: before, and after in either process."""
+    """Register functions to be called before each fork of this process, and after it in parent and child."""
     register = getattr(os, "register_at_fork", None)
     if register:
         register(before=before, after_in_parent=in_parent, after_in_child=in_child)

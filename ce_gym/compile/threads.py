@@ -1,4 +1,4 @@
-"""Worker threads shared by all kernels, and memory lent to one thread at a time."""
+"""Worker threads shared by all kernels, and memory blocks that one thread uses at a time."""
 
 import os
 import threading
@@ -17,10 +17,10 @@ _lock = threading.Lock()
 
 
 class MemoryPool:
-    """Aligned blocks of equal length, made when first needed and kept for the next user.
+    """Aligned blocks of equal length, allocated on demand and reused.
 
-    One that an exception keeps from coming back is freed with its last user. `take` and `give` may be called from any
-    thread: a list's pop and append are atomic.
+    A block that is not given back because of an exception is freed. `take` and `give` may be called from any thread,
+    because pop and append of a list are atomic.
     """
 
     def __init__(self, n_words: int):
@@ -28,7 +28,7 @@ class MemoryPool:
         self._free: list[tuple[np.ndarray, int]] = []
 
     def take(self) -> tuple[np.ndarray, int]:
-        """A block as 64-bit integers, shape (n_words,), and its address."""
+        """Return a block of 64-bit integers, shape (n_words,), and its address."""
         try:
             return self._free.pop()
         except IndexError:
@@ -36,15 +36,15 @@ class MemoryPool:
             return block, block.ctypes.data
 
     def give(self, block: tuple[np.ndarray, int]) -> None:
-        """Back to the pool."""
+        """Return a block to the pool."""
         self._free.append(block)
 
 
 def run_chunks(work: Callable[[int, int], None], count: int, num_threads: int) -> None:
-    """Call `work(first, end)` on contiguous parts of range(count), one part per thread, the first in this one.
+    """Call `work(first, end)` on contiguous parts of range(count), one part per thread, the first part in this thread.
 
-    When this returns or raises, no part is running: Ctrl-C waits for that. Parts that no thread has begun by the
-    time this one is free, since all are busy with other calls, are done by this one.
+    When this function returns or raises, no part is running; Ctrl-C waits for running parts. This thread also executes
+    parts that no other thread has started by then, because all threads are busy with other calls.
     """
     num_threads = min(num_threads, count)
     if num_threads <= 1:
@@ -68,7 +68,7 @@ def run_chunks(work: Callable[[int, int], None], count: int, num_threads: int) -
 
 
 def _threads() -> ThreadPoolExecutor:
-    """The workers, started when first needed."""
+    """Return the workers, which are started at their first use."""
     global _pool
     with _lock:
         if _pool is None:
@@ -77,7 +77,7 @@ def _threads() -> ThreadPoolExecutor:
 
 
 def _after_fork() -> None:
-    """A forked child has none of its parent's threads: it starts its own."""
+    """Let a forked child start its own threads, because threads of the parent do not exist there."""
     global _pool, _lock
     _pool, _lock = None, threading.Lock()
 

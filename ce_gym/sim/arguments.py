@@ -1,4 +1,4 @@
-"""Checks of arguments. An error is one line with the argument, its value and what was expected."""
+"""Checks of arguments. An error is one line with the argument, its value and the expected values."""
 
 from __future__ import annotations
 

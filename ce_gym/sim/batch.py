@@ -1,4 +1,4 @@
-"""`Batch`: the state of many robots on a device, made from a schema, and the kernels that work on it."""
+"""`Batch`: the state of many robots on a device, made from a schema."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class Batch:
         rows: The schema of their state.
         num_envs: Number of robots.
         dtype: "float64" or "float32" for the lanes.
-        device: Where they live.
+        device: Device with the memory of the state.
         terrain: The ground, if it is a field.
-        num_threads: Threads that the robots are split over.
+        num_threads: Threads that share the robots.
 
     Attributes:
         schema: Rows by name.
-        arrays: What kernels and the host work on, by name of the row.
-        tables: Arrays that all robots have in common.
+        arrays: Arrays of the rows, by name.
+        tables: Arrays that all robots share, by name.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Batch:
         return self.place.zeros(shape, row.dtype)
 
     def rows(self, name: str) -> Array:
-        """Return a copy of a state buffer, one robot per row; KeyError if there is none."""
+        """Return a copy of a state buffer, one robot per row; KeyError for an unknown name."""
         return self.place.read(self.arrays[name], self.num_envs)
 
     def write(self, name: str, values: Any, mask: Any = None) -> None:
@@ -74,8 +74,8 @@ class Batch:
 
         Args:
             name: Of the buffer.
-            values: Shape (num_envs, size) or what broadcasts to it; (num_envs,) for a plain buffer of size 0.
-            mask: Which robots, bool, shape (num_envs,); all of them if None.
+            values: Shape (num_envs, size) or a shape that broadcasts to it; (num_envs,) for a plain buffer of size 0.
+            mask: Robots to write, bool, shape (num_envs,); all robots if None.
         """
         self.place.write(self.arrays[name], values, mask)
 
@@ -84,8 +84,8 @@ class Batch:
 
         Args:
             name: Of the buffer.
-            values: To be written to it.
-            source: Where they come from, for the message.
+            values: Values for the buffer.
+            source: Origin of the values, for the message.
 
         Raises:
             ValueError: The norm of a quaternion is not within 1e-3 of 1.
@@ -93,7 +93,7 @@ class Batch:
         return unit_quaternions(values, self.schema[name].quaternions, source + name, self.dtype)
 
     def snapshot(self, file: File | None = None) -> Snapshot:
-        """Return the state by name, shape (num_envs, size) or (num_envs,); write it to a file, too, if one is given."""
+        """Return the state by name, shape (num_envs, size) or (num_envs,), and write it to a file if one is given."""
         state = {name: self.place.host(self.rows(name)) for name, row in self.schema.items() if row.writer != "scene"}
         if file is not None:
             with Path(file).open("wb") as stream:  # numpy would add a suffix to a name
@@ -104,8 +104,8 @@ class Batch:
         """Continue from a snapshot, or from a file with one.
 
         Raises:
-            ValueError: If it is not one of such a batch, or holds a quaternion that is not of unit length; nothing is
-                changed then.
+            ValueError: If the snapshot is from another kind of batch, or has a quaternion that is not of unit length.
+                Then nothing has been changed.
         """
         state = snapshot if isinstance(snapshot, Mapping) else load_snapshot(snapshot)
         expected = self.snapshot()
@@ -122,10 +122,10 @@ class Batch:
 
 
 def load_snapshot(file: File) -> Snapshot:
-    """Read a snapshot from a file; no code in it is run.
+    """Read a snapshot from a file, without executing code from the file.
 
     Raises:
-        ValueError: If it is not such a file; one line.
+        ValueError: If the file has no snapshot; one line.
     """
     try:
         with np.load(file, allow_pickle=False) as stored:

@@ -125,7 +125,7 @@ class Chain:
 
 
 def gradient_program(model: Model, options: StepOptions) -> Program:
-    """Return the program that turns `w_q`, `w_v`, ... of the state after a sub-step into those of the state before."""
+    """Return the program that turns the gradient `w_q`, `w_v`, ... after a sub-step into the gradient before it."""
     mechanism, layout = model.mechanism, model.robot.layout
     primal = primal_function(mechanism, options)
     chain = Chain(primal, adjoint_function(mechanism, options, leads_on=True), iterations_of(mechanism, options))
@@ -159,7 +159,7 @@ def _split(chain: Chain, gradients: list[Variable]) -> Call:
 def linearization_program(model: Model, options: StepOptions, whole_state: bool = False) -> Program:
     """Return the program that writes `ends`: the derivative of the state after a sub-step in each direction.
 
-    Directions are those of the state before the sub-step and of the target, one after the other.
+    Directions are the coordinates of the state before the sub-step, then the entries of the target.
 
     Args:
         model: The robot at a transmission level.
@@ -295,7 +295,7 @@ class _LinearizationCalls:
             yield assign({CONTACT_ACTS: ca.DM(0)}, only_if=only_if)
 
     def _ends(self) -> Iterator[Call]:
-        """Yield the calls that compute the columns of the step's derivative from those of its acceleration."""
+        """Yield the calls that compute the derivative of the step from the derivative of the acceleration."""
         state = {"diverged": TRIED_DIVERGED}
         yield call(self.linear.slope_function(), state)
         for group, still in zip(self.blocks, self.stills, strict=True):

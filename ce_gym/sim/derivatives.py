@@ -1,7 +1,6 @@
 """`StepDerivatives`: gradients through the steps of a simulator, and their linearisation.
 
-One kernel makes the reverse mode of one sub-step: it repeats the iterations that the step needed and goes back through
-them.
+One kernel computes the reverse mode of one sub-step: it repeats the iterations of the step and differentiates them.
 """
 
 from __future__ import annotations
@@ -32,14 +31,14 @@ from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
 @dataclass
 class Record:
-    """Some sub-steps one after the other.
+    """Consecutive sub-steps.
 
     Attributes:
-        arrays: State before the first.
-        kept: Robots that began where the record before left them, shape (num_envs,); None for all of them.
-        targets: Of each sub-step.
-        after: What is compared to see whether somebody has set it since.
-        in_parts: Of each sub-step the robots that made it in parts, shape (num_envs,); None for none.
+        arrays: State before the first sub-step.
+        kept: Robots that started from the end of the previous record, shape (num_envs,); None for all robots.
+        targets: Target of each sub-step.
+        after: Positions and velocities after the last sub-step, which show later whether a robot has been set since.
+        in_parts: For each sub-step the robots that halved it, shape (num_envs,); None if no robot did.
     """
 
     arrays: dict[str, NDArray]
@@ -52,23 +51,23 @@ class Record:
 class StepDerivatives:
     """Derivatives of the steps of a simulator, in reverse mode.
 
-    Positions are differentiated in their tangent space: a rotation of the base, a translation of it, both in base axes,
-    rotations of ball joints, then the other joints. What was decided in a step (touching, sticking, slipping, a limit
-    that acts) is differentiated as decided, through all iterations of the step.
+    Positions are differentiated in their tangent space: rotation and translation of the base, both in base axes,
+    rotations of ball joints, then the other joints. Decisions of a step (touching, sticking, slipping, an active limit)
+    are differentiated as decided, through all iterations of the step.
 
-    On terrain the ground under a contact is the plane that the step found there. Of a sub-step that a robot made in
-    parts (see `Simulator`), `backward` goes through the parts; their lengths are decided. `gradient` and `linearize`
-    are of a whole one.
+    On terrain the ground under a contact is the plane that the step found there. If a robot halved a sub-step (see
+    `Simulator`), `backward` goes through its parts, whose lengths count as constant. `gradient` and `linearize` always
+    differentiate a whole sub-step.
 
     Args:
-        simulator: Whose steps; on the CPU.
-        keep_every: Every how many recorded sub-steps the state is kept; those between are recomputed on the way back,
-            which costs a step each.
+        simulator: The simulator, on the CPU.
+        keep_every: Number of recorded sub-steps per stored state. `backward` recomputes the states between, which takes
+            a step each.
 
     Attributes:
-        state_sizes: Of the tangent of each part of a state.
-        n_recorded: How many sub-steps have been recorded.
-        bytes_recorded: Memory of what has been recorded.
+        state_sizes: Sizes of the tangent space of each part of a state.
+        n_recorded: Number of recorded sub-steps.
+        bytes_recorded: Memory of the record.
 
     Raises:
         ValueError: If the simulator's steps cannot be differentiated.
@@ -106,7 +105,7 @@ class StepDerivatives:
         return sum({id(array): array.nbytes for arrays in held for array in arrays}.values())
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
-        """Step the simulator, and record: as `Simulator.step`."""
+        """Step the simulator as `Simulator.step` does, and record the sub-steps."""
         simulator, rows = self.simulator, self._target(target)
         for _ in range(n_substeps):
             last = self._records[-1] if self._records else None
@@ -122,11 +121,11 @@ class StepDerivatives:
             record.in_parts.append(parts if parts.any() else None)
 
     def state(self) -> dict[str, NDArray]:
-        """Return all that steps depend on besides targets and parameters, by part, shape (num_envs, size) each."""
+        """Return the state that steps depend on, without targets and parameters, by part, shape (num_envs, size)."""
         return {name: self.simulator._batch.rows(name) for name in self._parts}
 
     def restore(self, state: Mapping[str, ArrayLike]) -> None:
-        """Set that, and clear divergence; parts that are left out stay as they are.
+        """Set parts of the state, and clear divergence; other parts do not change.
 
         Quaternions whose norm is within 1e-3 of 1 are scaled to unit length; others raise a ValueError.
         """
@@ -136,24 +135,24 @@ class StepDerivatives:
         batch.write("diverged", 0.0)
 
     def take(self) -> list[Record]:
-        """Hand over what has been recorded, and begin anew."""
+        """Return the recorded sub-steps, and start a new record."""
         records, self._records = self._records, []
         return records
 
     def backward(
         self, weights: Mapping[str, ArrayLike], records: list[Record] | None = None
     ) -> tuple[dict[str, NDArray], list[NDArray], NDArray]:
-        """Go back through all recorded sub-steps, and forget them.
+        """Propagate a gradient back through all recorded sub-steps, and delete the record.
 
-        A robot that was reset or set in between, or diverged, passes nothing on to what was before.
+        The gradient of a robot stops where the robot was reset or set, or diverged.
 
         Args:
-            weights: Gradient of something with respect to parts of the last state, shape (num_envs, size), see
-                `state_sizes`; those left out are zero.
-            records: What `take` handed over, which is kept, in place of what has been recorded since.
+            weights: Gradient of a quantity with respect to parts of the last state, shape (num_envs, size), see
+                `state_sizes`; zero for other parts.
+            records: Result of `take`, used in place of the record and not deleted.
 
         Returns:
-            Its gradient with respect to the first state, by part; to the target of each sub-step, first to last,
+            The gradient with respect to the first state, by part; to the target of each sub-step, first to last,
             (num_envs, n_targets) each; and to the declared parameters, (num_envs, n), in the order of declaration.
         """
         simulator, records = self.simulator, self.take() if records is None else records
@@ -177,31 +176,31 @@ class StepDerivatives:
         return self._rows(now, n), list(targets), parameters
 
     def gradient(self, target: ArrayLike, weights: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
-        """Return the gradient of one sub-step from the present state, which stays as it is.
+        """Return the gradient of one sub-step from the present state, without a step.
 
         Args:
             target: As for `Simulator.step`.
-            weights: Gradient of something with respect to parts of the state after it, as for `backward`.
+            weights: Gradient of a quantity with respect to parts of the state after the sub-step, as for `backward`.
 
         Returns:
-            Its gradient with respect to each part of the state before, to "target" and to "parameters", if there are
-            any, shape (num_envs, size) each.
+            The gradient with respect to each part of the state before, to "target" and to "parameters", as far as they
+            exist, shape (num_envs, size) each.
         """
         return self._gradient(self.simulator._arrays, self._target(target), self._weights(weights))
 
     def linearize(self, target: ArrayLike, whole_state: bool = False, by_rows: bool = False) -> tuple[NDArray, NDArray]:
-        """Return how one sub-step from the present state depends on that state and on the target.
+        """Return the Jacobian of one sub-step from the present state with respect to the state and the target.
 
         Args:
             target: As for `Simulator.step`.
-            whole_state: Whether the state is [q; v; load; anchor], what of these there is, instead of [q; v]: contacts
-                remember the latter two from step to step, and only the whole can be chained over steps in contact.
-            by_rows: Whether to use the kernel of the reverse mode, row by row, which takes longer than the one made for
-                this and compiles sooner. Methods other than `euler` do so anyway.
+            whole_state: Whether the state is [q; v; load; anchor], as far as the scene has them, instead of [q; v].
+                Contacts remember load and anchor, so that only whole states can be chained over steps in contact.
+            by_rows: Whether to use the kernel of the reverse mode, row by row, which is slower than the kernel of
+                columns and compiles faster. Methods other than `euler` always do so.
 
         Returns:
-            `A`, shape (num_envs, n, n), and `B`, shape (num_envs, n, n_targets), of that state, in the tangent space of
-            positions; n is 2 nv and what contacts remember.
+            `A`, shape (num_envs, n, n), and `B`, shape (num_envs, n, n_targets), in the tangent space of positions; n
+            is 2 nv, plus the sizes of load and anchor for the whole state.
         """
         simulator, sizes = self.simulator, self._linear_sizes(whole_state)
         options = simulator.options
@@ -220,7 +219,7 @@ class StepDerivatives:
         return {name: n for name, n in self.state_sizes.items() if name in ("q", "v", *remembered)}
 
     def _linearize_by_rows(self, target: ArrayLike, whole_state: bool = False) -> tuple[NDArray, NDArray]:
-        """Return the same row by row, in reverse mode, for any method, and for links that push each other apart."""
+        """Return the Jacobian row by row, in reverse mode, for any method and for scenes with self-collisions."""
         n, sizes = self.simulator.num_envs, self._linear_sizes(whole_state)
         A, B = list[NDArray](), list[NDArray]()
         for name, size in sizes.items():
@@ -233,7 +232,7 @@ class StepDerivatives:
     def _through_parts(
         self, arrays: Mapping[str, NDArray], target: NDArray, weights: Mapping[str, NDArray], chosen: NDArray
     ) -> dict[str, NDArray]:
-        """Return the gradient of a sub-step of those robots that made it in parts."""
+        """Return the gradient of a sub-step for robots that halved the sub-step."""
         rows = {name: read_rows(array, self.simulator.num_envs)[chosen] for name, array in arrays.items()}
         target, now = target[chosen], {name: value[chosen] for name, value in weights.items()}
         others = {name: np.zeros((len(target), size)) for name, size in self._other_sizes.items()}
@@ -289,7 +288,7 @@ class StepDerivatives:
     def _go_back(
         self, arrays: Mapping[str, NDArray], target: NDArray, now: dict[str, NDArray], others: dict[str, NDArray]
     ) -> None:
-        """Overwrite a gradient to the state after a sub-step, tiles, by that to the one before, and those to others."""
+        """Overwrite the gradient after a sub-step, in tiles, by the gradient before, and write that of `others`."""
         given = {f"w_{name}": array for name, array in now.items()}
         given |= {f"by_{name}": rows for name, rows in others.items()}
         every = {**arrays, **given, **self.simulator._batch.tables, "target": target}
@@ -299,20 +298,20 @@ class StepDerivatives:
         return {name: read_rows(array, n).astype(float, copy=False) for name, array in now.items()}
 
     def _is_as_left(self, record: Record) -> bool:
-        """Whether nobody has set robots or their figures since."""
+        """Return whether robots and their parameters have not been set since the record."""
         now = self.simulator._arrays
         figures = np.array_equal(now["parameters"], record.arrays["parameters"]) if "parameters" in now else True
         return figures and all(np.array_equal(now[name], array) for name, array in record.after.items())
 
     def _where_left(self, record: Record) -> NDArray | None:
-        """Return which robots are where a record left them, shape (num_envs,); None for all of them."""
+        """Return which robots are at the end of a record, shape (num_envs,); None for all robots."""
         now, n = self.simulator._arrays, self.simulator.num_envs
         read = self.simulator._device.read
         same = [(read(now[name], n) == read(array, n)).all(axis=1) for name, array in record.after.items()]
         return None if np.all(same) else np.all(same, axis=0)
 
     def _states(self, record: Record) -> list[tuple[dict[str, NDArray], NDArray]]:
-        """Return the state before each sub-step of a record and its target, all but the first are made again."""
+        """Return the state before each sub-step of a record and its target; all states but the first are recomputed."""
         states = [(record.arrays, record.targets[0])]
         for target in record.targets[1:]:
             states.append((self._stepped(states[-1][0], states[-1][1]), target))
@@ -330,11 +329,11 @@ class StepDerivatives:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of a sub-step, tried by some robots.
+    """A part of a sub-step that robots tried.
 
     Attributes:
-        arrays: State before it, in tiles, with its length as `DT`.
-        taken: Which robots went on from its end, shape (n,).
+        arrays: State before the part, in tiles, with the length of the part as `DT`.
+        taken: Robots that accepted the part, shape (n,).
     """
 
     arrays: dict[str, NDArray]
@@ -342,11 +341,11 @@ class _Part:
 
 
 def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray) -> list[_Part]:
-    """Make a sub-step of some robots again, as its kernel does (`ce_gym.dynamics.stepping.halving`).
+    """Repeat a sub-step of robots that halved it, as the kernel does (`ce_gym.dynamics.stepping.halving`).
 
     Args:
-        simulator: Whose robots.
-        rows: State before the sub-step by name, a robot in each row.
+        simulator: The simulator.
+        rows: State before the sub-step by name, one robot per row.
         target: Shape (n, n_targets).
     """
     model, options, dtype = simulator.model, simulator.options, simulator.dtype

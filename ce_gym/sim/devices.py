@@ -1,8 +1,8 @@
-"""Where robots live: numpy arrays and the CPU's kernels, or torch tensors and a GPU's.
+"""Devices that hold the state of robots: numpy arrays and kernels of the CPU, or torch tensors and kernels of a GPU.
 
-A device makes, reads and writes state arrays and loads the kernels that work on them. A state array is either in tiles,
-as kernels take it (see `ce_gym.sim.tiles`; a GPU has one tile with a lane for each robot), or plain, one robot per row.
-torch is imported when a GPU is asked for.
+A device makes, reads and writes state arrays and loads kernels. A state array is in tiles, the layout of kernels (see
+`ce_gym.sim.tiles`; a GPU has one tile with a lane for each robot), or plain, with one robot per row. torch is imported
+only for a GPU.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ Build = Callable[[], Sequence[Program]]
 
 
 class Device(Protocol):
-    """What a device offers.
+    """Arrays and kernels of a device.
 
     Attributes:
         name: "cpu", "cuda", "cuda:1" and so on.
-        fuses: Whether stages that follow each other are one kernel.
+        fuses: Whether consecutive stages are one kernel.
     """
 
     name: str
@@ -41,11 +41,11 @@ class Device(Protocol):
         ...
 
     def empty(self, shape: tuple[int, ...], dtype: str) -> Array:
-        """Return a plain array whose values are yet to be written."""
+        """Return an uninitialised plain array."""
         ...
 
     def rows(self, values: Any, dtype: str, shape: tuple[int, ...] = ()) -> Array:
-        """Return values as a plain array of this device; broadcast to `shape` and contiguous, if one is given."""
+        """Return values as a plain array of this device; if `shape` is given, broadcast to it and contiguous."""
         ...
 
     def copy(self, array: Array) -> Array:
@@ -61,7 +61,7 @@ class Device(Protocol):
         ...
 
     def host(self, array: Array) -> NDArray:
-        """Return a plain array in the memory of the CPU, its type kept."""
+        """Return a plain array in the memory of the CPU, with the same dtype."""
         ...
 
     def kernel(self, key: str, build: Build, dtype: str) -> Any:
@@ -162,7 +162,7 @@ class Cuda:
 
 
 class Emulated(Cuda):
-    """The GPU's tensors and sources on the CPU: for tests and comparisons where there is no GPU, and very slow."""
+    """Tensors and sources of the GPU on the CPU: for tests and comparisons without a GPU; very slow."""
 
     def __init__(self) -> None:
         self.name, self._place = "emulated cuda", "cpu"
@@ -180,15 +180,15 @@ def _torch() -> Any:
 
 
 def _beside(mask: Array, ndim: int) -> Array:
-    """Return a mask of rows with a column for those of an array with two axes."""
+    """Return a mask of rows that broadcasts to an array with `ndim` axes."""
     return mask[:, None] if ndim == 2 else mask
 
 
 def device_named(device: str | Device) -> Device:
-    """Return a device by name; one that is a device already stays as it is.
+    """Return a device by name, or the given device.
 
     Args:
-        device: "cpu", "cuda", or "cuda:N" for another GPU than the first.
+        device: "cpu", "cuda" or "cuda:N".
 
     Raises:
         ValueError: If there is no such device; one line.
@@ -204,5 +204,5 @@ def device_named(device: str | Device) -> Device:
 
 
 def to_numpy(values: Any) -> NDArray:
-    """Return numbers from anywhere as float64 in the CPU's memory."""
+    """Return numbers of any kind, such as a torch tensor, as float64 in the memory of the CPU."""
     return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=float)

@@ -1,4 +1,4 @@
-"""What the program of a simulator's kernel depends on, beside its options: the model, and the sources that trace it."""
+"""Keys of kernels in the cache: texts for the model, the sources that trace the model, and the force laws."""
 
 from dataclasses import replace
 
@@ -18,18 +18,18 @@ from ce_gym.model import FunctionConstraint, Robot
 from ce_gym.model.mechanism import Mechanism
 
 SOURCES = ("ce_gym.model", "ce_gym.dynamics", "ce_gym.sim")
-"""What traces a model and makes programs of it."""
+"""Packages that trace a model and make programs."""
 
 
 def model_key(model: Model) -> str:
-    """Return a text that is equal for equal models, for cache keys; where a robot was read from does not matter."""
+    """Return a text that is equal for equal models, for cache keys; the file of the robot does not matter."""
     robot = replace(model.robot, source="", notes=(), tasks=())
     options = f"{model.transmission} {model.locked_rotors} {model.eliminated}"
     return f"{source_fingerprint(*SOURCES)} {robot!r} {options} {_functions(robot)}"
 
 
 def laws_key(mechanism: Mechanism, options: StepOptions) -> str:
-    """Return a text that is equal for equal methods and laws, for cache keys; laws of others by what they trace to."""
+    """Return a text that is equal for equal methods and laws, for cache keys; laws of users are traced for that."""
     laws = normal_law(options.normal_law, options.material), FRICTION[options.friction], MOTORS[options.motors]
     laws = *laws, *scene_laws(mechanism, options)
     ours = all(type(law).__module__.startswith("ce_gym.") for law in laws)
@@ -38,7 +38,7 @@ def laws_key(mechanism: Mechanism, options: StepOptions) -> str:
 
 
 def _functions(robot: Robot) -> list[str]:
-    """Return what users' constraint functions compute, of which a description has only the names."""
+    """Return the traced constraint functions of users, of which a description has only the names."""
     q = SX.sym("q", len(robot.bodies))
     angles = {body.name: q[i] for i, body in enumerate(robot.bodies)}
     ties = [tie for tie in robot.constraints if isinstance(tie, FunctionConstraint)]

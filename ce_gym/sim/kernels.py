@@ -18,7 +18,7 @@ from ce_gym.sim.kernel_key import laws_key, model_key
 from ce_gym.sim.substeps import substeps
 
 MOST_PAIRS = 32
-"""Most pairs of capsules in a scene: the system of their forces is dense."""
+"""Most pairs of capsules in a scene, because the system of their forces is dense."""
 
 
 def select_contacts(robot: Robot, contacts: str | Sequence[str], argument: str = "contacts") -> tuple[str, ...]:
@@ -27,10 +27,10 @@ def select_contacts(robot: Robot, contacts: str | Sequence[str], argument: str =
     Args:
         robot: The robot.
         contacts: "all", or names of spheres or groups of spheres, one or several.
-        argument: What an error calls them.
+        argument: Name of the argument in errors.
 
     Raises:
-        ValueError: If a name is neither a sphere's nor a group's, or is listed twice.
+        ValueError: If a name is not a sphere or a group, or is listed twice.
     """
     names = [contacts] if isinstance(contacts, str) else list(contacts)
     known = sorted({c.group for c in robot.contacts} | {c.name for c in robot.contacts})
@@ -48,7 +48,7 @@ def select_pairs(mechanism: Mechanism, pairs: str | Sequence[Sequence[str]]) -> 
         pairs: "listed", "all", or pairs of names.
 
     Raises:
-        ValueError: If a name is no link's, a link has no capsule, or it stands for no such choice.
+        ValueError: If a link does not exist or has no capsule, or the choice is unknown.
     """
     robot = mechanism.robot
     if isinstance(pairs, str) and pairs not in ("listed", "all"):
@@ -79,9 +79,9 @@ def load_step_kernel(
     Args:
         model: The robot at a transmission level.
         options: The scene.
-        outputs: What to compute besides the state.
+        outputs: Quantities to compute besides the state.
         dtype: "float64" or "float32".
-        device: Whose kernel; the CPU's if None.
+        device: Device of the kernel; the CPU if None.
     """
 
     def build() -> tuple[Program]:

@@ -1,4 +1,4 @@
-"""Contact spheres of a robot above the ground: depths, and the lift that a pose needs."""
+"""Clearance between the contact spheres of a robot and the ground: depths, and the lift that a pose needs."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ce_gym.sim.terrain import Terrain
 
 
 class Placement:
-    """The contact spheres that take part, and the ground under them.
+    """Contact spheres of a robot, and the ground under them.
 
     Args:
         model: The robot.
         contacts: Names of the spheres.
         terrain: The ground; the plane z = 0 if None.
-        hulls: Convex shapes on a field whose corners some of the spheres are.
+        hulls: Convex shapes whose corners are some of the spheres, on a field.
     """
 
     def __init__(
@@ -36,12 +36,12 @@ class Placement:
         self._axes = np.array([sphere.axis for sphere in spheres]).reshape(-1, 3)
 
     def depth(self, q: ArrayLike) -> NDArray:
-        """Return how deep each sphere is in the ground, 0 if it is above [m], shape (..., n_contacts)."""
+        """Return the depth of each sphere in the ground, 0 above the ground [m], shape (..., n_contacts)."""
         over = self._over_ground(q)
         return np.maximum(self._reach(q, *over[2:]) - above(*over), 0)
 
     def lift(self, q: ArrayLike) -> float:
-        """Return how far to raise a robot for no contact to be deeper in the terrain than it is in flat ground [m]."""
+        """Return the lift after which no contact is deeper in the terrain than in flat ground [m]."""
         if self._terrain is None or not self._chosen:
             return 0.0
         over, level = self._over_ground(q), self._reach(q)
@@ -49,14 +49,14 @@ class Placement:
         return max(float(lift(allowed, *over).max()), *(self._lift_of(hull, q) for hull in self._hulls), -np.inf)
 
     def _lift_of(self, hull: Hull, q: ArrayLike) -> float:
-        """Return the same for the points of a hull."""
+        """Return the lift for the points of a hull [m]."""
         at, turned = self._model.body_poses(q)
         body = self._model.body_names.index(hull.body)
         x, y, z = at[body][:, None] + turned[body] @ np.array(hull.points).T
         return float(lift(np.minimum(z, hull.radius), z, *np.moveaxis(self._terrain.at(x, y), -1, 0)).max())  # type: ignore[union-attr]
 
     def _reach(self, q: ArrayLike, slope_x: ArrayLike = 0.0, slope_y: ArrayLike = 0.0) -> NDArray:
-        """Return how far each contact reaches from its centre towards ground of these slopes [m]."""
+        """Return the distance of the lowest point of each contact from its centre, towards ground with slopes [m]."""
         if not self._rim.any():
             return self._radius
         rotations = self._model.body_poses(q)[1][..., self._carriers, :, :]

@@ -28,8 +28,8 @@ from ce_gym.model.errors import check_names, listed_names
 from ce_gym.sim.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
+from ce_gym.sim.interruptible_runs import longest_run, run_substeps
 from ce_gym.sim.kernels import load_step_kernel, select_contacts, select_pairs
-from ce_gym.sim.pieces import piece_length, run_substeps
 from ce_gym.sim.placement import Placement
 from ce_gym.sim.schema import Row, Steps, checked_tolerance, physics_rows
 from ce_gym.sim.terrain import Terrain
@@ -251,7 +251,7 @@ class Simulator:
 
     def _advance(self, given: dict[str, Array], n_substeps: int) -> None:
         """Step all robots; the state is as before if that raises, by Ctrl-C in a long call."""
-        keep = n_substeps > piece_length(self.num_envs)
+        keep = n_substeps > longest_run(self.num_envs)
         before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
         arrays = self._arrays | self._batch.tables | given
         try:

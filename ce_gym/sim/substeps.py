@@ -120,7 +120,7 @@ def _one_call(
 
 
 def _accept(mechanism: Mechanism, options: StepOptions, step: StepVariables) -> tuple[Call, ...]:
-    """Return the calls that accept or reject what was tried and choose the next step, or part of a step, to try."""
+    """Return the calls that accept or reject a try, and choose the next step, or part of a step, to try."""
     if METHODS[options.method].controlled:
         return (call(step_size.control_function(step, mechanism.robot.layout)),)
     return (
@@ -136,7 +136,7 @@ def look_up(mechanism: Mechanism, options: StepOptions, state: Mapping[str, str]
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
-        state: Buffers of the state by name, if they are not those of the start of the step.
+        state: Buffers of the state by name, if not the start of the step.
     """
     contacts = {"places": "contact_places", "ground": "contact_ground"} if options.hulls else {}
     places, ground = contacts.get("places", "places"), contacts.get("ground", "ground")

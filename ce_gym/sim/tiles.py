@@ -1,7 +1,7 @@
 """State arrays of many robots in the layout of the kernels, and their conversion to and from plain rows.
 
-A tile holds as many robots as a vector register has lanes: arrays are (n_tiles, size, lanes). Robots beyond `num_envs`
-in the last tile are padding; they hold copies of valid states so that nothing in them can go wrong.
+A tile holds as many robots as a vector register has lanes, and arrays are (n_tiles, size, lanes). Robots beyond
+`num_envs` in the last tile are padding with copies of valid states.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from ce_gym.compile import aligned_zeros, lane_count
 
 
 def tile_count(num_envs: int, dtype: str) -> int:
-    """Return how many tiles hold `num_envs` robots."""
+    """Return the number of tiles that hold `num_envs` robots."""
     return -(-num_envs // lane_count(dtype))
 
 
@@ -33,8 +33,8 @@ def write_rows(array: NDArray, rows: ArrayLike, mask: NDArray[np.bool_] | None =
 
     Args:
         array: Tiled array, changed in place.
-        rows: Values, shape (num_envs, size) or anything that broadcasts to it.
-        mask: Robots to write, shape (num_envs,); all of them if None.
+        rows: Values, shape (num_envs, size) or a shape that broadcasts to it.
+        mask: Robots to write, shape (num_envs,); all robots if None.
     """
     n_tiles, size, lanes = array.shape
     if mask is None:

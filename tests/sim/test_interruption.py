@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Simulator
-from ce_gym.sim import pieces
+from ce_gym.sim import interruptible_runs
 
 N = 12
 SEEN = ("q", "v", "torque", "contact_forces", "diverged")
@@ -84,7 +84,7 @@ def watch(sim: Simulator, monkeypatch: pytest.MonkeyPatch, interrupted: int = 0,
         kernel(arrays, num_envs, repeats=repeats, **options)
 
     monkeypatch.setattr(sim, "_kernel", watched)
-    monkeypatch.setattr(pieces, "LONGEST", 3 * pieces.FEWEST)
+    monkeypatch.setattr(interruptible_runs, "LONGEST", 3 * interruptible_runs.FEWEST)
     return lengths
 
 
@@ -98,7 +98,7 @@ def test_no_memory_is_freed_that_a_thread_still_writes_to():
 
 def test_pieces_are_short():
     for num_envs in (1, 16, 1000, 50_000):
-        assert 1 <= pieces.piece_length(num_envs) <= max(1, 100_000 // num_envs)
+        assert 1 <= interruptible_runs.longest_run(num_envs) <= max(1, 100_000 // num_envs)
 
 
 @pytest.mark.parametrize("options", [{}, {"method": "extrapolated"}, {"dtype": "float32"}], ids=str)

@@ -1,6 +1,6 @@
-"""The same programs as CUDA C: emitted by `source`, compiled by `nvrtc`, launched by `gpu`, or run by `host`.
+"""Kernels of programs in CUDA C: emitted by `source`, compiled by `nvrtc`, launched by `gpu`, or run by `host`.
 
-Importing this package imports neither torch nor NVIDIA's packages.
+Importing this package imports neither torch nor the packages of NVIDIA.
 """
 
 from ce_gym.compile.cuda.kernel import CudaKernel

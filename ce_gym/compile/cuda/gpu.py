@@ -1,8 +1,8 @@
 # pyright: reportAttributeAccessIssue=false
-"""The GPU itself: whether there is one, what it is, and launching machine code on it.
+"""Detection of a GPU, and launches of machine code on it.
 
-Memory and streams are torch's, so that what torch does before and after a launch stays in order; launching is
-`cuda.core`'s. (Compiled modules carry no types, hence the line above.)
+Memory and streams come from torch, so that operations of torch before and after a launch stay in order. `cuda.core`
+launches. The first line turns off checks of types, because compiled modules have none.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ce_gym.compile.cuda.source import BLOCK, ENTRY
 
 @cache
 def architecture(gpu: int = 0) -> str:
-    """Return what to compile for on a GPU, such as `sm_90`.
+    """Return the architecture of a GPU, such as `sm_90`.
 
     Raises:
         CudaUnavailable: If there is no such GPU, or a package is missing; one line.
@@ -39,7 +39,7 @@ def architecture(gpu: int = 0) -> str:
 
 
 class _Stream:
-    """torch's present stream, as `cuda.core` wants to be told of it."""
+    """The current stream of torch, in the form that `cuda.core` takes."""
 
     def __init__(self, handle: int):
         self._handle = handle
@@ -52,7 +52,7 @@ class GpuLauncher:
     """One kernel on one GPU.
 
     Args:
-        code: machine code for its architecture.
+        code: machine code for the architecture of the GPU.
         gpu: number of the GPU.
     """
 
@@ -67,7 +67,7 @@ class GpuLauncher:
         self._gpu = gpu
 
     def __call__(self, addresses: Sequence[int], numbers: Sequence[int], count: int) -> None:
-        """Launch on torch's present stream, a thread for each robot."""
+        """Launch on the current stream of torch, with a thread for each robot."""
         stream = _Stream(self._torch.cuda.current_stream(self._gpu).cuda_stream)
         self._device.set_current()
         config = self._config(grid=-(-count // BLOCK), block=BLOCK)

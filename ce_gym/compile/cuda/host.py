@@ -1,7 +1,7 @@
-"""Emitted CUDA C run by the CPU: the same text, through a C++ compiler and a few lines that stand in for CUDA's.
+"""Emitted CUDA C on the CPU: a C++ compiler compiles the same text with a few definitions in place of CUDA.
 
-For tests and for comparisons where there is no GPU; a user never needs it. It shows that the arithmetic, the copying
-and the order of stages are right, not that a GPU rounds as IEEE 754 says, nor how fast it is.
+This is for tests and comparisons without a GPU. It checks arithmetic, copies and the order of stages. It does not check
+that a GPU rounds according to IEEE 754, and says little about speed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ static int __float_as_int(float a) { int b; memcpy(&b, &a, 4); return b; }
 """
 
 OPTIONS = ("-std=c++17", "-O0", "-w", "-ffp-contract=off", "-shared", "-fPIC")
-"""Not optimised: seconds instead of minutes, and nothing is fused or reordered."""
+"""Without optimisation, which takes minutes; nothing is fused or reordered."""
 
 
 def host_compiler() -> list[str] | None:
@@ -55,7 +55,7 @@ class HostLauncher:
     """Runs an emitted kernel robot by robot on arrays in the CPU's memory.
 
     Args:
-        source: The kernel; compiled only if the cache has no library of it yet.
+        source: The kernel; compiled only if its library is not in the cache.
 
     Raises:
         RuntimeError: One line, if there is no C++ compiler or it refuses the source.
@@ -78,7 +78,7 @@ class HostLauncher:
         """Run the kernel on all robots.
 
         Args:
-            addresses: Of the arrays, in the layout's order.
+            addresses: Of the arrays, in the order of the layout.
             numbers: Rows and columns of tables, repeat counts.
             count: Number of robots.
         """
@@ -86,7 +86,7 @@ class HostLauncher:
 
 
 def _compile(compiler: list[str], text: str, name: str) -> bytes:
-    """The shared library."""
+    """Return a shared library."""
     with tempfile.TemporaryDirectory(prefix="ce_gym-") as folder:
         file, library = Path(folder) / "kernel.cpp", Path(folder) / "kernel.so"
         file.write_text(text, encoding="utf-8")
@@ -98,7 +98,7 @@ def _compile(compiler: list[str], text: str, name: str) -> bytes:
 
 
 def _load(code: bytes) -> ctypes.CDLL:
-    """Load a shared library, which must be a file for as long as that takes."""
+    """Load a shared library from a temporary file."""
     with tempfile.TemporaryDirectory(prefix="ce_gym-", ignore_cleanup_errors=True) as folder:
         file = Path(folder) / "kernel.so"
         file.write_bytes(code)
@@ -106,7 +106,7 @@ def _load(code: bytes) -> ctypes.CDLL:
 
 
 def _loop(text: str) -> str:
-    """The kernel's threads one after the other, as a function with its arguments."""
+    """Return a C function with the arguments of the kernel that runs its threads one after the other."""
     found = re.search(rf'extern "C" __global__ void [^;{{]*? {ENTRY}\((?P<arguments>[^)]*)\)', text)
     assert found, "no kernel in the source"
     arguments = " ".join(found["arguments"].split())

@@ -1,4 +1,4 @@
-"""A kernel of the GPU and how it is called: checks of the tensors, their addresses, one launch."""
+"""A kernel of the GPU that can be called: checks of the tensors, their addresses, one launch."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from ce_gym.compile.cuda.source import Source
 from ce_gym.compile.program import Buffer
 
 Launcher = Callable[[Sequence[int], Sequence[int], int], None]
-"""Takes addresses of the arrays, 32-bit integers, and the number of robots."""
+"""Takes the addresses of the arrays, 32-bit integers, and the number of robots."""
 
 
 class CudaKernel:
-    """Machine code that works on robots, a thread for each.
+    """Machine code that processes robots, with a thread for each.
 
     Args:
-        source: what it was made from.
-        launch: runs it.
-        place: torch's name of the device whose memory it works on.
+        source: source of the machine code.
+        launch: launches the machine code.
+        place: name of the device in torch.
 
     Attributes:
         name: of the first program.
@@ -43,19 +43,19 @@ class CudaKernel:
         counters: Any = None,
         num_threads: int = 1,
     ) -> None:
-        """Run all stages on every robot; returns before the GPU has finished, as torch's operations do.
+        """Run all stages on every robot; returns before the GPU has finished, as operations of torch do.
 
         Args:
-            arrays: contiguous tensors: for each `tiles` buffer of shape (1, size, num_envs), for each `rows_*` buffer
-                (num_envs, size), for each table (rows, columns); others are ignored.
+            arrays: contiguous tensors by name of the buffer: `tiles`, shape (1, size, num_envs); `rows_*`, shape
+                (num_envs, size); tables, shape (rows, columns). Other tensors are ignored.
             num_envs: number of robots.
             repeats: a number for each of `self.repeats`.
             keys: int64, the bits of the unsigned keys, shape (num_envs,), if random numbers are drawn.
-            counters: int64, shape (num_envs,), likewise; counted up.
-            num_threads: of no consequence here; CPU's kernels have it.
+            counters: int64, shape (num_envs,), if random numbers are drawn; incremented.
+            num_threads: ignored; kernels of the CPU have this argument.
 
         Raises:
-            ValueError: one line naming the kernel, the array and what was expected.
+            ValueError: one line with the kernel, the array and the expected dtype, shape and device.
         """
         addresses, numbers = [], []
         for b in self._arguments:

@@ -1,4 +1,4 @@
-"""`load_cuda_kernel`: from the cache folder, or emitted, compiled and put there."""
+"""`load_cuda_kernel`: read a kernel from the cache folder, or emit, compile and cache it."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ from ce_gym.compile.program import Program
 from ce_gym.compile.sources import source_fingerprint, toolchain
 
 SOURCES = tuple(f"ce_gym.compile.{name}" for name in ("arrays", "cuda", "layout", "lowering", "program"))
-"""What turns stages into entries of the cache."""
+"""Modules that turn stages into entries of the cache."""
 Stages = Callable[[], Sequence[Program]]
 _loaded: dict[tuple[Path | None, str, int], CudaKernel] = {}
 _lock = threading.RLock()
 
 
 def load_cuda_kernel(key: str, build: Stages, dtype: str, gpu: int = 0) -> CudaKernel:
-    """A kernel from the cache, or compiled and put there, on a GPU.
+    """Return a kernel on a GPU from the cache, or compile and cache it.
 
     Args:
-        key: names everything the stages depend on, the sources that build them included; equal keys must mean equal
-            stages.
-        build: makes the stages; called only when the machine code is not in the cache.
+        key: all that the stages depend on, with the sources that build them. Equal keys must mean equal stages.
+        build: returns the stages; called only if the machine code is not in the cache.
         dtype: `float64` or `float32`.
         gpu: number of the GPU.
 
@@ -50,16 +49,16 @@ def load_cuda_kernel(key: str, build: Stages, dtype: str, gpu: int = 0) -> CudaK
 
 
 def kernel_name(key: str, dtype: str, arch: str) -> str:
-    """Return the name under which a kernel is cached: our sources, the architecture and the compiler count."""
+    """Return the name of a kernel in the cache, from the key, our sources, the architecture and the compiler."""
     facts = repr((key, dtype, arch, compiler_version(), source_fingerprint(*SOURCES), toolchain()))
     return "cuda_" + hashlib.sha256(facts.encode()).hexdigest()[:24]
 
 
 def cached_cubin(folder: Path | None, name: str, build: Stages, dtype: str, arch: str) -> tuple[bytes, Source, Usage]:
-    """Read a kernel from the cache; make it if it is missing or damaged.
+    """Read a kernel from the cache, or compile the kernel if it is missing or damaged.
 
     Returns:
-        Machine code, the source, and what the kernel takes.
+        Machine code, the source, and the resources of a thread.
     """
     entry = read_entry(folder, name)
     if entry is None:
@@ -70,7 +69,7 @@ def cached_cubin(folder: Path | None, name: str, build: Stages, dtype: str, arch
 
 
 def _compile(build: Stages, dtype: str, arch: str, folder: Path | None) -> tuple[dict, bytes]:
-    """The source and what the kernel takes as plain data, and machine code."""
+    """Return source, layout and resources as JSON data, and machine code."""
     started = time.perf_counter()
     source = emit_source(build(), dtype)
     with announced(f"{source.layout.name} ({dtype}, {arch})", folder, started):
@@ -79,7 +78,7 @@ def _compile(build: Stages, dtype: str, arch: str, folder: Path | None) -> tuple
 
 
 def host_kernel(build: Stages, dtype: str) -> CudaKernel:
-    """The same kernel run by the CPU, for tests and comparisons without a GPU; see `ce_gym.compile.cuda.host`."""
+    """Return a kernel that the CPU runs, for tests and comparisons without a GPU; see `ce_gym.compile.cuda.host`."""
     from ce_gym.compile.cuda.host import HostLauncher
 
     source = emit_source(build(), dtype)

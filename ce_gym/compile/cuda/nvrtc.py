@@ -1,8 +1,8 @@
 # pyright: reportAttributeAccessIssue=false
-"""From CUDA C to machine code by NVIDIA's run-time compiler, and what the compiler tells of it.
+"""Compilation of CUDA C by the run-time compiler of NVIDIA, with the registers and spills that the compiler reports.
 
-Uses the packages `cuda-core` and `nvidia-cuda-nvrtc` (extra `gpu`); needs neither a GPU, a driver nor a C compiler.
-(Compiled modules carry no types, hence the line above.)
+This takes the packages `cuda-core` and `nvidia-cuda-nvrtc` (extra `gpu`), but no GPU, driver or C compiler. The first
+line turns off checks of types, because compiled modules have none.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from functools import cache
 
 OPTIONS = {"std": "c++17", "fma": False, "prec_div": True, "prec_sqrt": True, "ftz": False, "disable_warnings": True}
-"""Every operation is rounded to nearest and by itself: which products and sums are rounded together is settled before,
-for every device alike (`ce_gym.compile.lowering.graph`)."""
+"""Every operation is rounded to nearest and alone. Multiply-adds have been fused before, equally for every device, by
+`ce_gym.compile.lowering.graph`."""
 REGISTERS = 65536
 """32-bit registers of a multiprocessor, on every architecture from sm_70 to sm_120."""
 WARPS = {"80": 64, "86": 48, "87": 48, "89": 48, "90": 64, "100": 64, "120": 48}
@@ -23,12 +23,12 @@ WARPS = {"80": 64, "86": 48, "87": 48, "89": 48, "90": 64, "100": 64, "120": 48}
 
 @dataclass(frozen=True)
 class Usage:
-    """What a thread of a kernel takes.
+    """Resources of a thread of a kernel.
 
     Attributes:
         registers: 32-bit registers.
-        stack: local memory [bytes]: arrays that have no register, and spills.
-        spill_stores, spill_loads: bytes that the code writes and reads for want of registers, each place once.
+        stack: local memory [bytes] of arrays without registers, and of spills.
+        spill_stores, spill_loads: bytes of spills that the code writes and reads, each instruction once.
     """
 
     registers: int
@@ -37,15 +37,15 @@ class Usage:
     spill_loads: int
 
     def occupancy(self, arch: str, block: int) -> float:
-        """Return the share of a multiCPU's warps that its registers can serve, as blocks of `block` threads."""
+        """Return the fraction of the warps of a multiprocessor that fit into its registers; `block` is in threads."""
         most = WARPS[arch.removeprefix("sm_").rstrip("a")]
-        per_warp = -(-32 * self.registers // 256) * 256  # registers are given to warps in units of 256
+        per_warp = -(-32 * self.registers // 256) * 256  # allocated in units of 256
         blocks = (REGISTERS // per_warp) // (block // 32)
         return min(blocks * (block // 32), most) / most
 
 
 class CudaUnavailable(ValueError):
-    """What CUDA needs is not there; one line says what and how to get it."""
+    """CUDA cannot be used; one line says which part is missing and how to install it."""
 
 
 @cache
@@ -78,11 +78,11 @@ def compile_cubin(text: str, arch: str) -> tuple[bytes, Usage]:
         arch: such as `sm_90`.
 
     Returns:
-        Machine code, and what its kernel takes.
+        Machine code, and the resources of a thread.
 
     Raises:
         CudaUnavailable: If the compiler is not installed.
-        RuntimeError: One line, if it refuses the source.
+        RuntimeError: One line, if the compiler rejects the source.
     """
     compiler_version()
     from cuda.core import Program, ProgramOptions
@@ -91,19 +91,19 @@ def compile_cubin(text: str, arch: str) -> tuple[bytes, Usage]:
     log = io.StringIO()
     try:
         code = Program(text, "c++", options).compile("cubin", logs=log)
-    except Exception as problem:  # of a class of its own in every version
+    except Exception as problem:  # another class in every version
         lines = [line for line in f"{problem}\n{log.getvalue()}".splitlines() if "error" in line.lower()]
         raise RuntimeError(f"{text.splitlines()[0]}: {arch}: {(lines or ['refused'])[-1].strip()}") from None
     return bytes(code.code), usage_in(log.getvalue())
 
 
 def usage_in(log: str) -> Usage:
-    """Read what a kernel takes from the compiler's log.
+    """Return the resources of a thread from the log of the compiler.
 
     Raises:
         RuntimeError: If the log does not say.
     """
-    spills = re.findall(r"(\d+) bytes spill stores, (\d+) bytes spill loads", log)  # of the kernel and what it calls
+    spills = re.findall(r"(\d+) bytes spill stores, (\d+) bytes spill loads", log)  # of the kernel and of its functions
     used = re.findall(r"Used (\d+) registers(?:.* (\d+) bytes cumulative stack size)?", log)
     if not spills or len(used) != 1:
         raise RuntimeError("the compiler's log does not say what the kernel takes")

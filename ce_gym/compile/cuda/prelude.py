@@ -1,6 +1,6 @@
-"""What every emitted source begins with: types, the copying of a robot's values, random numbers, the look-up.
+"""Beginning of every emitted source: C text of types, copies of the values of a robot, random numbers and look-ups.
 
-C text only. `random` and `lookup` hold the same two formulas for the CPU; tests hold them equal.
+Random numbers and look-ups are also implemented for the CPU, in `random` and `lookup`. Tests hold both equal.
 """
 
 from ce_gym.compile.lowering.random import FIRST_FACTOR, GOLDEN, RANDOM_BITS, SECOND_FACTOR
@@ -197,7 +197,7 @@ template <int PLACES, int POINTS> __device__ void look_up_grid(
 
 
 def prelude(dtype: str, *, random: bool, lookup: bool) -> str:
-    """Return the text.
+    """Return the beginning of a source.
 
     Args:
         dtype: `float64` or `float32`.

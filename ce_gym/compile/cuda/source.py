@@ -1,10 +1,10 @@
-"""A kernel as CUDA C: one thread is one robot, whose values are local arrays from its first load to its last store.
+"""A kernel in CUDA C: one thread is one robot, whose values are local arrays from its first load to its last store.
 
-A kernel is a list of programs, its stages, made in order on every robot, so that a whole environment step, reset
-included, is one launch. `Program` says what a stage does; the same programs are compiled for the CPU by `tile`.
+A kernel is a list of programs, its stages, which run in order on every robot. So a whole environment step with resets
+is one launch. `tile` compiles the same programs for the CPU.
 
-Where this differs from the CPU's tiles, results do not: a call that a tile leaves out only if none of its lanes
-needs it (`only_if`), a thread leaves out by itself, and such a call changes nothing in a lane that does not need it.
+Results are equal to results on the CPU. There a tile skips a call with `only_if` if none of its lanes needs the call;
+here a thread skips the call alone. Such a call changes nothing in a lane that does not need it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from ce_gym.compile.lowering.partial_evaluation import Fragment
 from ce_gym.compile.program import Buffer, Call, Grid, Lookup, Program, Repeat, Step, While, check_program
 
 BLOCK, BLOCKS = 128, 2
-"""Threads of a block, and blocks that a multiprocessor must have room for: 255 registers a thread at most.
+"""Threads of a block, and blocks that fit on a multiprocessor, which allows 255 registers per thread.
 
-Without the second number the compiler gives the long kernels 32 registers and spills the rest."""
+Without the second number the compiler uses 32 registers in long kernels and spills the other values."""
 LONG = 500
-"""Instructions above which a function with several callers is called, not copied into each."""
+"""Functions with several callers and more instructions are called; others are inlined."""
 ENTRY = "run"
 """Name of the kernel in its source."""
 C_TYPES = {"float64": "double", "float32": "float", "": "real"}
@@ -42,8 +42,8 @@ class Source:
 
     Attributes:
         text: CUDA C; the kernel is `run`.
-        layout: its calling convention: addresses of the arrays in the layout's order, of keys and counters if it is
-            random, rows and columns of each table, the repeat counts (32-bit integers), the number of robots.
+        layout: its calling convention: addresses of the arrays, and of keys and counters if the kernel is random; rows
+            and columns of each table, repeat counts (32-bit integers), number of robots.
     """
 
     text: str
@@ -53,16 +53,16 @@ class Source:
 def emit_source(stages: Sequence[Program], dtype: str) -> Source:
     """Emit a kernel.
 
-    A stage with `skip_unless` is left out for robots where that buffer is zero by then. Random numbers of a stage are
-    drawn at the robot's counter, which then goes up by one.
+    Robots skip a stage if the buffer `skip_unless` is zero by then. A stage draws random numbers at the counter of the
+    robot, and then increments the counter.
 
     Args:
-        stages: what to do, in order; buffers of the same name are the same and must be equal.
+        stages: programs in order; buffers of the same name are the same buffer and must be equal.
         dtype: of the arithmetic, `float64` or `float32`.
 
     Raises:
         ValueError: when a stage is not well formed, or two disagree about a buffer.
-        NotImplementedError: for an operation without a CUDA form, and for calls of parts of buffers.
+        NotImplementedError: for operations without a CUDA form, and for calls of parts of buffers.
     """
     for stage in stages:
         check_program(stage)
@@ -82,7 +82,7 @@ def emit_source(stages: Sequence[Program], dtype: str) -> Source:
 
 
 def _merged(stages: Sequence[Program]) -> Program:
-    """All stages as one program, for its buffers and arguments."""
+    """Return all stages as one program, for its buffers and arguments."""
     buffers: dict[str, Buffer] = {}
     for stage in stages:
         for buffer in stage.buffers:
@@ -104,7 +104,7 @@ class _KernelText:
         self.grids: dict[Grid, str] = {}
 
     def signature(self) -> str:
-        """First lines of the kernel; names from a program get a prefix or a suffix and so clash with none of C."""
+        """Return the head of the kernel; a prefix or suffix keeps names of buffers apart from names of C."""
         arguments = []
         for b in self.layout.arguments:
             const = "" if b.name in self.layout.written else "const "
@@ -120,7 +120,7 @@ class _KernelText:
         )
 
     def begin(self, first: Program) -> Iterator[str]:
-        """Find the robot, fetch its values."""
+        """Yield the lines that find the robot and load its values."""
         yield f"const word robots = count, lane = word(blockIdx.x) * {BLOCK} + threadIdx.x;"
         yield "if (lane >= robots) return;"
         if first.skip_unless:
@@ -136,7 +136,7 @@ class _KernelText:
             yield "word counter = counters[lane];"
 
     def end(self) -> Iterator[str]:
-        """Put back what has changed."""
+        """Yield the lines that store changed values."""
         for b in self.program.buffers:
             if b.kind == "tiles" and b.name in self.layout.written:
                 yield f"write_lane<{b.size}>(all_{b.name}, {b.name}_, lane, robots);"
@@ -146,7 +146,7 @@ class _KernelText:
             yield "counters[lane] = counter;"
 
     def stage(self, stage: Program, *, first: bool) -> Iterator[str]:
-        """One program on this robot."""
+        """Yield the lines of one program."""
         lines = [*self._draws(stage), *self._steps(stage.steps)]
         if self.layout.is_random:
             lines.append("++counter;")
@@ -167,7 +167,7 @@ class _KernelText:
             yield "}"
 
     def _steps(self, steps: Sequence[Step | Repeat]) -> Iterator[str]:
-        """Steps in order. Neighbouring calls equal but for `only_if` and `again` are one loop: the code stands once."""
+        """Yield the lines of steps. Adjacent calls that differ in `only_if` and `again` only become one loop."""
         for _, same in groupby(steps, lambda s: replace(s, only_if="", again=()) if isinstance(s, Call) else s):
             equal = list(same)
             step = equal[0]
@@ -186,7 +186,7 @@ class _KernelText:
                 yield from self._calls([s for s in equal if isinstance(s, Call)])
 
     def _calls(self, calls: Sequence[Call]) -> Iterator[str]:
-        """Calls of one function with the same buffers, one after the other."""
+        """Yield the lines of adjacent calls of one function with the same buffers."""
         first, flag = calls[0], calls[-1].only_if
         call = self._variant(first)
         if len(calls) == 1:
@@ -230,7 +230,7 @@ class _KernelText:
         return self.names.setdefault(key, f"{function.name()}_{len(self.names)}")
 
     def constants(self) -> list[str]:
-        """The grids that have been named."""
+        """Return the definitions of all grids."""
         scalar, texts = np.dtype(self.layout.dtype).type, []
         for grid, name in self.grids.items():
             numbers = ", ".join(f"real({float(scalar(x)).hex()})" for point in grid for x in point)

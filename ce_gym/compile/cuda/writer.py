@@ -1,8 +1,8 @@
-"""The builder that writes CUDA C: the methods of `ce_gym.compile.lowering.vector.VectorBuilder`, one robot to a thread.
+"""A builder that writes CUDA C, with the methods of `ce_gym.compile.lowering.vector.VectorBuilder`.
 
-`lowering` and `math` emit through either builder, so the order of operations, the polynomials and their coefficients
-stand once. Every operation is rounded by itself: the text must be compiled without contraction of sums and products
-(`nvrtc` does), and then gives the CPU's numbers, bit for bit.
+`lowering` and `math` emit through either builder, so the order of operations and the polynomials exist once. Every
+operation is rounded alone. The compiler must not fuse sums and products, see `nvrtc`; then results have the bits of the
+CPU.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ SIGNED = {64: "long long", 32: "int"}
 INTEGER = {"add": "+", "sub": "-", "and_": "&", "or_": "|", "xor": "^", "shl": "<<"}
 """Operations on bits, some of them on masks too."""
 NAMES = {"minnum": "fmin", "maxnum": "fmax"}
-"""LLVM's name of a function -> C's, where they differ."""
+"""Names of functions in LLVM -> in C, where they differ."""
 
 
 class Term(str):
     """A C expression without side effects: a literal or the name of a constant. Equal texts are equal values.
 
     Attributes:
-        kind: its type: `real`, `bits` (unsigned, as wide as a number) or `bool`.
+        kind: type: `real`, `bits` (unsigned, as wide as a number) or `bool`.
     """
 
     kind: str
 
     def __new__(cls, text: str, kind: str = "real") -> Term:
-        """A text with a type."""
+        """Return an expression with a type."""
         term = super().__new__(cls, text)
         term.kind = kind
         return term
@@ -42,8 +42,8 @@ class Writer:
         dtype: `float64` or `float32`.
         bits: width of a number, 64 or 32.
         float_type: the type of numbers.
-        builder: what stands in for LLVM's builder.
-        lines: the statements so far.
+        builder: replacement of the builder of LLVM.
+        lines: statements so far.
     """
 
     float_type = "real"
@@ -54,13 +54,13 @@ class Writer:
         self.lines: list[str] = []
 
     def let(self, kind: str, expression: str) -> Term:
-        """Name the value of an expression."""
+        """Assign the value of an expression to a new constant and return its name."""
         name = Term(f"x{len(self.lines)}", kind)
         self.lines.append(f"const {kind} {name} = {expression};")
         return name
 
     def const(self, number: float) -> Term:
-        """A number, rounded to the dtype and written without loss."""
+        """Return a number, rounded to the dtype and written without loss."""
         rounded = float(np.dtype(self.dtype).type(number))
         if isnan(rounded):
             return Term("NOT_A_NUMBER")
@@ -70,7 +70,7 @@ class Writer:
         return Term(f"({text})" if text.startswith("-") else text)
 
     def int_const(self, number: int) -> Term:
-        """An integer as wide as a number."""
+        """Return an integer as wide as a number."""
         return Term(f"bits({number % 2**self.bits:#x}ull)", "bits")
 
     def add(self, a: Term, b: Term) -> Term:
@@ -98,44 +98,44 @@ class Writer:
         return self.intrinsic("fma", a, b, c)
 
     def intrinsic(self, name: str, *operands: Term) -> Term:
-        """One of C's functions, such as fma, sqrt, fabs, floor, minnum, copysign."""
+        """Return the value of a C function, such as fma, sqrt, fabs, floor, minnum, copysign."""
         suffix = "" if self.bits == 64 else "f"
         return self.let("real", f"{NAMES.get(name, name)}{suffix}({', '.join(operands)})")
 
     def polynomial(self, x: Term, coefficients: tuple[float, ...]) -> Term:
-        """Horner's scheme; coefficients in ascending order."""
+        """Return a polynomial by Horner's scheme; coefficients in ascending order."""
         result = self.const(coefficients[-1])
         for coefficient in reversed(coefficients[:-1]):
             result = self.fma(result, x, self.const(coefficient))
         return result
 
     def compare(self, sign: str, a: Term, b: Term) -> Term:
-        """A mask; every comparison with a NaN is false except `!=`."""
+        """Return a mask; every comparison with NaN is false except `!=`."""
         return self.let("bool", f"{a} {sign} {b}")
 
     def select(self, mask: Term, a: Term, b: Term) -> Term:
-        """`a` where the mask is true, else `b`."""
+        """Return `a` where the mask is true, else `b`."""
         return self.let(a.kind, f"{mask} ? {a} : {b}")
 
     def to_bits(self, a: Term) -> Term:
-        """The number's bits as an integer."""
+        """Return the bits of a number as an integer."""
         return self.let("bits", f"bits({'__double_as_longlong' if self.bits == 64 else '__float_as_int'}({a}))")
 
     def from_bits(self, a: Term) -> Term:
-        """The integer's bits as a number."""
+        """Return the bits of an integer as a number."""
         name = "__longlong_as_double" if self.bits == 64 else "__int_as_float"
         return self.let("real", f"{name}({self.signed(a)})")
 
     def signed(self, a: Term) -> str:
-        """An integer read as one with a sign."""
+        """Return an integer as a signed one."""
         return f"({SIGNED[self.bits]}){a}"
 
     def is_odd(self, bits: Term) -> Term:
-        """A mask: whether the lowest bit of an integer is set."""
+        """Return a mask: whether the lowest bit of an integer is set."""
         return self.let("bool", f"({bits} & 1) != 0")
 
     def load(self, base: str, index: int) -> Term:
-        """Value `index` of a buffer, as it is now."""
+        """Return the current value `index` of a buffer."""
         return self.let("real", f"{base}[{index}]")
 
     def store(self, value: Term, base: str, index: int) -> None:
@@ -144,7 +144,7 @@ class Writer:
 
 
 class _Instructions:
-    """Stands in for LLVM's builder where `math` and `lowering` ask for one instruction by name."""
+    """Replacement of the builder of LLVM, for instructions that `math` and `lowering` use by name."""
 
     def __init__(self, writer: Writer):
         self._writer = writer
@@ -156,17 +156,17 @@ class _Instructions:
         raise AttributeError(f"{name!r} has no CUDA form")
 
     def not_(self, a: Term) -> Term:
-        """A mask's opposite."""
+        """Return the negation of a mask."""
         return self._writer.let("bool", f"!{a}")
 
     def ashr(self, a: Term, b: Term) -> Term:
-        """Bits shifted right, the sign's copies from the left."""
+        """Return bits shifted right arithmetically."""
         return self._writer.let("bits", f"bits(({self._writer.signed(a)}) >> {b})")
 
     def sitofp(self, a: Term, _type: str) -> Term:
-        """An integer with a sign as a number."""
+        """Return a signed integer as a number."""
         return self._writer.let("real", f"real({self._writer.signed(a)})")
 
     def icmp_signed(self, sign: str, a: Term, b: Term) -> Term:
-        """A mask from two integers with signs."""
+        """Return a mask from two signed integers."""
         return self._writer.let("bool", f"({self._writer.signed(a)}) {sign} ({self._writer.signed(b)})")

@@ -1,1 +1,1 @@
-"""From a traced function to vector code: graph, order, functions of vectors, one tile."""
+"""Lowering of a traced function to vector code: graph, order, functions of vectors, one tile."""

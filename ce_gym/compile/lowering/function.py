@@ -163,7 +163,7 @@ class _Operations:
         self.sines: dict[Value, tuple[Value, Value]] = {}
 
     def constant(self, number: float) -> Value:
-        """A constant; its number is kept for `power`."""
+        """Return a constant and record its number for `power`."""
         value = self.v.const(number)
         self.numbers[value] = number
         return value
@@ -178,37 +178,37 @@ class _Operations:
         return OPERATIONS[op](self, *operands)
 
     def sin_cos(self, x: Value) -> tuple[Value, Value]:
-        """Both at once: the argument is reduced once for all its sines and cosines."""
+        """Return sine and cosine; the argument is reduced once for all its sines and cosines."""
         if x not in self.sines:
             self.sines[x] = vector_math.sin_cos(self.v, x)
         return self.sines[x]
 
     def truth(self, mask: Value) -> Value:
-        """A mask as CasADi has it, 1.0 or 0.0; the mask itself is kept for `mask`."""
+        """Return a mask as a number, 1.0 or 0.0 as in CasADi, and record the mask for `mask`."""
         value = self.v.select(mask, self.v.const(1.0), self.v.const(0.0))
         self.masks[value] = mask
         return value
 
     def mask(self, value: Value) -> Value:
-        """Where a value is not zero."""
+        """Return the mask of lanes where a value is not zero."""
         if value not in self.masks:
             self.masks[value] = self.v.compare("!=", value, self.v.const(0.0))
         return self.masks[value]
 
     def differ(self, a: Value, b: Value) -> Value:
-        """Whether two values differ; of two that are masks already, by a bit each."""
+        """Return whether two values differ; two masks are compared as bits."""
         if a in self.masks and b in self.masks:
             return self.truth(self.v.builder.xor(self.masks[a], self.masks[b]))
         return self.truth(self.v.compare("!=", a, b))
 
     def sign(self, x: Value) -> Value:
-        """-1, 1, or x itself where it is neither negative nor positive."""
+        """Return -1 or 1, and x itself where x is zero or NaN."""
         v, zero = self.v, self.v.const(0.0)
         positive = v.select(v.compare(">", x, zero), v.const(1.0), x)
         return v.select(v.compare("<", x, zero), v.const(-1.0), positive)
 
     def power(self, x: Value, y: Value) -> Value:
-        """Integer powers by multiplication, halves by the square root, the rest by exp and log."""
+        """Return integer powers by multiplication, the power 0.5 as square root, and others by exp and log."""
         exponent = self.numbers.get(y)
         if exponent is not None and exponent == int(exponent) and abs(exponent) <= 64:
             return vector_math.integer_power(self.v, x, int(exponent))
@@ -221,17 +221,17 @@ Operation = Callable[..., Value]
 
 
 def _builder(method: str) -> Operation:
-    """An operation that the vector builder has."""
+    """Return an operation that is a method of the vector builder."""
     return lambda s, *operands: getattr(s.v, method)(*operands)
 
 
 def _intrinsic(name: str) -> Operation:
-    """An operation that is one LLVM intrinsic."""
+    """Return an operation that is an LLVM intrinsic."""
     return lambda s, *operands: s.v.intrinsic(name, *operands)
 
 
 def _elementary(name: str) -> Operation:
-    """An operation from `lowering.math`."""
+    """Return an operation of `lowering.math`."""
     return lambda s, *operands: getattr(vector_math, name)(s.v, *operands)
 
 

@@ -1,12 +1,12 @@
-"""A smooth surface over a table of numbers, looked up at a point in each lane, with its slopes.
+"""Look-up of a smooth surface over a table, with slopes, at a point in each lane.
 
-The surface is the biquadratic B-spline whose control values are the entries: a point within half a cell of entry (i, j)
-is a weighted mean of the nine entries around it, along either axis with the weights
+The surface is the biquadratic B-spline whose control values are the entries. Its value at a point within half a cell of
+entry (i, j) is a weighted mean of the nine entries around (i, j), with the weights along either axis
 
     (1/2 - t)^2 / 2,    3/4 - t^2,    (1/2 + t)^2 / 2,        -1/2 <= t <= 1/2 cells from the entry.
 
-Its slopes are continuous (a bilinear surface has creases), it never leaves the range of the entries around, and it is
-the plane itself where they lie on one. Beyond the outermost entries it is extrapolated linearly.
+Its slopes are continuous; a bilinear surface has creases. Values stay in the range of the nine entries, and planes
+are reproduced exactly. Beyond the outermost entries the surface is extrapolated linearly.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ INT, INDEX = ir.IntType(64), ir.IntType(32)
 
 @dataclass(frozen=True)
 class Table:
-    """Where a table is.
+    """Location and shape of a table.
 
     Attributes:
-        address: of its first entry, 64-bit integer.
-        rows, columns: its shape, 64-bit integers.
+        address: of the first entry, 64-bit integer.
+        rows, columns: shape, 64-bit integers.
     """
 
     address: Value
@@ -36,17 +36,17 @@ class Table:
 
 
 def emit_lookup(v: VectorBuilder, table: Table, frame: Value, points: Value, output: Value, n_points: int) -> None:
-    """Emit the look-up at every point of the lanes, as a loop.
+    """Emit a loop that looks up value and slopes at every point of the lanes.
 
-    Whatever the coordinates are, NaN included, only entries of the table are read.
+    Only entries of the table are read, whatever the coordinates are, also for NaN.
 
     Args:
         v: builder of the block to append to.
         table: at least 3 by 3, of the builder's dtype.
-        frame: pointer to three vectors: place (x, y) of the first entry and the length of a cell.
-        points: pointer to the vectors x, y of each point.
-        output: pointer to the vectors value, slope along x, slope along y of each point.
-        n_points: how many there are.
+        frame: pointer to three vectors: x and y of the first entry, and the cell size.
+        points: pointer to the vectors x and y of each point.
+        output: pointer to the vectors of value, slope along x and slope along y of each point.
+        n_points: number of points.
     """
     b, cells = v.builder, in_cells(v, frame)
     with loop(b, INT(n_points), "point") as point:
@@ -63,7 +63,7 @@ def emit_lookup(v: VectorBuilder, table: Table, frame: Value, points: Value, out
 
 
 def in_cells(v: VectorBuilder, frame: Value) -> Callable[[Value], list[Value]]:
-    """Return what emits the x and y of the point at a pointer, in cells from the first entry."""
+    """Return a function that emits x and y of the point at a pointer, in cells from the first entry."""
     x0, y0, cell = (v.load(frame, i) for i in range(3))
     per_cell = v.div(v.const(1.0), cell)
     return lambda here: [v.mul(v.sub(v.load(here, i), first), per_cell) for i, first in enumerate((x0, y0))]
@@ -71,7 +71,7 @@ def in_cells(v: VectorBuilder, frame: Value) -> Callable[[Value], list[Value]]:
 
 @dataclass(frozen=True)
 class _Along:
-    """One axis: the first of the three entries that take part, their weights, and the slopes of those per cell."""
+    """Interpolation along one axis: the first of three entries, their weights, and slopes of the weights per cell."""
 
     first: Value
     weights: tuple[Value, ...]
@@ -79,7 +79,7 @@ class _Along:
 
 
 def _along(v: VectorBuilder, u: Value, count: Value) -> _Along:
-    """Place a coordinate, in cells from the first of `count` entries, between entries."""
+    """Return the interpolation at a coordinate, in cells from the first of `count` entries."""
     half = v.const(0.5)
     first, t, beyond = nearest_entry(v, u, count)
     slopes = (v.sub(t, half), v.mul(v.const(-2.0), t), v.add(t, half))
@@ -93,10 +93,10 @@ def _along(v: VectorBuilder, u: Value, count: Value) -> _Along:
 
 
 def nearest_entry(v: VectorBuilder, u: Value, count: Value) -> tuple[Value, Value, Value]:
-    """Return the entry before the nearest one, the distance from that, and how far the place is beyond the border."""
+    """Return the entry before the nearest one, the distance from the nearest one and the distance beyond the border."""
     b, half = v.builder, v.const(0.5)
     number = v.splat(b.sitofp(count, v.float_type.element))
-    # Both comparisons are false for a NaN, which so becomes a number before it becomes an index.
+    # Both comparisons are false for NaN, so that NaN becomes a number before it is converted to an index.
     inside = v.select(v.compare(">", u, half), u, half)
     upper = v.sub(number, v.const(1.5))
     inside = v.select(v.compare("<", inside, upper), inside, upper)
@@ -107,9 +107,9 @@ def nearest_entry(v: VectorBuilder, u: Value, count: Value) -> tuple[Value, Valu
 
 
 def _entries(v: VectorBuilder, table: Table, row: Value, column: Value) -> list[list[Value]]:
-    """Load three by three entries of each lane, from (row, column) on.
+    """Return three by three entries of each lane, from (row, column) on.
 
-    A line of three at a time, which on many CPUs is faster than their gather instructions.
+    Each load reads a line of three entries, which on many CPUs is faster than gather instructions.
     """
     b, pitch = v.builder, v.builder.mul(table.columns, INT(v.bits // 8))
     start = addresses(v, table, row, column)
@@ -117,7 +117,9 @@ def _entries(v: VectorBuilder, table: Table, row: Value, column: Value) -> list[
     for lane in map(INDEX, range(v.lanes)):
         address = b.extract_element(start, lane)
         for line in lines:
-            line.append(v.load_three(address, more=line is not lines[2]))  # what follows may not be the table's
+            line.append(
+                v.load_three(address, more=line is not lines[2])
+            )  # the fourth entry of the last line may lie outside the table
             address = b.add(address, pitch)
     return [v.spread(line) for line in lines]
 
@@ -131,6 +133,6 @@ def addresses(v: VectorBuilder, table: Table, row: Value, column: Value) -> Valu
 
 
 def _sum(v: VectorBuilder, weights: tuple[Value, ...], values: list[Value]) -> Value:
-    """Weighted sum of three vectors."""
+    """Return the weighted sum of three vectors."""
     products = [v.mul(weight, value) for weight, value in zip(weights, values, strict=True)]
     return v.add(v.add(products[0], products[1]), products[2])

@@ -1,7 +1,7 @@
-"""The surface of `lookup` without its slopes, at the points of a grid that every lane has put and turned its own way.
+"""Look-up of the surface of `lookup` without slopes at the points of a grid, which every lane moves and rotates.
 
-Points are never in memory: each is two products and sums away from the grid's middle, in cells. Whether all points of
-all lanes are away from the border is asked once for the grid; if so, none asks for itself.
+Points are not stored; each is computed from the centre of the grid by two multiply-adds per coordinate. One test per
+grid finds out whether all points of all lanes are away from the border, which spares the test of each point.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ def emit_grid_lookup(
 
     Args:
         v: builder of the block to append to.
-        table: as of `emit_lookup`.
-        frame: likewise.
-        pose: pointer to cosine and sine of the angle by which grids are turned, then x and y of where each is put.
+        table: see `emit_lookup`.
+        frame: see `emit_lookup`.
+        pose: pointer to cosine and sine of the angle of all grids, then x and y of the centre of each grid.
         output: pointer to the values, grid after grid.
-        n_places: how many grids there are.
-        grid: x and y of its points.
+        n_places: number of grids.
+        grid: x and y of the points of the grid.
     """
     b, room, offsets = v.builder, Room.of(v), _offsets(v, grid)
     per_cell = v.div(v.const(1.0), v.load(frame, 2))
@@ -63,7 +63,7 @@ def _turned(v: VectorBuilder, offsets: Value, middle: list[Value], c: Value, s: 
 
 
 def _all_inside(v: VectorBuilder, table: Table, middle: list[Value], reach: Value) -> Value:
-    """Whether every lane is so far from the border that all of its points are, by half a cell; of NaN none is."""
+    """Return whether all points of all lanes are more than half a cell inside the border; false for NaN."""
     b, flags = v.builder, ir.IntType(v.lanes)
     far = flags(-1)
     for u, count in zip(middle, (table.rows, table.columns), strict=True):
@@ -74,7 +74,7 @@ def _all_inside(v: VectorBuilder, table: Table, middle: list[Value], reach: Valu
 
 
 def _offsets(v: VectorBuilder, grid: Grid) -> Value:
-    """Pointer to x and y of the grid's points, in the module."""
+    """Return a pointer to x and y of the points of a grid, which are constants of the module."""
     numbers = [float(np.dtype(v.dtype).type(x)) for point in grid for x in point]
     kind = ir.ArrayType(v.float_type.element, len(numbers))
     name = v.builder.module.get_unique_name("grid")

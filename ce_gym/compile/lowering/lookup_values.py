@@ -1,12 +1,12 @@
-"""The surface of `lookup` without its slopes, at many points: two loops over a handful of points at a time.
+"""Look-up of the surface of `lookup` without slopes at many points: two loops over a few points at a time.
 
-    place   where the nine entries of a point are, and their weights, in all lanes at once
-    sum     lane by lane the three lines of entries, weighed and added, a line being one vector; then all lanes at once
+    place   indices and weights of the nine entries of a point, in all lanes at once
+    sum     lane by lane the weighted sum of the three lines of entries, one vector per line; then all lanes at once
 
-In between they are in memory, from which one instruction loads a lane's weight into all of a vector. Weights add up to
-1, so that of three entries two weights are enough, those of the differences from the middle one. Values may differ from
-those of `emit_lookup` in their last bits. Where no point is near the border, what only that needs is left out: the same
-bits.
+Indices and weights are stored between the loops, because one instruction loads the weight of a lane into a whole
+vector. The three weights of an axis add up to 1, so two of them are enough, applied to differences from the middle
+entry. Values may differ from `emit_lookup` in the last bits. If no point is near the border, the code for borders is
+left out, with the same bits.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from ce_gym.compile.lowering.lookup import INDEX, INT, Table, in_cells
 from ce_gym.compile.lowering.vector import Value, VectorBuilder, loop
 
 CHUNK = 16
-"""Points at a time: few enough for what is kept of them to stay in the fastest memory."""
+"""Points at a time: few enough for their indices and weights to stay in the level-1 cache."""
 Cells = Callable[[Value], list[Value]]
-"""Emits the x and y of a point by its number, in cells from the first entry."""
+"""Emits x and y of a point by its number, in cells from the first entry."""
 
 
 def emit_value_lookup(
     v: VectorBuilder, table: Table, frame: Value, points: Value, output: Value, n_points: int
 ) -> None:
-    """Emit the look-up of values, one vector for each point; arguments as of `emit_lookup`."""
+    """Emit the look-up of values, one vector for each point; arguments: see `emit_lookup`."""
     cells = in_cells(v, frame)
     room = Room.of(v)
     emit_values(v, table, room, lambda i: cells(v.builder.gep(points, [v.builder.mul(i, INT(2))])), output, n_points)
@@ -37,14 +37,14 @@ def emit_value_lookup(
 
 @dataclass(frozen=True)
 class Room:
-    """Memory for the points of a chunk: the place of the middle one of the nine entries, and four weights."""
+    """Memory for the points of a chunk: index of the middle one of the nine entries, and four weights."""
 
     starts: Value
     weights: Value
 
     @classmethod
     def of(cls, v: VectorBuilder) -> Room:
-        """Take it once in the whole function."""
+        """Allocate the memory once in the whole function."""
         with v.builder.goto_entry_block():
             starts = v.builder.alloca(ir.VectorType(INDEX, v.lanes), INT(CHUNK))
             weights = v.builder.alloca(v.float_type, INT(4 * CHUNK))
@@ -59,12 +59,12 @@ def emit_values(
 
     Args:
         v: builder of the block to append to.
-        table: as of `emit_lookup`.
-        room: for a chunk.
-        cells: where the points are.
+        table: see `emit_lookup`.
+        room: memory for a chunk.
+        cells: emits the coordinates of the points.
         output: pointer to a vector for each point.
-        n_points: how many there are.
-        inside: whether all are farther from the border than half a cell.
+        n_points: number of points.
+        inside: whether all points are more than half a cell inside the border.
     """
     b, place = v.builder, _inner if inside else _anywhere
     with loop(b, INT(-(-n_points // CHUNK)), "chunk") as chunk:
@@ -85,7 +85,7 @@ def emit_values(
 
 
 def _inner(v: VectorBuilder, u: Value, count: Value) -> tuple[Value, tuple[Value, Value]]:
-    """Nearest entry to a coordinate, and the weights of the one before it and of the next one."""
+    """Return the nearest entry to a coordinate, and the weights of its two neighbours."""
     nearest = v.intrinsic("rint", u)
     t, half = v.sub(u, nearest), v.const(0.5)
     low, high = v.sub(t, half), v.add(t, half)
@@ -93,10 +93,10 @@ def _inner(v: VectorBuilder, u: Value, count: Value) -> tuple[Value, tuple[Value
 
 
 def _anywhere(v: VectorBuilder, u: Value, count: Value) -> tuple[Value, tuple[Value, Value]]:
-    """The same for any coordinate, straight on beyond the border; what is no number has weights that are none."""
+    """Return the same for any coordinate, extrapolated linearly beyond the border; weights are NaN for NaN."""
     one, half = v.const(1.0), v.const(0.5)
     number = v.splat(v.builder.sitofp(count, v.float_type.element))
-    # Both comparisons are false for a NaN, which so becomes a number before it becomes an index.
+    # Both comparisons are false for NaN, so that NaN becomes a number before it is converted to an index.
     inside, upper = v.select(v.compare(">", u, half), u, half), v.sub(number, v.const(1.5))
     inside = v.select(v.compare("<", inside, upper), inside, upper)
     nearest, last = v.intrinsic("rint", inside), v.sub(number, v.const(2.0))
@@ -113,22 +113,26 @@ def _index(v: VectorBuilder, number: Value) -> Value:
 
 
 def _columns(v: VectorBuilder, table: Table, starts: Value, weights: Value) -> list[Value]:
-    """Means of each lane's three columns of entries."""
+    """Return the weighted means of the three columns of entries of each lane."""
     b, scalar = v.builder, v.float_type.element
     pitch = b.mul(table.columns, INT(v.bits // 8))
-    corner = b.sub(table.address, b.add(pitch, INT(v.bits // 8)))  # of the nine, if the middle one is the table's first
+    corner = b.sub(
+        table.address, b.add(pitch, INT(v.bits // 8))
+    )  # first of the nine entries if the middle one is the first of the table
     starts, weights = (b.bitcast(at, kind.as_pointer()) for at, kind in ((starts, INDEX), (weights, scalar)))
     means = []
     for lane in range(v.lanes):
         offset = b.mul(b.sext(b.load(b.gep(starts, [INT(lane)])), INT), INT(v.bits // 8))
         addresses = [b.add(b.add(corner, b.mul(pitch, INT(k))), offset) for k in range(3)]
-        lines = [v.load_three(addresses[k], more=k < 2) for k in range(3)]  # what follows the third may not be there
+        lines = [
+            v.load_three(addresses[k], more=k < 2) for k in range(3)
+        ]  # the fourth entry of the last line may lie outside the table
         before, after = (v.splat(b.load(b.gep(weights, [INT(k * v.lanes + lane)])), 4) for k in range(2))
         means.append(_mean(v, lines, before, after))
     return v.spread(means)
 
 
 def _mean(v: VectorBuilder, three: list[Value], before: Value, after: Value) -> Value:
-    """Weighted mean of three."""
+    """Return the weighted mean of three vectors."""
     first, middle, last = three
     return v.fma(after, v.sub(last, middle), v.fma(before, v.sub(first, middle), middle))

@@ -1,8 +1,8 @@
 """Elementary functions on vectors: branch-free, no library calls, within 2 units in the last place (the tangent: 3).
 
-Pure builder functions: each takes a `VectorBuilder` and vector values and returns vector values. The plan is the
+Each function takes a `VectorBuilder` and vector values and returns vector values. The method is the
 classic one (Cody and Waite 1980, Software Manual for the Elementary Functions; W. Kahan's and K. C. Ng's fdlibm for the
-logarithm): reduce the argument with a constant split in parts, evaluate one polynomial, put the parts together.
+logarithm): reduce the argument with a constant split into parts, evaluate one polynomial, combine the parts.
 
 Coefficients: relative minimax fits by a Remez exchange in 60-digit arithmetic, weighted so that the error of the
 function (not of the polynomial) is equalised, then rounded to the dtype. The number beside each is the error's log2.
@@ -56,7 +56,7 @@ EXPONENT_BIAS = {"float64": 1023, "float32": 127}
 
 
 def split(number: Fraction, dtype: str, parts: int) -> list[float]:
-    """A number as a sum of `parts` floats of falling size, each the rounded rest of what came before."""
+    """Return a number as a sum of `parts` floats of falling size, each the rounded remainder of the sum before."""
     result = []
     for _ in range(parts):
         part = float(np.dtype(dtype).type(float(number)))
@@ -165,7 +165,7 @@ def atan2(v: VectorBuilder, y: Value, x: Value) -> Value:
     at_origin = v.compare("==", denominator, v.const(0.0))
     denominator = v.select(at_origin, v.const(1.0), denominator)
     t = v.div(numerator, denominator)
-    # t + rest is the quotient to twice the digits; `lost` is what the sum low + high was rounded by.
+    # t + rest is the quotient to twice the digits; `lost` is the rounding error of the sum low + high.
     lost = v.select(wide, v.sub(low, v.sub(denominator, high)), v.const(0.0))
     remaining = v.fma(v.neg(t), lost, v.fma(v.neg(t), denominator, numerator))
     rest = v.div(remaining, denominator)

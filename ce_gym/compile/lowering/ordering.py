@@ -1,7 +1,7 @@
 """The order in which operations are emitted: a list schedule that keeps register pressure low.
 
-A trace has several hundred live values where a CPU has 32 vector registers, and LLVM keeps the order it is given. The
-sub-step of a quadruped with 12 joints reloads a sixth fewer spilled values than in CasADi's order.
+A trace has several hundred live values, a CPU has 32 vector registers, and LLVM keeps the given order. With this order
+the sub-step of a quadruped with 12 joints reloads a sixth fewer spilled values than with the order of CasADi.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ TWINS = (casadi.OP_SIN, casadi.OP_COS)
 
 
 def ordered(graph: Graph) -> list[int]:
-    """Return the operations, without inputs, constants and outputs, in the order to emit them in.
+    """Return the operations, without inputs, constants and outputs, in the order of emission.
 
-    Greedy: of the operations that are ready, the one that is the last user of most operands; of several, the one that
-    became ready last, whose operands are nearest.
+    Greedy: the next operation is the ready one that is the last user of most operands. Among equals, the operation that
+    became ready last is next, because its operands are likely in registers.
     """
     ops, operands = graph.ops, graph.operands
     users = {k: list(dict.fromkeys(by)) for k, by in graph.users().items()}
@@ -32,7 +32,7 @@ def ordered(graph: Graph) -> list[int]:
     order: list[int] = []
 
     def offer(k: int) -> None:
-        """Put an operation on the heap; one whose worth has risen is put there again."""
+        """Put an operation on the heap, again if its priority has risen."""
         heapq.heappush(possible, (-sum(waiting[a] == 1 for a in needs[k]), -len(order), k))
 
     def do(k: int) -> None:

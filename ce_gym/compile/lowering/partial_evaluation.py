@@ -3,7 +3,7 @@
 Two facts about a call allow a split. Inputs that change from call to call leave all other operations constant. A
 `flag`, an output of size 1, says whether the operations that depend on the flag are needed. The prologue computes the
 flag and everything that depends on neither; each variant of the remainder has a constant and a changing fragment. All
-operations are those of the full function, so their results have the same bits.
+operations also exist in the full function, so results have the same bits.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def split(graph: Graph, outputs: Sequence[Nodes], changing: Nodes, flag: int | N
         graph: The function.
         outputs: Nodes of each output of the function.
         changing: Nodes that may have other values in a repeated call.
-        flag: Number of an output that is zero where operations that depend on it are not needed; None if there is none.
+        flag: Number of an output that is zero where operations that depend on it are not needed; None without a flag.
 
     Raises:
         ValueError: If the flag may change in a repeated call.
@@ -109,7 +109,7 @@ def split(graph: Graph, outputs: Sequence[Nodes], changing: Nodes, flag: int | N
 def variants(graph: Graph, outputs: Sequence[Nodes], flag: int) -> tuple[Fragment, Fragment, Fragment]:
     """Return three fragments without kept values: the flag, the full function, and the function where the flag is zero.
 
-    Arguments are those of `split`.
+    Arguments: see `split`.
     """
     flags, numbers = _values(graph, outputs[flag]), frozenset(range(len(outputs)))
     of_flag = _subgraph(graph, graph.ancestors(flags) | outputs[flag], {})

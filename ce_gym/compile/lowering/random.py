@@ -1,8 +1,8 @@
-"""Counter-based uniform numbers: a draw is a function of (key, counter, index) and of nothing else.
+"""Counter-based uniform numbers: a draw is a function of (key, counter, index) only.
 
 The mixer is splitmix64's finaliser (Steele, Lea and Flood 2014, Fast splittable pseudorandom number generators). The
-key and the counter are mixed into a start, from which the draws of that lane follow splitmix64's own sequence. The same
-formula stands here twice, as numpy and as vector code, and a test holds them equal.
+key and the counter are mixed into a start, from which the draws of the lane follow the sequence of splitmix64. The
+formula exists twice, as numpy and as vector code, and a test holds both equal.
 """
 
 import numpy as np
@@ -18,12 +18,12 @@ RANDOM_BITS = {"float64": 53, "float32": 24}
 
 
 def uniform(keys: np.ndarray, counters: np.ndarray, size: int, dtype: DTypeLike) -> np.ndarray:
-    """The numbers a kernel's `random` buffer gets.
+    """Return the numbers of a `random` buffer of a kernel.
 
     Args:
         keys: uint64, shape (n,): one stream each.
-        counters: int64, shape (n,): the place in the stream.
-        size: draws per place.
+        counters: int64, shape (n,): the position in the stream.
+        size: draws per position.
         dtype: float64 (53 random bits) or float32 (24).
 
     Returns:
@@ -43,12 +43,12 @@ def _mix(x: np.ndarray) -> np.ndarray:
 
 
 def emit_uniform(v: VectorBuilder, keys: Value, counters: Value, outputs: list[tuple[Value, int]]) -> None:
-    """Fill random buffers with `uniform`; several buffers share one sequence, one after the other.
+    """Emit code that fills random buffers with `uniform`; several buffers share one sequence, one after the other.
 
     Args:
         v: builder of the block to append to.
         keys: vector of 64-bit integers, one per lane.
-        counters: likewise.
+        counters: vector of 64-bit integers, one per lane.
         outputs: pointer to the first vector of each buffer and its size.
     """
     b = v.builder

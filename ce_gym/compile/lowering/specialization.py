@@ -1,6 +1,6 @@
 """Specialization of a graph for nodes that are known to be zero: choices that follow are made, dead code is removed.
 
-Only choices are simplified; all remaining operations are those of the full graph, so their results have the same bits.
+Only choices are simplified. Every remaining operation also exists in the full graph, so results have the same bits.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Everything that is done to one tile, as LLVM code: skip test, rows to lanes, random numbers, steps, lanes to rows."""
+"""LLVM code of one tile: skip test, rows to lanes, random numbers, steps, lanes to rows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ INT = ir.IntType(64)
 FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
 Pairs: TypeAlias = frozenset[tuple[int, int]]
 MANY = 64
-"""Values per environment from which on rows are written block by block."""
+"""Rows with at least this many values are written block by block."""
 
 
 def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...], parts: int = 1) -> None:
@@ -32,11 +32,11 @@ def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tup
 
     Args:
         builder: of the function that loops over tiles.
-        program: what to do.
-        layout: its calling convention.
-        arguments: 64-bit integers: address of the address table, address of the repeat counts, address of this
-            thread's scratch memory, number of the tile, number of environments.
-        parts: in how many parts lanes go through calls.
+        program: the program.
+        layout: calling convention of the program.
+        arguments: 64-bit integers: addresses of the address table, of the repeat counts and of the scratch memory of
+            the thread; number of the tile; number of environments.
+        parts: number of parts into which a call splits the lanes of a tile.
     """
     work = _TileWork(builder, program, layout, arguments, parts)
     if not program.skip_unless:
@@ -47,7 +47,7 @@ def emit_tile(builder: Builder, program: Program, layout: Layout, arguments: tup
 
 
 class _TileWork:
-    """Addresses of one tile's buffers and the code that uses them."""
+    """Addresses of the buffers of one tile, and the code that uses them."""
 
     def __init__(
         self, builder: Builder, program: Program, layout: Layout, arguments: tuple[Value, ...], parts: int
@@ -70,13 +70,13 @@ class _TileWork:
         self.kept: dict[casadi.Function, Value] = {}
 
     def any_lane(self, name: str) -> Value:
-        """Whether a buffer of size 1 is not zero in some lane."""
+        """Return whether a buffer of size 1 is nonzero in some lane."""
         v, bits = self.vectors, ir.IntType(self.vectors.lanes)
         set_lanes = v.compare("!=", v.load(self.lanes[name], 0), v.const(0.0))
         return self.builder.icmp_unsigned("!=", self.builder.bitcast(set_lanes, bits), bits(0))
 
     def emit(self) -> None:
-        """All work on the tile, in order."""
+        """Emit all work on the tile, in order."""
         kinds = {
             kind: [b for b in self.program.buffers if b.kind == kind] for kind in ("rows_in", "random", "rows_out")
         }
@@ -90,14 +90,14 @@ class _TileWork:
             self._lanes_to_rows(buffer)
 
     def _address(self, position: int) -> Value:
-        """Entry of the address table, as an integer."""
+        """Return an entry of the address table, as an integer."""
         return self.builder.load(self.builder.gep(self.table, [INT(position)]))
 
     def _array(self, buffer: Buffer) -> Value:
         return self._address(self.layout.arguments.index(buffer))
 
     def _lanes_of(self, buffer: Buffer, scratch: Value, tile: Value) -> Value:
-        """Pointer to the first vector of a buffer in this tile."""
+        """Return a pointer to the first vector of a buffer in this tile."""
         if buffer.kind == "tiles":
             offset = self.builder.mul(tile, INT(ALIGNMENT * buffer.size))
             address = self.builder.add(self._array(buffer), offset)
@@ -106,7 +106,7 @@ class _TileWork:
         return self.builder.inttoptr(address, self.vectors.float_type.as_pointer())
 
     def _rows_to_lanes(self, buffer: Buffer) -> None:
-        """Copy this tile's rows to lanes; lanes past the last environment repeat its row."""
+        """Copy the rows of this tile to lanes; lanes past the last environment repeat its row."""
         b = self.builder
         with loop(b, INT(self.vectors.lanes), "lane") as lane:
             row = self._smaller(b.add(self.first_env, lane), self.last_env)
@@ -134,7 +134,7 @@ class _TileWork:
                 b.store(_convert(b, b.load(lane_element), FLOATS[buffer.dtype or self.layout.dtype]), row_element)
 
     def _blocks_to_rows(self, buffer: Buffer) -> None:
-        """Copy blocks of as many values as there are lanes, transposed; the last one may overlap the one before."""
+        """Copy square blocks, one value per lane, transposed; the last block may overlap the one before."""
         b, v, n = self.builder, self.vectors, self.vectors.lanes
         row_type = FLOATS[buffer.dtype or self.layout.dtype]
         rows = b.inttoptr(self._array(buffer), row_type.as_pointer())
@@ -150,7 +150,7 @@ class _TileWork:
 
     @contextmanager
     def _elements(self, buffer: Buffer, row: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
-        """Loop over the values of one environment: where each is in its row and where in its lane."""
+        """Loop over the values of one environment and yield pointers to each value in its row and in its lane."""
         b = self.builder
         row_type = FLOATS[buffer.dtype or self.layout.dtype]
         rows = b.inttoptr(self._array(buffer), row_type.as_pointer())
@@ -161,12 +161,12 @@ class _TileWork:
             yield b.gep(rows, [b.add(row_start, value)]), b.gep(lanes, [in_lanes])
 
     def _fill_random(self, buffers: list[Buffer]) -> None:
-        """Draw the numbers of all random buffers from each lane's key and counter."""
+        """Draw the numbers of all random buffers from the key and counter of each lane."""
         keys, counters = (self._words(self._address(self.layout.keys + i)) for i in range(2))
         emit_uniform(self.vectors, keys, counters, [(self.lanes[b.name], b.size) for b in buffers])
 
     def _words(self, address: Value) -> Value:
-        """One 64-bit integer per lane from an array with one per environment."""
+        """Return one 64-bit integer per lane, from an array with one per environment."""
         b = self.builder
         words = b.inttoptr(address, INT.as_pointer())
         result: Value = ir.Constant(ir.VectorType(INT, self.vectors.lanes), ir.Undefined)
@@ -177,7 +177,7 @@ class _TileWork:
 
     @contextmanager
     def _repeated(self, times: str) -> Iterator[None]:
-        """What is built inside `with` is done as often as a run-time integer says."""
+        """Repeat the code built inside `with`; a run-time integer gives the number of times."""
         count = self.builder.load(self.builder.gep(self.repeats, [INT(self.layout.repeats.index(times))]))
         with loop(self.builder, count, "repeat"):
             yield
@@ -194,7 +194,7 @@ class _TileWork:
 
     @contextmanager
     def _while(self, flag: str) -> Iterator[None]:
-        """What is built inside `with` is done again and again while a buffer is not zero in some lane."""
+        """Repeat the code built inside `with` while a buffer is nonzero in some lane."""
         b = self.builder
         head, body, end = (b.append_basic_block(f"while_{part}") for part in ("head", "body", "end"))
         b.branch(head)
@@ -206,7 +206,7 @@ class _TileWork:
         b.position_at_end(end)
 
     def _look_up(self, lookup: Lookup) -> None:
-        """Look up the surface over a table at every point."""
+        """Emit the look-up of the surface over a table at every point."""
         buffers = {b.name: b for b in self.layout.buffers}
         rows = self.layout.shapes[lookup.table]
         table = Table(self._array(buffers[lookup.table]), self._address(rows), self._address(rows + 1))
@@ -273,7 +273,7 @@ class _TileWork:
         return self.kept[function]
 
     def _call_body(self, call: Call) -> None:
-        """Call it whole, as often as it takes: for every part of the lanes, and of the buffers."""
+        """Call the whole function for every part of the lanes, and `times` for parts of the buffers."""
         b, parts, f, body = self.builder, self.parts, call.function, self._body(call)
         pointers = [self.lanes[name] for name in call.inputs + call.outputs]
         if parts == call.times == 1:
@@ -334,7 +334,7 @@ def _shared(call: Call) -> Pairs:
 
 
 def _convert(builder: Builder, value: Value, to: ir.Type) -> Value:
-    """A float in the other precision, or as it is."""
+    """Return a float in the given precision."""
     if value.type == to:
         return value
     wider = getattr(to, "element", to) == FLOATS["float64"]

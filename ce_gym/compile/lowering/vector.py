@@ -1,4 +1,4 @@
-"""A thin layer over llvmlite's builder: one value is one vector, one lane of it per environment.
+"""A thin layer over the builder of llvmlite: one value is one vector with a lane for each environment.
 
 llvmlite cannot declare vector intrinsics, so they are declared here by their mangled names.
 """
@@ -13,24 +13,24 @@ from llvmlite import ir
 from ce_gym.compile.arrays import ALIGNMENT, lane_count
 
 Value: TypeAlias = Any
-"""An llvmlite value. llvmlite's builder makes its methods with decorators that type checkers cannot follow."""
+"""An llvmlite value. The methods of llvmlite's builder have decorators that type checkers cannot follow."""
 
 Builder: TypeAlias = Any
-"""An llvmlite IRBuilder, for the same reason."""
+"""An llvmlite IRBuilder, see `Value`."""
 
 
 class VectorBuilder:
     """Emits instructions on vectors of `lanes` floats of one dtype at the end of one LLVM block.
 
-    No instruction has fast-math flags: LLVM may not fuse, reorder or replace any; each operation is rounded by itself.
+    No instruction has fast-math flags: LLVM may not fuse, reorder or replace any, and each operation is rounded alone.
 
     Args:
         builder: the llvmlite builder.
         dtype: `float64` or `float32`.
-        parts: in how many vectors a tile's lanes lie one after the other, of which this is about one.
+        parts: number of vectors that hold the lanes of a tile; the builder works on one of them.
 
     Attributes:
-        builder, dtype, parts: as given.
+        builder, dtype, parts: see above.
         lanes: elements of a vector.
         bits: width of one float, 64 or 32.
         float_type, int_type: the vector type and the integer vector of the same shape.
@@ -48,7 +48,7 @@ class VectorBuilder:
         self._constants: dict[str, ir.Constant] = {}
 
     def const(self, number: float) -> ir.Constant:
-        """The same number in every lane, rounded to the dtype."""
+        """Return the same number in every lane, rounded to the dtype."""
         rounded = float(np.dtype(self.dtype).type(number))
         key = rounded.hex()
         if key not in self._constants:
@@ -56,11 +56,11 @@ class VectorBuilder:
         return self._constants[key]
 
     def int_const(self, number: int) -> ir.Constant:
-        """The same integer in every lane."""
+        """Return the same integer in every lane."""
         return ir.Constant(self.int_type, [number] * self.lanes)
 
     def splat(self, scalar: Value, lanes: int = 0) -> Value:
-        """A number known at run time in every lane, or in so many; float or integer."""
+        """Return a run-time number, float or integer, in every lane, or in a vector of `lanes` lanes."""
         vector = ir.VectorType(scalar.type, lanes or self.lanes)
         first = self.builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.IntType(32)(0))
         places = ir.Constant(ir.VectorType(ir.IntType(32), vector.count), [0] * vector.count)
@@ -97,42 +97,42 @@ class VectorBuilder:
         return self.builder.call(function, operands)
 
     def _declared(self, name: str, result: ir.Type, arguments: list[ir.Type]) -> Value:
-        """A function of LLVM's, declared once in a module."""
+        """Return an intrinsic, declared once in a module."""
         module = self.builder.module
         known = module.globals.get(name)
         return ir.Function(module, ir.FunctionType(result, arguments), name) if known is None else known
 
     def polynomial(self, x: Value, coefficients: tuple[float, ...]) -> Value:
-        """Horner's scheme; coefficients in ascending order."""
+        """Return a polynomial by Horner's scheme; coefficients in ascending order."""
         result: Value = self.const(coefficients[-1])
         for coefficient in reversed(coefficients[:-1]):
             result = self.fma(result, x, self.const(coefficient))
         return result
 
     def compare(self, sign: str, a: Value, b: Value) -> Value:
-        """A mask; like C, every comparison with a NaN is false except `!=`."""
+        """Return a mask; as in C, every comparison with NaN is false except `!=`."""
         if sign == "!=":
             return self.builder.fcmp_unordered(sign, a, b)
         return self.builder.fcmp_ordered(sign, a, b)
 
     def select(self, mask: Value, a: Value, b: Value) -> Value:
-        """`a` where the mask is true, else `b`; what is not chosen may be NaN without harm."""
+        """Return `a` where the mask is true, else `b`; the value that is not chosen may be NaN."""
         return self.builder.select(mask, a, b)
 
     def to_bits(self, a: Value) -> Value:
-        """The float's bits as an integer."""
+        """Return the bits of a float as an integer."""
         return self.builder.bitcast(a, self.int_type)
 
     def from_bits(self, a: Value) -> Value:
-        """The integer's bits as a float."""
+        """Return the bits of an integer as a float."""
         return self.builder.bitcast(a, self.float_type)
 
     def is_odd(self, bits: Value) -> Value:
-        """A mask: whether the lowest bit of an integer is set."""
+        """Return a mask: whether the lowest bit of an integer is set."""
         return self.builder.trunc(bits, ir.VectorType(ir.IntType(1), self.lanes))
 
     def load(self, base: Value, index: int) -> Value:
-        """Vector `index` of an aligned buffer that starts at `base`."""
+        """Return vector `index` of an aligned buffer that starts at `base`."""
         return self.builder.load(self.element(base, index), align=ALIGNMENT // self.parts)
 
     def store(self, value: Value, base: Value, index: int) -> None:
@@ -140,7 +140,7 @@ class VectorBuilder:
         self.builder.store(value, self.element(base, index), align=ALIGNMENT // self.parts)
 
     def transposed(self, vectors: list[Value]) -> list[Value]:
-        """Vector i of what is returned holds lane i of each, in their order; as many as there are lanes."""
+        """Return as many vectors as there are lanes; vector i holds lane i of each given vector, in their order."""
         vectors, half = list(vectors), self.lanes // 2
         while half:
             upper = [bool(lane & half) for lane in range(self.lanes)]
@@ -154,9 +154,9 @@ class VectorBuilder:
         return vectors
 
     def load_three(self, address: Value, *, more: bool = False) -> Value:
-        """Three floats from an address, a 64-bit integer, on; as a vector of four, for `spread`.
+        """Return three floats from an address, a 64-bit integer, as a vector of four, for `spread`.
 
-        `more` says that a fourth one may be read, which is faster.
+        `more` allows a read of a fourth float, which is faster.
         """
         four, word = ir.VectorType(self.float_type.element, 4), ir.IntType(32)
         pointer, flags = self.builder.inttoptr(address, four.as_pointer()), ir.VectorType(ir.IntType(1), 4)
@@ -167,12 +167,12 @@ class VectorBuilder:
         return self.builder.call(load, (pointer, word(self.bits // 8), ir.Constant(flags, [1, 1, 1, 0]), nothing))
 
     def spread(self, threes: list[Value]) -> list[Value]:
-        """Three vectors: lane l of the i-th is number i of `threes[l]`, which `load_three` has returned."""
+        """Return three vectors: lane l of vector i is number i of `threes[l]`, a result of `load_three`."""
         fours = [self._joined(threes[k::4]) for k in range(4)]  # number e of lane k + 4 g is at 4 g + e
         first, second = [(lane // 4) * 4 + lane % 4 // 2 for lane in range(self.lanes)], [0, self.lanes]
 
         def pairs(a: Value, b: Value, half: int) -> Value:
-            """(a0 b0 a1 b1), or with the other half (a2 b2 a3 b3), four by four."""
+            """Return (a0 b0 a1 b1), or with the other half (a2 b2 a3 b3), in groups of four."""
             return self._shuffled(a, b, [2 * half + at + second[lane % 2] for lane, at in enumerate(first)])
 
         spread = []
@@ -182,7 +182,7 @@ class VectorBuilder:
         return spread
 
     def _joined(self, vectors: list[Value]) -> Value:
-        """One vector after the other, as one."""
+        """Return one vector after the other as one vector."""
         while len(vectors) > 1:
             length = vectors[0].type.count
             mask = ir.Constant(ir.VectorType(ir.IntType(32), 2 * length), list(range(2 * length)))
@@ -195,13 +195,13 @@ class VectorBuilder:
         return self.builder.shuffle_vector(a, b, mask)
 
     def element(self, base: Value, index: int) -> Value:
-        """Address of vector `index`."""
+        """Return the address of vector `index`."""
         return self.builder.gep(base, [ir.Constant(ir.IntType(64), index * self.parts)], inbounds=True)
 
 
 @contextmanager
 def loop(builder: Builder, count: Value, name: str) -> Iterator[Value]:
-    """Emit what is built inside `with` as a loop over 0 <= index < count."""
+    """Emit the code built inside `with` as a loop over 0 <= index < count."""
     word, before = ir.IntType(64), builder.block
     head, body, end = (builder.append_basic_block(f"{name}_{part}") for part in ("head", "body", "end"))
     builder.branch(head)

@@ -17,19 +17,19 @@ from ce_gym.sim.terrain.files import read_heights
 class Terrain:
     """A height field.
 
-    Its surface is the biquadratic B-spline with the heights as control values: slopes are continuous, a plane is met
-    exactly, and no place is higher or lower than the heights around it: what is sharp is rounded over a cell. Beyond
-    the outermost heights the surface goes on straight; that is level where these come in equal pairs, as in all
-    constructors but `slope`.
+    The surface is the biquadratic B-spline with the heights as control values. Slopes are continuous, planes are
+    exact, and every point lies between the heights around it; edges are rounded over a cell. Beyond the outermost
+    heights the surface is extrapolated linearly. It is level there if the two outermost rows or columns are equal, as
+    in all constructors but `slope`.
 
     Attributes:
-        heights: Shape (rows, columns), 3 or more of each [m]. Entry (i, j) belongs to the place
+        heights: Shape (rows, columns), 3 or more of each [m]. Entry (i, j) is the height at
             `(origin[0] + i cell, origin[1] + j cell)`.
         cell: Distance of neighbouring heights along x and along y [m].
         origin: Place (x, y) of the first height [m].
 
     Raises:
-        ValueError: If a figure is out of range or the heights are no such array.
+        ValueError: If a number is out of range or the heights have another shape.
 
     Examples:
         Before, in the middle of and after five steps of 10 cm:
@@ -63,7 +63,7 @@ class Terrain:
 
     @classmethod
     def flat(cls) -> Terrain:
-        """Return the plane z = 0, as a field. A simulator without terrain has the same ground for less."""
+        """Return the plane z = 0 as a field. A simulator without terrain has the same ground and is faster."""
         return cls(np.zeros((3, 3)), 1.0)
 
     @classmethod
@@ -84,7 +84,7 @@ class Terrain:
         """Return a square of random ground around the world's origin.
 
         Args:
-            seed: Of the heights.
+            seed: Seed of the heights.
             amplitude: Heights are drawn uniformly from `-amplitude` to `amplitude` [m].
             cell: Distance of the heights [m].
             size: Side of the square [m].
@@ -149,10 +149,10 @@ class Terrain:
             file: Heights [m] as a NumPy array `.npy`, rows along x and columns along y; or a picture that Pillow reads,
                 seen from above with x to the right and y up.
             cell: Distance of the heights [m], a pixel of the picture.
-            height: Of white [m], or of the largest value of 16 bits; black is 0. For pictures only.
+            height: Height of white, or of the largest 16-bit value [m]; black is 0. For pictures only.
 
         Raises:
-            ValueError: If the file cannot be read or a figure is out of range.
+            ValueError: If the file cannot be read or a number is out of range.
         """
         check("cell", cell, is_number(cell) and cell > 0, "a length above 0 m")
         check("height", height, is_number(height), "a length in metres")
@@ -160,11 +160,11 @@ class Terrain:
         return cls(heights, cell, tuple(-cell * (n - 1) / 2 for n in heights.shape))
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray:
-        """Return the surface at places, as the compiled step sees it.
+        """Return height and slopes of the surface at places, as in the compiled step.
 
         Args:
-            x: Places [m].
-            y: Likewise, of a shape that broadcasts with that of `x`.
+            x: Places along x [m].
+            y: Places along y [m], of a shape that broadcasts with `x`.
 
         Returns:
             Height [m], dz/dx and dz/dy, shape (..., 3).
@@ -182,7 +182,7 @@ class Terrain:
 
 
 def _spline(u: NDArray, count: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Return which three of `count` heights take part at `u`, in cells, their weights and the slopes of those."""
+    """Return indices of the three of `count` heights around `u`, in cells, their weights, and slopes of the weights."""
     inside = np.clip(u, 0.5, count - 1.5)
     nearest = np.minimum(np.floor(inside + 0.5), count - 2)
     t = inside - nearest

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ce_gym.sim.arguments import check
 
 MOST_HEIGHTS = 2**24
-"""Heights that a kernel takes."""
+"""Most heights that a kernel takes."""
 
 
 def read_heights(file: str | Path, height: float) -> NDArray[np.float64]:
@@ -19,10 +19,10 @@ def read_heights(file: str | Path, height: float) -> NDArray[np.float64]:
 
     Args:
         file: A NumPy array `.npy` of that shape [m]; or a picture, seen from above with x to the right and y up.
-        height: Of the brightest value that the picture's format has [m]; black is 0.
+        height: Height of the brightest value of the picture's format [m]; black is 0.
 
     Raises:
-        ValueError: If there is no such file, or it is neither.
+        ValueError: If the file does not exist or has another format.
     """
     path = Path(file)
     check("file", str(file), path.is_file(), "a file with a height map")

@@ -1,4 +1,4 @@
-"""Which contacts of a robot are corners of convex shapes that a field of heights could rise into."""
+"""Convex contact shapes of a robot that ground between their corners could rise into."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from ce_gym.sim.terrain.field import Terrain
 def hulls_on(robot: Robot, contacts: Sequence[str], terrain: Terrain | None) -> tuple[Hull, ...]:
     """Return the convex shapes among the contacts of a scene that need points between their corners.
 
-    Corners of one shape are the contacts of a primitive, or points of group "foot" on one link with one radius, as of
-    a sole; such points on the base are legs, with nothing between them. Points are half a cell apart, or as far as
-    ground as curved as this rises between them by half of `RISE`. None is needed if that is so between any two corners.
+    Corners of one shape are the contacts of a primitive, or points of group "foot" on one link with one radius, such as
+    a sole. Points of group "foot" on the base are legs, with nothing between them. Points are half a cell apart, or as
+    far as the curvature of the ground lets it rise by half of `RISE` between two points. A shape needs no points if the
+    ground rises less between any two corners.
 
     Args:
         robot: The robot.
-        contacts: Names of the contacts of the scene, in its order.
+        contacts: Names of the contacts of the scene, in order.
         terrain: The ground; None if it is flat.
     """
     if terrain is None:

@@ -1,4 +1,4 @@
-"""Sub-steps made in pieces, between which a long call answers Ctrl-C."""
+"""Interruptible runs: a long call is split into short calls of the kernel, between which Ctrl-C takes effect."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ce_gym.compile import CriticalSection
 from ce_gym.sim.substeps import TIMES
 
 LONGEST = 100_000
-"""Sub-steps of all robots in one piece: a fraction of a second, whatever the robot and the method."""
+"""Most sub-steps of all robots in one call of a kernel, which take a fraction of a second for any robot and method."""
 FEWEST = 16
-"""Robots that take no less time than this many: the lanes of a tile."""
+"""Smaller batches take as long as this many robots: the lanes of a tile."""
 
 
-def piece_length(num_envs: int) -> int:
-    """Return the most sub-steps in one piece for so many robots."""
+def longest_run(num_envs: int) -> int:
+    """Return the most sub-steps in one call of a kernel for a number of robots."""
     return max(1, LONGEST // max(num_envs, FEWEST))
 
 
@@ -27,17 +27,17 @@ def run_substeps(
     section: CriticalSection,
     num_threads: int = 1,
 ) -> None:
-    """Call a kernel until it has made `n_substeps` sub-steps; the state is that of a single call, bit for bit.
+    """Call a kernel until it has made `n_substeps` sub-steps; results have the same bits as after a single call.
 
     Args:
         kernel: Repeats sub-steps.
-        arrays: What it takes.
+        arrays: Arguments of the kernel.
         num_envs: Number of robots.
         n_substeps: Number of sub-steps.
-        section: The one that this is called in; its interruption points are between the pieces.
+        section: The section around this call; its interruption points are between the calls of the kernel.
         num_threads: Threads that share the robots.
     """
-    longest = piece_length(num_envs)
+    longest = longest_run(num_envs)
     while True:
         kernel(arrays, num_envs, repeats={TIMES: min(n_substeps, longest)}, num_threads=num_threads)
         n_substeps -= longest
