@@ -28,9 +28,9 @@ from ce_gym.model.errors import check_names, listed_names
 from ce_gym.sim.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
+from ce_gym.sim.ground_clearance import GroundClearance
 from ce_gym.sim.interruptible_runs import longest_run, run_substeps
 from ce_gym.sim.kernels import load_step_kernel, select_contacts, select_pairs
-from ce_gym.sim.placement import Placement
 from ce_gym.sim.schema import Row, Steps, checked_tolerance, physics_rows
 from ce_gym.sim.terrain import Terrain
 from ce_gym.sim.terrain.hulls import hulls_on
@@ -146,7 +146,7 @@ class Simulator:
         self.dtype, self.num_threads = dtype, num_threads
         self.contact_names = select_contacts(model.robot, contacts)
         hulls = hulls_on(model.robot, self.contact_names, terrain)
-        self._placement = Placement(model, self.contact_names, terrain, hulls)
+        self._placement = GroundClearance(model, self.contact_names, terrain, hulls)
         self.options = StepOptions(
             control=control,  # type: ignore[arg-type]
             contacts=self.contact_names,

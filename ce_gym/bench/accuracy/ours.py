@@ -8,8 +8,8 @@ from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene, Way
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.step_size import control_sizes
+from ce_gym.sim.ground_clearance import GroundClearance
 from ce_gym.sim.kernels import load_step_kernel
-from ce_gym.sim.placement import Placement
 from ce_gym.sim.schema import FIRST
 from ce_gym.sim.substeps import FRAME, HEIGHTS
 from ce_gym.sim.tiles import tiles, write_rows
@@ -91,7 +91,7 @@ class Ours:
             q[:, 2] += noise[:, 0]
         rows = {"q": q, "v": v, "diverged": np.zeros((self.num_envs, 1))}
         if model.contact_names:
-            depth = Placement(model, model.contact_names, scene.terrain).depth(q)
+            depth = GroundClearance(model, model.contact_names, scene.terrain).depth(q)
             loads = scene.robot.material.stiffness * depth
             rows |= {name: loads for name in ("load", "whole_load") if name in self.arrays}
         for name in ("anchor", "pair_force"):

@@ -14,7 +14,7 @@ from ce_gym.dynamics.model import Model
 from ce_gym.sim.terrain import Terrain
 
 
-class Placement:
+class GroundClearance:
     """Contact spheres of a robot, and the ground under them.
 
     Args:
