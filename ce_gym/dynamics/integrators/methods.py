@@ -1,9 +1,10 @@
-"""Time-stepping methods: which stages a step is made of, as data.
+"""The time-stepping methods.
 
-`EULER`, the default, is one linearly implicit step: order 1, stable for stiff contact, friction and gains.
-`EXTRAPOLATED` makes one such step and two of half the length and extrapolates (Richardson): order 2 in smooth motion,
-as stable, with an estimate of its error. `ADAPTIVE` makes such steps as long as the estimate allows. Runge-Kutta
-methods are explicit and meant for smooth scenes and for references; stiff contact limits their steps.
+The default `EULER` is one linearly implicit step: order 1, stable for stiff contact, friction and gains. The method
+`EXTRAPOLATED` makes a whole step and two half steps and extrapolates (Richardson): order 2 for smooth motion, equally
+stable, with an error estimate. The method `ADAPTIVE` chooses the length of such steps from the estimate. Runge-Kutta
+methods are explicit. They are meant for smooth scenes and for references, because stiff contact limits their step
+length.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from ce_gym.dynamics.integrators.plan import Ends, Plan, Rates, Stage
 
 EULER = Plan(1, (Stage("whole"),), Ends({"whole": 1.0}, {"whole": 1.0}))
 
-# Friction goes by the load of the step before, which is off in proportion to that step's length. Extrapolation removes
-# this only where the whole and the halves are off in proportion to their own lengths, so each goes by its own.
+# Friction uses the normal force of the previous step, whose error is in proportion to the length of that step. To let
+# extrapolation remove the error, the whole step and the half steps each use normal forces of steps of their own length.
 EXTRAPOLATED = Plan(
     2,
     (Stage("coarse", load="whole_load"), Stage("half", length=1 / 2), Stage("fine", start="half", length=1 / 2)),
@@ -27,10 +28,10 @@ ADAPTIVE = replace(EXTRAPOLATED, controlled=True)
 
 
 def runge_kutta(order: int, a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Plan:
-    """Return an explicit Runge-Kutta method; forces that a step reports are those at its start.
+    """Return an explicit Runge-Kutta method; reported forces belong to the start of a step.
 
     Args:
-        order: Of the method.
+        order: Order of the method.
         a: Coefficients of the stages after the first, one row each.
         b: Weights of the stages.
     """

@@ -1,7 +1,7 @@
-"""What a time step consists of, as data: stages that evaluate the physics, and how they are combined.
+"""Time-stepping methods as data: stages that evaluate the physics, and their combination.
 
-A plan has two readers: `unroll` makes one expression of it, `ce_gym.sim.substeps` calls of a compiled program. Both
-leave the arithmetic of combining stages to this file.
+`unroll` turns a plan into one expression, `ce_gym.sim.substeps` into the calls of a compiled program. Both use the
+functions of this file to combine stages.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from ce_gym.dynamics.state import State
 from ce_gym.model.coordinates import Layout
 
 MOVED = "moved"
-"""Name of the output that says how far a step moves its fastest joint, at the speed of its end [rad or m]."""
+"""Name of the output with the distance of the fastest joint in a step, at its final speed [rad or m]."""
 OFF = "off"
-"""Name of the output that estimates the errors of a step, shape (nv + 1,), see `step_errors`."""
-TOUCHES = ("load", "pair_force")
-"""Parts of a state that are above 0 where something touches."""
+"""Name of the output with the estimated errors of a step, shape (nv + 1,), see `step_errors`."""
+TOUCHES = ("load", "pressed")
+"""Parts of a state that are positive where bodies touch."""
 LANDING, CONTACT = 0.02, 0.005
-"""What an error of velocity counts as: how far it moves in this time, where a contact begins or ends, and else [s]."""
+"""Times that convert an error of velocity to one of position: where a contact begins or ends, and otherwise [s]."""
 STOPPED = 0.1
-"""Part of the velocity that a step may change where a contact begins."""
+"""Fraction of the velocity that a step may change where a contact begins."""
 LOAD = "load"
-"""Part of a state that says what contacts carried, unless a stage has another."""
+"""Part of a state with the normal forces of the previous step, unless a stage has another."""
 AFTER = "after"
-"""Name of the step as a whole, where outputs are evaluated at its end and not combined from stages."""
+"""Name of the whole step, for outputs that are evaluated at its end and not combined from stages."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Rates:
     """The state before the step, moved by `dt` times a weighted sum of the stages' rates of change.
 
     Attributes:
-        weights: Of the stages, in their order; those left out count as 0.
+        weights: Weights of the stages, in order; 0 for stages that are left out.
     """
 
     weights: tuple[float, ...] = ()
@@ -48,12 +48,12 @@ class Rates:
 class Ends:
     """A weighted sum of the states at the ends of stages, on the group of orientations.
 
-    What contacts remember and guesses of dependent coordinates are taken from the last stage.
+    Memory of contacts and guesses of dependent coordinates are taken from the last stage.
 
     Attributes:
-        weights: Of each stage, by name, the last one first; they sum to 1.
-        means: Of each stage in what is a mean over the step; they sum to 1.
-        error: The two stages whose distance in `v` estimates the error of the step; empty if there is no estimate.
+        weights: Weight of each stage, by name, the last stage first; the sum is 1.
+        means: Weight of each stage in outputs that are means over the step; the sum is 1.
+        error: The two stages whose difference in `v` estimates the error of the step; empty without an estimate.
     """
 
     weights: Mapping[str, float]
@@ -65,17 +65,17 @@ class Ends:
 class Stage:
     """One evaluation of the physics.
 
-    A stage with a length is a linearly implicit Euler step, iterated until its active set is the one it assumed. One of
-    length 0 evaluates forces and accelerations of the moment. Where it does not start from the state before the step,
-    the ground is looked up again.
+    A stage with a length is a linearly implicit Euler step, iterated until the active set is the assumed one. A stage
+    of length 0 evaluates forces and accelerations at its start. The ground is looked up again at each new start.
 
     Attributes:
-        name: In buffers and weights.
-        start: Name of the stage at whose end it starts, "" for the state before the step; or `Rates` of earlier stages.
-        length: As a fraction of the step.
-        iterations: How many iterations may follow the first; fewer if the forces of the scene never need as many.
-        load: Part of the state before the step that says what contacts carried, for one that starts there; what they
-            carry at its end is that part of the state after the step.
+        name: Name in variables and weights.
+        start: Name of the stage at whose end this one starts, "" for the state before the step; or `Rates` of earlier
+            stages.
+        length: Length as a fraction of the step.
+        iterations: Most iterations after the first; fewer if the forces of the scene need fewer.
+        load: Part of the state with the normal forces of contacts for a stage that starts before the step. The forces
+            at the end of the stage are stored in that part after the step.
     """
 
     name: str
@@ -90,10 +90,10 @@ class Plan:
     """A time-stepping method.
 
     Attributes:
-        order: Its global error is of this order in the step length, where the motion is smooth.
-        stages: In the order in which they are evaluated; the first starts from the state before the step.
-        end: How the state after the step follows from them.
-        controlled: Whether kernels make steps as long as the estimate of their error allows, see `step_size.py`.
+        order: Order of the global error in the step length, for smooth motion.
+        stages: In the order of evaluation; the first stage starts from the state before the step.
+        end: Combination of the stages to the state after the step.
+        controlled: Whether kernels choose the step length from the error estimate, see `step_size.py`.
     """
 
     order: int
@@ -108,12 +108,12 @@ class Plan:
 
     @property
     def is_euler(self) -> bool:
-        """Whether that stage is a whole linearly implicit Euler step."""
+        """Whether the only stage is a whole linearly implicit Euler step."""
         return self.single and self.stages[0].length == 1
 
     @property
     def estimates(self) -> bool:
-        """Whether it estimates its error."""
+        """Whether the method estimates its error."""
         return isinstance(self.end, Ends) and bool(self.end.error)
 
     def shares(self, moment: Literal["start", "end", "mean"]) -> Mapping[str, float]:
@@ -126,7 +126,7 @@ class Plan:
 
 
 def combined(plan: Plan, ends: Mapping[str, State], layout: Layout) -> State:
-    """Return the state after a step, given the states at the ends of its stages; of a plan whose `end` is `Ends`."""
+    """Return the state after a step from the states at the ends of its stages, for a plan whose `end` is `Ends`."""
     assert isinstance(plan.end, Ends)
     weights, last = plan.end.weights, ends[plan.stages[-1].name]
     if plan.single:
@@ -145,7 +145,7 @@ def combined(plan: Plan, ends: Mapping[str, State], layout: Layout) -> State:
 
 
 def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:
-    """Return the estimated error of a step in `v` [rad/s or m/s]; 0 for a plan that has none."""
+    """Return the estimated error of a step in `v` [rad/s or m/s]; 0 for a plan without an estimate."""
     if isinstance(plan.end, Rates) or not plan.end.error:
         return SX(0)
     one, other = plan.end.error
@@ -153,18 +153,19 @@ def error_estimate(plan: Plan, ends: Mapping[str, State]) -> SX:
 
 
 def step_errors(plan: Plan, before: State, ends: Mapping[str, State], layout: Layout) -> SX:
-    """Return estimated errors after a step of a plan that has an estimate [rad or m], shape (nv + 1,).
+    """Return estimated errors after a step of a plan with an estimate [rad or m], shape (nv + 1,).
 
-    Those of positions, rotation vectors for orientations, which come first; last that of velocities while anything
-    touches, of a floating base those of the base, times `LANDING` if a contact begins or ends in any stage, else times
-    `CONTACT`. Where the beginning of a contact takes more than `STOPPED` of the velocity at once, the whole step and
-    its halves may agree on a wrong end, because neither rebounds. The whole change of the velocity counts there.
+    The first nv entries are errors of positions: first rotation vectors of orientations, then all others. The last
+    entry is 0 without contact. In contact it is the error of the velocities, or of the base velocity of a floating
+    robot, times `LANDING` if a contact begins or ends in any stage and times `CONTACT` otherwise. If the beginning of a
+    contact takes more than `STOPPED` of the velocity, the whole change of the velocity counts as its error: the whole
+    step and its halves may agree on a wrong end there, because neither rebounds.
 
     Args:
         plan: The method.
         before: State before the step.
-        ends: At the ends of stages, by name.
-        layout: Which rows of `q` are what.
+        ends: States at the ends of stages, by name.
+        layout: Layout of the coordinates.
     """
     assert isinstance(plan.end, Ends)
     one, other = (ends[name] for name in plan.end.error)

@@ -89,7 +89,7 @@ def adjoint_function(
 
 
 def first_adjoint_function(adjoint: ca.Function) -> ca.Function:
-    """Return the reverse mode of a first iteration that is also the last: 10 % shorter than that of any iteration.
+    """Return the reverse mode of a first iteration that is also the last, which is 10 % shorter than in general.
 
     Returns:
         Function of those inputs of `adjoint` that are not constant there -> outputs but `owed` and `pending`.

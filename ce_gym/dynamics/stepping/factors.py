@@ -1,4 +1,4 @@
-"""Matrices as sparse as a tree of joints: factorisation without pivoting, and solves in place."""
+"""Sparse factors of matrices with the sparsity of a tree of joints, without pivoting, and solutions with them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from ce_gym.dynamics.algebra.spatial import SX
 
 
 def factorised(A: SX, order: list[int]) -> SX:
-    """Factorise a matrix `A = U L`, whose symmetric part is positive definite; tips first nothing is filled in.
+    """Factorise a matrix `A = U L` with positive definite symmetric part, from tips to base, which avoids fill-in.
 
     Args:
         A: Shape (n, n).
-        order: Rows of the matrix, from the base to the tips.
+        order: Rows of the matrix, the rows of a body before the rows of its children.
 
     Returns:
-        Shape (n, n): reciprocals of the pivots on the diagonal, and `U`, whose diagonal is 1, and `L`, whose are those
-        pivots, above and below, in the order.
+        Shape (n, n): reciprocals of the pivots on the diagonal; in the given order, `U` above, whose diagonal is 1, and
+        `L` below, whose diagonal has the pivots.
     """
     A = SX(A)
     for place in reversed(range(len(order))):
@@ -32,7 +32,7 @@ def factorised(A: SX, order: list[int]) -> SX:
 
 
 def solved_with(factor: SX, order: list[int], b: SX) -> SX:
-    """Solve `A x = b` for right-hand sides (n, m), given what `factorised` returned."""
+    """Solve `A x = b` for right-hand sides (n, m), given the result of `factorised`."""
     known, x = factor.sparsity(), [b[i, :] for i in range(b.shape[0])]
     for place in reversed(range(len(order))):
         for j in order[:place]:

@@ -1,12 +1,12 @@
-"""How a step on a height field finds the ground under each contact, as traced functions around the look-ups.
+"""Traced functions around the look-ups that find the ground under each contact on a height field.
 
-A sphere touches sloping ground beside the place under its centre. So the field is looked up twice: under the centre,
-and where a sphere on the plane found there would touch it. The plane at the second place is the one that the sphere
-meets, but for errors of second order in how much the ground turns over a radius. With the first alone forces would not
-be normal to the path on which a sphere can roll, and energy would grow. Spheres without radius need no second look. One
-that moves around a rim is looked up likewise, beside the centre of the rim.
+A sphere on a slope touches the ground beside the point under its centre. So the field is looked up twice: under the
+centre, and where a sphere would touch the plane found there. The plane at the second point is the contact plane, up to
+errors of second order in the change of the slope over a radius. With the first look-up alone, forces would not be
+normal to the path of a rolling sphere, and energy would grow. Spheres without radius need one look-up. For a rim, the
+second look-up is beside the centre of the rim.
 
-Shapes with contacts between their corners, see `ce_gym.dynamics.hulls`, are looked up at all of their points.
+Hulls, see `ce_gym.dynamics.hulls`, are looked up at all of their points.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ce_gym.model.mechanism import Mechanism
 
 
 def places_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
-    """Trace where the centres of the contact spheres are.
+    """Trace x and y of the centres of the contact spheres.
 
     Returns:
         Function (q) or, for a robot whose loops need guesses, (q, dependent) -> x and y of each centre [m], shape
@@ -37,7 +37,7 @@ def places_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
 
 
 def touching_function(mechanism: Mechanism, options: StepOptions) -> ca.Function | None:
-    """Trace where the spheres with a radius, and rims, would touch a plane.
+    """Trace x and y of the points where spheres with a radius, and rims, would touch a plane.
 
     Returns:
         Function (places, ground) or, for a robot with rims, (q, places, ground), or with `dependent` as for
@@ -57,7 +57,7 @@ def touching_function(mechanism: Mechanism, options: StepOptions) -> ca.Function
 
 
 def _leaning(mechanism: Mechanism, options: StepOptions, slope: SX, round_ones: list[int]) -> tuple[dict[str, SX], SX]:
-    """Return what the axes of rims depend on, and x and y from centres to where spheres touch planes, shape (2, m)."""
+    """Return symbols of the pose, and x and y from centres to points where spheres touch planes, shape (2, m)."""
     given, kinematics = _posed(mechanism, options)
     spheres, ways = contact_spheres(mechanism, options), [SX(2, 0)]
     for i, column in zip(round_ones, ca.horzsplit(slope), strict=True):
@@ -68,11 +68,11 @@ def _leaning(mechanism: Mechanism, options: StepOptions, slope: SX, round_ones: 
 
 
 def planes_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
-    """Trace the planes that the spheres meet.
+    """Trace the contact planes of spheres.
 
     Returns:
-        Function (places, ground, touching, found) -> ground: height under each centre [m] and slopes of the plane that
-        was found, shape (3 m,), where the sphere touches, shape (3 n_contacts,).
+        Function (places, ground, touching, found) -> ground, shape (3 n_contacts,): height of the contact plane under
+        each centre [m] and its slopes. `found` are the height and slopes at `touching`, shape (3 m,).
     """
     _, round_ones, places, ground = _spheres(mechanism, options)
     touching, found = SX.sym("touching", 2, len(round_ones)), SX.sym("found", 3, len(round_ones))
@@ -84,18 +84,19 @@ def planes_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
 
 
 def hull_places_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
-    """Trace where the points of hulls are: as `places_function`, -> `hull_places`, shape (2 n_points,)."""
+    """Trace x and y of the points of hulls: inputs of `places_function` -> `hull_places`, shape (2 n_points,)."""
     given, kinematics = _posed(mechanism, options)
     return traced("hull_places", given, {"hull_places": ca.vec(_hull_points(options, kinematics)[:2, :])})
 
 
 def hulls_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
-    """Trace where hulls touch the ground, and put that behind the contacts.
+    """Trace the points where hulls touch the ground, appended to the contacts.
 
     Returns:
         Function (q, contact_places, contact_ground, hull_ground), or with `dependent` as for `places_function`, ->
-        (places, ground, region_points): x and y of contacts and of regions of hulls [m], shape (2 n_touches,), the
-        ground of each, shape (3 n_touches,), and where on their bodies regions touch it [m], shape (3 n_regions,).
+        (places, ground, region_points). The results are x and y of contacts and of regions of hulls [m], shape
+        (2 n_touches,); the ground under each, shape (3 n_touches,); and the points of regions that touch the ground, in
+        axes of their bodies [m], shape (3 n_regions,).
     """
     given, kinematics = _posed(mechanism, options)
     points, n = _hull_points(options, kinematics), len(options.contacts)
@@ -125,19 +126,19 @@ def _hull_points(options: StepOptions, kinematics: Kinematics) -> SX:
 
 
 def _in_world(kinematics: Kinematics, points: list[tuple[str, np.ndarray]]) -> SX:
-    """Return where points of bodies are [m], shape (3, n)."""
+    """Return the world coordinates of points of bodies [m], shape (3, n)."""
     return ca.horzcat(SX(3, 0), *[kinematics.bodies[body].point_position(constant(at)) for body, at in points])
 
 
 def _posed(mechanism: Mechanism, options: StepOptions) -> tuple[dict[str, SX], Kinematics]:
-    """Return symbols for positions, with guesses if there are any, and where they put the bodies."""
+    """Return symbols for positions, and guesses of dependent coordinates if there are any, and the kinematics."""
     state = symbolic_state(mechanism, options)
     kinematics = outward_velocity_pass(mechanism, state.q, SX(*state.v.shape), state.dependent)
     return {name: value for name, value in state.items() if name in ("q", "dependent")}, kinematics
 
 
 def _spheres(mechanism: Mechanism, options: StepOptions) -> tuple[SX, list[int], SX, SX]:
-    """Return radii of what is round, which spheres and rims those are, and symbols for the places and ground of all."""
+    """Return radii of round contacts and their numbers, and symbols for the places and the ground of all contacts."""
     spheres = contact_spheres(mechanism, options)
     radius = np.array([sphere.radius for sphere in spheres])
     round_ones = np.flatnonzero(radius + np.array([sphere.rim for sphere in spheres])).tolist()

@@ -90,7 +90,7 @@ def copy_function(step: StepVariables) -> ca.Function:
 
 
 def accumulated(old: Mapping[str, SX], tried: Mapping[str, SX], first: SX, part: SX) -> dict[str, SX]:
-    """Return state and outputs after a part of a step: means are summed, outputs of the start are those of the first.
+    """Return state and outputs after a part of a step: means are summed, outputs of the start come from the first part.
 
     Args:
         old: State and outputs after the previous part.

@@ -1,17 +1,18 @@
-"""Steps as long as their error allows: what becomes of a step that was tried, and how long the next one is.
+"""Step-size control: acceptance of a step from its estimated error, and the length of the next step.
 
-Every step is made by Euler's method in a whole and in two halves, which differ by an estimate of the error of the
-halves, d; what is taken is the result extrapolated from both. Its own error is less: d is in proportion to h^2, and
-extrapolation removes that part, so that what is left is how much d / h^2 changes. A step is taken if the largest d of
-all positions is within `ALLOWED` times the tolerance, or the change of d since the last step is at such a rate that it
-would take `HORIZON` to add up to that: in free flight d does not change. Other steps are refused and tried again
-shorter. Contact needs no search for events: a step in which a contact begins or ends is refused until it is so short
-that the landing does not matter. In contact the error of velocities counts too, see `step_errors`: the flight after a
-bounce makes it grow.
+Every step is made by Euler's method as a whole and as two halves. Their difference d estimates the error of the halves,
+and the result is extrapolated from both. d is in proportion to h^2, where h is the length of the step. Extrapolation
+removes this part of the error, so that the remaining error follows from the change of d / h^2.
+
+A step is accepted if the largest d of all positions is within `ALLOWED` times the tolerance. It is also accepted if the
+change of d since the last step would reach that bound only after `HORIZON`; in free flight d does not change. Other
+steps are rejected and tried again with a shorter length. Contact needs no search for events: a step in which a contact
+begins or ends is rejected until it is so short that the landing does not matter. In contact the error of velocities
+counts, too, because the flight after a bounce makes it grow, see `step_errors`.
 
 Lengths follow Gustafsson's PI controller (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2, 1996;
-Soederlind, Numerical Algorithms 31, 2002). The norm is that of CENIC (Kurtz and Castro 2025, arXiv:2511.08771): the
-largest error of a position, 1 rad counting as 1 m, with no part for velocities without contact.
+Soederlind, Numerical Algorithms 31, 2002). As in CENIC (Kurtz and Castro 2025, arXiv:2511.08771), the norm is the
+largest error of a position, with 1 rad counting as 1 m. Velocities do not count without contact.
 """
 
 from __future__ import annotations
@@ -26,28 +27,28 @@ from ce_gym.dynamics.stepping.variables import DT, LEFT, RETRIES, UNFINISHED, St
 from ce_gym.model.coordinates import Layout
 
 ALLOWED = 0.25
-"""Part of the tolerance that one step may be off by: errors of steps add up."""
+"""Allowed error of one step as a fraction of the tolerance, because errors of steps add up."""
 SHORTEST = 2.0**-14
-"""Least length of a step as a part of the interval: there it is taken whatever its error."""
+"""Shortest step as a fraction of the interval; it is accepted whatever its error."""
 AIM = 0.4
-"""Part of what is allowed that the error of the next step should be: few are refused."""
+"""Aim for the error of the next step as a fraction of the allowed error, so that few steps are rejected."""
 GROWTH, SHRINKAGE = 5.0, 0.1
-"""Most and least that the next step is to the last one."""
+"""Largest and smallest ratio of the next step to the last one."""
 BEFORE, NOW = 0.2, 0.35
-"""Exponents of the errors of the step before and of this one: 0.4 / 2 and 0.7 / 2 for an estimate of second order."""
+"""Exponents of the errors of the previous and of this step: 0.4 / 2 and 0.7 / 2 for an estimate of second order."""
 STRETCH = 0.1
-"""A step may be longer than proposed by so much if that spares the interval one more."""
+"""A step may be longer than proposed by this fraction if that saves a step of the interval."""
 HORIZON = 1.0
-"""See above [s]."""
+"""Time in which the change of d may add up to the allowed error [s]."""
 TRYING, REFUSING = Variable("trying"), Variable("refusing")
 """Length of the step that is tried [s], 0 for a robot that has finished; whether the step before was rejected."""
 
 
 def control_sizes(layout: Layout) -> dict[str, int]:
-    """Return sizes of what a robot carries besides its state.
+    """Return the sizes of the variables of a controller, by name.
 
-    The length to be tried next [s]; of the last step taken the estimated error [rad or m] and d / h^2, see above
-    [rad/s^2 or m/s^2]; how many were taken and how many of those missed the tolerance; and that [rad or m].
+    They are the length to be tried next [s], the estimated error [rad or m] and d / h^2 [rad/s^2 or m/s^2] of the last
+    accepted step, the numbers of accepted steps and of those that missed the tolerance, and the tolerance [rad or m].
     """
     names = ("step_length", "step_error", "step_change", "steps_taken", "steps_missed", "tolerance")
     return dict.fromkeys(names, 1) | {"step_change": layout.nv}
@@ -78,8 +79,8 @@ def control_function(step: StepVariables, layout: Layout) -> ca.Function:
 
     Returns:
         Function (tried_moved, left, trying, refusing, retries, dt, `control_sizes`, tried_off, start, tried) -> (start,
-        all of `control_sizes` but the tolerance, retries, refusing, left, trying, unfinished, lengths of the step and
-        its stages), where `start` and `tried` are the state and the outputs before and after the step.
+        `control_sizes` without the tolerance, retries, refusing, left, trying, unfinished, lengths of the step and its
+        stages). `start` and `tried` are the state and the outputs before and after the step.
     """
     old, tried = ({name: x[name].symbol() for name in step.start} for x in (step.start, step.tried))
     variables = (step.tried[MOVED], LEFT, TRYING, REFUSING, RETRIES, DT)
@@ -125,14 +126,15 @@ def control_function(step: StepVariables, layout: Layout) -> ca.Function:
 
 
 def next_length(left: SX, length: SX) -> SX:
-    """Return the length of the next step [s]: an equal part of what is left, not much longer than proposed."""
+    """Return the length of the next step [s]: an equal part of the rest of the interval, near the proposed length."""
     return left / ca.fmax(ca.ceil(left / length - STRETCH), 1)
 
 
 def _proposed(trying: SX, length: SX, error: SX, before: SX, refused: SX, refusing: SX) -> SX:
-    """Return the length that is proposed after a step, given its error and the one before as parts of what is aimed at.
+    """Return the proposed length after a step [s].
 
-    Right after a refused one no step grows; one that was cut short by the end of its interval does not lower it.
+    `error` and `before` are the errors of the step and of the previous one, divided by the aimed error. The length does
+    not grow right after a rejected step. A step that the end of the interval cut short does not shorten the next one.
     """
     smallest = 1e-6  # so that powers stay finite
     error, before = ca.fmax(error, smallest), ca.fmax(before, smallest)

@@ -1,4 +1,4 @@
-"""A plan as one expression: every stage with all the iterations it may need, one after the other.
+"""A plan as one expression: every stage with all iterations that it may need.
 
 Explicit stages work on positions and on the momentum of the base in the world. Unit quaternions are advanced in the
 four-dimensional space around them, by a vector field that keeps their length, and scaled back at the end of the step,
@@ -32,14 +32,14 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
     """Make one step of a robot.
 
     Args:
-        plan: How.
-        scene: The robot and what surrounds it.
+        plan: The method.
+        scene: The robot and its surroundings.
         before: State before the step.
-        target: Held constant over it, see `solve`.
+        target: Constant over the step, see `solve`.
         dt: Length of the step [s].
 
     Returns:
-        The result of each stage by name, and of the whole step as `AFTER`.
+        Result of each stage by name, and of the whole step as `AFTER`.
     """
     parts: dict[str, Stepped] = {}
     layout = scene.mechanism.robot.layout
@@ -48,9 +48,9 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
             start = _moved(stage.start, before, list(parts.values()), dt, layout)
         else:
             start = parts[stage.start].state if stage.start else before.replaced(load=before[stage.load])
-        if parts and stage.start and not scene.looked_up.numel():  # the ground is known around the start of the step
+        if parts and stage.start and not scene.looked_up.numel():  # looked up at the start of the step only
             scene = looked_up_from(scene, parts[plan.stages[0].name].solved.kinematics)
-        length = stage.length * dt if stage.length else 0.0  # a number also where dt is a symbol, see `solve`
+        length = stage.length * dt if stage.length else 0.0  # a number even if dt is a symbol, see `solve`
         parts[stage.name] = iterated(scene, start, target, length, stage.iterations)
     first = parts[plan.stages[0].name]
     if isinstance(plan.end, Rates):
@@ -64,7 +64,7 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
 
 
 def _moved(rates: Rates, before: State, parts: list[Stepped], dt: float, layout: Layout) -> State:
-    """Return the state before a step, moved along rates of its stages."""
+    """Return the state before a step, moved along the rates of stages."""
     terms = [weight * _rate(part.solved, layout) for weight, part in zip(rates.weights, parts, strict=False) if weight]
     names = list(rates_of(parts[0].solved)) if parts else []
     moved = _from_flat(_flat(before, names, layout) + dt * sum(terms, SX(0)), before, names, layout)
@@ -80,9 +80,9 @@ def rates_of(solved: Solved) -> dict[str, SX]:
 
 
 def iterated(scene: Scene, state: State, target: SX, dt: float, most: int) -> Stepped:
-    """Advance one robot by one linearly implicit Euler step with all its iterations, `most` after the first."""
+    """Advance one robot by a linearly implicit Euler step with all its iterations, at most `most` after the first."""
     iterate, needed = first_iterate(scene), min(most, iterations_needed(scene.mechanism, scene.options))
-    if needed:  # traced once and put into itself, which is faster than to trace every iteration
+    if needed:  # one traced iteration, substituted into itself: faster than tracing each
         symbol = SX.sym("iterate", iterate.numel())
         following = ca.cse(ca.densify(iteration(scene, state, target, dt, symbol).iterate))
         for _ in range(needed):
@@ -91,7 +91,7 @@ def iterated(scene: Scene, state: State, target: SX, dt: float, most: int) -> St
 
 
 def _flat(state: State, names: list[str], layout: Layout) -> SX:
-    """Stack positions, velocities with the base's linear one in the world, and some fields."""
+    """Stack positions, velocities with the linear velocity of the base in world axes, and some fields."""
     v = state.v
     if layout.floating:
         v = ca.vertcat(v[:3], quaternion_to_rotation(state.q[3:7]) @ v[3:6], v[6:])
@@ -109,7 +109,7 @@ def _from_flat(flat: SX, like: State, names: list[str], layout: Layout) -> State
 
 
 def _rate(solved: Solved, layout: Layout) -> SX:
-    """Return the time derivative of what `_flat` stacks."""
+    """Return the time derivative of the stack of `_flat`."""
     state, vdot = solved.system.start.state, solved.vdot
     q, v, others = state.q, state.v, list(rates_of(solved).values())
     turning = [quaternion_product(q[i : i + 4], ca.vertcat(0, v[j : j + 3])) / 2 for i, j in layout.turns]

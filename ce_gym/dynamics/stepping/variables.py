@@ -100,7 +100,7 @@ class StepVariables:
             self._fractions[self.stages[stage.name].dt] = stage.length
 
     def lengths(self, dt: SX) -> dict[str, SX]:
-        """Return the lengths of a step and its stages [s] by the names of their variables; `dt` is that of the step."""
+        """Return the lengths of a step and its stages [s] by names of variables, given the length of the step."""
         return {length.name: fraction * dt for length, fraction in self._fractions.items()}
 
 
