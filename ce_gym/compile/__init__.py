@@ -3,7 +3,7 @@
 Importing this package imports neither CasADi nor LLVM; `load_kernel` does so when needed.
 """
 
-from ce_gym.compile.arrays import aligned_copy, aligned_zeros, lane_count
+from ce_gym.compile.arrays import aligned_copy, aligned_zeros, lane_count, tile_count
 from ce_gym.compile.critical import CriticalSection
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.loading import load_kernel
@@ -28,4 +28,5 @@ __all__ = [
     "load_kernel",
     "scratch_buffers",
     "source_fingerprint",
+    "tile_count",
 ]

@@ -10,7 +10,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -71,6 +71,15 @@ def write_entry(folder: Path | None, name: str, record: dict, code: bytes) -> No
         _replace(_path(folder, name), _digest(name, payload) + payload)
     except OSError as problem:
         _tell_once(f"ce_gym: kernels compiled now are not kept in {folder}: {problem.strerror or problem}")
+
+
+def read_or_make(folder: Path | None, name: str, make: Callable[[], tuple[dict, bytes]]) -> tuple[dict, bytes]:
+    """Return an entry of the cache; if there is none, make and write it."""
+    entry = read_entry(folder, name)
+    if entry is None:
+        entry = make()
+        write_entry(folder, name, *entry)
+    return entry
 
 
 def _path(folder: Path, name: str) -> Path:

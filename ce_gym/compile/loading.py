@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ce_gym.compile.arrays import lane_count
-from ce_gym.compile.cache import announced, cache_folder, read_entry, write_entry
+from ce_gym.compile.cache import announced, cache_folder, read_or_make
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.layout import layout_from, layout_of
 from ce_gym.compile.program import Program, check_program
@@ -67,11 +67,7 @@ def kernel_name(key: str, dtype: str) -> str:
 def _load(folder: Path | None, name: str, build: Callable[[], Program], dtype: str) -> Kernel:
     from ce_gym.compile.machine_code import load_object
 
-    entry = read_entry(folder, name)
-    if entry is None:
-        entry = _compile(build, dtype, folder)
-        write_entry(folder, name, *entry)
-    record, code = entry
+    record, code = read_or_make(folder, name, lambda: _compile(build, dtype, folder))
     return Kernel(layout_from(record), load_object(code))
 
 

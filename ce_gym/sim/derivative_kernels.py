@@ -23,12 +23,13 @@ from ce_gym.dynamics.stepping.derivatives import (
     adjoint_function,
     adjoint_weights,
     first_adjoint_function,
+    input_gradients,
     iterations_of,
     primal_function,
     state_parts,
 )
 from ce_gym.dynamics.stepping.linearization import Linearization, blocks
-from ce_gym.dynamics.stepping.variables import Variable, Variables
+from ce_gym.dynamics.stepping.variables import Variable
 from ce_gym.sim.calls import NONE, assign, call
 from ce_gym.sim.kernel_key import laws_key, model_key
 from ce_gym.sim.substeps import DT, FRAME, HEIGHTS, look_up
@@ -131,7 +132,7 @@ def gradient_program(model: Model, options: StepOptions) -> Program:
     chain = Chain(primal, adjoint_function(mechanism, options, leads_on=True), iterations_of(mechanism, options))
     sizes = {name: primal.numel_in(name) for name in primal.name_in()}
     weights = adjoint_weights(primal, layout)
-    others = Variables("by", {name: sizes[name] for name in ("target", "parameters") if name in sizes})
+    others = input_gradients(primal)
     names = (*state_parts(primal), "diverged", DT, *(["parameters"] if "parameters" in sizes else []))
     buffers = [Buffer(name, sizes[name], "tiles") for name in names] + _ground_buffers(options)
     buffers += [Buffer("target", sizes["target"], "rows_in")] if "target" in sizes else []

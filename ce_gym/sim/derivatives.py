@@ -18,7 +18,7 @@ from ce_gym.dynamics.algebra.batched import evaluate
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import MOVED
 from ce_gym.dynamics.algebra.tracing import output_names
-from ce_gym.dynamics.stepping.derivatives import primal_function, state_parts
+from ce_gym.dynamics.stepping.derivatives import adjoint_weights, input_gradients, primal_function, state_parts
 from ce_gym.dynamics.stepping.halving import PART, subdivide_function
 from ce_gym.dynamics.stepping.linearization import REMEMBERED
 from ce_gym.dynamics.stepping.variables import LEFT, RETRIES, StepVariables
@@ -90,8 +90,10 @@ class StepDerivatives:
         self._keep_every, self._linear = keep_every, dict[bool, Any]()
         primal = primal_function(simulator.model.mechanism, simulator.options)
         self._parts = state_parts(primal)
-        self.state_sizes = {n: simulator.model.nv if n == "q" else size for n, size in self._parts.items()}
-        self._other_sizes = {n: primal.numel_in(n) for n in ("target", "parameters") if n in primal.name_in()}
+        self._weight_variables = adjoint_weights(primal, simulator.model.robot.layout)
+        self._input_gradients = input_gradients(primal)
+        self.state_sizes = {name: variable.size for name, variable in self._weight_variables.items()}
+        self._other_sizes = {name: variable.size for name, variable in self._input_gradients.items()}
 
     @property
     def n_recorded(self) -> int:
@@ -289,9 +291,8 @@ class StepDerivatives:
         self, arrays: Mapping[str, NDArray], target: NDArray, now: dict[str, NDArray], others: dict[str, NDArray]
     ) -> None:
         """Overwrite the gradient after a sub-step, in tiles, by the gradient before, and write that of `others`."""
-        given = {f"w_{name}": array for name, array in now.items()}
-        given |= {f"by_{name}": rows for name, rows in others.items()}
-        every = {**arrays, **given, **self.simulator._batch.tables, "target": target}
+        gradients = self._weight_variables.named(now) | self._input_gradients.named(others)
+        every = {**arrays, **gradients, **self.simulator._batch.tables, "target": target}
         self._kernel(every, len(target), num_threads=self.simulator.num_threads)
 
     def _rows(self, now: dict[str, NDArray], n: int) -> dict[str, NDArray]:

@@ -9,12 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.compile import aligned_zeros, lane_count
-
-
-def tile_count(num_envs: int, dtype: str) -> int:
-    """Return the number of tiles that hold `num_envs` robots."""
-    return -(-num_envs // lane_count(dtype))
+from ce_gym.compile import aligned_zeros, lane_count, tile_count
 
 
 def tiles(num_envs: int, size: int, dtype: str) -> NDArray:

@@ -17,7 +17,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from ce_gym.compile.cache import cache_folder, read_entry, write_entry
+from ce_gym.compile.cache import cache_folder, read_or_make
 from ce_gym.compile.cuda.source import BLOCK, ENTRY, Source
 
 SHIM = """#include <cmath>
@@ -67,12 +67,8 @@ class HostLauncher:
             raise RuntimeError("no C++ compiler (c++, g++, clang++ or the package ziglang) to run CUDA C on the host")
         text = SHIM + source.text + _loop(source.text)
         name = "host_" + hashlib.sha256(" ".join((*compiler, *OPTIONS, text)).encode()).hexdigest()[:24]
-        folder = cache_folder()
-        entry = read_entry(folder, name)
-        if entry is None:
-            entry = {}, _compile(compiler, text, source.layout.name)
-            write_entry(folder, name, *entry)
-        self._run = _load(entry[1]).run_all
+        _, code = read_or_make(cache_folder(), name, lambda: ({}, _compile(compiler, text, source.layout.name)))
+        self._run = _load(code).run_all
 
     def __call__(self, addresses: Sequence[int], numbers: Sequence[int], count: int) -> None:
         """Run the kernel on all robots.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from ce_gym.compile.cache import announced, cache_folder, read_entry, write_entry
+from ce_gym.compile.cache import announced, cache_folder, read_or_make
 from ce_gym.compile.cuda.kernel import CudaKernel, Launcher
 from ce_gym.compile.cuda.nvrtc import Usage, compile_cubin, compiler_version
 from ce_gym.compile.cuda.source import Source, emit_source
@@ -60,11 +60,7 @@ def cached_cubin(folder: Path | None, name: str, build: Stages, dtype: str, arch
     Returns:
         Machine code, the source, and the resources of a thread.
     """
-    entry = read_entry(folder, name)
-    if entry is None:
-        entry = _compile(build, dtype, arch, folder)
-        write_entry(folder, name, *entry)
-    record, code = entry
+    record, code = read_or_make(folder, name, lambda: _compile(build, dtype, arch, folder))
     return code, Source(record["text"], layout_from(record["layout"])), Usage(**record["usage"])
 
 

@@ -117,6 +117,12 @@ def adjoint_weights(primal: ca.Function, layout: Layout, outputs: tuple[str, ...
     return Variables("w", sizes | {name: primal.numel_out(name) for name in outputs})
 
 
+def input_gradients(primal: ca.Function) -> Variables:
+    """Return the variables of the gradient with respect to the target and the parameters, as far as they exist."""
+    names = [name for name in ("target", "parameters") if name in primal.name_in()]
+    return Variables("by", {name: primal.numel_in(name) for name in names})
+
+
 def _nonempty(values: dict[str, SX]) -> dict[str, SX]:
     return {name: value for name, value in values.items() if value.numel()}
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
@@ -15,6 +16,8 @@ from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import MOVED, OFF
 from ce_gym.dynamics.laws.scene_laws import iterations_needed, state_sizes
 from ce_gym.model.mechanism import Mechanism
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Variables(dict[str, Variable]):
         """Return a symbol for each variable, by name."""
         return {name: variable.symbol() for name, variable in self.items()}
 
-    def named(self, values: Mapping[str, SX]) -> dict[str, SX]:
+    def named(self, values: Mapping[str, T]) -> dict[str, T]:
         """Return values, given by name, by the names of their buffers."""
         return {self[name].name: value for name, value in values.items()}
 
