@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import aligned_copy
 from ce_gym.dynamics.algebra.batched import evaluate
+from ce_gym.dynamics.algebra.tracing import output_names
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import MOVED
-from ce_gym.dynamics.algebra.tracing import output_names
 from ce_gym.dynamics.stepping.derivatives import adjoint_weights, input_gradients, primal_function, state_parts
 from ce_gym.dynamics.stepping.halving import PART, subdivide_function
 from ce_gym.dynamics.stepping.linearization import REMEMBERED

@@ -80,7 +80,7 @@ class Simulator:
         seldom: Contacts, as in `contacts`, that are computed only where they are near the ground, such as "knee"; while
             they are not near, that saves their time.
         retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move too far, see
-            `ce_gym.dynamics.stepping.parts.LARGEST_MOVE`; it alone then makes the sub-step in parts.
+            `ce_gym.dynamics.stepping.halving.LARGEST_MOVE`; it alone then makes the sub-step in parts.
         control_period: Controllers of positions look every so often, a multiple of `dt`, and hold their torques in
             between [s]; 0 for controllers so fast that they never stop looking.
         device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.

@@ -9,6 +9,8 @@ import casadi as ca
 
 from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step, While, scratch_buffers
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.integrators.plan import LOAD
 from ce_gym.dynamics.stepping import halving, step_size
 from ce_gym.dynamics.stepping.broad_phase import has_broad_phase
 from ce_gym.dynamics.stepping.ground_lookup import (
@@ -18,8 +20,6 @@ from ce_gym.dynamics.stepping.ground_lookup import (
     planes_function,
     touching_function,
 )
-from ce_gym.dynamics.integrators.methods import METHODS
-from ce_gym.dynamics.integrators.plan import LOAD
 from ce_gym.dynamics.stepping.trace import NEAR, combination_function, iteration_function, step_function
 from ce_gym.dynamics.stepping.variables import UNFINISHED, StepVariables, measured_sizes, stage_iterations
 from ce_gym.model.mechanism import Mechanism

@@ -21,8 +21,8 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
-from ce_gym.dynamics.stepping.halving import LARGEST_MOVE, accumulated
 from ce_gym.dynamics.integrators.plan import MOVED, OFF
+from ce_gym.dynamics.stepping.halving import LARGEST_MOVE, accumulated
 from ce_gym.dynamics.stepping.variables import DT, LEFT, RETRIES, UNFINISHED, StepVariables, Variable
 from ce_gym.model.coordinates import Layout
 
