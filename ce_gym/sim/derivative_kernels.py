@@ -169,8 +169,8 @@ def linearization_program(model: Model, options: StepOptions, whole_state: bool 
     """
     linear = Linearization(model.mechanism, options, whole_state)
     columns = _LinearizationCalls(linear, iterations_of(model.mechanism, options))
-    found = ("ground", "region_points", "places")
-    sizes = {name: x.numel() for name, x in linear.given.inputs().items() if name not in found}
+    looked_up = ("ground", "region_points", "places")
+    sizes = {name: x.numel() for name, x in linear.given.inputs().items() if name not in looked_up}
     buffers = [Buffer(name, size, "rows_in" if name == "target" else "tiles") for name, size in sizes.items()]
     buffers += _ground_buffers(options)
     buffers.append(Buffer(ENDS, linear.size * linear.places["end"], "rows_out", "float64"))
@@ -251,9 +251,8 @@ class _LinearizationCalls:
 
     def buffers(self) -> list[Buffer]:
         """Return the buffers that are parts of `ENDS`."""
-        found = [block for group in self.blocks for block in group]
-        size = self.linear.size
-        return [Buffer(x.buffers["end"], size * x.count, "scratch", within=ENDS, start=x.start) for x in found]
+        size, every = self.linear.size, [block for group in self.blocks for block in group]
+        return [Buffer(x.buffers["end"], size * x.count, "scratch", within=ENDS, start=x.start) for x in every]
 
     def calls(self) -> Iterator[Call]:
         """Yield all calls in order."""
@@ -274,8 +273,8 @@ class _LinearizationCalls:
             yield _copy(TRIED_ITERATE, "iterate", self.linear.iterate.numel(), only_if)
         if chained:
             yield _copy("vdot", VDOT_BEFORE, self.linear.nv, only_if)
-        found = {"iterate": TRIED_ITERATE, "diverged": TRIED_DIVERGED, "unconverged": _active(k + 1)}
-        yield call(self.iterate, outputs=found, only_if=only_if)
+        results = {"iterate": TRIED_ITERATE, "diverged": TRIED_DIVERGED, "unconverged": _active(k + 1)}
+        yield call(self.iterate, outputs=results, only_if=only_if)
         if self.drift:
             yield call(self.drift, only_if=only_if)
         if self.pressed_drift:

@@ -351,7 +351,7 @@ def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray
     """
     model, options, dtype = simulator.model, simulator.options, simulator.dtype
     kernel, n = load_step_kernel(model, replace(options, retry=0), (), dtype), len(target)
-    step = StepVariables(model.mechanism, options, {})
+    step = StepVariables(model.mechanism, options)
     subdivide = subdivide_function(step, options.retry)
     arguments = [name for name in kernel.buffers if name in rows] + [RETRIES.name]
     values = {**rows, RETRIES.name: np.zeros((n, 1)), PART.name: np.ones((n, 1)), LEFT.name: np.ones((n, 1))}

@@ -21,7 +21,7 @@ from ce_gym.dynamics.stepping.ground_lookup import (
     touching_function,
 )
 from ce_gym.dynamics.stepping.trace import NEAR, combination_function, iteration_function, step_function
-from ce_gym.dynamics.stepping.variables import UNFINISHED, StepVariables, measured_sizes, stage_iterations
+from ce_gym.dynamics.stepping.variables import UNFINISHED, StepVariables
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.calls import NONE, assign, call
 
@@ -50,21 +50,16 @@ def substeps(
         and the steps. Outputs that are empty for the robot are left out.
     """
     options, plan = replace(options, dt=None), METHODS[options.method]
-    measured = tuple(measured_sizes(mechanism, options))
-    if not any(stage_iterations(mechanism, options).values()):
-        function = step_function(mechanism, options, (*outputs, *measured))
+    step = StepVariables(mechanism, options, outputs)
+    if step.stages:
+        function = iteration_function(mechanism, options, step.evaluated, chooses=has_broad_phase(options))
     else:
-        of_stages = (*outputs, *measured) if plan.single else tuple(name for name in outputs if name != "error")
-        function = iteration_function(mechanism, options, of_stages, chooses=has_broad_phase(options))
-    output_sizes = {name: function.numel_out(name) if name in function.name_out() else 1 for name in outputs}
-    if 0 in output_sizes.values():
-        return substeps(mechanism, options, tuple(name for name, size in output_sizes.items() if size))
-    found = (*ITERATES, "ground", "region_points")
-    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in found}
-    sizes |= {"retries": 1, **output_sizes} | ({FRAME: 3} if "ground" in function.name_in() else {})
+        function = step_function(mechanism, options, step.evaluated)
+    computed = (*ITERATES, "ground", "region_points")
+    sizes = {name: function.numel_in(name) for name in function.name_in() if name not in computed}
+    sizes |= {"retries": 1, **step.outputs} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= step_size.control_sizes(mechanism.robot.layout) if plan.controlled else {}
 
-    step = StepVariables(mechanism, options, output_sizes)
     clear = [_clear(function, NEAR_ITERATE)] if NEAR_ITERATE in function.name_in() else []
     begin = call((step_size if plan.controlled else halving).begin_function(step))
     stages = _stages if step.stages else _one_call

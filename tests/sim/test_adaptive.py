@@ -194,7 +194,7 @@ def test_lengths_of_steps():
     assert float(share(1.0, 5.0)) == 1.0
 
     model = pendulum()
-    step = StepVariables(model.mechanism, StepOptions(method="adaptive"), {})
+    step = StepVariables(model.mechanism, StepOptions(method="adaptive"))
     after = control_function(step, model.robot.layout)
     numbers = dict.fromkeys(after.name_in(), 0.0)
     numbers |= {"dt": 1.0, "left": 1.0, "trying": 0.1, "step_length": 0.1, "tolerance": 1.0, "tried_q": [1.0, 2.0]}

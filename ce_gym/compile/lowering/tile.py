@@ -281,10 +281,12 @@ class _TileWork:
             return
         sizes = {buffer.name: buffer.size for buffer in self.layout.buffers}
         numel = [f.numel_in(i) for i in range(f.n_in())] + [f.numel_out(i) for i in range(f.n_out())]
-        goes_on = [sizes[name] > n for name, n in zip(call.inputs + call.outputs, numel, strict=True)]
+        advances = [sizes[name] > n for name, n in zip(call.inputs + call.outputs, numel, strict=True)]
         narrow = [b.bitcast(pointer, argument.type) for pointer, argument in zip(pointers, body.args, strict=True)]
         with loop(b, INT(call.times), "time") as time, loop(b, INT(parts), "part") as part:
-            first = [b.mul(time, INT(n * parts)) if goes else INT(0) for n, goes in zip(numel, goes_on, strict=True)]
+            first = [
+                b.mul(time, INT(n * parts)) if advance else INT(0) for n, advance in zip(numel, advances, strict=True)
+            ]
             b.call(body, [b.gep(pointer, [b.add(at, part)]) for pointer, at in zip(narrow, first, strict=True)])
 
     def _body(self, call: Call, fragment: Fragment | None = None) -> ir.Function:

@@ -6,7 +6,7 @@ step that has not been accepted yet.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -14,7 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import MOVED, OFF
-from ce_gym.dynamics.laws.scene_laws import iterations_needed, state_sizes
+from ce_gym.dynamics.laws.scene_laws import iterations_needed, output_sizes, state_sizes
 from ce_gym.model.mechanism import Mechanism
 
 T = TypeVar("T")
@@ -79,41 +79,38 @@ class StepVariables:
     Args:
         mechanism: The robot at a transmission level.
         options: The scene.
-        outputs: Sizes of the outputs, by name.
+        outputs: Names of the outputs; those that are empty for the robot are left out.
 
     Attributes:
         start: At the start of the step, and again after it once the step is accepted.
-        tried: After the step that is tried, with `measured_sizes`.
+        tried: After the step that is tried, with `MOVED` and, if the step size is controlled, `OFF`.
         stages: At the end of each stage, by name. The only stage of a method is the step itself: `tried`. Methods that
             do not iterate are traced as one function; they have no stages here.
         iterations: How many iterations may follow the first one of each stage.
+        outputs: Sizes of the outputs.
+        evaluated: Outputs of the traced step, or of a stage; others follow from several stages.
     """
 
-    def __init__(self, mechanism: Mechanism, options: StepOptions, outputs: Mapping[str, int]) -> None:
-        plan = METHODS[options.method]
-        sizes = state_sizes(mechanism, options) | {"diverged": 1, **outputs}
-        self.start = StateVariables("", sizes)
-        self.tried = StateVariables("tried", sizes | measured_sizes(mechanism, options))
-        self.iterations = stage_iterations(mechanism, options)
-        sizes.pop("error", None)  # a difference of stages
-        self._fractions = {self.tried.dt: 1.0}
+    def __init__(self, mechanism: Mechanism, options: StepOptions, outputs: Sequence[str] = ()) -> None:
+        plan, known = METHODS[options.method], output_sizes(mechanism, options)
+        self.outputs = {name: size for name in outputs if (size := known.get(name, 1))}
+        measured = {MOVED: 1} | ({OFF: mechanism.robot.layout.nv + 1} if plan.controlled else {})
+        state = state_sizes(mechanism, options) | {"diverged": 1}
+        self.start = StateVariables("", state | self.outputs)
+        self.tried = StateVariables("tried", state | self.outputs | measured)
+        most = iterations_needed(mechanism, options)
+        self.iterations = {stage.name: min(stage.iterations, most) for stage in plan.stages}
+        iterates = any(self.iterations.values())
+        evaluated = self.outputs | measured
+        if iterates and not plan.single:
+            evaluated = {name: size for name, size in self.outputs.items() if name != "error"}
+        self.evaluated = tuple(evaluated)
         self.stages = dict[str, StateVariables]()
-        for stage in plan.stages if any(self.iterations.values()) else ():
-            self.stages[stage.name] = self.tried if plan.single else StateVariables(stage.name, sizes)
+        self._fractions = {self.tried.dt: 1.0}
+        for stage in plan.stages if iterates else ():
+            self.stages[stage.name] = self.tried if plan.single else StateVariables(stage.name, state | evaluated)
             self._fractions[self.stages[stage.name].dt] = stage.length
 
     def lengths(self, dt: SX) -> dict[str, SX]:
         """Return the lengths of a step and its stages [s] by names of variables, given the length of the step."""
         return {length.name: fraction * dt for length, fraction in self._fractions.items()}
-
-
-def stage_iterations(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
-    """Return how many iterations may follow the first one of each stage, by name."""
-    most = iterations_needed(mechanism, options)
-    return {stage.name: min(stage.iterations, most) for stage in METHODS[options.method].stages}
-
-
-def measured_sizes(mechanism: Mechanism, options: StepOptions) -> dict[str, int]:
-    """Return the sizes of the outputs that decide whether a step is accepted, by name."""
-    errors = {OFF: mechanism.robot.layout.nv + 1} if METHODS[options.method].controlled else {}
-    return {MOVED: 1} | errors
