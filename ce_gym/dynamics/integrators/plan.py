@@ -21,7 +21,7 @@ MOVED = "moved"
 """Name of the output with the distance of the fastest joint in a step, at its final speed [rad or m]."""
 OFF = "off"
 """Name of the output with the estimated errors of a step, shape (nv + 1,), see `step_errors`."""
-TOUCHES = ("load", "pressed")
+TOUCHES = ("load", "pair_force")
 """Parts of a state that are positive where bodies touch."""
 LANDING, CONTACT = 0.02, 0.005
 """Times that convert an error of velocity to one of position: where a contact begins or ends, and otherwise [s]."""
