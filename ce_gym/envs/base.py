@@ -168,7 +168,7 @@ class BaseEnv(EzPickle):
     def critic_structure(self) -> dict[str, int]:
         """Length of each block of the critic's observation, in order; the policy's if the critic sees no more."""
         program = self.batch.program
-        return dict(program.probe.sizes) if program.critic_size else program.observation_sizes
+        return dict(program.stages.block_sizes) if program.critic_size else program.observation_sizes
 
     def policy_spec(self) -> dict[str, Any]:
         """Return what is needed to run a policy of this environment elsewhere; see `ce_gym.envs.policy_spec`."""
@@ -189,7 +189,7 @@ class BaseEnv(EzPickle):
 
     @cached_property
     def _look(self) -> ca.Function:
-        return self.batch.program.look()
+        return self.batch.program.stages.observation_function()
 
     def look(self, state: Mapping[str, NDArray]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Observe robots that something else simulates, through the same terms as the environment's own.

@@ -191,11 +191,11 @@ class DifferentiableEnv:
 
 def _roughness(stages: Stages, term: Term) -> str:
     """Return what is not smooth in how a term depends on the motion; "" if nothing is."""
-    state = stages.state | stages.seen_ground | {"previous_action": SX.sym("previous", stages.spec.n_actions)}
-    context = stages._context(state)
+    state = stages.state | stages.ground_values | {"previous_action": SX.sym("previous", stages.spec.n_actions)}
+    context = stages.context(state)
     value = ca.vec(term(context))
     moving = [state[name] for name in ("q", "v", "load", "torque", "action", "previous_action") if name in state]
-    moving += list(context.remembered.values())
+    moving += list(context.memory.values())
     moved = ca.vertcat(*moving)
     if not ca.depends_on(value, moved):
         return ""

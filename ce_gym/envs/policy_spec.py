@@ -97,7 +97,7 @@ def _action(program: TaskProgram) -> dict[str, Any]:
 
 
 def _blocks(program: TaskProgram) -> list[dict[str, Any]]:
-    look = program.look()
+    look = program.stages.observation_function()
     state = {name: SX.sym(name, look.size1_in(name)) for name in look.name_in()}
     seen = dict(zip(look.name_out(), look.call(list(state.values())), strict=True))
     blocks = []

@@ -183,4 +183,6 @@ def kernel_key(program: TaskProgram) -> str:
     """Return a text that names everything that the kernels of a task on a robot depend on."""
     traced = f"{source_fingerprint(*SOURCES)} {model_key(program.model)}"
     laws = laws_key(program.model.mechanism, program.options)
-    return f"{traced} {program.task!r} {program.contact_forces} {program.probe.added} {program.options.hulls} {laws}"
+    return (
+        f"{traced} {program.task!r} {program.contact_forces} {program.stages.user_terms} {program.options.hulls} {laws}"
+    )

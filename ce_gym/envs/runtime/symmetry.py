@@ -249,7 +249,7 @@ def _nearest(points: NDArray) -> NDArray[np.int64]:
 
 def _seen(program: TaskProgram, terms: Mapping, state: States) -> NDArray | None:
     """Values of terms, one state per row; None if they look at something whose reflection is not known."""
-    function = program.terms_function(terms)
+    function = program.stages.terms_function(terms)
     if not set(function.name_in()) <= state.keys():
         return None
     return np.array(function(*[ca.DM(state[name].T) for name in function.name_in()])).T.reshape(STATES, -1)

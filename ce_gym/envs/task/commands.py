@@ -25,19 +25,19 @@ class Commands:
     def __init__(self, task: Task, curriculum: Curriculum) -> None:
         self.task, self.curriculum = task, curriculum
 
-    def new(self, sampler: Sampler, grown: SX | None) -> dict[str, SX]:
+    def draw(self, sampler: Sampler, grown: SX | None) -> dict[str, SX]:
         """Return a command within the robot's present range, or to stand still; and a heading."""
         standing = sampler.unit() < self.task.standing_fraction
         moving = sampler.within(self.task.command_range)
-        moving = moving if grown is None else self.curriculum.share(grown) * moving
+        moving = moving if grown is None else self.curriculum.range_share(grown) * moving
         command = {"command": ca.if_else(standing, 0, moving)}
         return command | ({"heading": sampler.uniform(-np.pi, np.pi)} if self.task.heading else {})
 
-    def steered(self, values: dict[str, SX], command: dict[str, SX]) -> dict[str, SX]:
+    def steer(self, q: SX, command: dict[str, SX]) -> dict[str, SX]:
         """Replace the commanded yaw rate by one that turns the robot to its heading."""
         if "heading" not in command:
             return command
-        w, x, y, z = (values["q"][3 + i] for i in range(4))
+        w, x, y, z = (q[3 + i] for i in range(4))
         behind = command["heading"] - ca.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         error = ca.atan2(ca.sin(behind), ca.cos(behind))
         low, high = self.task.command_range[2]

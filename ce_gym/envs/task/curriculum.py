@@ -52,7 +52,7 @@ class Curriculum:
         """Metrics of how far robots have come."""
         return ("terrain_level",) * self.on_field + ("times_grown",) * self.widening
 
-    def followed(self, s: TermContext, state: dict[str, SX]) -> dict[str, SX]:
+    def progress(self, s: TermContext, state: dict[str, SX]) -> dict[str, SX]:
         """Return what a control step adds to the account of an episode, by name of the state."""
         after = {}
         if self.climbing:
@@ -63,7 +63,7 @@ class Curriculum:
             after["tracked"] = state["tracked"] + track_linear_velocity(s)
         return after
 
-    def level(self, state: dict[str, SX], sampler: Sampler, control_dt: float) -> SX:
+    def next_level(self, state: dict[str, SX], sampler: Sampler, control_dt: float) -> SX:
         """Return the level of the terrain on which the next episode begins."""
         count = self.task.terrain.get("levels", 1)
         anywhere = ca.floor(sampler.uniform(0, count))
@@ -76,13 +76,13 @@ class Curriculum:
         level = ca.fmax(0, state["level"] + ca.if_else(up, 1, ca.if_else(down, -1, 0)))
         return ca.if_else(level > count - 1, anywhere, level)  # what has passed the last is sent anywhere
 
-    def grown(self, state: dict[str, SX]) -> SX:
+    def next_times_grown(self, state: dict[str, SX]) -> SX:
         """Return how often the range of commands has grown when the next episode begins."""
         mean = state["tracked"] / self.task.episode_length
         change = ca.if_else(mean > WELL, 1, ca.if_else(mean < BADLY, -1, 0))
         most = math.ceil(round((1 - self.task.command_curriculum) / WIDER, 6))
         return ca.fmax(0, ca.fmin(most, state["grown"] + change))
 
-    def share(self, grown: SX) -> SX:
+    def range_share(self, grown: SX) -> SX:
         """Return the share of the range of commands that a robot gets."""
         return ca.fmin(1, self.task.command_curriculum + WIDER * grown)

@@ -19,9 +19,6 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.hulls import Hull
 from ce_gym.dynamics.laws.scene_parameters import law_values
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
-from ce_gym.envs.task.curriculum import Curriculum
-from ce_gym.envs.task.sampling import Sampler
-from ce_gym.envs.task.terrain_kinds import PLATFORM
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.substeps import FRAME, HEIGHTS
 
@@ -125,13 +122,3 @@ def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str,
             depth = reach(sphere.radius, sphere.rim, axes[:, i], *slopes) - above(centres[2, i], height, *slopes)
             load.append(stiffness * ca.fmax(depth, 0))
     return ca.vertcat(*load, SX(len(options.touches) - len(options.contacts), 1))
-
-
-def starting_place(curriculum: Curriculum, level: SX, sampler: Sampler) -> SX:
-    """Return where an episode begins, x and y [m]: about the middle of a tile of a level, or on a part of a map."""
-    terrain = curriculum.task.terrain
-    if "begin" in terrain:
-        return ca.vertcat(*[sampler.uniform(low, high) for low, high in terrain["begin"]])
-    column = ca.floor(sampler.uniform(0, terrain["columns"]))
-    middle = terrain["size"] * (ca.vertcat(level, column) + 0.5)
-    return middle + sampler.symmetric(2, PLATFORM / 2)

@@ -50,16 +50,16 @@ class TermContext:
 
     Attributes:
         term: Kind and name of the term that is being traced, for what it remembers.
-        remembered: What terms have recalled, by name of the state.
-        resets: With what that begins, a number or shape (size,).
-        kept: What terms have kept, likewise.
-        places: Where terms look at the ground of a field, as a `Lookup` has it, by name of what they find.
-        grids: Points that they look at around every place, if it is more than the place, likewise.
-        heights: What they find there [m], shape (n,), likewise.
-        unit: Draws a number in [0, 1) while sensors err; None where terms are exact, as rewards and critics have them.
-        drifts: Errors that stay for an episode, by name of the state.
-        erring: Terms that have asked for errors.
-        again: Whether those are traced a second time, without errors, for a critic.
+        memory: Values that terms have recalled, by name of the state.
+        resets: Values of the memory at the start of an episode, a number or shape (size,), by name.
+        next_memory: Values that terms have kept for the next control step, by name.
+        places: Points of a `Lookup` of the ground that a term makes, by name.
+        grids: Grid of a `Lookup` by name; empty if the term looks at the places alone.
+        heights: Ground heights that a `Lookup` returns [m], shape (n,), by name.
+        unit: Draws a number in [0, 1); None while terms are traced without sensor errors, for rewards and critics.
+        biases: Sensor errors that are constant over an episode, by name of the state.
+        noisy_terms: Terms that use sensor errors.
+        exact_pass: Whether noisy terms are traced again for the critic, without errors.
     """
 
     def __init__(
@@ -73,16 +73,16 @@ class TermContext:
         self.mechanism, self.control_dt, self._values = mechanism, control_dt, values
         self._gait_period, self._contacts = gait_period, tuple(contacts)
         self.term = ""
-        self.remembered: dict[str, SX] = {}
+        self.memory: dict[str, SX] = {}
         self.resets: dict[str, ArrayLike] = {}
-        self.kept: dict[str, SX] = {}
+        self.next_memory: dict[str, SX] = {}
         self.places: dict[str, SX] = {}
         self.grids: dict[str, Grid] = {}
         self.heights: dict[str, SX] = {}
         self.unit: Callable[[], SX] | None = None
-        self.drifts: dict[str, SX] = {}
-        self.erring: set[str] = set()
-        self.again = False
+        self.biases: dict[str, SX] = {}
+        self.noisy_terms: set[str] = set()
+        self.exact_pass = False
         robot = mechanism.robot
         self._n_joints = len(robot.commanded)
         pose = dict(robot.pose.joints)
@@ -97,13 +97,13 @@ class TermContext:
             reset: With what an episode begins, a number or shape (size,).
         """
         key = self._key(name)
-        if key not in self.remembered:
-            self.remembered[key] = self._values[key] if key in self._values else SX.sym(key, size)
+        if key not in self.memory:
+            self.memory[key] = self._values[key] if key in self._values else SX.sym(key, size)
             self.resets[key] = reset
-        return self.remembered[key]
+        return self.memory[key]
 
     def _key(self, name: str) -> str:
-        exact = "_exact" if self.again and self.term in self.erring else ""
+        exact = "_exact" if self.exact_pass and self.term in self.noisy_terms else ""
         return f"{self.term}_{name}{exact}".replace("__", "_")  # CasADi's rule for names
 
     def keep(self, name: str, value: SX) -> None:
@@ -113,11 +113,11 @@ class TermContext:
             ValueError: If nothing of that name and size has been recalled.
         """
         key = self._key(name)
-        size = self.remembered[key].numel() if key in self.remembered else 0
+        size = self.memory[key].numel() if key in self.memory else 0
         if SX(value).numel() != size:
             expected = f"recall({name!r}, size={SX(value).numel()}) before"
             raise ValueError(f"{self.term}: keep({name!r}) of {SX(value).numel()} numbers; expected {expected}")
-        self.kept[key] = ca.densify(ca.vec(SX(value)))
+        self.next_memory[key] = ca.densify(ca.vec(SX(value)))
 
     q = _buffer("q", "Positions, shape (nq,).")
     v = _buffer("v", "Velocities, shape (nv,).")
@@ -175,15 +175,15 @@ class TermContext:
 
     def drift(self, name: str, size: int = 1) -> SX:
         """Return errors of a sensor that stay for an episode, in [-1, 1), shape (size,); 0 where terms are exact."""
-        self.erring.add(self.term)
+        self.noisy_terms.add(self.term)
         if self.unit is None:
             return SX(ca.DM.zeros(size))
         key = self._key(name)
-        return self.drifts.setdefault(key, self._values.get(key, SX.sym(key, size)))
+        return self.biases.setdefault(key, self._values.get(key, SX.sym(key, size)))
 
     def chance(self, size: int) -> SX:
         """Return numbers in [0, 1), drawn anew in every control step, shape (size,); 1 where terms are exact."""
-        self.erring.add(self.term)
+        self.noisy_terms.add(self.term)
         if self.unit is None:
             return SX(ca.DM.ones(size))
         return ca.vertcat(*[self.unit() for _ in range(size)])
@@ -191,7 +191,7 @@ class TermContext:
     @property
     def exact(self) -> bool:
         """Whether terms are exact; a term that looks at this is traced once with errors and once without."""
-        self.erring.add(self.term)
+        self.noisy_terms.add(self.term)
         return self.unit is None
 
     @property
