@@ -1,4 +1,4 @@
-"""A task on a robot before anything is traced: its terms by name, its actions, its scene."""
+"""A task on a robot before tracing: terms by name, actions, scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ce_gym.sim.terrain.hulls import hulls_on
 
 
 class TaskSpec:
-    """Which terms, contacts, actions and scene a task has on a robot.
+    """Terms, contacts, actions and scene of a task on a robot.
 
     Args:
         model: The robot at a transmission level.
@@ -25,16 +25,17 @@ class TaskSpec:
         contact_forces: Whether to compute contact forces for recording.
 
     Attributes:
-        curriculum: What robots carry over from one episode to the next.
-        actions: What an action asks for.
-        contacts: Names of the spheres that take part in the physics.
-        randomised: Figures that are drawn for each episode.
-        ground: How the task sees a field; None on flat ground.
+        curriculum: Curricula of the task.
+        actions: Map from actions to targets of joints or motors.
+        contacts: Names of the contact spheres that the physics computes.
+        randomised: Parameters that are drawn for each episode.
+        field: Terrain of the task; None on flat ground.
+        ground: Look-ups of the field under the robot; None on flat ground.
         options: The scene of the sub-steps.
         reward_terms, termination_terms, metric_terms, observation_terms, critic_terms: Terms by name.
 
     Raises:
-        ValueError: If the robot lacks what the task needs, or the task names something that does not exist.
+        ValueError: The robot has no floating base, or the task names a term, contact or joint that does not exist.
     """
 
     def __init__(self, model: Model, task: Task, contact_forces: bool = False) -> None:

@@ -1,12 +1,12 @@
-"""What a reward, observation or termination may ask about one robot at the end of a control step, as SX.
+"""The quantities of one robot at the end of a control step that terms read, as CasADi expressions.
 
-A term is a free function of a `TermContext`. What is here is traced when it is asked for and costs nothing otherwise.
+A term is a function of a `TermContext`. A quantity is traced when a term reads it, and costs nothing otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, reduce
 
 import casadi as ca
 import numpy as np
@@ -24,11 +24,11 @@ from ce_gym.model.errors import check_names
 from ce_gym.model.mechanism import Mechanism
 
 GROUPS = "foot", "knee", "torso"
-"""Groups of contact spheres that the package's own terms look at; a robot need not have all of them."""
+"""Groups of contact spheres that terms of the package use; a robot may lack some of them."""
 
 
 def _buffer(name: str, document: str, default: SX | None = None) -> property:
-    """Return a property that is the value of a state buffer, or the default where the task has no such buffer."""
+    """Return a property with the value of a state buffer, or with the default if the task has no such buffer."""
 
     def read(s: TermContext) -> SX:
         return s._values[name] if default is None else s._values.get(name, SX(default))
@@ -41,15 +41,14 @@ class TermContext:
 
     Args:
         mechanism: The robot at a transmission level.
-        values: Expressions of the state buffers, by name: q, v, command, action, previous_action, torque,
-            air_time, clock, load, scaled_parameters; what terms remember; and seen_ground, height and slopes of the
-            ground under the base and each contact sphere, shape (3 (1 + n_spheres),), if it is not flat.
+        values: Expressions of the state buffers by name, such as q, v, command, action, clock or load. On a field,
+            `seen_ground` has height and slopes of the ground under the base and each contact sphere.
         control_dt: Length of a control step [s].
-        gait_period: Time of one cycle of the gait's clock [s].
-        contacts: Names of the contact spheres that take part in the physics.
+        gait_period: Period of the gait clock [s].
+        contacts: Names of the contact spheres that the physics computes.
 
     Attributes:
-        term: Kind and name of the term that is being traced, for what it remembers.
+        term: Kind and name of the term that is being traced, which begin the names of its memory.
         memory: Values that terms have recalled, by name of the state.
         resets: Values of the memory at the start of an episode, a number or shape (size,), by name.
         next_memory: Values that terms have kept for the next control step, by name.
@@ -89,12 +88,14 @@ class TermContext:
         self.standing_joints = np.array([pose.get(name, 0.0) for name in robot.commanded])
 
     def recall(self, name: str, size: int = 1, reset: ArrayLike = 0.0) -> SX:
-        """Return what this term kept in the control step before, shape (size,): memory of its own, one of each robot.
+        """Return the value that this term kept in the previous control step, shape (size,).
+
+        Memory belongs to one term and one robot.
 
         Args:
-            name: Of the memory, a word.
-            size: How many numbers it has.
-            reset: With what an episode begins, a number or shape (size,).
+            name: Name of the memory.
+            size: Length of the value.
+            reset: Value at the start of an episode, a number or shape (size,).
         """
         key = self._key(name)
         if key not in self.memory:
@@ -107,10 +108,10 @@ class TermContext:
         return f"{self.term}_{name}{exact}".replace("__", "_")  # CasADi's rule for names
 
     def keep(self, name: str, value: SX) -> None:
-        """Keep something for the next control step, see `recall`.
+        """Keep a value for the next control step, see `recall`.
 
         Raises:
-            ValueError: If nothing of that name and size has been recalled.
+            ValueError: The term has not called `recall` with this name and size.
         """
         key = self._key(name)
         size = self.memory[key].numel() if key in self.memory else 0
@@ -122,51 +123,53 @@ class TermContext:
     q = _buffer("q", "Positions, shape (nq,).")
     v = _buffer("v", "Velocities, shape (nv,).")
     command = _buffer("command", "Commanded forward and sideways velocity [m/s] and yaw rate [rad/s], shape (3,).")
-    action = _buffer("action", "The action just carried out, clipped, shape (n_joints,).")
-    previous_action = _buffer("previous_action", "The action before it, shape (n_joints,).")
+    action = _buffer("action", "Action of this control step, clipped, shape (n_joints,).")
+    previous_action = _buffer("previous_action", "Action of the previous control step, shape (n_joints,).")
     torque = _buffer("torque", "Motor torque at each joint in the last sub-step [N m], shape (n_joints,).")
-    motor_torque = _buffer("motor_torque", "Torque of each motor's windings in the last sub-step [N m], (n_motors,).")
+    motor_torque = _buffer(
+        "motor_torque", "Electromagnetic torque of each motor in the last sub-step [N m], (n_motors,)."
+    )
     motor_warmth = _buffer(
         "motor_warmth", "Temperatures of windings, then of housings, above the air [K], shape (2 n_warm,).", SX(0, 1)
     )
     battery_sag = _buffer("battery_sag", "Voltage drop of the battery under load [V], shape (1,) or (0,).", SX(0, 1))
     load = _buffer("load", "Normal force on each contact in the last sub-step [N], shape (n_contacts,).", SX(0, 1))
     scaled_parameters = _buffer(
-        "scaled_parameters", "The randomised figures of the episode, each in [-1, 1], shape (n,).", SX(0, 1)
+        "scaled_parameters", "Randomised parameters of the episode, each scaled to [-1, 1], shape (n,).", SX(0, 1)
     )
-    terrain_level = _buffer("level", "Level of the terrain on which the episode began; 0 on flat ground.", SX(0))
+    terrain_level = _buffer("level", "Terrain level of the episode; 0 on flat ground.", SX(0))
     times_grown = _buffer(
-        "grown", "How often the range of commands has grown, see `ce_gym.envs.task.curriculum`.", SX(0)
+        "grown", "Growth steps of the command range so far, see `ce_gym.envs.task.curriculum`.", SX(0)
     )
 
     def ground_under(self, name: str, places: SX) -> SX:
-        """Return heights of the ground under places [m], shape (n,): a look-up, on flat ground just zeros.
+        """Return heights of the ground under places [m], shape (n,); zeros on flat ground.
 
         Args:
-            name: Of what is found, a word.
-            places: x and y of each [m], shape (2, n); of positions, what the term recalls and drifts by, and heights
-                that it has found so.
+            name: Name of the look-up.
+            places: x and y of each place [m], shape (2, n). They may depend on positions, on `recall` and `drift`, and
+                on heights of earlier look-ups.
         """
-        return self._looked_up(name, ca.vec(places), places.shape[1])
+        return self._look_up(name, ca.vec(places), places.shape[1])
 
     def ground_around(self, name: str, heading: SX, places: SX, grid: ArrayLike) -> SX:
-        """Return heights of the ground around places [m], shape (n m,), place by place, for less than `ground_under`.
+        """Return heights of the ground on a grid around each place [m], shape (n m,); cheaper than `ground_under`.
 
         Args:
-            name: Of what is found, a word.
-            heading: Cosine and sine of the angle by which the grid is turned, shape (2,).
-            places: Where it is put, x and y of each [m], shape (2, n); both as for `ground_under`.
-            grid: x and y of its points [m], shape (2, m).
+            name: Name of the look-up.
+            heading: Cosine and sine of the angle of the grid, shape (2,).
+            places: x and y of each place [m], shape (2, n), as in `ground_under`.
+            grid: x and y of the points of the grid relative to a place [m], shape (2, m).
         """
         points = tuple((float(x), float(y)) for x, y in np.asarray(grid).T)
-        return self._looked_up(name, ca.vertcat(heading, ca.vec(places)), places.shape[1] * len(points), points)
+        return self._look_up(name, ca.vertcat(heading, ca.vec(places)), places.shape[1] * len(points), points)
 
     @property
     def on_field(self) -> bool:
-        """Whether the ground is a field, which is looked up, and not the plane z = 0."""
+        """Whether the ground is a field and not the plane z = 0."""
         return self._ground.numel() > 0
 
-    def _looked_up(self, name: str, places: SX, size: int, grid: Grid = ()) -> SX:
+    def _look_up(self, name: str, places: SX, size: int, grid: Grid = ()) -> SX:
         if not self.on_field:
             return SX(ca.DM.zeros(size))
         key = self._key(name)
@@ -174,7 +177,7 @@ class TermContext:
         return self.heights.setdefault(key, self._values.get(key, SX.sym(key, size)))
 
     def drift(self, name: str, size: int = 1) -> SX:
-        """Return errors of a sensor that stay for an episode, in [-1, 1), shape (size,); 0 where terms are exact."""
+        """Return random numbers in [-1, 1) that stay constant over an episode, shape (size,); 0 in exact terms."""
         self.noisy_terms.add(self.term)
         if self.unit is None:
             return SX(ca.DM.zeros(size))
@@ -182,7 +185,7 @@ class TermContext:
         return self.biases.setdefault(key, self._values.get(key, SX.sym(key, size)))
 
     def chance(self, size: int) -> SX:
-        """Return numbers in [0, 1), drawn anew in every control step, shape (size,); 1 where terms are exact."""
+        """Return random numbers in [0, 1), new in each control step, shape (size,); 1 in exact terms."""
         self.noisy_terms.add(self.term)
         if self.unit is None:
             return SX(ca.DM.ones(size))
@@ -190,7 +193,7 @@ class TermContext:
 
     @property
     def exact(self) -> bool:
-        """Whether terms are exact; a term that looks at this is traced once with errors and once without."""
+        """Whether the term is traced without sensor errors, as rewards and blocks of the critic are."""
         self.noisy_terms.add(self.term)
         return self.unit is None
 
@@ -201,14 +204,14 @@ class TermContext:
 
     @property
     def air_time(self) -> SX:
-        """How long each foot had been in the air up to the previous control step [s], shape (n_feet,)."""
-        self._feet  # noqa: B018  (says so if there are none)
+        """Time that each foot had been in the air at the previous control step [s], shape (n_feet,)."""
+        self._feet  # noqa: B018  (raises for a robot without feet)
         return self._values["air_time"]
 
     @property
     def foot_loads(self) -> list[SX]:
-        """Normal force on each foot in the last sub-step [N]; 0 on one whose spheres take no part in the physics."""
-        self._feet  # noqa: B018  (says so if there are none)
+        """Normal force on each foot in the last sub-step [N]; 0 if the physics computes none of its spheres."""
+        self._feet  # noqa: B018  (raises for a robot without feet)
         loads = {contact.body: SX(0) for contact in self.mechanism.robot.contacts if contact.group == "foot"}
         bodies = {contact.name: contact.body for contact in self.mechanism.robot.contacts if contact.group == "foot"}
         for i, name in enumerate(self._contacts):
@@ -218,7 +221,7 @@ class TermContext:
 
     @property
     def phase(self) -> SX:
-        """Where the gait's clock is [rad]; it starts at 0 with the episode."""
+        """Phase of the gait clock [rad]; 0 at the start of the episode."""
         return (2 * np.pi * self.control_dt / self._gait_period) * self._values["clock"]
 
     @property
@@ -240,28 +243,28 @@ class TermContext:
 
     @property
     def ball_rotations(self) -> SX:
-        """Rotation vector of each ball joint from its standing pose, axes of what it turns [rad], (3 n_balls,)."""
-        robot, found = self.mechanism.robot, [SX(0, 1)]
+        """Rotation vector of each ball joint from its standing pose, in axes of the moving body [rad], (3 n_balls,)."""
+        robot, vectors = self.mechanism.robot, [SX(0, 1)]
         for row, _ in robot.layout.ball_turns:
             w, x, y, z = robot.standing_q[row : row + 4]
-            back = SX(ca.DM([w, -x, -y, -z]))
-            found.append(rotation_vector(quaternion_product(back, self.q[row : row + 4])))
-        return ca.vertcat(*found)
+            inverse = SX(ca.DM([w, -x, -y, -z]))
+            vectors.append(rotation_vector(quaternion_product(inverse, self.q[row : row + 4])))
+        return ca.vertcat(*vectors)
 
     @property
     def ball_velocities(self) -> SX:
-        """Angular velocity of each ball joint, in the axes of what it turns [rad/s], shape (3 n_balls,)."""
+        """Angular velocity of each ball joint, in axes of the moving body [rad/s], shape (3 n_balls,)."""
         layout = self.mechanism.robot.layout
         return self.v[layout.base_nv : layout.joints_v] if layout.balls else SX(0, 1)
 
     @property
     def base_angular_velocity(self) -> SX:
-        """In the base frame [rad/s], shape (3,)."""
+        """Angular velocity of the base in its frame [rad/s], shape (3,)."""
         return self.v[:3]
 
     @property
     def base_linear_velocity(self) -> SX:
-        """In the base frame [m/s], shape (3,)."""
+        """Linear velocity of the base in its frame [m/s], shape (3,)."""
         return self.v[3:6]
 
     @property
@@ -275,7 +278,7 @@ class TermContext:
 
     @cached_property
     def up(self) -> SX:
-        """The world's upward direction in the base frame, shape (3,); (0, 0, 1) if upright."""
+        """Upward direction of the world in the base frame, shape (3,); (0, 0, 1) if upright."""
         return self.kinematics.bodies[self.mechanism.robot.bodies[0].name].R[2, :].T
 
     @cached_property
@@ -290,12 +293,12 @@ class TermContext:
         return [speeds[rotor.name] for rotor in self.mechanism.robot.rotors()]
 
     def lowest_points(self, group: str) -> list[tuple[str, SX, SX]]:
-        """Return body, height above the ground [m] and velocity (3,) [m/s] of each contact sphere of a group.
+        """Return body, height of the lowest point above the ground [m] and velocity [m/s] of each contact of a group.
 
-        One that moves around a rim is where it is lowest: the velocity is that of the body there, none if it rolls.
+        The velocity of a contact with a rim is the velocity of the body at the lowest point of the rim.
 
         Raises:
-            ValueError: If neither the robot nor the package's own terms know such a group.
+            ValueError: Neither the robot nor the package has such a group.
         """
         known = {contact.group: None for contact in self.mechanism.robot.contacts} | dict.fromkeys(GROUPS)
         check_names(f"{self.term}: group", [group], known, "a group of contacts among")
@@ -312,21 +315,21 @@ class TermContext:
                 if sphere.rim:
                     up = body.R[2, :].T
                     centre = centre - above_deepest(0.0, sphere.rim, up, axis, ca.dot(axis, up))
-                away = reach(sphere.radius, sphere.rim, body.R @ axis, *slopes)
-                points.append((sphere.body, above - away, body.R @ body.point_velocity(centre)))
+                extent = reach(sphere.radius, sphere.rim, body.R @ axis, *slopes)
+                points.append((sphere.body, above - extent, body.R @ body.point_velocity(centre)))
         return points
 
     @property
     def foot_places(self) -> list[SX]:
         """Mean x and y of the spheres of each foot and z of its lowest point, in the world [m], shape (3,) each."""
-        self._feet  # noqa: B018  (says so if there are none)
+        self._feet  # noqa: B018  (raises for a robot without feet)
         spheres: dict[str, list[SX]] = {}
         for sphere in self.mechanism.robot.contacts:
             if sphere.group == "foot":
                 body = self.kinematics.bodies[sphere.body]
-                away = reach(sphere.radius, sphere.rim, body.R @ constant(np.array(sphere.axis)))
+                extent = reach(sphere.radius, sphere.rim, body.R @ constant(np.array(sphere.axis)))
                 centre = body.point_position(constant(np.array(sphere.position)))
-                spheres.setdefault(sphere.body, []).append(centre - ca.vertcat(0.0, 0.0, away))
+                spheres.setdefault(sphere.body, []).append(centre - ca.vertcat(0.0, 0.0, extent))
         return [
             ca.vertcat(sum(p[:2] for p in points) / len(points), ca.mmin(ca.horzcat(*[p[2] for p in points])))
             for points in spheres.values()
@@ -334,7 +337,7 @@ class TermContext:
 
     @cached_property
     def foot_sides(self) -> list[float]:
-        """How far to the left of the base's middle the spheres of each foot are in the standing pose, means [m]."""
+        """Mean y of the contact spheres of each foot in the standing pose, positive to the left [m]."""
         standing, sides = standing_pose(self.mechanism), dict[str, list[float]]()
         for sphere in self.mechanism.robot.contacts:
             if sphere.group == "foot":
@@ -348,7 +351,7 @@ class TermContext:
 
     @cached_property
     def _feet(self) -> dict[str, list[tuple[SX, SX]]]:
-        """Height and velocity of the spheres of each foot; a foot is a body with spheres of the group "foot"."""
+        """Height and velocity of the spheres of each foot; a foot is a body with contacts of the group "foot"."""
         feet: dict[str, list[tuple[SX, SX]]] = {}
         for body, height, velocity in self.lowest_points("foot"):
             feet.setdefault(body, []).append((height, velocity))
@@ -359,12 +362,7 @@ class TermContext:
     @cached_property
     def foot_heights(self) -> SX:
         """Height of the lowest point of each foot above the ground [m], shape (n_feet,)."""
-        lowest = []
-        for spheres in self._feet.values():
-            height = spheres[0][0]
-            for other, _ in spheres[1:]:
-                height = ca.fmin(height, other)
-            lowest.append(height)
+        lowest = [reduce(ca.fmin, (height for height, _ in spheres)) for spheres in self._feet.values()]
         return ca.vertcat(SX(0, 1), *lowest)
 
     @cached_property
@@ -384,5 +382,5 @@ class TermContext:
 
     @cached_property
     def commanded_to_move(self) -> SX:
-        """1 if the command asks for motion, else 0."""
+        """1 if a velocity is commanded, else 0."""
         return ca.sumsqr(self.command) > 0.01
