@@ -149,7 +149,7 @@ class ControlStepGradient:
         after = {}
         for name, size in sizes.items():
             gradient = gradients.get(name, SX(ca.DM.zeros(size)))
-            if name in self.carried and name not in outputs:  # the stage leaves this part of the state as it is
+            if name in self.carried and name not in outputs:  # the stage does not write this part of the state
                 gradient = gradient + weights[name]
             after[f"{name}_after"] = ca.if_else(diverged > 0.5, 0, gradient)
 

@@ -210,8 +210,8 @@ class Stages:
         )
         if not any(term.added for terms in kinds for term in terms.values()):
             return ""
-        places = {f"{name}_places": place for name, place in self._places.items()}
-        function = traced("user_terms", self._inputs, self._evaluation | places)
+        results = {f"{name}_result": x for name, x in (self._evaluation | self._places).items()}
+        function = traced("user_terms", self._inputs, results)
         return f"{function.serialize()} {list(self.rows.values())!r} {self.grids!r}"
 
     def _learn(self, s: TermContext) -> dict[str, SX]:
