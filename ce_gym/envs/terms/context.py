@@ -20,6 +20,7 @@ from ce_gym.dynamics.forces.ground import above_deepest, reach
 from ce_gym.dynamics.recursion.derived import spanning_coordinates
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.dynamics.standing import standing_pose
+from ce_gym.model.description import ContactSphere
 from ce_gym.model.errors import check_names
 from ce_gym.model.mechanism import Mechanism
 
@@ -205,19 +206,15 @@ class TermContext:
     @property
     def air_time(self) -> SX:
         """Time that each foot had been in the air at the previous control step [s], shape (n_feet,)."""
-        self._feet  # noqa: B018  (raises for a robot without feet)
+        self._foot_spheres  # noqa: B018  (raises for a robot without feet)
         return self._values["air_time"]
 
     @property
     def foot_loads(self) -> list[SX]:
         """Normal force on each foot in the last sub-step [N]; 0 if the physics computes none of its spheres."""
-        self._feet  # noqa: B018  (raises for a robot without feet)
-        loads = {contact.body: SX(0) for contact in self.mechanism.robot.contacts if contact.group == "foot"}
-        bodies = {contact.name: contact.body for contact in self.mechanism.robot.contacts if contact.group == "foot"}
-        for i, name in enumerate(self._contacts):
-            if name in bodies:
-                loads[bodies[name]] += self.load[i]
-        return list(loads.values())
+        loads = {name: self.load[i] for i, name in enumerate(self._contacts)}
+        feet = self._foot_spheres.values()
+        return [sum([loads[sphere.name] for sphere in spheres if sphere.name in loads], SX(0)) for spheres in feet]
 
     @property
     def phase(self) -> SX:
@@ -270,7 +267,7 @@ class TermContext:
     @property
     def base_height(self) -> SX:
         """Height of the base origin above the ground [m]."""
-        return self.q[2] - self._ground[0] if self._ground.numel() else self.q[2]
+        return self.q[2] - self._ground[0] if self.on_field else self.q[2]
 
     @property
     def _ground(self) -> SX:
@@ -308,7 +305,7 @@ class TermContext:
                 body = self.kinematics.bodies[sphere.body]
                 centre = constant(np.array(sphere.position))
                 above, slopes = body.point_position(centre)[2], []
-                if self._ground.numel():
+                if self.on_field:
                     height, *slopes = ca.vertsplit(self._ground[3 * i + 3 : 3 * i + 6])
                     above = over_ground(above, height, *slopes)
                 axis = constant(np.array(sphere.axis))
@@ -322,53 +319,56 @@ class TermContext:
     @property
     def foot_places(self) -> list[SX]:
         """Mean x and y of the spheres of each foot and z of its lowest point, in the world [m], shape (3,) each."""
-        self._feet  # noqa: B018  (raises for a robot without feet)
-        spheres: dict[str, list[SX]] = {}
-        for sphere in self.mechanism.robot.contacts:
-            if sphere.group == "foot":
-                body = self.kinematics.bodies[sphere.body]
+        places = []
+        for name, spheres in self._foot_spheres.items():
+            body, points = self.kinematics.bodies[name], []
+            for sphere in spheres:
                 extent = reach(sphere.radius, sphere.rim, body.R @ constant(np.array(sphere.axis)))
-                centre = body.point_position(constant(np.array(sphere.position)))
-                spheres.setdefault(sphere.body, []).append(centre - ca.vertcat(0.0, 0.0, extent))
-        return [
-            ca.vertcat(sum(p[:2] for p in points) / len(points), ca.mmin(ca.horzcat(*[p[2] for p in points])))
-            for points in spheres.values()
-        ]
+                points.append(body.point_position(constant(np.array(sphere.position))) - ca.vertcat(0.0, 0.0, extent))
+            lowest = ca.mmin(ca.horzcat(*[point[2] for point in points]))
+            places.append(ca.vertcat(sum(point[:2] for point in points) / len(points), lowest))
+        return places
 
     @cached_property
     def foot_sides(self) -> list[float]:
         """Mean y of the contact spheres of each foot in the standing pose, positive to the left [m]."""
-        standing, sides = standing_pose(self.mechanism), dict[str, list[float]]()
-        for sphere in self.mechanism.robot.contacts:
-            if sphere.group == "foot":
-                place = standing.p[sphere.body] + standing.R[sphere.body] @ np.array(sphere.position)
-                sides.setdefault(sphere.body, []).append(place[1])
-        return [float(np.mean(places)) for places in sides.values()]
+        standing, sides = standing_pose(self.mechanism), []
+        for name, spheres in self._foot_spheres.items():
+            y = [standing.p[name][1] + standing.R[name][1] @ np.array(sphere.position) for sphere in spheres]
+            sides.append(float(np.mean(y)))
+        return sides
 
     def touching(self, group: str) -> SX:
         """Whether each contact sphere of a group is on the ground, 0 or 1, shape (n,)."""
         return ca.vertcat(SX(0, 1), *[height for _, height, _ in self.lowest_points(group)]) < 0
 
     @cached_property
-    def _feet(self) -> dict[str, list[tuple[SX, SX]]]:
-        """Height and velocity of the spheres of each foot; a foot is a body with contacts of the group "foot"."""
-        feet: dict[str, list[tuple[SX, SX]]] = {}
-        for body, height, velocity in self.lowest_points("foot"):
-            feet.setdefault(body, []).append((height, velocity))
+    def _foot_spheres(self) -> dict[str, list[ContactSphere]]:
+        """Contact spheres of each foot by body; a foot is a body with contacts of the group "foot"."""
+        feet: dict[str, list[ContactSphere]] = {}
+        for sphere in self.mechanism.robot.contacts:
+            if sphere.group == "foot":
+                feet.setdefault(sphere.body, []).append(sphere)
         if not feet:
             raise ValueError(f"{self.term}: {self.mechanism.robot.name} has no contact spheres of group 'foot'")
         return feet
 
     @cached_property
+    def _feet(self) -> list[list[tuple[SX, SX]]]:
+        """Height and velocity of the contact spheres, foot by foot."""
+        points = self.lowest_points("foot")
+        return [[(height, v) for body, height, v in points if body == foot] for foot in self._foot_spheres]
+
+    @cached_property
     def foot_heights(self) -> SX:
         """Height of the lowest point of each foot above the ground [m], shape (n_feet,)."""
-        lowest = [reduce(ca.fmin, (height for height, _ in spheres)) for spheres in self._feet.values()]
+        lowest = [reduce(ca.fmin, (height for height, _ in spheres)) for spheres in self._feet]
         return ca.vertcat(SX(0, 1), *lowest)
 
     @cached_property
     def foot_velocities(self) -> SX:
         """Mean velocity of the spheres of each foot, world axes [m/s], shape (3, n_feet)."""
-        return ca.horzcat(SX(3, 0), *[sum(v for _, v in spheres) / len(spheres) for spheres in self._feet.values()])
+        return ca.horzcat(SX(3, 0), *[sum(v for _, v in spheres) / len(spheres) for spheres in self._feet])
 
     @cached_property
     def foot_contact(self) -> SX:
