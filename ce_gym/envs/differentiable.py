@@ -98,9 +98,7 @@ class DifferentiableEnv:
     def step(self, actions: Any) -> tuple[Any, ...]:
         """Step the environment and record the step; arguments and results as for `step` of the environment."""
         batch, same_step = self.batch, getattr(self.env, "autoreset_mode", None) == AutoresetMode.SAME_STEP
-        arrays = (
-            self._spare.pop() if self._spare else {name: aligned_copy(batch.arrays[name]) for name in self._recorded}
-        )
+        arrays = self._spare.pop() if self._spare else {x: aligned_copy(batch.arrays[x]) for x in self._recorded}
         for name, array in arrays.items():
             array[...] = batch.arrays[name]
         counters, ignored = batch.arrays["counters"].copy(), batch.arrays["finished"].copy()
@@ -174,10 +172,9 @@ class DifferentiableEnv:
     @cached_property
     def not_smooth(self) -> dict[str, str]:
         """Terms that are not smooth, see the attributes of the class."""
-        p = self.batch.program
-        kinds = p.reward_terms, p.termination_terms, p.observation_terms | p.critic_terms
-        named = {f"{term.kind} {name}": term for terms in kinds for name, term in terms.items()}
-        roughness = {name: _roughness(p.stages, term) for name, term in named.items()}
+        program = self.batch.program
+        terms = {f"{term.kind} {term.name}": term for term in program.terms if term.kind != "metric"}
+        roughness = {name: _roughness(program.stages, term) for name, term in terms.items()}
         return {name: kind for name, kind in roughness.items() if kind}
 
     def _rows(self, gradient: Any) -> NDArray:
@@ -191,7 +188,7 @@ class DifferentiableEnv:
                 continue
             if name not in columns or np.size(part) != rows[:, columns[name]].size:
                 raise ValueError(
-                    f"gradient of observation {name!r} has shape {np.shape(part)}; expected the shape of the block"
+                    f"gradient of observation {name!r} has shape {np.shape(part)}; expected that of {name}"
                 )
             rows[:, columns[name]] += np.reshape(part, (n, -1))
         return rows

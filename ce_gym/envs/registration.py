@@ -53,15 +53,12 @@ def ids_of(stem: str, robot: str, stretches: bool, tasks: Iterable[str] = tuple(
         tasks: Names of tasks.
     """
     levels = (None, *LEVELS, ELASTIC) if stretches else (None, *LEVELS)
-    return {
-        f"{stem}{camel_case(task)}{f'-{camel_case(level)}' if level else ''}-v0": {
-            "robot": robot,
-            "task": task,
-            "transmission": level or "exact",
-        }
-        for task in tasks
-        for level in levels
-    }
+    ids = {}
+    for task in tasks:
+        for level in levels:
+            name = f"{stem}{camel_case(task)}{f'-{camel_case(level)}' if level else ''}-v0"
+            ids[name] = {"robot": robot, "task": task, "transmission": level or "exact"}
+    return ids
 
 
 def register_environments() -> None:

@@ -7,14 +7,13 @@ module, which is imported when an environment is made with a render mode.
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
 from ce_gym.envs.runtime.batch import TaskBatch
-from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.sim.arguments import check_whole
 
 RENDER_MODES = ("human", "rgb_array")
@@ -67,12 +66,10 @@ class Screen:
         self._mode, self._batch = mode, batch
         self._renderer: Renderer | None = None
         if mode is not None:
-            model, fps = batch.program.model, 1 / batch.program.control_dt
-            make: Any = getattr(import_module(_renderers[0]), mode)
-            ground = field_of(batch.program.task.terrain)
-            self._renderer = make(
-                model, model.standing_q, width=int(width), height=int(height), fps=fps, terrain=ground
-            )
+            program, make = batch.program, getattr(import_module(_renderers[0]), mode)
+            size = {"width": int(width), "height": int(height)}
+            options = {**size, "fps": 1 / program.control_dt, "terrain": program.field}
+            self._renderer = make(program.model, program.model.standing_q, **options)
 
     def frames(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each environment; in mode "human" show the first environment and return None."""

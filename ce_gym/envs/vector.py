@@ -138,9 +138,8 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         if not same_step and batch.arrays["finished"].any():
             ignored = batch.rows("finished")
             if self.autoreset_mode == AutoresetMode.DISABLED:
-                raise gymnasium.error.ResetNeeded(
-                    f"{int(ignored.sum())} environments are finished; reset them with options={{'reset_mask': ...}}"
-                )
+                advice = "reset them with options={'reset_mask': ...}"
+                raise gymnasium.error.ResetNeeded(f"{int(ignored.sum())} environments are finished; {advice}")
         o = batch.step(rows, ignored, same_step)
         if ignored is not None:  # mode NextStep: a reset replaces the step of these environments
             o.observation = batch.reset(ignored)

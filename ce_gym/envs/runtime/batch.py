@@ -180,8 +180,6 @@ def programs(program: TaskProgram, fused: bool) -> tuple[Program, ...]:
 
 def kernel_key(program: TaskProgram) -> str:
     """Return a text that identifies the kernels of a task on a robot, for the cache."""
-    traced = f"{source_fingerprint(*SOURCES)} {model_key(program.model)}"
+    traced = f"{source_fingerprint(*SOURCES)} {model_key(program.model)} {program.stages.user_terms}"
     laws = laws_key(program.model.mechanism, program.options)
-    return (
-        f"{traced} {program.task!r} {program.contact_forces} {program.stages.user_terms} {program.options.hulls} {laws}"
-    )
+    return f"{traced} {program.task!r} {program.contact_forces} {program.options.hulls} {laws}"

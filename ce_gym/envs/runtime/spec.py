@@ -10,7 +10,7 @@ from ce_gym.envs.task.ground import Ground
 from ce_gym.envs.task.randomisation import Randomised
 from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.task.terrain_tiles import field_of
-from ce_gym.envs.terms.registry import terms_of
+from ce_gym.envs.terms.registry import Term, terms_of
 from ce_gym.model.errors import check_names
 from ce_gym.sim.kernels import select_contacts, select_pairs
 from ce_gym.sim.terrain.hulls import hulls_on
@@ -52,9 +52,8 @@ class TaskSpec:
         check_names("noise", task.noise, self.observation_terms, "an observation among")
         self.contacts = select_contacts(robot, task.contacts)
         if task.latency[1] > task.n_substeps:
-            raise ValueError(
-                f"latency={task.latency}; expected at most the {task.n_substeps} sub-steps of a control step"
-            )
+            expected = f"at most the {task.n_substeps} sub-steps of a control step"
+            raise ValueError(f"latency={task.latency}; expected {expected}")
         self.field = field_of(task.terrain)
         hulls = hulls_on(robot, self.contacts, self.field)
         self.ground = Ground(self.model.mechanism, self.contacts, hulls) if self.curriculum.on_field else None
@@ -74,6 +73,13 @@ class TaskSpec:
             seldom=tuple(name for name in select_contacts(robot, task.seldom, "seldom") if name in self.contacts),
             hulls=hulls,
         )
+
+    @property
+    def terms(self) -> list[Term]:
+        """All terms: rewards, terminations, metrics, observations, critic blocks."""
+        rewards, terminations, metrics = self.reward_terms, self.termination_terms, self.metric_terms
+        kinds = (rewards, terminations, metrics, self.observation_terms, self.critic_terms)
+        return [term for terms in kinds for term in terms.values()]
 
     @property
     def n_actions(self) -> int:

@@ -200,15 +200,7 @@ class Stages:
     @cached_property
     def user_terms(self) -> str:
         """A text that identifies the terms that users have added, for cache keys; empty without such terms."""
-        spec = self.spec
-        kinds = (
-            spec.reward_terms,
-            spec.termination_terms,
-            spec.metric_terms,
-            spec.observation_terms,
-            spec.critic_terms,
-        )
-        if not any(term.added for terms in kinds for term in terms.values()):
+        if not any(term.added for term in self.spec.terms):
             return ""
         results = {f"{name}_result": x for name, x in (self._evaluation | self._places).items()}
         function = traced("user_terms", self._inputs, results)

@@ -270,9 +270,8 @@ def _matched(values: NDArray | None, mirrored: NDArray | None) -> SignedPermutat
     if values is None or mirrored is None:
         return None
     size = np.maximum(np.sqrt((mirrored**2).mean(axis=0)), 1e-9)
-    gaps = np.stack(
-        [np.sqrt(((mirrored[:, :, None] - sign * values[:, None, :]) ** 2).mean(axis=0)) for sign in (1, -1)]
-    )
+    squares = [(mirrored[:, :, None] - sign * values[:, None, :]) ** 2 for sign in (1, -1)]
+    gaps = np.sqrt(np.stack([square.mean(axis=0) for square in squares]))
     gaps[0] -= 1e-9 * np.eye(len(size))  # constant entries keep their index
     index, sign = gaps.min(axis=0).argmin(axis=1), np.ones(len(size), np.float32)
     rows = np.arange(len(size))

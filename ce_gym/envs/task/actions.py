@@ -70,10 +70,8 @@ class ActionMap:
             names = [self.targets[i] for i in self.moved]
             self.scale = np.array([motors.get(name, robot.body(name).joint.torque) for name in names])
             if not np.isfinite(self.scale).all():
-                what = "motor" if self.control.startswith("motor") else "joint"
-                raise ValueError(
-                    f"{robot.name}: actions={task.actions!r} needs a torque limit (effort) of every {what}"
-                )
+                needed = f"a torque limit (effort) of every {task.actions.split('_')[0]}"
+                raise ValueError(f"{robot.name}: actions={task.actions!r} needs {needed}")
 
     def _positions(self, mechanism: Mechanism, scale: float) -> tuple[np.ndarray, np.ndarray]:
         """Return `rest` and `scale` of position targets.

@@ -29,9 +29,8 @@ def starting_pose(model: Model, task: Task, sampler: Sampler) -> SX:
         standing[2] += sampler.uniform(*height)
         direction, angle = sampler.uniform(-np.pi, np.pi), sampler.uniform(*lean)
         quaternion = turned_by(quaternion, angle * ca.vertcat(ca.cos(direction), ca.sin(direction), 0))
-    balls = [
-        turned_by(standing[row : row + 4], noise[3 * i : 3 * i + 3]) for i, (row, _) in enumerate(layout.ball_turns)
-    ]
+    rows = [row for row, _ in layout.ball_turns]
+    balls = [turned_by(standing[row : row + 4], noise[3 * i : 3 * i + 3]) for i, row in enumerate(rows)]
     joints = standing[layout.joints_q :] + noise[3 * layout.balls :]
     return ca.densify(ca.vertcat(standing[:3], quaternion, *balls, joints))
 

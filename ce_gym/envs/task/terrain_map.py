@@ -51,9 +51,8 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _where(file: str) -> str:
     """Return the expectation for a file that does not exist: where it was searched, and the remedy."""
-    places = (
-        "" if Path(file).is_absolute() else f", looked for in {str(Path.cwd())!r} and beside a policy that names it"
-    )
+    searched = f", looked for in {str(Path.cwd())!r} and beside a policy that names it"
+    places = "" if Path(file).is_absolute() else searched
     return f"a file with a height map{places}; copy it there or name another `file`"
 
 

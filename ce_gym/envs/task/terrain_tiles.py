@@ -50,12 +50,8 @@ def checked_terrain(value: Any) -> dict[str, Any]:
     given = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
     kind: Any = given.pop("kind", "mixed" if "kinds" in given else None)
     known = isinstance(kind, str) and kind in (*DEFAULTS, "map")
-    check(
-        "terrain",
-        value,
-        known,
-        f"{', '.join(map(repr, DEFAULTS))}, a Terrain, or a mapping with such a `kind` or 'map'",
-    )
+    expected = f"{', '.join(map(repr, DEFAULTS))}, a Terrain, or a mapping with such a `kind` or 'map'"
+    check("terrain", value, known, expected)
     if kind == "map":
         return checked_map(given)
     _check_arguments("terrain", kind, given, DEFAULTS[kind])

@@ -128,20 +128,14 @@ class TermContext:
     previous_action = _buffer("previous_action", "Action of the previous control step, shape (n_joints,).")
     torque = _buffer("torque", "Motor torque at each joint in the last sub-step [N m], shape (n_joints,).")
     motor_torque = _buffer(
-        "motor_torque", "Electromagnetic torque of each motor in the last sub-step [N m], (n_motors,)."
+        "motor_torque", "Torque of each motor before friction in the last sub-step [N m], (n_motors,)."
     )
-    motor_warmth = _buffer(
-        "motor_warmth", "Temperatures of windings, then of housings, above the air [K], shape (2 n_warm,).", SX(0, 1)
-    )
+    motor_warmth = _buffer("motor_warmth", "Winding, then housing temperatures above the air [K], (2 n_warm,).", SX(0, 1))
     battery_sag = _buffer("battery_sag", "Voltage drop of the battery under load [V], shape (1,) or (0,).", SX(0, 1))
     load = _buffer("load", "Normal force on each contact in the last sub-step [N], shape (n_contacts,).", SX(0, 1))
-    scaled_parameters = _buffer(
-        "scaled_parameters", "Randomised parameters of the episode, each scaled to [-1, 1], shape (n,).", SX(0, 1)
-    )
+    scaled_parameters = _buffer("scaled_parameters", "Randomised parameters, scaled to [-1, 1], shape (n,).", SX(0, 1))
     terrain_level = _buffer("level", "Terrain level of the episode; 0 on flat ground.", SX(0))
-    times_grown = _buffer(
-        "grown", "Growth steps of the command range so far, see `ce_gym.envs.task.curriculum`.", SX(0)
-    )
+    times_grown = _buffer("grown", "Growth steps of the command range, see `ce_gym.envs.task.curriculum`.", SX(0))
 
     def ground_under(self, name: str, places: SX) -> SX:
         """Return heights of the ground under places [m], shape (n,); zeros on flat ground.
