@@ -39,9 +39,9 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
         ce_gym/MyRobotVelocity-v0 ce_gym/MyRobotVelocity-Armature-v0
     """
     if not isinstance(path, str | os.PathLike):
-        given = repr(path.name) if isinstance(path, Robot) else repr(path)
+        value = repr(path.name) if isinstance(path, Robot) else repr(path)
         expected = "the path of a file, which worker processes can read, too"
-        raise bad("register_robot", "path", f"{type(path).__name__} {given}", expected)
+        raise bad("register_robot", "path", f"{type(path).__name__} {value}", expected)
     file = Path(path).resolve()
     robot = load_robot(file)
     if problems := missing(robot):

@@ -180,8 +180,8 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
     def elapsed_steps(self) -> Array:
         """Control steps since each episode began, by which time runs out, int64, shape (num_envs,).
 
-        Learners set it at random at first, so that episodes do not all end together; lengths and means that are
-        reported of those first episodes count from there too.
+        Learners set random values at first, so that episodes do not all end together. Reported lengths and means of
+        the first episodes count from these values.
         """
         return self.batch.place.rows(self.batch.rows("elapsed")[:, 0], "int64")
 

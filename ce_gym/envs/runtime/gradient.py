@@ -39,7 +39,7 @@ class ControlStepGradient:
         carried: Sizes of the gradients that pass from control step to control step, by name of the state.
 
     Raises:
-        ValueError: If the control step of the task cannot be differentiated.
+        ValueError: The control step of the task cannot be differentiated.
     """
 
     def __init__(self, program: TaskProgram) -> None:

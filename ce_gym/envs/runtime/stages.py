@@ -68,12 +68,13 @@ class Stages:
         return _call("evaluate", self._inputs, self._evaluation), self._inputs["draws"].numel()
 
     def _evaluate(self, action: SX, sampler: Sampler) -> dict[str, SX]:
-        """Trace the buffers that a control step writes after its sub-steps, by name."""
+        """Trace the buffers that a control step writes after its sub-steps, by name, in the order of the stages."""
         spec, state = self.spec, self.state
-        before = state | self.ground_values | {"action": action, "previous_action": state["action"]}
-        s = self.context(before)
+        values = state | self.ground_values | {"action": action, "previous_action": state["action"]}
+        s = self.context(values)
         after = {"action": action, "elapsed": state["elapsed"] + 1, "clock": state["clock"] + 1}
 
+        # rewards, terminations, metrics
         rewards = [term.weight * term.number(s) * spec.control_dt for term in spec.reward_terms.values()]
         reward = ca.fmax(0, sum(rewards, SX(0))) if self.task.only_positive else sum(rewards, SX(0))
         diverged = state["diverged"] > 0.5
@@ -84,27 +85,30 @@ class Stages:
         after["failures"] = state["failures"] + diverged
         if "air_time" in state:
             after["air_time"] = ca.if_else(s.foot_contact, 0, state["air_time"] + spec.control_dt)
+
+        # curriculum, memory of terms
         after |= spec.curriculum.progress(s, state)
         after |= self._learn(s)
 
+        # commands, pushes
         command = self._next_command(after["clock"], sampler)
         after |= self._push(after["clock"], sampler)
         after |= self.commands.steer(state["q"], command)
 
-        s = self.context(before | after)
+        # observations
+        s = self.context(values | after)
         policy, critic = self._blocks(s, sampler)
         self.block_sizes = {name: block.numel() for name, block in (policy | critic).items()}
         after |= self._learn(s)
         newest = self._noisy(policy, sampler)
         observation, history = _stack(newest, self._add_history(newest), critic)
-        after |= history
+        after |= history | {"chosen": done, "observation": observation}
 
-        # robots that have diverged may have rewards that are NaN or infinite
+        # results; rewards of diverged robots may be NaN or infinite
         outcome = ca.vertcat(reward, terminated, truncated, diverged, done, *rewards)
         outcome = ca.if_else(ca.logic_or(ca.logic_not(diverged), ca.fabs(outcome) < ca.inf), outcome, 0)
         sums = ca.if_else(ca.logic_and(done, ca.fabs(after["sums"]) < ca.inf), after["sums"], 0)
-        ended = ca.vertcat(ca.if_else(done, after["elapsed"], 0), sums)
-        return after | {"chosen": done, "observation": observation, "outcome": outcome, "ended": ended}
+        return after | {"outcome": outcome, "ended": ca.vertcat(ca.if_else(done, after["elapsed"], 0), sums)}
 
     def spawn(self) -> tuple[Call, int]:
         """Trace the pose of `chosen` robots on a tile of the field as if the ground were at height 0.
@@ -156,7 +160,7 @@ class Stages:
             Calls in order. The places of a call may depend on the heights at the places of earlier calls.
 
         Raises:
-            ValueError: If a place depends on a value that is not known before observations are made.
+            ValueError: A place depends on a value that is not known before observations are made.
         """
         state = self.state | {"clock": SX(0) if begins else self.state["clock"] + 1}
         s = self.context(state | self.ground_values | {"previous_action": state["action"]})

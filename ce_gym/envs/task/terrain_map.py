@@ -15,12 +15,12 @@ MARGIN = 1.0
 """Default distance of the starting range from the edge of the map, at most a quarter of its length [m]."""
 
 
-def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
+def checked_map(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return the ground of a task on a map.
 
     Args:
-        given: `field`, a `Terrain`, or `file` with `cell` and `height`, see `Terrain.from_file`; `begin`, the ranges of
-            x and y in which episodes start [m].
+        arguments: `field`, a `Terrain`, or `file` with `cell` and `height`, see `Terrain.from_file`; `begin`, the
+            ranges of x and y in which episodes start [m].
 
     Returns:
         `kind`, `field` and `begin`.
@@ -28,20 +28,20 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: An argument is not valid; one line.
     """
-    for name, value in given.items():
+    for name, value in arguments.items():
         check(f"terrain[{name!r}]", value, name in ARGUMENTS, f"one of {listed_names(name, ARGUMENTS)} for 'map'")
-    field: Any = given.get("field")
-    file: Any = given.get("file")
+    field: Any = arguments.get("field")
+    file: Any = arguments.get("file")
     exactly_one = (field is None) != (file is None)
-    check("terrain", {"kind": "map", **given}, exactly_one, "either a `field` or a `file` of a 'map'")
+    check("terrain", {"kind": "map", **arguments}, exactly_one, "either a `field` or a `file` of a 'map'")
     if field is None:
         check("terrain['file']", file, isinstance(file, str), "a path")
         check("terrain['file']", file, Path(file).is_file(), _where(file))
-        field = Terrain.from_file(file, given.get("cell", 0.1), given.get("height", 1.0))
+        field = Terrain.from_file(file, arguments.get("cell", 0.1), arguments.get("height", 1.0))
     check("terrain['field']", field, isinstance(field, Terrain), "a Terrain")
-    fits = file is not None or not {"cell", "height"} & given.keys()
-    check("terrain", {"kind": "map", **given}, fits, "`cell` and `height` with a `file` only")
-    begin = _inside(field) if given.get("begin") is None else given["begin"]
+    fits = file is not None or not {"cell", "height"} & arguments.keys()
+    check("terrain", {"kind": "map", **arguments}, fits, "`cell` and `height` with a `file` only")
+    begin = _inside(field) if arguments.get("begin") is None else arguments["begin"]
     check("terrain['begin']", begin, _are_ranges(begin), "two pairs (low, high), of x and of y [m]")
     for axis, (low, high), (first, last) in zip("xy", begin, _ends(field), strict=True):
         inside = first <= low and high <= last

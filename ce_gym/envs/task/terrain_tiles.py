@@ -47,36 +47,36 @@ def checked_terrain(value: Any) -> dict[str, Any]:
         ValueError: An argument is not valid; one line.
     """
     value = {"kind": "map", "field": value} if isinstance(value, Terrain) else value
-    given = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
-    kind: Any = given.pop("kind", "mixed" if "kinds" in given else None)
+    arguments = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
+    kind: Any = arguments.pop("kind", "mixed" if "kinds" in arguments else None)
     known = isinstance(kind, str) and kind in (*DEFAULTS, "map")
     expected = f"{', '.join(map(repr, DEFAULTS))}, a Terrain, or a mapping with such a `kind` or 'map'"
     check("terrain", value, known, expected)
     if kind == "map":
-        return checked_map(given)
-    _check_arguments("terrain", kind, given, DEFAULTS[kind])
+        return checked_map(arguments)
+    _check_arguments("terrain", kind, arguments, DEFAULTS[kind])
     if kind != "mixed":
-        return {"kind": kind, **DEFAULTS[kind], **given}
-    kinds = _checked_mixture(given.get("kinds"))
+        return {"kind": kind, **DEFAULTS[kind], **arguments}
+    kinds = _checked_mixture(arguments.get("kinds"))
     finest = min(DEFAULTS[name].get("cell", COMMON["cell"]) for name in kinds)
-    return {"kind": kind, **DEFAULTS[kind], "cell": finest, **given, "kinds": kinds}
+    return {"kind": kind, **DEFAULTS[kind], "cell": finest, **arguments, "kinds": kinds}
 
 
-def _checked_mixture(given: Any) -> dict[str, dict[str, Any]]:
+def _checked_mixture(shares: Any) -> dict[str, dict[str, Any]]:
     """Return the kinds of a mixture, each with its share and all its arguments."""
-    known = isinstance(given, Mapping) and bool(given) and set(given) <= set(DEFAULTS) - {"mixed"}
-    check("terrain['kinds']", given, known, f"shares by kind among {', '.join(list(DEFAULTS)[:-1])}")
+    known = isinstance(shares, Mapping) and bool(shares) and set(shares) <= set(DEFAULTS) - {"mixed"}
+    check("terrain['kinds']", shares, known, f"shares by kind among {', '.join(list(DEFAULTS)[:-1])}")
     kinds = {}
-    for name, value in given.items():
+    for name, value in shares.items():
         defaults = {"share": 1.0} | {key: x for key, x in DEFAULTS[name].items() if key not in COMMON}
-        arguments = dict(value) if isinstance(value, Mapping) else {"share": value}
-        _check_arguments(f"terrain['kinds'][{name!r}]", name, arguments, defaults)
-        kinds[name] = defaults | arguments
+        chosen = dict(value) if isinstance(value, Mapping) else {"share": value}
+        _check_arguments(f"terrain['kinds'][{name!r}]", name, chosen, defaults)
+        kinds[name] = defaults | chosen
     return kinds
 
 
-def _check_arguments(place: str, kind: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
-    for name, value in given.items():
+def _check_arguments(place: str, kind: str, arguments: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    for name, value in arguments.items():
         expected = f"one of {listed_names(name, known)}" if known else "no argument"
         check(f"{place}[{name!r}]", value, name in known, f"{expected} for {kind!r}")
         if name != "kinds":

@@ -72,9 +72,9 @@ def touch_down_pitch(s: TermContext) -> SX:
 
 def distance(s: TermContext) -> SX:
     """Distance that the base has travelled along its own heading [m]."""
-    way = s.recall("way") + s.control_dt * s.base_linear_velocity[0]
-    s.keep("way", way)
-    return way
+    travelled = s.recall("way") + s.control_dt * s.base_linear_velocity[0]
+    s.keep("way", travelled)
+    return travelled
 
 
 def _greatest(s: TermContext, value: SX) -> SX:

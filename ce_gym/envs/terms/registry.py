@@ -121,8 +121,8 @@ def _advice(error: Exception, s: TermContext) -> str:
         return f"no attribute {error.name!r} of TermContext; expected one of {listed_names(error.name, known)}"
     if isinstance(error, KeyError):
         bodies = [body.name for body in s.mechanism.robot.bodies]
-        given = str(error.args[0]) if error.args else ""
-        return given if "has no body" in given else f"no key {given!r}; bodies are {listed_names(given, bodies)}"
+        key = str(error.args[0]) if error.args else ""
+        return key if "has no body" in key else f"no key {key!r}; bodies are {listed_names(key, bodies)}"
     if "truth value" in str(error):
         return "a condition on a traced value (Python's if, and, or, min, max); expected ca.if_else, ca.fmin, ca.fmax"
     text = str(error).strip().splitlines() or [type(error).__name__]
