@@ -130,7 +130,9 @@ class TermContext:
     motor_torque = _buffer(
         "motor_torque", "Torque of each motor before friction in the last sub-step [N m], (n_motors,)."
     )
-    motor_warmth = _buffer("motor_warmth", "Winding, then housing temperatures above the air [K], (2 n_warm,).", SX(0, 1))
+    motor_warmth = _buffer(
+        "motor_warmth", "Winding, then housing temperatures above the air [K], (2 n_warm,).", SX(0, 1)
+    )
     battery_sag = _buffer("battery_sag", "Voltage drop of the battery under load [V], shape (1,) or (0,).", SX(0, 1))
     load = _buffer("load", "Normal force on each contact in the last sub-step [N], shape (n_contacts,).", SX(0, 1))
     scaled_parameters = _buffer("scaled_parameters", "Randomised parameters, scaled to [-1, 1], shape (n,).", SX(0, 1))

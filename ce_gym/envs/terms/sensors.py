@@ -100,7 +100,6 @@ def winding_temperatures(s: TermContext) -> SX:
     return s.motor_warmth[: s.motor_warmth.numel() // 2] / 100  # windings, then housings
 
 
-
 def battery_sag(s: TermContext) -> SX:
     """Voltage drop of the battery under load over its nominal voltage [-], shape (1,); empty without a battery."""
     battery = s.mechanism.robot.battery
