@@ -165,7 +165,7 @@ def report_scene(env_id: str, **arguments: Any) -> SceneReport:
     outputs = ("torque", "contact_forces") if program.contact_forces else ("torque",)
     whole = SubStep(program.model, program.options, outputs)
     again = dict.fromkeys(call.function for call in whole.calls if call.only_if and call.inputs)
-    sometimes = [(AGAIN[f.name()], f) for f in again] + [("reset", program.function("begin"))]
+    sometimes = [(AGAIN[f.name()], f) for f in again] + [("reset", program.function("reset"))]
     return SceneReport(
         name=env_id,
         program=program,
@@ -286,13 +286,13 @@ def _once(program: TaskProgram) -> Iterator[Item]:
     if late := _late_actions(program):
         yield Item("late actions", "late actions", late, None)
     task = replace(program.task, **NO_TERMS)
-    assess = TaskProgram(program.model, task).function("assess")
+    assess = TaskProgram(program.model, task).function("evaluate")
     yield Item("commands and clocks", "commands and clocks", assess.n_instructions(), assess)
     steps = [(field, term) for field in TERMS for term in getattr(program.task, field)]
     for field, term in (*steps, ("noise and history", "noise and history")):
         known = field in TERMS
         before, task = assess, with_term(task, field, term, program.task) if known else program.task
-        assess = TaskProgram(program.model, task).function("assess")
+        assess = TaskProgram(program.model, task).function("evaluate")
         if known or assess.n_instructions() != before.n_instructions():
             yield Item(field, term, assess.n_instructions() - before.n_instructions(), assess)
 
@@ -319,7 +319,7 @@ def with_term(task: Task, field: str, term: str, like: Task | None = None) -> Ta
 
 def _terms_left_out(program: TaskProgram) -> Iterator[Item]:
     """What each term and feature that the task does not have would add to what is done once in its step."""
-    task, whole = program.task, program.function("assess").n_instructions()
+    task, whole = program.task, program.function("evaluate").n_instructions()
     changes = [
         (field, term, with_term(task, field, term))
         for field, kind in TERMS.items()
@@ -335,5 +335,5 @@ def _terms_left_out(program: TaskProgram) -> Iterator[Item]:
         if change:
             changes.append(("task", name, replace(task, **change)))
     for group, name, other in changes:
-        function = TaskProgram(program.model, other).function("assess")
+        function = TaskProgram(program.model, other).function("evaluate")
         yield Item(group, name, function.n_instructions() - whole, function)

@@ -1,4 +1,4 @@
-"""What single and vector environments have in common."""
+"""Base class and helpers of single and vector environments."""
 
 from __future__ import annotations
 
@@ -27,42 +27,42 @@ from ce_gym.sim.devices import Array
 
 
 class BaseEnv(EzPickle):
-    """Base of the environments; they are thin over a batch.
+    """Base class of the environments, which wrap a batch.
 
     Attributes:
         batch: The batch.
         task: Name of the task.
         model: The robot at a transmission level.
-        closed: Whether it has been closed.
+        closed: Whether `close` has been called.
     """
 
     closed = False
 
-    def _hold(self, batch: TaskBatch, task: str, shown_as: Mapping[str, Any]) -> None:
-        """Take a batch, and the arguments that say how it is shown."""
+    def _attach(self, batch: TaskBatch, task: str, display: Mapping[str, Any]) -> None:
+        """Set the batch, and the render and observation modes from the arguments `display`."""
         self.batch, self.task, self.model = batch, task, batch.program.model
-        self.render_mode, self._as_dict = shown_as["render_mode"], shown_as["obs_mode"] == "dict"
-        self._screen = Screen(self.render_mode, batch, width=shown_as["width"], height=shown_as["height"])
+        self.render_mode, self._as_dict = display["render_mode"], display["obs_mode"] == "dict"
+        self._screen = Screen(self.render_mode, batch, width=display["width"], height=display["height"])
         self._section = CriticalSection(self._title)
 
     def __getstate__(self) -> dict[str, Any]:
-        own = {name: self.__dict__.get(name) for name in ("spec", "_np_random")}
-        return {**EzPickle.__getstate__(self), "own": own, "state": self.snapshot()}
+        attributes = {name: self.__dict__.get(name) for name in ("spec", "_np_random")}
+        return {**EzPickle.__getstate__(self), "attributes": attributes, "state": self.snapshot()}
 
-    def __setstate__(self, made: dict[str, Any]) -> None:
-        self.__init__(*made["_ezpickle_args"], **made["_ezpickle_kwargs"])  # type: ignore[misc]
-        self.__dict__.update(made["own"])
-        self.restore(made["state"])
+    def __setstate__(self, pickled: dict[str, Any]) -> None:
+        self.__init__(*pickled["_ezpickle_args"], **pickled["_ezpickle_kwargs"])  # type: ignore[misc]
+        self.__dict__.update(pickled["attributes"])
+        self.restore(pickled["state"])
 
     def snapshot(self, file: File | None = None) -> Snapshot:
-        """Return all that the robots carry, episodes and random streams included; `restore` continues bit for bit.
+        """Return the full state of the robots, episodes and random streams; `restore` continues bit for bit.
 
         Args:
-            file: Where to write it besides, as `.npz`.
+            file: Path of an `.npz` file to which the snapshot is also written.
 
         Returns:
-            Arrays by name, a row for each robot, copies in the memory of the CPU. Wrappers outside, such as Gymnasium's
-            `TimeLimit`, have state of their own.
+            Arrays by name with one row for each robot, copied to the CPU. Wrappers such as Gymnasium's `TimeLimit` have
+            further state.
         """
         return self.batch.snapshot(file)
 
@@ -70,40 +70,39 @@ class BaseEnv(EzPickle):
         """Continue from a snapshot of such an environment.
 
         Args:
-            snapshot: What `snapshot` returned, or the name of the file that it wrote.
+            snapshot: Result of `snapshot`, or path of its file.
 
         Raises:
-            ValueError: If it is of other robots, another scene or another task.
+            ValueError: The snapshot is from another robot, scene, task or number of environments.
         """
-        with self._changing():
+        with self._exclusive():
             self.batch.restore(snapshot)
 
     @property
     def n_diverged(self) -> int:
-        """How many episodes have ended so far because the simulation failed; waits for a GPU."""
+        """Number of episodes so far that ended because the robot diverged; waits for a GPU."""
         return int(self.batch.rows("failures").sum())
 
     def set_command(self, command: Any) -> None:
-        """Command velocities until the task draws new ones.
+        """Set the commanded velocities until the task draws new ones.
 
         Args:
             command: Forward [m/s], sideways [m/s], yaw rate [rad/s], shape (3,) or (num_envs, 3).
 
         Raises:
-            ValueError: If the shape is wrong or a number is not finite.
-            RuntimeError: If another thread steps or resets this environment.
+            ValueError: The shape is wrong or a number is not finite.
+            RuntimeError: Another thread steps or resets this environment.
             gymnasium.error.ClosedEnvironmentError: After `close`.
         """
         batch = self.batch
-        given, shapes = batch.place.rows(command, batch.dtype), ((3,), (batch.num_envs, 3))
-        if tuple(given.shape) not in shapes or not np.isfinite(batch.place.host(given)).all():
-            expected = f"(3,) or {shapes[1]}, finite"
-            raise ValueError(f"command has shape {tuple(given.shape)}; expected {expected}")
-        with self._changing():
-            batch.write("command", given)
+        rows, shapes = batch.place.rows(command, batch.dtype), ((3,), (batch.num_envs, 3))
+        if tuple(rows.shape) not in shapes or not np.isfinite(batch.place.host(rows)).all():
+            raise ValueError(f"command has shape {tuple(rows.shape)}; expected (3,) or {shapes[1]}, finite")
+        with self._exclusive():
+            batch.write("command", rows)
 
     def _keys(self, seed: Any) -> NDArray[np.uint64]:
-        """Return keys of random streams, shape (num_envs,): for one seed `s` those of s, s + 1, and so on."""
+        """Return the keys of the random streams, shape (num_envs,): s, s + 1, ... for one seed `s`."""
         n = self.batch.num_envs
         if isinstance(seed, str) or not hasattr(seed, "__len__"):
             return np.arange(n, dtype=np.uint64) + np.uint64(checked_seed(seed))
@@ -111,37 +110,38 @@ class BaseEnv(EzPickle):
             raise ValueError(f"seed has {len(seed)} entries; expected {n} whole numbers")
         return np.array([checked_seed(s) for s in seed], np.uint64)
 
-    def _shown(self, rows: Array) -> Any:
-        """Return observation rows (..., n_obs) as the space has them: the policy's part, or a dictionary of both.
+    def _observation(self, rows: Array) -> Any:
+        """Return rows (..., n_obs) in the form of the observation space: the policy's part, or a dictionary of both.
 
-        Fresh arrays; of a GPU views of tensors that no later step writes to.
+        The parts are new arrays, or views of arrays that no later step writes.
         """
-        several = self.batch.num_envs > 1 and not self.batch.fused  # others are not touched again
-        program, copied = self.batch.program, np.array if several else lambda part: part
-        policy = copied(rows[..., : program.observation_size])
+        program = self.batch.program
+        is_reused = self.batch.num_envs > 1 and not self.batch.fused
+        copy = np.array if is_reused else lambda part: part
+        policy = copy(rows[..., : program.observation_size])
         if not self._as_dict:
             return policy
-        return {"policy": policy, "critic": copied(rows[..., -(program.critic_size or program.observation_size) :])}
+        return {"policy": policy, "critic": copy(rows[..., -(program.critic_size or program.observation_size) :])}
 
     @property
     def _title(self) -> str:
         return f"{type(self).__name__} {self.task!r} of {self.batch.num_envs} {self.batch.program.model.robot.name}"
 
-    def _changing(self) -> CriticalSection:
-        """Return the section of a call that changes the state: all of it or nothing, one call at a time.
+    def _exclusive(self) -> CriticalSection:
+        """Return the critical section for a call that changes the state: complete or without effect, one at a time.
 
         Raises:
-            gymnasium.error.ClosedEnvironmentError: If it is closed.
+            gymnasium.error.ClosedEnvironmentError: After `close`.
         """
         if self.closed:
             raise ClosedEnvironmentError(f"{self._title}: called after close(), expected a new environment")
         return self._section
 
     def state(self) -> dict[str, Array]:
-        """Return what a recorder needs, copies by name, one robot per row.
+        """Return copies of the recorded state by name, one robot per row.
 
-        q (n, nq); v (n, nv); command (n, 3); torque of the motors at the joints (n, n_joints) [N m]; and, if computed,
-        contact_forces (n, n_contacts, 3) [N].
+        `q` (n, nq), `v` (n, nv), `command` (n, 3), `torque` of the motors at the joints (n, n_joints) [N m] and, if
+        computed, `contact_forces` (n, n_contacts, 3) [N].
         """
         batch = self.batch
         state = {name: batch.rows(name) for name in ("q", "v", "command", "torque")}
@@ -156,7 +156,7 @@ class BaseEnv(EzPickle):
 
     @property
     def contact_names(self) -> tuple[str, ...]:
-        """The contact spheres that take part, in the order of recorded contact forces."""
+        """Names of the contact spheres that the physics computes, in the order of `contact_forces`."""
         return self.batch.program.contacts
 
     @property
@@ -166,50 +166,50 @@ class BaseEnv(EzPickle):
 
     @property
     def critic_structure(self) -> dict[str, int]:
-        """Length of each block of the critic's observation, in order; the policy's if the critic sees no more."""
+        """Length of each block of the critic's observation, in order; the policy's if the critic has no others."""
         program = self.batch.program
-        return dict(program.probe.sizes) if program.critic_size else program.observation_sizes
+        return dict(program.stages.block_sizes) if program.critic_size else program.observation_sizes
 
     def policy_spec(self) -> dict[str, Any]:
-        """Return what is needed to run a policy of this environment elsewhere; see `ce_gym.envs.policy_spec`."""
+        """Return the specification to run a policy of this environment elsewhere; see `ce_gym.envs.policy_spec`."""
         return policy_spec(self.batch.program, self.task)
 
     @cached_property
     def symmetry(self) -> Symmetry | None:
-        """The left-right reflection of observations and actions, None if the robot or its task has none."""
+        """The left-right reflection of observations and actions; None if robot or task are not symmetric."""
         return left_right(self.batch.program)
 
     def differentiable(self, largest: float = np.inf) -> DifferentiableEnv:
-        """Return this environment's control steps with gradients; see `DifferentiableEnv`.
+        """Return the control steps of this environment with gradients; see `DifferentiableEnv`.
 
         Args:
-            largest: A robot's carried gradient is shortened to this norm between control steps.
+            largest: Largest norm of the gradient of a robot that passes from a control step to the one before.
         """
         return DifferentiableEnv(self, largest)
 
     @cached_property
-    def _look(self) -> ca.Function:
-        return self.batch.program.look()
+    def _observation_function(self) -> ca.Function:
+        return self.batch.program.stages.observation_function()
 
     def look(self, state: Mapping[str, NDArray]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Observe robots that something else simulates, through the same terms as the environment's own.
+        """Observe robots of another simulator with the terms of this environment.
 
         Args:
-            state: What the task looks at, by name, one robot per row: q (n, nq), v (n, nv), command (n, 3), the action
-                just carried out (n, n_actions), clock (n, 1), the control steps since the start, and so on.
+            state: State that the terms read, by name, one robot per row: `q` (n, nq), `v` (n, nv), `command` (n, 3),
+                the last `action` (n, n_actions), `clock`, the control steps since the start (n, 1), and so on.
 
         Returns:
-            One observation of the policy, without noise or history, shape (n, n_blocks); whether the task's conditions
+            Observation of the policy without noise and history, shape (n, n_obs); whether the terminations of the task
             end the episode, shape (n,).
 
         Raises:
-            ValueError: If something that the task looks at is missing.
+            ValueError: A part of the state that the terms read is missing.
         """
-        names = self._look.name_in()
-        missing = [name for name in names if name not in state]
-        if missing:
-            raise ValueError(f"{self.task}: looks at {', '.join(missing)}; expected all of {', '.join(names)}")
-        *blocks, failed = self._look.call([ca.DM(np.asarray(state[name], float).T) for name in names])
+        function = self._observation_function
+        names = function.name_in()
+        if missing := [name for name in names if name not in state]:
+            raise ValueError(f"{self.task}: the state lacks {', '.join(missing)}; expected all of {', '.join(names)}")
+        *blocks, failed = function.call([ca.DM(np.asarray(state[name], float).T) for name in names])
         observation = np.concatenate([block.full() for block in blocks]).T
         clipped = np.clip(observation, -OBSERVATION_BOUND, OBSERVATION_BOUND)
         return clipped.astype(np.float32), failed.full()[0] > 0.5
@@ -219,7 +219,7 @@ def spaces(program: TaskProgram, obs_mode: str) -> tuple[Any, Any]:
     """Return observation and action space of one robot.
 
     Raises:
-        ValueError: If the mode does not exist.
+        ValueError: The mode does not exist.
     """
     check_choice("obs_mode", obs_mode, ("vector", "dict"))
     bound = OBSERVATION_BOUND
@@ -235,7 +235,7 @@ def checked_action(action: Any, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return an action as contiguous float32 rows.
 
     Raises:
-        ValueError: If it is not an array of numbers, its shape is wrong or it is not finite.
+        ValueError: The action is not an array of finite numbers of this shape.
     """
     try:
         rows = np.asarray(action)
@@ -248,15 +248,15 @@ def checked_action(action: Any, shape: tuple[int, int]) -> NDArray[np.float32]:
     if not np.isfinite(rows).all():
         raise ValueError("action holds a number that is not finite")
     if rows.dtype != np.float32:
-        rows = np.clip(rows, -1.0, 1.0)  # as the kernel does; a large number could not be converted
+        rows = np.clip(rows, -1.0, 1.0)  # as in the kernel; large numbers do not fit into float32
     return np.ascontiguousarray(rows, dtype=np.float32).reshape(shape)
 
 
 def checked_seed(seed: Any) -> int:
-    """Return a seed of one environment.
+    """Return the seed of one environment as an int.
 
     Raises:
-        ValueError: If it is not a whole number from 0 to 2**62.
+        ValueError: The seed is not a whole number from 0 to 2**62.
     """
     whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
     check("seed", seed, whole and 0 <= seed <= 2**62, "a whole number from 0 to 2**62")
@@ -267,11 +267,11 @@ def check_options(options: Mapping[str, Any] | None, known: tuple[str, ...] = ()
     """Check the options of a reset.
 
     Raises:
-        ValueError: If there is one that does nothing; one line.
+        ValueError: There is an unknown option.
     """
     for name in options or ():
         if name not in known:
-            raise ValueError(f"options[{name!r}] means nothing to reset; expected {' or '.join(known) or 'no options'}")
+            raise ValueError(f"options[{name!r}] has no effect in reset; expected {' or '.join(known) or 'no options'}")
 
 
 def _brief(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Environments of a user's own robot, under ids of its own.
+"""Registration of environments for a robot file of the user.
 
     ids = ce_gym.register_robot("my_robot.yaml")
     env = gymnasium.make("ce_gym/MyRobotVelocity-Armature-v0")
@@ -20,18 +20,18 @@ from ce_gym.model.load import load_robot
 
 
 def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tuple[str, ...]:
-    """Register every task at every transmission level for a robot; harmless if done before.
+    """Register every task at every transmission level for a robot. Repeated calls have no effect.
 
     Args:
         path: A robot file that `load_robot` reads: .yaml, .urdf (a plain URDF needs its YAML file for contacts and
             gains) or .xml.
-        name: What the ids start with; by default the robot's own name, `my_robot` as `MyRobot`.
+        name: Start of the ids; by default the name of the robot, `my_robot` as `MyRobot`.
 
     Returns:
-        The ids: `ce_gym/<Name><Task>-v0`, which is the exact level, and `ce_gym/<Name><Task>-<Level>-v0`.
+        The ids: `ce_gym/<Name><Task>-v0` for the exact level, and `ce_gym/<Name><Task>-<Level>-v0`.
 
     Raises:
-        RobotError: The file is wrong, the robot lacks what the tasks need, or another robot has the ids already.
+        RobotError: The file is not valid, the robot does not fit the tasks, or another robot has the ids.
 
     Examples:
         >>> ids = ce_gym.register_robot(ce_gym.load_robot("tello").source, name="my_robot")
@@ -39,9 +39,9 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
         ce_gym/MyRobotVelocity-v0 ce_gym/MyRobotVelocity-Armature-v0
     """
     if not isinstance(path, str | os.PathLike):
-        given = repr(path.name) if isinstance(path, Robot) else repr(path)
+        value = repr(path.name) if isinstance(path, Robot) else repr(path)
         expected = "the path of a file, which worker processes can read, too"
-        raise bad("register_robot", "path", f"{type(path).__name__} {given}", expected)
+        raise bad("register_robot", "path", f"{type(path).__name__} {value}", expected)
     file = Path(path).resolve()
     robot = load_robot(file)
     if problems := missing(robot):
@@ -52,26 +52,26 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
 
 
 def missing(robot: Robot) -> list[RobotError]:
-    """Return what a robot lacks for the tasks, each in one line that says what to add."""
+    """Return an error for each property that the tasks need and the robot lacks; one line each."""
     file = robot.source or robot.name
-    found = []
+    problems = []
     if not robot.floating:
-        found.append(bad(file, "base", "fixed", "a floating base, because tasks are about walking"))
+        problems.append(bad(file, "base", "fixed", "a floating base, because tasks are about walking"))
     if not any(contact.group == "foot" for contact in robot.contacts):
-        found.append(bad(file, "contacts of group 'foot'", None, "at least one contact sphere in this group"))
+        problems.append(bad(file, "contacts of group 'foot'", None, "at least one contact sphere in this group"))
     if not robot.independent:
-        found.append(bad(file, "independent", (), "at least one joint"))
-    for joint, gain in robot.gains.kp:  # without any, actions must be torques
+        problems.append(bad(file, "independent", (), "at least one joint"))
+    for joint, gain in robot.gains.kp:  # a robot without gains needs torques as actions
         if not gain > 0.0:
             expected = "a position gain above 0 (actions are targets), or none at all"
-            found.append(bad(file, f"gains.kp.{joint}", gain, expected))
+            problems.append(bad(file, f"gains.kp.{joint}", gain, expected))
     if not robot.pose.height > 0.0:
-        found.append(bad(file, "pose.height", robot.pose.height, "the height of the standing base above 0 [m]"))
-    return found
+        problems.append(bad(file, "pose.height", robot.pose.height, "the height of the standing base above 0 [m]"))
+    return problems
 
 
 def zero_limits(robot: Robot) -> list[str]:
-    """Return a line for each limit of joints that is 0 in a robot's file, as CAD programs write it by default."""
+    """Return a line for each kind of joint limit that is 0 in the robot file, the default of CAD programs."""
     joints = [robot.body(name) for name in robot.commanded]
     weak = [body.name for body in joints if body.joint.torque == 0.0 and not body.joint.stiffness]
     slow = [body.name for body in joints if body.joint.velocity == 0.0]
@@ -86,7 +86,7 @@ def _listed(names: list[str]) -> str:
 
 
 def id_stem(robot: Robot, name: str | None = None) -> str:
-    """Return what the ids of a robot's environments start with, such as "ce_gym/MyRobot".
+    """Return the start of the ids of a robot, such as "ce_gym/MyRobot".
 
     Raises:
         RobotError: The name has no letters or digits.

@@ -1,4 +1,4 @@
-"""`DifferentiableEnv`: control steps of an environment, and the way back through them."""
+"""`DifferentiableEnv`: control steps of an environment with reverse-mode gradients."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ STEPS = {
     ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_FLOOR, ca.OP_CEIL, ca.OP_SIGN,
     ca.OP_IF_ELSE_ZERO,
 }  # fmt: skip
-"""Operations that jump, where what they decide by depends on the robot's motion."""
+"""Operations with a discontinuous value."""
 KINKS = {ca.OP_FABS, ca.OP_FMIN, ca.OP_FMAX}
-"""Operations whose slope jumps."""
+"""Operations with a discontinuous slope."""
 
 
 @dataclass
 class Record:
-    """One control step.
+    """One recorded control step.
 
     Attributes:
-        arrays: The state before it, by name of the buffer, and its clock.
-        counters: Of the random streams before it.
-        action: Shape (num_envs, n_actions).
-        ignored: Who was reset instead, shape (num_envs,).
-        replaced: Who returned the first observation of the next episode, shape (num_envs,).
+        arrays: State before the step, and its clock, by name of the buffer.
+        counters: Counters of the random streams before the step.
+        action: Action, shape (num_envs, n_actions).
+        ignored: Robots that were reset instead of stepped, shape (num_envs,).
+        replaced: Robots that returned the first observation of the next episode, shape (num_envs,).
     """
 
     arrays: dict[str, NDArray]
@@ -48,22 +48,22 @@ class Record:
 
 
 class DifferentiableEnv:
-    """Control steps of an environment with gradients: sub-steps, observations and rewards, all terms included.
+    """Control steps of an environment with gradients of sub-steps, observations and rewards.
 
-    What was decided (touching, sticking, a limit that acts, a term that counts) is differentiated as decided. A robot
-    whose episode ended, or that was reset, passes nothing on to what was before; one that diverged, or made a sub-step
-    in parts (see `Simulator`), has no gradient.
+    Gradients hold the active set of the step fixed: contacts that touch or stick, active limits, branches of terms.
+    They do not pass the end or the start of an episode. A robot that diverged, or halved a sub-step (see `Simulator`),
+    has a gradient of zero.
 
     Args:
-        env: One of ours, unwrapped; on the CPU, on flat ground, without latency.
-        largest: A robot's carried gradient is shortened to this norm between control steps; infinity leaves it alone.
+        env: An unwrapped environment of this package on the CPU, with flat ground and without latency.
+        largest: Largest norm of the gradient of a robot that passes from a control step to the one before.
 
     Attributes:
-        not_smooth: What is not smooth among the terms, by kind and name: "no gradient" of those that only distinguish
-            cases, "jumps" where a case is decided by the motion, "kinks" where a slope changes.
+        not_smooth: Terms that are not smooth in the motion of the robot, by kind and name: "no gradient" (piecewise
+            constant), "jumps" (discontinuous) or "kinks" (discontinuous slope).
 
     Raises:
-        ValueError: If such an environment cannot be differentiated.
+        ValueError: The environment cannot be differentiated.
 
     Examples:
         >>> env = gymnasium.make_vec("ce_gym/MiniCheetahVelocity-v0", num_envs=8)
@@ -85,27 +85,29 @@ class DifferentiableEnv:
             raise ValueError(f"largest={largest!r}; expected a number above 0")
         gradient = ControlStepGradient(self.batch.program)
         self._kernel = load_kernel(f"control step gradient {kernel_key(self.batch.program)}", gradient.program, dtype)
-        self._kept = [name for name in (*self._kernel.buffers, "clock") if name in self.batch.schema]
+        self._recorded = [name for name in (*self._kernel.buffers, "clock") if name in self.batch.schema]
         self._carried = {f"w_{name}": place.tiles(n, size, dtype) for name, size in gradient.carried.items()}
-        self._following = np.full(n, -1.0)  # clock of the control step gone back through last
+        self._following = np.full(n, -1.0)  # clock of the control step that was differentiated last
         self._records, self._spare = list[Record](), list[dict[str, NDArray]]()
 
     @property
     def n_recorded(self) -> int:
-        """How many control steps have been recorded and not gone back through."""
+        """Number of recorded control steps that have not been differentiated."""
         return len(self._records)
 
     def step(self, actions: Any) -> tuple[Any, ...]:
-        """Step the environment and record; arguments and results are those of its own `step`."""
+        """Step the environment and record the step; arguments and results as for `step` of the environment."""
         batch, same_step = self.batch, getattr(self.env, "autoreset_mode", None) == AutoresetMode.SAME_STEP
-        arrays = self._spare.pop() if self._spare else {name: aligned_copy(batch.arrays[name]) for name in self._kept}
+        arrays = self._spare.pop() if self._spare else {x: aligned_copy(batch.arrays[x]) for x in self._recorded}
         for name, array in arrays.items():
             array[...] = batch.arrays[name]
         counters, ignored = batch.arrays["counters"].copy(), batch.arrays["finished"].copy()
         retries = batch.arrays["retries"].copy()
         result = self.env.step(actions)
-        arrays["diverged"][batch.arrays["retries"] > retries] = 1  # made in parts, which are not differentiated
-        action = np.clip(actions, -2, 2).astype(np.float32).reshape(batch.num_envs, -1)  # what is beyond 1 stays so
+        arrays["diverged"][batch.arrays["retries"] > retries] = 1  # halved sub-steps are not differentiated
+        action = (
+            np.clip(actions, -2, 2).astype(np.float32).reshape(batch.num_envs, -1)
+        )  # keeps actions beyond 1 beyond 1
         replaced = np.reshape(np.logical_or(result[2], result[3]), -1) & same_step
         self._records.append(Record(arrays, counters, action, ignored, replaced))
         return result
@@ -113,21 +115,22 @@ class DifferentiableEnv:
     def backward(
         self, by_observation: Any = None, by_reward: ArrayLike = 0.0, by_final_observation: Any = None
     ) -> NDArray:
-        """Go back through the last recorded control step, and forget it.
+        """Differentiate the last recorded control step and remove it from the record.
 
-        What it owes to the state before it is kept, and goes into the next call, for the control step before.
+        The gradient with respect to the state before this step is stored and used by the next call, which
+        differentiates the control step before.
 
         Args:
-            by_observation: Gradient of something with respect to the observation that the step returned, in its shape;
-                None for zero. The first observation of a new episode depends on nothing that was before.
-            by_reward: With respect to its reward, shape (num_envs,).
-            by_final_observation: With respect to `final_obs`, where the next episode began in the same step.
+            by_observation: Gradient of a loss with respect to the observation that the step returned, in its shape;
+                None for zero. Ignored for the first observation of a new episode.
+            by_reward: Gradient with respect to the reward, shape (num_envs,).
+            by_final_observation: Gradient with respect to `final_obs`, where the next episode began in the same step.
 
         Returns:
-            Gradient with respect to the action, shape (num_envs, n_actions); 0 for one that was ignored.
+            Gradient with respect to the action, shape (num_envs, n_actions); 0 for ignored actions.
 
         Raises:
-            ValueError: If no control step is left, or a shape is wrong.
+            ValueError: No control step is recorded, or a shape is wrong.
         """
         if not self._records:
             raise ValueError("backward: no control step is recorded; expected `step` before")
@@ -144,71 +147,73 @@ class DifferentiableEnv:
         control[:, 0] = (self._following == clock + 1) & ~record.ignored
         control[:, 1] = min(self.largest, float(np.finfo(dtype).max))
         result = np.empty((n, self.batch.program.n_actions), dtype)
-        given = {"action_in": record.action, "w_observation": rows, "w_reward": rewards}
-        given |= {"control": control, "by_action": result}
+        arrays = {"action_in": record.action, "w_observation": rows, "w_reward": rewards}
+        arrays |= {"control": control, "by_action": result}
         streams = {"keys": self.batch.arrays["keys"].view(np.uint64), "counters": record.counters}
-        self._kernel(record.arrays | self._carried | given, n, num_threads=self.batch.num_threads, **streams)
+        self._kernel(record.arrays | self._carried | arrays, n, num_threads=self.batch.num_threads, **streams)
         self._following = np.where(record.ignored, -1.0, clock)
         self._spare.append(record.arrays)
         return result
 
     def state_gradient(self) -> dict[str, NDArray]:
-        """Return gradients with respect to the state before the control step that was gone back through last.
+        """Return gradients with respect to the state before the control step that was differentiated last.
 
-        By name of the state, shape (num_envs, size); that of `q` in the tangent space of positions. Not shortened yet.
+        Arrays by name of the state, shape (num_envs, size), not yet limited to `largest`. The gradient to `q` is in the
+        tangent space of positions.
         """
         read = self.batch.place.read
         return {name[2:]: read(array, self.batch.num_envs) for name, array in self._carried.items()}
 
     def clear(self) -> None:
-        """Forget all that is recorded."""
+        """Remove all recorded control steps."""
         self._spare += [record.arrays for record in self._records]
         self._records.clear()
 
     @cached_property
     def not_smooth(self) -> dict[str, str]:
-        """See above."""
-        p = self.batch.program
-        kinds = p.reward_terms, p.termination_terms, p.observation_terms | p.critic_terms
-        named = {f"{term.kind} {name}": term for terms in kinds for name, term in terms.items()}
-        found = {name: _roughness(p.stages, term) for name, term in named.items()}
-        return {name: kind for name, kind in found.items() if kind}
+        """Terms that are not smooth, see the attributes of the class."""
+        program = self.batch.program
+        terms = {f"{term.kind} {term.name}": term for term in program.terms if term.kind != "metric"}
+        roughness = {name: _roughness(program.stages, term) for name, term in terms.items()}
+        return {name: kind for name, kind in roughness.items() if kind}
 
-    def _rows(self, given: Any) -> NDArray:
-        """Return gradients with respect to observations as a kernel has them: the policy's part, then the critic's."""
+    def _rows(self, gradient: Any) -> NDArray:
+        """Return gradients with respect to observations in the layout of the kernel: policy, then critic."""
         p, n = self.batch.program, self.batch.num_envs
         rows = np.zeros((n, p.observation_size + p.critic_size), self.batch.dtype)
         columns = {"policy": slice(p.observation_size), "critic": slice(-(p.critic_size or p.observation_size), None)}
-        parts = given if isinstance(given, Mapping) else {"policy": given}
+        parts = gradient if isinstance(gradient, Mapping) else {"policy": gradient}
         for name, part in parts.items():
             if part is None:
                 continue
             if name not in columns or np.size(part) != rows[:, columns[name]].size:
-                raise ValueError(f"gradient of observation {name!r} has shape {np.shape(part)}; expected that of it")
+                raise ValueError(
+                    f"gradient of observation {name!r} has shape {np.shape(part)}; expected that of {name}"
+                )
             rows[:, columns[name]] += np.reshape(part, (n, -1))
         return rows
 
 
 def _roughness(stages: Stages, term: Term) -> str:
-    """Return what is not smooth in how a term depends on the motion; "" if nothing is."""
-    state = stages.state | stages.seen_ground | {"previous_action": SX.sym("previous", stages.spec.n_actions)}
-    context = stages._context(state)
+    """Return "no gradient", "jumps" or "kinks" for a term that is not smooth in the motion, else ""."""
+    state = stages.state | stages.ground_values | {"previous_action": SX.sym("previous", stages.spec.n_actions)}
+    context = stages.context(state)
     value = ca.vec(term(context))
     moving = [state[name] for name in ("q", "v", "load", "torque", "action", "previous_action") if name in state]
-    moving += list(context.remembered.values())
+    moving += list(context.memory.values())
     moved = ca.vertcat(*moving)
     if not ca.depends_on(value, moved):
         return ""
     if not ca.sparsify(ca.jacobian(value, moved)).nnz():
         return "no gradient"
     others = [x for x in ca.symvar(value) if not ca.depends_on(x, moved)]
-    found = _operations_on(ca.Function("term", [moved, ca.vertcat(SX(0, 1), *others)], [value]))
-    return "jumps" if found & STEPS else "kinks" if found & KINKS else ""
+    operations = _operations_on(ca.Function("term", [moved, ca.vertcat(SX(0, 1), *others)], [value]))
+    return "jumps" if operations & STEPS else "kinks" if operations & KINKS else ""
 
 
 def _operations_on(function: ca.Function) -> set[int]:
     """Return the operations of a function that depend on its first argument."""
-    depends, found = dict[int, bool](), set[int]()
+    depends, operations = dict[int, bool](), set[int]()
     for k in range(function.n_instructions()):
         op = function.instruction_id(k)
         if op == ca.OP_OUTPUT:
@@ -218,7 +223,7 @@ def _operations_on(function: ca.Function) -> set[int]:
             depends[result] = function.instruction_input(k)[0] == 0
             continue
         operands = [depends[i] for i in function.instruction_input(k)] if op != ca.OP_CONST else []
-        # a case that the clock or the command decides is none of the motion
-        found |= {op} if any(operands[:1] if op == ca.OP_IF_ELSE_ZERO else operands) else set()
+        # a branch counts only if its condition depends on the motion, not on the clock or the command
+        operations |= {op} if any(operands[:1] if op == ca.OP_IF_ELSE_ZERO else operands) else set()
         depends[result] = any(operands)
-    return found
+    return operations

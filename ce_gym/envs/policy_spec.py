@@ -1,7 +1,6 @@
-"""The specification of a policy: all that is needed to run it on another simulator or on a robot.
+"""The specification of a policy: the data for running the policy on another simulator or on a robot.
 
-Plain data, so that it can be written beside a policy or into its file. Nothing is said here that is written elsewhere:
-where the numbers of an observation come from is read off the traced terms.
+The traced terms yield the source of each number of an observation.
 """
 
 from __future__ import annotations
@@ -23,21 +22,21 @@ MEANINGS = {
     "joint_pd": "joint target [rad] = default_pose + scale * clip(action, -1, 1); torque = kp * (target - position) "
     "- kd * velocity, within torque_limits; joints without an action hold the default pose",
     "joint_torque": "joint torque [N m] = scale * clip(action, -1, 1); joints without an action have none",
-    "motor_pd": "rotor target [rad] = rest + scale * clip(action, -1, 1); the gains of a motor are those of its "
-    "joints as it feels them in the default pose while the other motors of its cluster are at rest",
+    "motor_pd": "rotor target [rad] = rest + scale * clip(action, -1, 1); the gains of a motor are the gains of its "
+    "joints, reflected to the rotor in the default pose with the other motors of its cluster at rest",
     "motor_torque": "rotor torque [N m] = scale * clip(action, -1, 1); motors without an action have none",
 }
-"""What an action means, by its kind."""
+"""Meaning of an action, by its kind."""
 
 COORDINATES = {
     "q": "base position in the world (3) [m], base quaternion w x y z, body to world (4), quaternions of "
     "ball joints, child to parent (4 each), joints in the order of `joints` [rad]",
     "v": "angular (3) [rad/s] and linear velocity (3) [m/s] of the base in the base frame, angular "
-    "velocities of ball joints in the axes of what they turn (3 each), joints [rad/s]",
+    "velocities of ball joints in axes of the moving body (3 each), joints [rad/s]",
     "command": "forward and sideways velocity in the base frame [m/s], yaw rate [rad/s]",
     "action": "the action before this observation, after clipping",
 }
-"""What an observation is made of, by the name that its blocks use."""
+"""Sources of the numbers of an observation, by the name in its blocks."""
 
 
 def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
@@ -45,12 +44,12 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
 
     Args:
         program: The task on the robot.
-        task: Its name.
+        task: Name of the task.
 
     Returns:
-        JSON-able data. `joints`, `default_pose` [rad], `kp` [N m/rad], `kd` [N m s/rad] and `torque_limits` [N m] are
-        in one order. `observation["blocks"]` lie one after another; where a block has `of`, its entry i is
-        `offset[i] + scale[i] * of[rows[i]]`, with `of` one of `coordinates`; else `meaning` says what it is.
+        JSON-able data. `joints`, `default_pose` [rad], `kp` [N m/rad], `kd` [N m s/rad] and `torque_limits` [N m] share
+        one order. An observation is the sequence of `observation["blocks"]`. Entry i of a block with a source `of`, one
+        of `coordinates`, is `offset[i] + scale[i] * of[rows[i]]`. The key `meaning` describes all other blocks.
     """
     robot, chosen = program.model.robot, program.task
     joints = robot.commanded
@@ -97,20 +96,20 @@ def _action(program: TaskProgram) -> dict[str, Any]:
 
 
 def _blocks(program: TaskProgram) -> list[dict[str, Any]]:
-    look = program.look()
-    state = {name: SX.sym(name, look.size1_in(name)) for name in look.name_in()}
-    seen = dict(zip(look.name_out(), look.call(list(state.values())), strict=True))
+    function = program.stages.observation_function()
+    state = {name: SX.sym(name, function.size1_in(name)) for name in function.name_in()}
+    values = dict(zip(function.name_out(), function.call(list(state.values())), strict=True))
     blocks = []
     for name, size in program.observation_sizes.items():
         document = inspect.getdoc(program.observation_terms[name].function) or ""
         noise = {"noise": program.task.noise[name]} if program.task.noise.get(name) else {}
         meaning = " ".join(document.split())
-        blocks.append({"name": name, "size": size, "meaning": meaning, **_source(seen[name], state), **noise})
+        blocks.append({"name": name, "size": size, "meaning": meaning, **_source(values[name], state), **noise})
     return blocks
 
 
 def _source(block: SX, state: dict[str, SX]) -> dict[str, Any]:
-    """Where a block takes its numbers from, if each is one number of the state, scaled and shifted; else nothing."""
+    """Return the source of a block whose entries are scaled and shifted entries of one state buffer, else {}."""
     used = [name for name, symbol in state.items() if ca.depends_on(block, symbol)]
     if len(used) != 1:
         return {}

@@ -1,4 +1,4 @@
-"""The ids under which environments are found: `ce_gym/<Robot><Task>[-<Level>]-v0`."""
+"""Ids of environments: `ce_gym/<Robot><Task>[-<Level>]-v0`."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ ROBOTS = (
     *("mini_cheetah", "mit_humanoid", "tello", "jvrc1"),
     *("go1", "go2", "anymal_c", "spot", "g1", "h1", "t1", "berkeley_humanoid", "cassie", "dr_legs"),
 )
-"""Robots that ship with the package and have what the tasks ask for."""
+"""Robots of the package that have environments."""
 STRETCHING = ("mini_cheetah",)
-"""Those of them whose files say how transmissions give way, and which so have the elastic level."""
+"""Robots with elastic transmissions in their files, which also have the level "elastic"."""
 
 
 def camel_case(name: str) -> str:
@@ -26,7 +26,7 @@ def camel_case(name: str) -> str:
 
 
 def environment_ids() -> dict[str, dict[str, str]]:
-    """Return the arguments that each id stands for. An id without a level is the exact one.
+    """Return the arguments of each id. An id without a level has the exact level.
 
     Examples:
         >>> ce_gym.environment_ids()["ce_gym/TelloVelocity-None-v0"]
@@ -39,7 +39,7 @@ def environment_ids() -> dict[str, dict[str, str]]:
 
 
 def tasks_of(robot: str) -> tuple[str, ...]:
-    """Return the tasks for which a robot that ships with the package has ids."""
+    """Return the tasks for which a robot of the package has ids."""
     return (*TASKS, *(skill for skill, robots in SKILLED.items() if robot in robots))
 
 
@@ -47,33 +47,30 @@ def ids_of(stem: str, robot: str, stretches: bool, tasks: Iterable[str] = tuple(
     """Return the arguments of every id of a robot: `<stem><Task>[-<Level>]-v0`.
 
     Args:
-        stem: What they begin with.
+        stem: Start of the ids.
         robot: A name or a path.
-        stretches: Whether it has elastic transmissions.
+        stretches: Whether the robot has elastic transmissions.
         tasks: Names of tasks.
     """
     levels = (None, *LEVELS, ELASTIC) if stretches else (None, *LEVELS)
-    return {
-        f"{stem}{camel_case(task)}{f'-{camel_case(level)}' if level else ''}-v0": {
-            "robot": robot,
-            "task": task,
-            "transmission": level or "exact",
-        }
-        for task in tasks
-        for level in levels
-    }
+    ids = {}
+    for task in tasks:
+        for level in levels:
+            name = f"{stem}{camel_case(task)}{f'-{camel_case(level)}' if level else ''}-v0"
+            ids[name] = {"robot": robot, "task": task, "transmission": level or "exact"}
+    return ids
 
 
 def register_environments() -> None:
-    """Register every id of ours; harmless if done before."""
+    """Register every id of the package. Repeated calls have no effect."""
     register(environment_ids())
 
 
 def register(ids: Mapping[str, Mapping[str, str]]) -> None:
-    """Register ids with Gymnasium; harmless if done before.
+    """Register ids with Gymnasium. Repeated calls have no effect.
 
     Raises:
-        RobotError: If an id stands for something else already.
+        RobotError: An id is registered with other arguments.
     """
     for name, arguments in ids.items():
         if name in gymnasium.registry:

@@ -1,48 +1,47 @@
-"""What `render` shows: environments ask for a render mode, the top of the package says where its renderer is.
+"""Rendering of environments by a module that is registered by name.
 
-The packages that draw depend on this one, so this file cannot import them: `use_renderers` registers the name of a
-module with a function for each render mode, which is imported when an environment is made with a render mode.
+The viewer depends on this package, so this file cannot import the viewer. `use_renderers` registers the name of a
+module, which is imported when an environment is made with a render mode.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
 from ce_gym.envs.runtime.batch import TaskBatch
-from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.sim.arguments import check_whole
 
 RENDER_MODES = ("human", "rgb_array")
 
-_home: list[str] = []  # the module of the renderers, once it is known
+_renderers: list[str] = []  # name of the registered module
 
 
 class Renderer(Protocol):
     """Shows one robot."""
 
     def draw(self, q: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        """Show the robot at positions `q`, shape (nq,); return a picture, shape (height, width, 3), if it is one."""
+        """Show the robot at positions `q`, shape (nq,); return the picture, shape (height, width, 3), if it has one."""
         ...
 
     def close(self) -> None:
-        """Give back whatever is held; harmless if done before."""
+        """Release all resources. Repeated calls have no effect."""
         ...
 
 
 def use_renderers(module: str) -> None:
-    """Say where renderers are.
+    """Register the module of the renderers.
 
     Args:
-        module: Name of a module with a function for each render mode, which takes a model, positions in a typical
-            pose, shape (nq,), and the keywords width [pixels], height [pixels], fps [1/s] and terrain (None if flat),
-            and returns a `Renderer`.
+        module: Name of a module with a function for each render mode. A function takes a model, positions in a typical
+            pose, shape (nq,), and the keywords width [pixels], height [pixels], fps [1/s] and terrain (None if flat).
+            It returns a `Renderer`.
     """
-    _home[:] = [module]
+    _renderers[:] = [module]
 
 
 class Screen:
@@ -51,12 +50,12 @@ class Screen:
     Args:
         mode: "human", "rgb_array" or None.
         batch: The environments.
-        width: Of a picture [pixels].
-        height: Of a picture [pixels].
+        width: Width of a picture [pixels].
+        height: Height of a picture [pixels].
 
     Raises:
-        ValueError: If there is no such mode, or the size is not positive.
-        ViewerError: If what the mode needs is not installed.
+        ValueError: The mode does not exist, or the size is not positive.
+        ViewerError: A package that the mode needs is not installed.
     """
 
     def __init__(self, mode: str | None, batch: TaskBatch, *, width: int, height: int) -> None:
@@ -67,15 +66,13 @@ class Screen:
         self._mode, self._batch = mode, batch
         self._renderer: Renderer | None = None
         if mode is not None:
-            model, fps = batch.program.model, 1 / batch.program.control_dt
-            make: Any = getattr(import_module(_home[0]), mode)
-            ground = field_of(batch.program.task.terrain)
-            self._renderer = make(
-                model, model.standing_q, width=int(width), height=int(height), fps=fps, terrain=ground
-            )
+            program, make = batch.program, getattr(import_module(_renderers[0]), mode)
+            size = {"width": int(width), "height": int(height)}
+            options = {**size, "fps": 1 / program.control_dt, "terrain": program.field}
+            self._renderer = make(program.model, program.model.standing_q, **options)
 
     def frames(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each environment; or show the first one and return None."""
+        """Return a picture of each environment; in mode "human" show the first environment and return None."""
         if self._renderer is None:
             logger.warn(f"render() does nothing without a render mode; make the environment with one of {RENDER_MODES}")
             return None
@@ -87,11 +84,11 @@ class Screen:
         return tuple(picture for picture in pictures if picture is not None)
 
     def refresh(self) -> None:
-        """Show the new state in mode "human", which Gymnasium expects to draw by itself."""
+        """Show the new state in mode "human", without a call of `render`, as Gymnasium requires."""
         if self._mode == "human":
             self.frames()
 
     def close(self) -> None:
-        """Give back whatever the renderer holds; harmless if done before."""
+        """Release the resources of the renderer. Repeated calls have no effect."""
         if self._renderer is not None:
             self._renderer.close()

@@ -17,18 +17,20 @@ from ce_gym.envs.runtime.setup import make_batch
 class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One robot and one task.
 
-    Observations and actions are float32 vectors; `observation_structure` names the blocks of the observation. `info`
-    holds `diverged`, whether the simulation failed numerically: the episode is then truncated, at the last good state;
-    `reward_<name>` for each reward term; and, as in Gymnasium's MuJoCo environments, `x_position`, `y_position`,
-    `distance_from_origin` [m], `x_velocity` and `y_velocity` [m/s] of the base in the world.
+    Observations and actions are float32 vectors; `observation_structure` names the blocks of an observation. `info` has
+
+    - `diverged`: whether the simulation failed numerically. The episode is then truncated at the last good state.
+    - `reward_<name>`: each weighted reward term.
+    - `x_position`, `y_position`, `distance_from_origin` [m], `x_velocity`, `y_velocity` [m/s] of the base in the world,
+      as in Gymnasium's MuJoCo environments.
 
     Args:
-        robot: Name of a robot that ships with the package, or a path to a robot file.
+        robot: Name of a robot of the package, or a path to a robot file.
         task: Name of a task.
-        obs_mode: "vector", or "dict" for `{"policy": ..., "critic": ...}`, where the critic may see more.
-        render_mode: None; "rgb_array", for pictures as arrays; or "human", for a live page at this machine's loopback.
-        width: Of a picture [pixels].
-        height: Of a picture [pixels].
+        obs_mode: "vector", or "dict" for `{"policy": ..., "critic": ...}`, where the critic may have more blocks.
+        render_mode: None; "rgb_array" for pictures as arrays; or "human" for a live page on localhost.
+        width: Width of a picture [pixels].
+        height: Height of a picture [pixels].
         **kwargs: See `ce_gym.envs.runtime.setup.make_batch`.
     """
 
@@ -45,9 +47,9 @@ class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         height: int = 480,
         **kwargs: Any,
     ) -> None:
-        shown_as = {"obs_mode": obs_mode, "render_mode": render_mode, "width": width, "height": height}
-        super().__init__(robot, task, **shown_as, **kwargs)
-        self._hold(make_batch(robot, task, num_envs=1, **kwargs), task, shown_as)
+        display = {"obs_mode": obs_mode, "render_mode": render_mode, "width": width, "height": height}
+        super().__init__(robot, task, **display, **kwargs)
+        self._attach(make_batch(robot, task, num_envs=1, **kwargs), task, display)
         self.observation_space, self.action_space = spaces(self.batch.program, obs_mode)
         self._names = [f"reward_{name}" for name in self.batch.program.reward_terms]
         self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
@@ -55,52 +57,52 @@ class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start a new episode; see `gymnasium.Env.reset`. The same seed gives the same episodes, step by step.
+        """Start a new episode; see `gymnasium.Env.reset`. The same seed gives the same episodes.
 
         Raises:
-            ValueError: If the seed is none, or an option is given, for there are none.
+            ValueError: The seed is not valid, or `options` is not empty.
         """
         check_options(options)
         keys = None if seed is None else self._keys(seed)
-        with self._changing():
+        with self._exclusive():
             gymnasium.Env.reset(self, seed=seed)
             if keys is None and not self.batch.arrays["seeded"][0]:
                 keys = self.np_random.integers(2**63, size=1)
             if keys is not None:
                 self.batch.seed(keys)
-            observation = self._shown(self.batch.reset(np.ones(1, bool))[0])
+            observation = self._observation(self.batch.reset(np.ones(1, bool))[0])
         self._screen.refresh()
-        return observation, {"diverged": False, **self._whereabouts()}
+        return observation, {"diverged": False, **self._base_motion()}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Carry out one control step; see `gymnasium.Env.step`.
 
         Raises:
-            ValueError: If the action has the wrong shape or is not finite.
-            RuntimeError: If another thread steps or resets this environment.
+            ValueError: The action has the wrong shape or is not finite.
+            RuntimeError: Another thread steps or resets this environment.
             gymnasium.error.ClosedEnvironmentError: After `close`.
         """
         rows = checked_action(action, (1, self.batch.program.n_actions))
-        with self._changing():
+        with self._exclusive():
             outcome = self.batch.step(rows)
         diverged = bool(outcome.diverged[0])
         info = {"diverged": diverged, **dict(zip(self._names, outcome.terms[0].tolist(), strict=True))}
-        info |= self._whereabouts()
-        observation = self._shown(outcome.observation[0])
+        info |= self._base_motion()
+        observation = self._observation(outcome.observation[0])
         self._screen.refresh()
         return observation, float(outcome.reward[0]), bool(outcome.terminated[0]), diverged, info
 
     def render(self) -> Any:
-        """Return a picture, uint8, shape (height, width, 3), or None if there is none."""
+        """Return a picture, uint8, shape (height, width, 3); None in other modes than "rgb_array"."""
         frames = self._screen.frames()
         return None if frames is None else frames[0]
 
     def close(self) -> None:
-        """Give back whatever rendering holds; harmless if done before."""
+        """Release the resources of rendering. Repeated calls have no effect."""
         self.closed = True
         self._screen.close()
 
-    def _whereabouts(self) -> dict[str, float]:
+    def _base_motion(self) -> dict[str, float]:
         q, v = self.batch.first("q"), self.batch.first("v")
         (x, y), (w, i, j, k), (a, b, c) = q[:2], q[3:7], v[3:6]
         return {
@@ -113,5 +115,5 @@ class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         }
 
     def state(self) -> dict[str, NDArray]:
-        """Return what a recorder needs: q, v, command, torque and, if computed, contact_forces (n_contacts, 3)."""
+        """Return the recorded state: q, v, command, torque and, if computed, contact_forces (n_contacts, 3)."""
         return {name: rows[0] for name, rows in super().state().items()}

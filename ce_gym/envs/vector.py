@@ -22,34 +22,34 @@ from ce_gym.sim.devices import Array, Device, device_named
 class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
     """Many copies of one robot and one task, stepped by one kernel.
 
-    Environment `i` of a batch seeded with `s` behaves as a single environment seeded with `s + i`, bit for bit,
-    whatever the size of the batch and the number of threads. `infos` holds `diverged`, bool (num_envs,): environments
-    whose simulation failed numerically; they are truncated at their last good state and reset alone; and
-    `reward_terms`, the weighted terms of the rewards by name, each (num_envs,); with curricula `terrain_level` and
-    `times_grown`, where each robot stands in them. Where an episode has ended,
-    `infos["episode_terms"]` has its length, its return, the sum of every reward term and the mean of every metric (see
-    `Task`).
+    Environment `i` of a batch with seed `s` and a single environment with seed `s + i` agree bit for bit, for any
+    number of environments and threads. `infos` has
 
-    On a GPU actions, observations and rewards are its torch tensors, with the same random streams from the same seeds.
-    To leave the host out of it, mode is SameStep only, `infos` always holds `episode_terms`, `final_obs` and
-    `final_info` with the masks of who is done beside them, and nothing is checked that would need waiting: actions that
-    are not numbers count as 1. Robots there are recorded through `state()`, not rendered.
+    - `diverged`, bool (num_envs,): environments that failed numerically. They are truncated at their last good state.
+    - `reward_terms`: the weighted reward terms by name, each (num_envs,).
+    - `terrain_level` and `times_grown` of tasks with curricula: the progress of each robot.
+    - `episode_terms` where an episode has ended: length, return, sum of each reward term, mean of each metric.
+
+    On a GPU, actions, observations and rewards are torch tensors on this GPU. The same seeds give the same random
+    streams. To avoid synchronisation, the autoreset mode is SameStep, `infos` always has `episode_terms`, `final_obs`
+    and `final_info` with their masks, and actions are not checked: NaN counts as 1. Record robots through `state()`;
+    they are not rendered.
 
     Attributes:
-        device: Of what it takes and returns: "cpu", or torch's device.
+        device: Device of actions and observations: "cpu", or a torch device.
 
     Args:
         num_envs: Number of environments.
         device: "cpu", or "cuda" or "cuda:N" for a GPU.
-        max_episode_steps: Control steps until time is up; the task's own if None.
-        autoreset_mode: When a finished environment starts again: "NextStep" (Gymnasium's default), "SameStep" or
-            "Disabled", see `gymnasium.vector.AutoresetMode`.
+        max_episode_steps: Control steps until time is up; `episode_length` of the task if None.
+        autoreset_mode: "NextStep" (default of Gymnasium), "SameStep" or "Disabled", see
+            `gymnasium.vector.AutoresetMode`.
         robot, task, obs_mode, width, height: See `LeggedEnv`.
-        render_mode: None; "rgb_array", for a picture of every environment; or "human", for a live page of the first.
+        render_mode: None; "rgb_array" for a picture of each environment; or "human" for a live page of the first one.
         **kwargs: See `ce_gym.envs.runtime.setup.make_batch`.
 
     Raises:
-        ValueError: If there is no such device, or an argument is not one of the choices.
+        ValueError: The device does not exist, or an argument is not valid.
     """
 
     metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -69,15 +69,15 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         height: int = 480,
         **kwargs: Any,
     ) -> None:
-        made_with = {name: value for name, value in locals().items() if name not in ("self", "kwargs", "__class__")}
-        super().__init__(**made_with, **kwargs)
+        arguments = {name: value for name, value in locals().items() if name not in ("self", "kwargs", "__class__")}
+        super().__init__(**arguments, **kwargs)
         place = device_named(device)
         self.autoreset_mode = _autoreset_mode(autoreset_mode, place)
         if place.fuses and render_mode is not None:
             raise ValueError(f"render_mode={render_mode!r}; expected None on device {place.name!r}")
         if max_episode_steps is not None:
             checked_value("max_episode_steps", max_episode_steps, 1)
-        self._hold(make_batch(robot, task, num_envs=num_envs, device=place, **kwargs), task, made_with)
+        self._attach(make_batch(robot, task, num_envs=num_envs, device=place, **kwargs), task, arguments)
         program, self.num_envs = self.batch.program, num_envs
         self.max_episode_steps = max_episode_steps or program.task.episode_length
         self.batch.write("limit", self.max_episode_steps)
@@ -97,52 +97,51 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         """Start new episodes; see `gymnasium.vector.VectorEnv.reset`.
 
         Args:
-            seed: One number `s`, giving seeds s, s + 1, ..., or one for each environment.
-            options: `reset_mask`, bool (num_envs,), resets (and seeds) only some environments.
+            seed: A seed `s` for the seeds s, s + 1, ..., or one seed for each environment.
+            options: `reset_mask`, bool (num_envs,): environments to reset and seed.
 
         Raises:
-            ValueError: If the mask or the list of seeds has the wrong shape, or there is no such option.
+            ValueError: The mask or the list of seeds has the wrong shape, or an option does not exist.
         """
         batch, mask = self.batch, self._reset_mask(options)
-        keys, new = None if seed is None else self._keys(seed), mask
-        with self._changing():
+        keys, to_seed = None if seed is None else self._keys(seed), mask
+        with self._exclusive():
             VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
-            if keys is None and (new := mask & ~batch.arrays["seeded"]).any():
+            if keys is None and (to_seed := mask & ~batch.arrays["seeded"]).any():
                 keys = self.np_random.integers(2**63, size=self.num_envs)
             if keys is not None:
-                batch.seed(keys, new)
+                batch.seed(keys, to_seed)
             observation = batch.reset(mask)
         self._screen.refresh()
         diverged = batch.place.zeros((self.num_envs,), "bool")
-        return self._shown(observation), {"diverged": diverged, **batch.curriculum()}
+        return self._observation(observation), {"diverged": diverged, **batch.curriculum()}
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Carry out one control step; see `gymnasium.vector.VectorEnv.step`. A GPU may not have finished by the end.
+        """Carry out one control step; see `gymnasium.vector.VectorEnv.step`. A GPU may still run when this returns.
 
         Raises:
-            ValueError: If the actions have the wrong shape or, on the CPU, are not finite.
-            gymnasium.error.ResetNeeded: In "Disabled" mode, if a finished environment has not been reset.
-            RuntimeError: If another thread steps or resets these environments.
+            ValueError: The actions have the wrong shape or, on the CPU, are not finite.
+            gymnasium.error.ResetNeeded: In mode "Disabled", a finished environment has not been reset.
+            RuntimeError: Another thread steps or resets these environments.
             gymnasium.error.ClosedEnvironmentError: After `close`.
         """
         rows = self._checked(actions)
-        with self._changing():
+        with self._exclusive():
             outcome, infos = self._advance(rows)
         self._screen.refresh()
-        return self._shown(outcome.observation), outcome.reward, outcome.terminated, outcome.truncated, infos
+        return self._observation(outcome.observation), outcome.reward, outcome.terminated, outcome.truncated, infos
 
     def _advance(self, rows: Array) -> tuple[Outcome, dict[str, Any]]:
-        """Step with actions, shape (num_envs, n_actions), and reset finished environments as the mode says."""
+        """Step with actions, shape (num_envs, n_actions), and reset finished environments according to the mode."""
         batch, same_step = self.batch, self.autoreset_mode == AutoresetMode.SAME_STEP
         ignored = None
         if not same_step and batch.arrays["finished"].any():
             ignored = batch.rows("finished")
             if self.autoreset_mode == AutoresetMode.DISABLED:
-                raise gymnasium.error.ResetNeeded(
-                    f"{int(ignored.sum())} environments are finished; reset them with options={{'reset_mask': ...}}"
-                )
+                advice = "reset them with options={'reset_mask': ...}"
+                raise gymnasium.error.ResetNeeded(f"{int(ignored.sum())} environments are finished; {advice}")
         o = batch.step(rows, ignored, same_step)
-        if ignored is not None:  # next-step mode: these ignore the action and show the first observation instead
+        if ignored is not None:  # mode NextStep: a reset replaces the step of these environments
             o.observation = batch.reset(ignored)
             o.reward[ignored] = 0.0
             o.ended[ignored] = 0.0
@@ -158,38 +157,38 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         if batch.fused or o.done.any():
             infos["episode_terms"], infos["_episode_terms"] = self._episode_terms(o), o.done
             if same_step:
-                infos["final_obs"], infos["_final_obs"] = self._shown(o.final_observation), o.done
+                infos["final_obs"], infos["_final_obs"] = self._observation(o.final_observation), o.done
                 infos["final_info"], infos["_final_info"] = {"diverged": batch.place.copy(o.diverged)}, o.done
         return o, infos
 
     def _episode_terms(self, outcome: Outcome) -> dict[str, Array]:
-        """Length, sums of reward terms and means of metrics of the episodes that have just ended, zero elsewhere."""
+        """Return length, sums of reward terms and means of metrics of episodes that have just ended, else zero."""
         length, *sums = self.batch.place.copy(outcome.ended).T
         terms = dict(zip(self.batch.program.sum_names, sums, strict=True))
         means = {name: total / length.clip(min=1) for name, total in terms.items() if name.startswith("metrics/")}
         return {"length": length, **terms, **means}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of every environment, each uint8 (height, width, 3), or None if there are none."""
+        """Return a picture of each environment, uint8 (height, width, 3); None in other modes than "rgb_array"."""
         return self._screen.frames()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Give back whatever rendering holds; see `gymnasium.vector.VectorEnv.close`."""
+        """Release the resources of rendering; see `gymnasium.vector.VectorEnv.close`."""
         self._screen.close()
 
     @property
     def elapsed_steps(self) -> Array:
         """Control steps since each episode began, by which time runs out, int64, shape (num_envs,).
 
-        Learners set it at random at first, so that episodes do not all end together; lengths and means that are
-        reported of those first episodes count from there too.
+        Learners set random values at first, so that episodes do not all end together. Reported lengths and means of
+        the first episodes count from these values.
         """
         return self.batch.place.rows(self.batch.rows("elapsed")[:, 0], "int64")
 
     @elapsed_steps.setter
     def elapsed_steps(self, steps: Any) -> None:
         rows = self.batch.place.rows(steps, self.batch.dtype, (self.num_envs,))[:, None]
-        with self._changing():
+        with self._exclusive():
             self.batch.write("elapsed", rows)
 
     def _checked(self, actions: Any) -> Array:
@@ -202,7 +201,7 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         return rows
 
     def _reset_mask(self, options: dict[str, Any] | None) -> Array:
-        """Read, but do not take away, the mask: wrappers outside look at it too."""
+        """Return the mask of `options`, which stays there for wrappers."""
         check_options(options, ("reset_mask",))
         place, n = self.batch.place, self.num_envs
         mask = (options or {}).get("reset_mask")
@@ -210,21 +209,22 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
             return place.rows(True, "bool", (n,))
         kind, shape = str(getattr(mask, "dtype", "")), tuple(getattr(mask, "shape", ()))
         if kind.removeprefix("torch.") != "bool" or shape != (n,) or not mask.any():
-            given = " ".join(repr(mask).split())
-            raise ValueError(f"reset_mask={given}; expected a bool array of shape ({n},) with a true entry")
+            text = " ".join(repr(mask).split())
+            raise ValueError(f"reset_mask={text}; expected a bool array of shape ({n},) with a true entry")
         return place.rows(mask, "bool")
 
 
 def _autoreset_mode(mode: str | AutoresetMode | None, place: Device) -> AutoresetMode:
-    """Return an autoreset mode given as itself, by name ("SAME_STEP") or by value ("SameStep").
+    """Return the autoreset mode for a mode, its name ("SAME_STEP"), its value ("SameStep") or None.
 
     Raises:
-        ValueError: If there is no such mode, or not on this device.
+        ValueError: The mode does not exist, or not on this device.
     """
-    usual = AutoresetMode.SAME_STEP if place.fuses else AutoresetMode.NEXT_STEP
-    known = (AutoresetMode.SAME_STEP,) if place.fuses else tuple(AutoresetMode)
-    for one in known:
-        if (usual if mode is None else mode) in (one, one.name, one.value):
-            return one
-    expected = ", ".join(repr(one.value) for one in known) + (f" on device {place.name!r}" if place.fuses else "")
+    default = AutoresetMode.SAME_STEP if place.fuses else AutoresetMode.NEXT_STEP
+    supported = (AutoresetMode.SAME_STEP,) if place.fuses else tuple(AutoresetMode)
+    for known in supported:
+        if (default if mode is None else mode) in (known, known.name, known.value):
+            return known
+    expected = ", ".join(repr(known.value) for known in supported)
+    expected += f" on device {place.name!r}" if place.fuses else ""
     raise ValueError(f"autoreset_mode={mode!r}; expected one of {expected}")

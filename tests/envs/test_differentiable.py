@@ -42,7 +42,7 @@ class Objective:
 
     def __init__(self, env) -> None:
         rng = np.random.default_rng(1)
-        self.env, self.start, self.look = env, env.snapshot(), env.batch.program.look()
+        self.env, self.start, self.look = env, env.snapshot(), env.batch.program.stages.observation_function()
         self.actions = np.round(rng.uniform(-0.5, 0.5, (STEPS, N, ACTIONS)) / GRID) * GRID
         self.by_observation, self.by_reward = rng.normal(size=(STEPS, N, SEEN)), rng.normal(size=(STEPS, N))
 

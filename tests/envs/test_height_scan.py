@@ -87,29 +87,29 @@ def test_around_feet_it_is_about_their_lowest_points():
     """Where it looks, and how far up the feet are, by the model's own contact points."""
     scan = {"size": (0.2, 0.0), "around": "feet", "clip": 9.0}
     program = make_program("mini_cheetah", "velocity", terrain="rough", observations={"height_scan": scan})
-    (key,), robot = program.probe.looked, program.model.robot
+    (key,), robot = program.stages.grids, program.model.robot
     (call,) = program.stages.places(begins=False)
     q = program.model.standing_q + 0.0
     q[:7] = [3.0, 4.0, 0.5, np.cos(0.4), 0.0, 0.0, np.sin(0.4)]
-    turned, places = looked_at(np.array(call.function(q)).ravel(), program.probe.grids[key])
+    turned, places = looked_at(np.array(call.function(q)).ravel(), program.stages.grids[key])
     at = places[:, None] + turned
     spheres = [i for i, sphere in enumerate(robot.contacts) if sphere.group == "foot"]
     feet = program.model.contact_points(q, np.zeros(program.model.nv))[0][spheres]
     ahead = 0.1 * np.array([np.cos(0.8), np.sin(0.8)])
     expected = feet[:, None, :2] + np.array([-1.0, 0.0, 1.0])[:, None] * ahead
     np.testing.assert_allclose(at, expected, atol=1e-12)
-    s = program.stages._context(program.stages.state)
+    s = program.stages.context(program.stages.state)
     lowest = ca.Function("lowest", [s.q], [ca.horzcat(*s.foot_places)[2, :]])(q)
     radius = np.array([robot.contacts[i].radius for i in spheres])
     np.testing.assert_allclose(np.array(lowest)[0], feet[:, 2] - radius, atol=1e-12)
-    assert program.probe.looked[key] == 12
+    assert program.stages.ground_values[key].numel() == 12
 
 
 def test_flat_ground_is_not_looked_up():
     program = make_program(TRIPOD, "velocity", observations={"height_scan": {}})
     assert not any(isinstance(call, Lookup) for call in program.step_program().calls)
     plain = make_program(TRIPOD, "velocity", observations=["base_height"])
-    more = program.function("assess").n_instructions() - plain.function("assess").n_instructions()
+    more = program.function("evaluate").n_instructions() - plain.function("evaluate").n_instructions()
     assert more < 3 * 187, "one height, shown 187 times"
 
 
@@ -123,7 +123,7 @@ def test_a_term_may_look_only_where_it_is_known_to_look(monkeypatch: pytest.Monk
         return s.ground_under("there", s.torque[:2])
 
     program = make_program(TRIPOD, "velocity", terrain="rough", observations=["peeping"])
-    assert program.probe.looked == {"observation_peeping_there": 1}
+    assert program.stages.ground_values["observation_peeping_there"].numel() == 1
 
     @ce_gym.observation
     def chasing(s):

@@ -109,7 +109,7 @@ def test_ctrl_c_at_any_line(make, call):
 @pytest.mark.parametrize(("make", "call"), EVERY_CALL)
 def test_a_second_thread_is_refused(make, call, monkeypatch: pytest.MonkeyPatch):
     env, twin, errors = make(), make(), []
-    kernel = env.batch._step
+    kernel = env.batch._step_kernel
 
     def other():
         with pytest.raises(RuntimeError) as caught:
@@ -117,7 +117,7 @@ def test_a_second_thread_is_refused(make, call, monkeypatch: pytest.MonkeyPatch)
         errors.append(str(caught.value))
 
     def watched(*arguments, **options):
-        env.batch._step = kernel  # what is not refused ends, too
+        env.batch._step_kernel = kernel  # what is not refused ends, too
         thread = threading.Thread(target=other)
         thread.start()
         thread.join()
@@ -125,7 +125,7 @@ def test_a_second_thread_is_refused(make, call, monkeypatch: pytest.MonkeyPatch)
 
     for one in (env, twin):
         begin(one, 0)
-    monkeypatch.setattr(env.batch, "_step", watched)
+    monkeypatch.setattr(env.batch, "_step_kernel", watched)
     for one in (env, twin):
         act(one, 1)
     name = f"{type(env).__name__} 'velocity' of {env.batch.num_envs} mini_cheetah"

@@ -44,8 +44,8 @@ def test_lines_add_up_to_the_kernel(report: SceneReport):
     """The calls of the very program that an environment is compiled from."""
     counts, n = always(report.program), report.program.task.n_substeps
     assert report.sub_step == sum(counts[name] for name in (*AROUND, "iteration", "zeros"))
-    assert report.env_step == n * report.sub_step + counts["act"] + counts["assess"]
-    assert sum(group.instructions for group in report.groups) == counts["act"] + counts["assess"]
+    assert report.env_step == n * report.sub_step + counts["act"] + counts["evaluate"]
+    assert sum(group.instructions for group in report.groups) == counts["act"] + counts["evaluate"]
     assert {item.name: item.instructions for item in report.sometimes} == {
         "another iteration of a sub-step": counts["iteration"],
         "a sub-step in parts": counts["subdivide"],
@@ -62,7 +62,7 @@ def test_lines_add_up_whatever_a_task_asks_for():
     )  # fmt: skip
     counts, n = always(report.program), report.program.task.n_substeps
     assert report.sub_step == sum(counts[name] for name in (*AROUND, "iteration", "zeros"))
-    once = counts["act"] + counts["assess"] + n * counts["arrive"] + counts["arrived"]
+    once = counts["act"] + counts["evaluate"] + n * counts["arrive"] + counts["arrived"]
     assert report.env_step == n * report.sub_step + once
     layers_there = {item.name: item.instructions for item in report.layers}
     assert layers_there["limited motors"] > 0
@@ -151,10 +151,10 @@ def test_methods_and_friction_count_every_call(report: SceneReport):
 
 
 def test_a_term_costs_what_it_adds_when_it_is_there(report: SceneReport):
-    model, before = report.program.model, always(report.program)["assess"]
+    model, before = report.program.model, always(report.program)["evaluate"]
     for field, term in (("rewards", "joint_limits"), ("observations", "feet_in_contact")):
         more = {**VELOCITY.rewards, term: 0.5} if field == "rewards" else (*VELOCITY.observations, term)
-        after = always(TaskProgram(model, replace(VELOCITY, **{field: more})))["assess"]
+        after = always(TaskProgram(model, replace(VELOCITY, **{field: more})))["evaluate"]
         (line,) = (item for item in report.terms_left_out if item.name == term)
         assert line.instructions == after - before > 0
 

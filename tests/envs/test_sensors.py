@@ -24,7 +24,7 @@ def program(**terms) -> TaskProgram:
 
 def read(p: TaskProgram, term: str, **state) -> np.ndarray:
     """What a term reads in a state; what is not given is that of the standing robot at rest, long in its episode."""
-    function = p.terms_function({term: p.observation_terms[term]})
+    function = p.stages.terms_function({term: p.observation_terms[term]})
     known = {"q": p.model.standing_q, "clock": 9.0} | {
         k if k in p.schema else f"observation_{term}_{k}": x for k, x in state.items()
     }
@@ -89,7 +89,7 @@ def test_a_bias_is_drawn_for_an_episode_and_spares_the_critic():
     p = make_program(TRIPOD, "velocity", observations=terms, critic=["base_height"])
     drifts = {name: row.size for name, row in p.schema.items() if row.writer == "drift"}
     assert drifts == {"observation_accelerometer_bias": 3, "observation_gyro_bias": 3}
-    call, function = (c := p.stages.assess()[0]), c.function
+    call, function = (c := p.stages.evaluate()[0]), c.function
     values = {name: np.zeros(function.size1_in(i)) for i, name in enumerate(call.inputs)} | {"q": p.model.standing_q}
     values |= {"clock": 3.0, "observation_gyro_bias": [1.0, -1.0, 0.5]}
     found = function(*[values[name] for name in call.inputs])[call.outputs.index("observation")]

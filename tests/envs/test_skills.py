@@ -131,7 +131,7 @@ def states(program, **changes) -> dict[str, np.ndarray]:
 
 
 def values(program, terms, state) -> dict[str, float]:
-    function = program.terms_function(terms)
+    function = program.stages.terms_function(terms)
     found = function(*[state[function.name_in(i)] for i in range(function.n_in())])
     return dict(zip(terms, np.asarray(found).ravel().tolist(), strict=True))
 

@@ -140,9 +140,9 @@ def test_contacts_start_with_the_springs_force():
 
 def test_options_that_mean_nothing_are_refused():
     envs, env = make("SameStep"), gymnasium.make(ID, **OPTIONS)
-    with pytest.raises(ValueError, match=r"options\['foo'\] means nothing to reset; expected reset_mask"):
+    with pytest.raises(ValueError, match=r"options\['foo'\] has no effect in reset; expected reset_mask"):
         envs.reset(options={"foo": 1})
-    with pytest.raises(ValueError, match=r"options\['foo'\] means nothing to reset; expected no options"):
+    with pytest.raises(ValueError, match=r"options\['foo'\] has no effect in reset; expected no options"):
         env.reset(options={"foo": 1})
     env.reset(options={})
 

@@ -135,7 +135,7 @@ def test_parameters_of_the_package_s_terms():
     assert "torques" not in program.reward_terms
     s = {"q": np.r_[0, 0, 0.3, 1, np.zeros(15)], "v": np.r_[np.zeros(3), 0.4, np.zeros(14)]}
     other = make_program("mini_cheetah", "velocity", terminations={"tilt": {"angle": 0.5}, "fallen": {"share": 2.0}})
-    look = other.look()
+    look = other.stages.observation_function()
     values = {name: np.zeros(look.size1_in(name)) for name in look.name_in()} | s
     failed = look.call([values[name] for name in look.name_in()])[-1]
     assert float(failed) == 1.0, "lower than twice the standing height"
@@ -206,7 +206,7 @@ def test_functions_of_numpy_are_quiet():
     def numpys(s):
         return np.exp(-(s.base_height**2)) + np.sqrt(s.q[2])
 
-    assert make_program("mini_cheetah", "velocity", rewards={"numpys": 1.0}).probe.added
+    assert make_program("mini_cheetah", "velocity", rewards={"numpys": 1.0}).stages.user_terms
 
 
 def test_a_parameter_needs_a_default():

@@ -107,16 +107,16 @@ def test_a_field_is_flat_first_and_as_asked_last(kind: str):
 def test_flat_ground_costs_nothing():
     """Nothing of a field is there, and the counts are no higher; whoever makes it cheaper may lower them.
 
-    Before there was terrain `assess` took 799 and `begin` 734. Since then 161 came for the end of an episode (length,
+    Before there was terrain `evaluate` took 799 and `reset` 734. Since then 161 came for the end of an episode (length,
     failures, time limit, sums, masks of NaN), which another function of 211 or the host had to do; and 134 for how an
     episode begins, 126 of them for the springs' forces on the contacts, and 3 for the count of sub-steps made in parts.
     None of it depends on the terrain.
     """
     program = make_program("mini_cheetah", "velocity")
-    counted = {name: program.function(name).n_instructions() for name in ("act", "assess", "begin")}
+    counted = {name: program.function(name).n_instructions() for name in ("act", "evaluate", "reset")}
     assert counted["act"] <= 85
-    assert counted["assess"] <= 960
-    assert counted["begin"] <= 871
+    assert counted["evaluate"] <= 960
+    assert counted["reset"] <= 871
     for kernel in (program.step_program(), program.reset_program()):
         assert not [buffer for buffer in kernel.buffers if buffer.kind == "table"]
     assert len(program.reset_program().calls) == 1

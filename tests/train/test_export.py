@@ -105,7 +105,7 @@ def test_the_specification_rebuilds_observations():
 
 def test_looking_needs_all_that_is_looked_at():
     envs = gymnasium.make_vec(ROBOT_ENV, 2).unwrapped
-    with pytest.raises(ValueError, match="looks at command"):
+    with pytest.raises(ValueError, match="the state lacks command"):
         envs.look({"q": np.zeros((2, 19)), "v": np.zeros((2, 18)), "action": np.zeros((2, 12))})
 
 

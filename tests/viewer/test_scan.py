@@ -26,7 +26,7 @@ def test_points_are_where_the_sensor_looks(seen: str) -> None:
     program = make_program(TRIPOD, "velocity", terrain="rough", **{seen: scan})
     q = program.model.standing_q + 0.0
     q[:7] = [3.0, 4.0, 0.5, np.cos(0.4), 0.0, 0.0, np.sin(0.4)]
-    (grid,), pose = program.probe.grids.values(), np.array(program.stages.places(begins=False)[0].function(q)).ravel()
+    (grid,), pose = program.stages.grids.values(), np.array(program.stages.places(begins=False)[0].function(q)).ravel()
     np.testing.assert_allclose(pose, [np.cos(0.8), np.sin(0.8), 3.0, 4.0], atol=1e-12)
     turn = np.array([[np.cos(0.8), np.sin(0.8)], [-np.sin(0.8), np.cos(0.8)]])
     (drawn,) = scans_of(program)
@@ -45,7 +45,7 @@ def leaning(program: TaskProgram, seed: int = 0) -> np.ndarray:
 def test_grids_around_feet_are_where_the_sensor_looks(robot: Any, feet: int) -> None:
     seen: Any = {"height_scan": {**GRID, "around": "feet"}}
     program = make_program(robot, "velocity", terrain="rough", observations=seen)
-    q, (grid,) = leaning(program), program.probe.grids.values()
+    q, (grid,) = leaning(program), program.stages.grids.values()
     found = np.array(program.stages.places(begins=False)[0].function(q)).ravel()
     positions, rotations = (rows[0] for rows in program.model.body_poses(q[None]))
     scans = scans_of(program)

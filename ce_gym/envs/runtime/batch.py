@@ -1,8 +1,8 @@
 """A batch of environments without Gymnasium: the state of a task's robots on a device, stepped and reset by kernels.
 
-Single and vector environments are thin over this, so that a lane of a batch and an environment of its own are the same
-numbers, bit for bit. On a GPU a control step and the resets that follow are one launch, because a look from the host
-would cost as much as the physics; on the CPU they are two kernels.
+Single and vector environments wrap a batch, so a robot in a batch and a robot alone give the same numbers, bit for bit.
+On a GPU a control step and the resets after it are one launch, because a query from the host would take as long as the
+physics. On the CPU they are two kernels.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from ce_gym.sim.devices import Array, Device
 from ce_gym.sim.kernel_key import laws_key, model_key
 
 SOURCES = ("ce_gym.envs.runtime", "ce_gym.envs.task", "ce_gym.envs.terms")
-"""What traces a task, beside what traces a model, and makes programs of it."""
-SHOWN = {"level": "terrain_level", "grown": "times_grown"}
-"""State of the curricula, and its names for those who watch."""
+"""Packages whose source traces a task, for the cache key of its kernels."""
+CURRICULUM_INFO = {"level": "terrain_level", "grown": "times_grown"}
+"""State of the curricula and the names that `info` has for it."""
 
 
 @dataclass
 class Outcome:
-    """What a control step leaves behind: fresh arrays, but for `ended`, which the next step overwrites.
+    """Results of a control step. All arrays are new except `ended`, which the next step overwrites.
 
     Attributes:
-        observation: float32, the policy's and then the critic's, shape (num_envs, n_obs); the first of the next episode
-            where one has begun.
-        final_observation: The same before any reset.
-        reward: float64, shape (num_envs,).
-        terminated: Failed, shape (num_envs,).
-        truncated: Time is up, or it has diverged.
-        diverged: Frozen at the last good state.
-        done: Terminated or truncated.
-        terms: Weighted reward terms, in the order of the task, shape (num_envs, n_terms).
-        ended: Length, return and sums of episodes that have ended, zero elsewhere, shape (num_envs, 1 + n_sums).
+        observation: Observation of the policy, then of the critic, float32, shape (num_envs, n_obs); the first one of
+            the next episode where that has begun.
+        final_observation: Observation before any reset, same shape.
+        reward: Rewards, float64, shape (num_envs,).
+        terminated: Whether the robot has failed, shape (num_envs,).
+        truncated: Whether time is up or the robot has diverged, shape (num_envs,).
+        diverged: Whether the robot is frozen at its last good state, shape (num_envs,).
+        done: Whether the episode is terminated or truncated, shape (num_envs,).
+        terms: Weighted reward terms in the order of the task, shape (num_envs, n_terms).
+        ended: Length, return and sums of episodes that have ended, else zero, shape (num_envs, 1 + n_sums).
     """
 
     observation: Array
@@ -62,12 +62,12 @@ class TaskBatch(Batch):
         program: The task on the robot.
         num_envs: Number of copies.
         dtype: "float64" or "float32" for state and arithmetic.
-        device: Where they live.
-        num_threads: Threads the copies are split over.
+        device: Device that holds the state and runs the kernels.
+        num_threads: Threads that share the copies.
         max_episode_steps: Control steps until time is up.
 
     Attributes:
-        fused: Whether a reset is part of each step.
+        fused: Whether each step resets the robots that are done.
     """
 
     def __init__(
@@ -83,24 +83,24 @@ class TaskBatch(Batch):
         self.program, self.fused = program, device.fuses
         key = kernel_key(program)
         kind = "fused step" if self.fused else "environment"
-        self._step = device.kernel(f"{kind} {key}", lambda: programs(program, self.fused), dtype)
-        self._begin = device.kernel(f"reset {key}", lambda: (program.reset_program(),), dtype)
+        self._step_kernel = device.kernel(f"{kind} {key}", lambda: programs(program, self.fused), dtype)
+        self._reset_kernel = device.kernel(f"reset {key}", lambda: (program.reset_program(),), dtype)
         ended = device.zeros((num_envs, 1 + len(program.sum_names)), "float64")
-        self._fixed = {name: self.arrays[name] for name in program.state_sizes} | self.tables | {"ended": ended}
-        out = [b for b in self._step.buffers.values() if b.kind == "rows_out" and b.name not in self._fixed]
-        self._results = [(b.name, (num_envs, b.size), b.dtype) for b in out]
+        self._persistent = {name: self.arrays[name] for name in program.state_sizes} | self.tables | {"ended": ended}
+        results = [b for b in self._step_kernel.buffers.values() if b.kind == "rows_out"]
+        self._results = [(b.name, (num_envs, b.size), b.dtype) for b in results if b.name not in self._persistent]
         self.write("limit", max_episode_steps)
         curriculum = (*program.curriculum.sizes, "command", "clock") if program.curriculum.sizes else ()
-        self._carried = (*curriculum, "failures")
+        self._kept_if_ignored = (*curriculum, "failures")
         keys = self.arrays["keys"]
         self._streams = {"keys": keys if self.fused else keys.view(np.uint64), "counters": self.arrays["counters"]}
 
     def seed(self, keys: Array, mask: Array | None = None) -> None:
-        """Start random streams and curricula anew.
+        """Restart random streams and curricula.
 
         Args:
-            keys: One number for each copy, int64 or uint64, shape (num_envs,).
-            mask: Which copies, bool, shape (num_envs,); all of them if None.
+            keys: Key of the random stream of each copy, int64 or uint64, shape (num_envs,).
+            mask: Copies to seed, bool, shape (num_envs,); all if None.
         """
         self.write("keys", np.asarray(keys).view(np.int64), mask)
         self.write("counters", 0, mask)
@@ -109,8 +109,8 @@ class TaskBatch(Batch):
             self.write(name, 0.0, mask)
 
     def curriculum(self) -> dict[str, Array]:
-        """Return where the copies are in the curricula of the task, each shape (num_envs,)."""
-        return {shown: self.rows(name)[:, 0] for name, shown in SHOWN.items() if name in self.schema}
+        """Return the progress of each copy in the curricula of the task by name, each shape (num_envs,)."""
+        return {key: self.rows(name)[:, 0] for name, key in CURRICULUM_INFO.items() if name in self.schema}
 
     def reset(self, mask: Array) -> Array:
         """Start new episodes where `mask` is true.
@@ -123,33 +123,32 @@ class TaskBatch(Batch):
         return self._reset(mask)
 
     def _reset(self, mask: Array) -> Array:
-        before = self.arrays["observation"]
-        after = self.place.copy(before)
+        observation = self.place.copy(self.arrays["observation"])
         if self.fused:
-            self._run(self._begin, {"observation": after})
-        else:  # a kernel of the CPU writes all rows of a tile, and leaves it to us to count
-            rows = np.empty_like(before)
-            self._run(self._begin, {"observation": rows})
+            self._run(self._reset_kernel, {"observation": observation})
+        else:  # a kernel of the CPU writes all rows of a tile, and does not advance the counters
+            rows = np.empty_like(observation)
+            self._run(self._reset_kernel, {"observation": rows})
             self.arrays["counters"] += mask
-            after[mask] = rows[mask]
-        self.arrays["observation"] = after
-        return after
+            observation[mask] = rows[mask]
+        self.arrays["observation"] = observation
+        return observation
 
     def step(self, action: Array, ignored: Array | None = None, autoreset: bool = False) -> Outcome:
         """Carry out one control step.
 
         Args:
             action: Shape (num_envs, n_actions), float32; clipped to [-1, 1].
-            ignored: Copies about to be reset, whose step must not use up random numbers nor count in a curriculum,
-                shape (num_envs,).
-            autoreset: Whether to begin the next episode of those that are done; a fused step always does.
+            ignored: Copies that are reset next, shape (num_envs,). Their step changes neither their random stream nor
+                their curriculum.
+            autoreset: Whether to start the next episode of copies that are done; a fused step always does.
         """
         rows = {name: self.place.empty(shape, dtype) for name, shape, dtype in self._results}
-        carried = {name: self.rows(name) for name in self._carried} if ignored is not None else {}
-        self._run(self._step, {**rows, "action_in": action}, {"n_substeps": self.program.task.n_substeps})
+        kept = {name: self.rows(name) for name in self._kept_if_ignored} if ignored is not None else {}
+        self._run(self._step_kernel, {**rows, "action_in": action}, {"n_substeps": self.program.task.n_substeps})
         if not self.fused:
             self.arrays["counters"] += 1 if ignored is None else ~ignored
-        for name, values in carried.items():
+        for name, values in kept.items():
             self.write(name, values, ignored)
         outcome, n = rows["outcome"], len(OUTCOME)
         flags = (outcome[:, 1:n] > 0.5).T
@@ -158,11 +157,11 @@ class TaskBatch(Batch):
             final = rows["final_observation"]
         elif autoreset and flags[-1].any():
             observation = self._reset(flags[-1])
-        results = (self.place.copy(outcome[:, 0]), *flags, outcome[:, n:], self._fixed["ended"])
+        results = (self.place.copy(outcome[:, 0]), *flags, outcome[:, n:], self._persistent["ended"])
         return Outcome(observation, final, *results)  # pyright: ignore[reportCallIssue]
 
     def first(self, name: str) -> list[float]:
-        """Return the values of the first copy in a state buffer, quickly."""
+        """Return a state buffer of the first copy as a list, without copying the other rows."""
         return self.arrays[name][0, :, 0].tolist()
 
     def restore(self, snapshot: Snapshot | File) -> None:
@@ -170,17 +169,17 @@ class TaskBatch(Batch):
         self.arrays["observation"] = self.place.copy(self.arrays["observation"])  # a caller may hold the old one
         super().restore(snapshot)
 
-    def _run(self, kernel: Any, given: dict[str, Array], repeats: Mapping[str, int] | None = None) -> None:
-        kernel(self._fixed | given, self.num_envs, repeats=repeats, num_threads=self.num_threads, **self._streams)
+    def _run(self, kernel: Any, arrays: dict[str, Array], repeats: Mapping[str, int] | None = None) -> None:
+        kernel(self._persistent | arrays, self.num_envs, repeats=repeats, num_threads=self.num_threads, **self._streams)
 
 
 def programs(program: TaskProgram, fused: bool) -> tuple[Program, ...]:
-    """Return what one launch of a control step consists of."""
+    """Return the programs of one launch of a control step."""
     return (program.step_program(fused), program.reset_program()) if fused else (program.step_program(),)
 
 
 def kernel_key(program: TaskProgram) -> str:
-    """Return a text that names everything that the kernels of a task on a robot depend on."""
-    traced = f"{source_fingerprint(*SOURCES)} {model_key(program.model)}"
+    """Return a text that identifies the kernels of a task on a robot, for the cache."""
+    traced = f"{source_fingerprint(*SOURCES)} {model_key(program.model)} {program.stages.user_terms}"
     laws = laws_key(program.model.mechanism, program.options)
-    return f"{traced} {program.task!r} {program.contact_forces} {program.probe.added} {program.options.hulls} {laws}"
+    return f"{traced} {program.task!r} {program.contact_forces} {program.options.hulls} {laws}"

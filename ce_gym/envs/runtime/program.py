@@ -1,12 +1,11 @@
 """A task on a robot as the two programs of an environment, and the schema of the state that they share.
 
-step:   act -> physics sub-steps -> assess      all robots, every control step
-reset:  begin                                   only tiles with a robot to reset
+step:   act -> physics sub-steps -> ground look-ups -> evaluate    all robots, every control step
+reset:  spawn -> ground look-ups -> reset                          only tiles with a robot to reset
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
@@ -17,8 +16,7 @@ import numpy as np
 from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, Step
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.runtime.spec import TaskSpec
-from ce_gym.envs.runtime.stages import OUTCOME, Probe, Stages
-from ce_gym.envs.terms.registry import Term
+from ce_gym.envs.runtime.stages import OUTCOME, Stages
 from ce_gym.sim.schema import Row, checked_tolerance, physics_rows, state_buffers
 from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
@@ -29,8 +27,8 @@ HOST_ROWS = (
     Row("seeded", 0, "host", dtype="bool"),
     Row("finished", 0, "host", dtype="bool"),
 )
-"""Control steps until time is up; the key of the random stream, its bits, and how often the stream was used; whether it
-has been seeded; whether an episode has ended and the next one has not begun."""
+"""State that only the host writes: control steps until time is up; key and counter of the random stream; whether the
+stream has been seeded; whether the episode has ended and the next one has not begun."""
 
 
 class TaskProgram(TaskSpec):
@@ -38,7 +36,7 @@ class TaskProgram(TaskSpec):
 
     @cached_property
     def _rows(self) -> dict[str, Row]:
-        """The schema without what terms add to it."""
+        """The schema without the rows that terms add."""
         seen = {term for terms in (self.observation_terms, self.critic_terms) for term in terms}
         outputs = ("torque", *(["motor_torque"] if "motor_torques" in seen else []))
         outputs += ("contact_forces",) if self.contact_forces else ()
@@ -67,22 +65,15 @@ class TaskProgram(TaskSpec):
         return {row.name: row for row in rows}
 
     @cached_property
-    def probe(self) -> Probe:
-        """What the terms turn out to be when they are traced."""
-        return Stages(self, self._rows).probe()
+    def stages(self) -> Stages:
+        """The traced stages around the sub-steps."""
+        return Stages(self, self._rows)
 
     @cached_property
     def schema(self) -> dict[str, Row]:
         """State of one robot, by name."""
-        rows = [Row("observation", self.observation_size + self.critic_size, "host", dtype="float32")]
-        if self.task.history > 1:
-            rows.append(Row("history", (self.task.history - 1) * sum(self.observation_sizes.values()), "task"))
-        return self._rows | {row.name: row for row in (*self.probe.memories, *rows)}
-
-    @property
-    def stages(self) -> Stages:
-        """What is done around the sub-steps, to be traced."""
-        return Stages(self, self.schema, self.probe.looked)
+        observation = Row("observation", self.observation_size + self.critic_size, "host", dtype="float32")
+        return self._rows | self.stages.rows | {"observation": observation}
 
     @cached_property
     def state_sizes(self) -> dict[str, int]:
@@ -91,7 +82,7 @@ class TaskProgram(TaskSpec):
 
     @cached_property
     def sum_names(self) -> list[str]:
-        """What `sums` adds up over an episode, in order."""
+        """Names of the entries of `sums`, the sums over an episode, in order."""
         return [
             "return",
             *(f"reward/{name}" for name in self.reward_terms),
@@ -101,7 +92,7 @@ class TaskProgram(TaskSpec):
     @cached_property
     def observation_sizes(self) -> dict[str, int]:
         """Length of each block of one observation of the policy, by name, in order."""
-        return {name: self.probe.sizes[name] for name in self.observation_terms}
+        return {name: self.stages.block_sizes[name] for name in self.observation_terms}
 
     @cached_property
     def observation_size(self) -> int:
@@ -110,29 +101,17 @@ class TaskProgram(TaskSpec):
 
     @cached_property
     def critic_size(self) -> int:
-        """Length of the critic's observation, the policy's blocks included; 0 if it has none of its own."""
-        return sum(self.probe.sizes.values()) if self.task.critic else 0
-
-    def look(self) -> ca.Function:
-        """Return the state buffers that are looked at -> each block of an observation, `failed`.
-
-        One observation of the policy, neither noisy nor clipped, and whether the episode ends: for robots that
-        something else simulates.
-        """
-        return self.stages.look()
-
-    def terms_function(self, terms: Mapping[str, Term]) -> ca.Function:
-        """Return the state buffers that terms look at, and the action before -> their values, one after the other."""
-        return self.stages.values(terms)
+        """Length of the critic's observation, the policy's blocks included; 0 if the task has no critic blocks."""
+        return sum(self.stages.block_sizes.values()) if self.task.critic else 0
 
     def step_program(self, fused: bool = False) -> Program:
-        """Return act, physics and assess as one program.
+        """Return act, physics and evaluate as one program.
 
         Args:
-            fused: Whether a reset of those who are done follows in the same launch, so that what they leave has to be
-                kept: `final_observation`.
+            fused: Whether robots that are done are reset in the same launch. `final_observation` then keeps the
+                observation before the reset.
         """
-        assess, n_draws = self.stages.assess()
+        evaluate, n_draws = self.stages.evaluate()
         act, size = self.actions.act("delay" in self.schema), self.observation_size + self.critic_size
         outputs = tuple(name for name in ("torque", "motor_torque", "contact_forces") if name in self.schema)
         _, scratch, physics = substeps(self.model.mechanism, self.options, outputs)
@@ -152,59 +131,56 @@ class TaskProgram(TaskSpec):
         else:
             buffers += [Buffer("target", targets, "scratch")]
             steps = (Call(act, ("action_in",), ("clipped", "target")), *physics)
-        look, seeing = self._look_at_ground(begins=False)
-        steps = (*steps, *look, assess)
+        look_ups, ground_buffers = self._ground_look_ups(begins=False)
+        steps = (*steps, *look_ups, evaluate)
         if fused:
-            seen = SX.sym("observation", size)
-            steps = (*steps, Call(ca.Function("keep", [seen], [seen]), ("observation",), ("final_observation",)))
+            x = SX.sym("observation", size)
+            steps = (*steps, Call(ca.Function("keep", [x], [x]), ("observation",), ("final_observation",)))
             buffers.append(Buffer("final_observation", size, "rows_out", "float32"))
-        return self._program("environment", [*buffers, *seeing], steps)
+        return self._program("environment", [*buffers, *ground_buffers], steps)
 
     def reset_program(self) -> Program:
         """Return the program that starts new episodes where `chosen` is 1."""
-        stages = self.stages
-        begin, n_draws = stages.begin()
+        reset, n_draws = self.stages.reset()
         buffers = [
             Buffer("first_draws", n_draws, "random"),
             Buffer("observation", self.observation_size + self.critic_size, "rows_out", "float32"),
         ]
-        steps: tuple[Step, ...] = (begin,)
+        steps: tuple[Step, ...] = (reset,)
         if self.ground:
-            place, n_draws = stages.place()
-            look, seeing = self._look_at_ground(begins=True)
-            buffers += [Buffer("place_draws", n_draws, "random"), *seeing]
-            steps = (place, *look, begin)
+            spawn, n_draws = self.stages.spawn()
+            look_ups, ground_buffers = self._ground_look_ups(begins=True)
+            buffers += [Buffer("spawn_draws", n_draws, "random"), *ground_buffers]
+            steps = (spawn, *look_ups, reset)
         return self._program("reset", buffers, steps, skip_unless="chosen")
 
     def _program(
         self, name: str, buffers: list[Buffer], steps: tuple[Step | Repeat, ...], skip_unless: str = ""
     ) -> Program:
-        """Return a program with those state buffers that it uses."""
+        """Return a program with the state buffers that its steps use."""
         program = Program(f"{self.model.robot.name} {self.model.transmission} {name}", (), steps, skip_unless)
         used = {skip_unless, *(name for call in program.calls for name in (*call.inputs, *call.outputs))}
-        own = {buffer.name for buffer in buffers}
-        state = [b for b in state_buffers(self.schema.values()) if b.name in used and b.name not in own]
+        declared = {buffer.name for buffer in buffers}
+        state = [b for b in state_buffers(self.schema.values()) if b.name in used and b.name not in declared]
         return replace(program, buffers=(*state, *buffers))
 
-    def _look_at_ground(self, begins: bool) -> tuple[tuple[Step, ...], list[Buffer]]:
-        """What a program has to do, and the buffers that takes, for the task to see the ground; nothing if flat."""
+    def _ground_look_ups(self, begins: bool) -> tuple[tuple[Step, ...], list[Buffer]]:
+        """Return the steps with which a program looks up the ground, and their buffers; empty on flat ground."""
         if not self.ground:
             return (), []
-        buffers, look = self.ground.look(self.state_sizes.get("dependent", 0))
+        buffers, steps = self.ground.look_up(self.state_sizes.get("dependent", 0))
         buffers = [Buffer(HEIGHTS, 0, "table"), *buffers]
-        if not (looked := self.probe.looked):
-            return look, buffers
-        for places in self.stages.places(begins):
-            look = (*look, places)
-            for i, at in enumerate(places.outputs):
-                name = at.removesuffix("_places")
-                look = (*look, Lookup(HEIGHTS, FRAME, at, name, slopes=False, grid=self.probe.grids[name]))
-                buffers += [Buffer(at, places.function.numel_out(i), "scratch"), Buffer(name, looked[name], "scratch")]
-        return look, buffers
+        for places in self.stages.places(begins) if self.stages.grids else ():
+            steps = (*steps, places)
+            for i, points in enumerate(places.outputs):
+                name = points.removesuffix("_places")
+                steps = (*steps, Lookup(HEIGHTS, FRAME, points, name, slopes=False, grid=self.stages.grids[name]))
+                buffers.append(Buffer(points, places.function.numel_out(i), "scratch"))
+                buffers.append(Buffer(name, self.stages.ground_values[name].numel(), "scratch"))
+        return steps, buffers
 
-    def function(self, name: Literal["act", "assess", "begin"]) -> ca.Function:
-        """Trace what is done once in an environment step, before and after its sub-steps, or in a reset."""
+    def function(self, name: Literal["act", "evaluate", "reset"]) -> ca.Function:
+        """Return the function of a stage: the action, the evaluation after the sub-steps, or the reset."""
         if name == "act":
             return self.actions.act("delay" in self.schema)
-        stages = self.stages
-        return (stages.assess() if name == "assess" else stages.begin())[0].function
+        return (self.stages.evaluate() if name == "evaluate" else self.stages.reset())[0].function

@@ -107,7 +107,7 @@ def make_program(
         file, expected = model.robot.source or model.robot.name, f"gains, because actions={figures.actions!r} need them"
         raise bad(file, "gains.kp", None, expected)
     program = TaskProgram(model, figures, contact_forces)
-    program.probe  # noqa: B018  (so that a wrong term is found here)
+    program.stages  # noqa: B018  (traces the terms, which finds wrong ones)
     return program
 
 

@@ -1,4 +1,4 @@
-"""A task on a robot before anything is traced: its terms by name, its actions, its scene."""
+"""A task on a robot before tracing: terms by name, actions, scene."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from ce_gym.envs.task.ground import Ground
 from ce_gym.envs.task.randomisation import Randomised
 from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.task.terrain_tiles import field_of
-from ce_gym.envs.terms.registry import terms_of
+from ce_gym.envs.terms.registry import Term, terms_of
 from ce_gym.model.errors import check_names
 from ce_gym.sim.kernels import select_contacts, select_pairs
 from ce_gym.sim.terrain.hulls import hulls_on
 
 
 class TaskSpec:
-    """Which terms, contacts, actions and scene a task has on a robot.
+    """Terms, contacts, actions and scene of a task on a robot.
 
     Args:
         model: The robot at a transmission level.
@@ -25,16 +25,17 @@ class TaskSpec:
         contact_forces: Whether to compute contact forces for recording.
 
     Attributes:
-        curriculum: What robots carry over from one episode to the next.
-        actions: What an action asks for.
-        contacts: Names of the spheres that take part in the physics.
-        randomised: Figures that are drawn for each episode.
-        ground: How the task sees a field; None on flat ground.
+        curriculum: Curricula of the task.
+        actions: Map from actions to targets of joints or motors.
+        contacts: Names of the contact spheres that the physics computes.
+        randomised: Parameters that are drawn for each episode.
+        field: Terrain of the task; None on flat ground.
+        ground: Look-ups of the field under the robot; None on flat ground.
         options: The scene of the sub-steps.
         reward_terms, termination_terms, metric_terms, observation_terms, critic_terms: Terms by name.
 
     Raises:
-        ValueError: If the robot lacks what the task needs, or the task names something that does not exist.
+        ValueError: The robot has no floating base, or the task names a term, contact or joint that does not exist.
     """
 
     def __init__(self, model: Model, task: Task, contact_forces: bool = False) -> None:
@@ -51,9 +52,8 @@ class TaskSpec:
         check_names("noise", task.noise, self.observation_terms, "an observation among")
         self.contacts = select_contacts(robot, task.contacts)
         if task.latency[1] > task.n_substeps:
-            raise ValueError(
-                f"latency={task.latency}; expected at most the {task.n_substeps} sub-steps of a control step"
-            )
+            expected = f"at most the {task.n_substeps} sub-steps of a control step"
+            raise ValueError(f"latency={task.latency}; expected {expected}")
         self.field = field_of(task.terrain)
         hulls = hulls_on(robot, self.contacts, self.field)
         self.ground = Ground(self.model.mechanism, self.contacts, hulls) if self.curriculum.on_field else None
@@ -73,6 +73,13 @@ class TaskSpec:
             seldom=tuple(name for name in select_contacts(robot, task.seldom, "seldom") if name in self.contacts),
             hulls=hulls,
         )
+
+    @property
+    def terms(self) -> list[Term]:
+        """All terms: rewards, terminations, metrics, observations, critic blocks."""
+        rewards, terminations, metrics = self.reward_terms, self.termination_terms, self.metric_terms
+        kinds = (rewards, terminations, metrics, self.observation_terms, self.critic_terms)
+        return [term for terms in kinds for term in terms.values()]
 
     @property
     def n_actions(self) -> int:

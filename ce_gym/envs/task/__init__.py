@@ -1,1 +1,1 @@
-"""What a task is: its data, actions, commands, ground, randomisation and curriculum, as traced functions."""
+"""Tasks: data, actions, commands, ground, randomisation and curriculum, as traced functions."""

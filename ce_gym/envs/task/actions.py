@@ -1,4 +1,4 @@
-"""What an action asks of joints or motors, as traced functions."""
+"""The map from actions to targets of joints or motors, as traced functions."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ CONTROL: dict[str, Control] = {
     "motor_pd": "motor_position",
     "motor_torque": "motor_torque",
 }
-"""How the dynamics calls what an action means."""
+"""Control mode of the dynamics for each meaning of an action."""
 
 
 class ActionMap:
-    """The way from the actions of a task to the targets of the dynamics.
+    """The map from the actions of a task to the targets of the dynamics.
 
     Args:
         mechanism: The robot at a transmission level.
         task: The task.
 
     Attributes:
-        control: How the dynamics calls what an action means.
-        targets: What each entry of a target is for.
-        moved: Which of them the actions move, in order.
-        rest: Target without action, shape (n_targets,): the standing pose [rad], or 0 [N m].
-        scale: What an action of 1 adds [rad or N m], shape (n_actions,).
+        control: Control mode of the dynamics.
+        targets: Name of the joint or rotor of each target.
+        moved: Index of the target of each action, shape (n_actions,).
+        rest: Targets for zero actions, shape (n_targets,): the standing pose [rad], or 0 [N m].
+        scale: Change of the target for an action of 1 [rad or N m], shape (n_actions,).
 
     Raises:
-        ValueError: If no joint matches, or a torque is asked for where there is no limit.
+        ValueError: No joint matches `action_joints`, or actions are torques and a torque limit is missing.
     """
 
     def __init__(self, mechanism: Mechanism, task: Task) -> None:
@@ -70,13 +70,14 @@ class ActionMap:
             names = [self.targets[i] for i in self.moved]
             self.scale = np.array([motors.get(name, robot.body(name).joint.torque) for name in names])
             if not np.isfinite(self.scale).all():
-                what = "motor" if self.control.startswith("motor") else "joint"
-                raise ValueError(
-                    f"{robot.name}: actions={task.actions!r} needs a torque limit (effort) of every {what}"
-                )
+                needed = f"a torque limit (effort) of every {task.actions.split('_')[0]}"
+                raise ValueError(f"{robot.name}: actions={task.actions!r} needs {needed}")
 
     def _positions(self, mechanism: Mechanism, scale: float) -> tuple[np.ndarray, np.ndarray]:
-        """A motor is turned as far as moves the joint that it drives most by `scale`, in the standing pose."""
+        """Return `rest` and `scale` of position targets.
+
+        An action of 1 on a motor turns the joint that this motor drives most by `scale` [rad], in the standing pose.
+        """
         pose = dict(mechanism.robot.pose.joints)
         motors = standing_motors(mechanism) if self.control == "motor_position" else {}
         rest = np.array([motors[name][0] if name in motors else pose.get(name, 0.0) for name in self.targets])
@@ -84,7 +85,7 @@ class ActionMap:
         return rest, scale * np.array([ratios[np.argmax(np.abs(ratios))] for ratios in turns])
 
     def act(self, late: bool) -> ca.Function:
-        """(action_in) -> clipped action, target, and 0 sub-steps waited if actions come late."""
+        """Trace action_in -> clipped action, target, and 0 sub-steps `waited` for actions with latency."""
         action = SX.sym("action_in", len(self.moved))
         clipped, target = ca.fmax(-1, ca.fmin(1, action)), SX(self.rest)
         target[self.moved] += self.scale * clipped
@@ -92,7 +93,7 @@ class ActionMap:
         return traced("act", {"action_in": action}, {"clipped": clipped, "target": target} | waited)
 
     def delayed(self, physics: tuple[Step | Repeat, ...]) -> tuple[Step | Repeat, ...]:
-        """Put before each sub-step the choice between the target of the last action and that of the new one."""
+        """Return the physics with a choice between the old and the new target before each sub-step."""
         n, waited, delay = len(self.targets), SX.sym("waited"), SX.sym("delay")
         old, new = SX.sym("target", n), SX.sym("new_target", n)
         outputs = {"target_next": ca.if_else(waited < delay, old, new), "waited_next": waited + 1}

@@ -1,4 +1,4 @@
-"""What a task commands: velocities, and headings to turn to."""
+"""Velocity commands of a task, and headings to which the robot turns."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ class Commands:
 
     Args:
         task: The task.
-        curriculum: Its curricula.
+        curriculum: The curricula of the task.
     """
 
     def __init__(self, task: Task, curriculum: Curriculum) -> None:
         self.task, self.curriculum = task, curriculum
 
-    def new(self, sampler: Sampler, grown: SX | None) -> dict[str, SX]:
-        """Return a command within the robot's present range, or to stand still; and a heading."""
+    def draw(self, sampler: Sampler, grown: SX | None) -> dict[str, SX]:
+        """Return a new `command` in the current range of the robot, or zero to stand still; and a `heading`."""
         standing = sampler.unit() < self.task.standing_fraction
         moving = sampler.within(self.task.command_range)
-        moving = moving if grown is None else self.curriculum.share(grown) * moving
+        moving = moving if grown is None else self.curriculum.range_share(grown) * moving
         command = {"command": ca.if_else(standing, 0, moving)}
         return command | ({"heading": sampler.uniform(-np.pi, np.pi)} if self.task.heading else {})
 
-    def steered(self, values: dict[str, SX], command: dict[str, SX]) -> dict[str, SX]:
-        """Replace the commanded yaw rate by one that turns the robot to its heading."""
+    def steer(self, q: SX, command: dict[str, SX]) -> dict[str, SX]:
+        """Return the commands with a yaw rate that turns the robot to its `heading`, if it has one."""
         if "heading" not in command:
             return command
-        w, x, y, z = (values["q"][3 + i] for i in range(4))
-        behind = command["heading"] - ca.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        error = ca.atan2(ca.sin(behind), ca.cos(behind))
+        w, x, y, z = (q[3 + i] for i in range(4))
+        turn = command["heading"] - ca.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        error = ca.atan2(ca.sin(turn), ca.cos(turn))
         low, high = self.task.command_range[2]
         rate = ca.fmax(low, ca.fmin(high, HEADING_GAIN * error))
         moving = ca.sumsqr(command["command"]) > 0

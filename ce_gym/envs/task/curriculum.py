@@ -1,12 +1,12 @@
-"""Curricula: what a robot carries over from one episode to the next, and how it is judged.
+"""Curricula: terrain level and command range of each robot, which change from episode to episode with its success.
 
-Every robot has its own level, in its lane of the kernel's state, so that it depends on its seed and its actions and on
-nothing else. Seeding an environment begins from the start.
+The level of a robot depends only on its seed and its actions. Seeding an environment resets the level.
 
-    terrain     up a level if it walked half a tile along its commands, down if not half of what it was asked
-    commands    a wider range if its mean tracking was above 80 %, a narrower one below 40 %
+    terrain     one level up after walking half a tile along the commands,
+                one level down below half of the commanded distance
+    commands    a wider range above a mean tracking of 80 %, a narrower range below 40 %
 
-Both are counted over whole episodes of the task's length: a robot that falls has not done the rest.
+Both rules refer to episodes of full length, so the time after a fall counts as failed.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.rewards import track_linear_velocity
 
-WIDER = 0.1
-"""How much of the whole range of commands is gained or lost at a time."""
-WELL, BADLY = 0.8, 0.4
-"""Mean tracking from which on the range grows, and below which it shrinks."""
+RANGE_STEP = 0.1
+"""Share of the full command range by which the range of a robot grows or shrinks."""
+GROW_ABOVE, SHRINK_BELOW = 0.8, 0.4
+"""Mean tracking above which the range grows, and below which it shrinks."""
 
 
 class Curriculum:
@@ -34,8 +34,8 @@ class Curriculum:
         task: The task.
 
     Attributes:
-        sizes: State that they need, by name; `level` of the terrain, how far a robot `walked` along its commands and
-            was asked to [m], how often its range of commands has `grown`, and how well it `tracked` them, summed.
+        sizes: Sizes of the state by name: terrain `level`; distance `walked` along the commands, and commanded [m];
+            growth steps of the command range, `grown`; sum of the tracking reward, `tracked`.
     """
 
     def __init__(self, task: Task) -> None:
@@ -49,40 +49,40 @@ class Curriculum:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """Metrics of how far robots have come."""
+        """Names of the metrics that report the curricula."""
         return ("terrain_level",) * self.on_field + ("times_grown",) * self.widening
 
-    def followed(self, s: TermContext, state: dict[str, SX]) -> dict[str, SX]:
-        """Return what a control step adds to the account of an episode, by name of the state."""
+    def progress(self, s: TermContext, state: dict[str, SX]) -> dict[str, SX]:
+        """Return the distances and the tracking of the episode after a control step, by name of the state."""
         after = {}
         if self.climbing:
-            asked = ca.norm_2(s.command[:2])
-            along = ca.dot(s.command[:2], s.base_linear_velocity[:2]) / ca.fmax(asked, 1e-6)
-            after["walked"] = state["walked"] + s.control_dt * ca.vertcat(along, asked)
+            speed = ca.norm_2(s.command[:2])
+            along = ca.dot(s.command[:2], s.base_linear_velocity[:2]) / ca.fmax(speed, 1e-6)
+            after["walked"] = state["walked"] + s.control_dt * ca.vertcat(along, speed)
         if self.widening:
             after["tracked"] = state["tracked"] + track_linear_velocity(s)
         return after
 
-    def level(self, state: dict[str, SX], sampler: Sampler, control_dt: float) -> SX:
-        """Return the level of the terrain on which the next episode begins."""
+    def next_level(self, state: dict[str, SX], sampler: Sampler, control_dt: float) -> SX:
+        """Return the terrain level of the next episode."""
         count = self.task.terrain.get("levels", 1)
-        anywhere = ca.floor(sampler.uniform(0, count))
+        random_level = ca.floor(sampler.uniform(0, count))
         if not self.climbing:
-            return anywhere
-        walked, asked = state["walked"][0], state["walked"][1]
-        left = ca.fmax(0, self.duration - control_dt * state["clock"])
+            return random_level
+        walked, commanded = state["walked"][0], state["walked"][1]
+        remaining_time = ca.fmax(0, self.duration - control_dt * state["clock"])
         up = walked > self.task.terrain["size"] / 2
-        down = walked < (asked + left * ca.norm_2(state["command"][:2])) / 2
+        down = walked < (commanded + remaining_time * ca.norm_2(state["command"][:2])) / 2
         level = ca.fmax(0, state["level"] + ca.if_else(up, 1, ca.if_else(down, -1, 0)))
-        return ca.if_else(level > count - 1, anywhere, level)  # what has passed the last is sent anywhere
+        return ca.if_else(level > count - 1, random_level, level)  # robots that solve the last level
 
-    def grown(self, state: dict[str, SX]) -> SX:
-        """Return how often the range of commands has grown when the next episode begins."""
+    def next_times_grown(self, state: dict[str, SX]) -> SX:
+        """Return the growth steps of the command range in the next episode."""
         mean = state["tracked"] / self.task.episode_length
-        change = ca.if_else(mean > WELL, 1, ca.if_else(mean < BADLY, -1, 0))
-        most = math.ceil(round((1 - self.task.command_curriculum) / WIDER, 6))
-        return ca.fmax(0, ca.fmin(most, state["grown"] + change))
+        change = ca.if_else(mean > GROW_ABOVE, 1, ca.if_else(mean < SHRINK_BELOW, -1, 0))
+        largest = math.ceil(round((1 - self.task.command_curriculum) / RANGE_STEP, 6))
+        return ca.fmax(0, ca.fmin(largest, state["grown"] + change))
 
-    def share(self, grown: SX) -> SX:
-        """Return the share of the range of commands that a robot gets."""
-        return ca.fmin(1, self.task.command_curriculum + WIDER * grown)
+    def range_share(self, grown: SX) -> SX:
+        """Return the share of the full command range after `grown` growth steps."""
+        return ca.fmin(1, self.task.command_curriculum + RANGE_STEP * grown)

@@ -1,7 +1,6 @@
-"""How a task sees the ground of a field, and puts robots on it: traced functions around a look-up.
+"""Look-ups of a terrain field under the robot, and the height at which a robot is put on the field.
 
-Of a field the task knows what is under the base and under every contact sphere of the robot, looked up once in a
-control step, after the physics.
+A task looks up the field under the base and under each contact sphere, once in a control step after the physics.
 """
 
 from __future__ import annotations
@@ -19,85 +18,87 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.hulls import Hull
 from ce_gym.dynamics.laws.scene_parameters import law_values
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
-from ce_gym.envs.task.curriculum import Curriculum
-from ce_gym.envs.task.sampling import Sampler
-from ce_gym.envs.task.terrain_kinds import PLATFORM
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.substeps import FRAME, HEIGHTS
 
 SEEN = "seen_ground"
-"""Buffer with height [m] and slopes of the ground under the base and under each contact sphere, one after the other."""
+"""Buffer with height [m] and two slopes of the ground under the base, each contact sphere and each hull point."""
 
 
 class Ground:
-    """The ground of a field under one robot.
+    """The terrain field under one robot.
 
     Args:
         mechanism: The robot.
-        contacts: Names of the spheres that take part in the physics.
-        hulls: Convex shapes whose corners some of these are.
+        contacts: Names of the contact spheres that the physics computes.
+        hulls: Convex hulls that touch the field with their points.
     """
 
     def __init__(self, mechanism: Mechanism, contacts: tuple[str, ...], hulls: tuple[Hull, ...]) -> None:
         self.mechanism, self.contacts, self.hulls = mechanism, contacts, hulls
         self.size = 3 * (1 + len(mechanism.robot.contacts) + sum(len(hull.points) for hull in hulls))
 
-    def look(self, dependent: int) -> tuple[list[Buffer], tuple[Step, ...]]:
-        """Return how to look at the ground, and the buffers for it but table and frame.
+    def look_up(self, dependent: int) -> tuple[list[Buffer], tuple[Step, ...]]:
+        """Return the buffers and the steps of the look-up, without table and frame.
 
         Args:
-            dependent: Length of the state `dependent`; 0 if there is none.
+            dependent: Length of the state `dependent`; 0 for a robot without it.
         """
         q = SX.sym("q", self.mechanism.robot.layout.nq)
-        given = {"q": q} | ({"dependent": SX.sym("dependent", dependent)} if dependent else {})
-        at = ca.horzcat(q[:2], sphere_centres(self.mechanism, given)[:2, :], self._between(given)[:2, :])
-        places = traced("seen_places", given, {"seen_places": ca.vec(at)})
+        state = {"q": q} | ({"dependent": SX.sym("dependent", dependent)} if dependent else {})
+        points = ca.horzcat(q[:2], sphere_centres(self.mechanism, state)[:2, :], self._hull_points(state)[:2, :])
+        places = traced("seen_places", state, {"seen_places": ca.vec(points)})
         buffers = [Buffer("seen_places", 2 * self.size // 3, "scratch"), Buffer(SEEN, self.size, "scratch")]
-        call = Call(places, tuple(given), ("seen_places",))
+        call = Call(places, tuple(state), ("seen_places",))
         return buffers, (call, Lookup(HEIGHTS, FRAME, "seen_places", SEEN))
 
     def lift(self, q: SX, dependent: SX | None, seen: SX) -> SX:
-        """Return how far to raise a robot for no contact to be deeper in the ground than it would be in flat [m].
+        """Return how far to raise a robot so that no contact is deeper in the field than in flat ground [m].
 
         Args:
-            q: Positions with the height that the robot would have on flat ground, shape (nq,).
-            dependent: State of that name, if there is one.
+            q: Positions on flat ground at height 0, shape (nq,).
+            dependent: State of that name; None for a robot without it.
             seen: The buffer `SEEN`.
         """
         spheres = self.mechanism.robot.contacts
         state = {"q": q} | ({} if dependent is None else {"dependent": dependent})
         centres, axes = sphere_centres(self.mechanism, state), sphere_axes(self.mechanism, state)
-        chosen = [i for i, sphere in enumerate(spheres) if sphere.name in self.contacts]
-        under, z = ca.reshape(seen[3:], 3, -1), centres[2, :]
-        needed = []
-        for i in chosen:
-            height, *slopes = ca.vertsplit(under[:, i])
-            level = reach(spheres[i].radius, spheres[i].rim, axes[:, i])
-            more = reach(spheres[i].radius, spheres[i].rim, axes[:, i], *slopes) - level
-            needed.append(lift(ca.fmin(z[i], level) + more, z[i], height, *slopes))
+        planes, z = ca.reshape(seen[3:], 3, -1), centres[2, :]
+        lifts = []
+        for i, sphere in enumerate(spheres):
+            if sphere.name in self.contacts:
+                height, *slopes = ca.vertsplit(planes[:, i])
+                level = reach(sphere.radius, sphere.rim, axes[:, i])
+                extra = reach(sphere.radius, sphere.rim, axes[:, i], *slopes) - level
+                lifts.append(lift(ca.fmin(z[i], level) + extra, z[i], height, *slopes))
         radii = [hull.radius for hull in self.hulls for _ in hull.points]
-        of_hulls = zip(radii, ca.horzsplit(self._between(state)), ca.horzsplit(under[:, len(spheres) :]), strict=True)
-        for radius, point, plane in of_hulls:
+        hull_planes = ca.horzsplit(planes[:, len(spheres) :])
+        for radius, point, plane in zip(radii, ca.horzsplit(self._hull_points(state)), hull_planes, strict=True):
             height, *slopes = ca.vertsplit(plane)
-            needed.append(lift(ca.fmin(point[2], radius), point[2], height, *slopes))
-        return ca.mmax(ca.vertcat(*needed)) if needed else seen[0]
+            lifts.append(lift(ca.fmin(point[2], radius), point[2], height, *slopes))
+        return ca.mmax(ca.vertcat(*lifts)) if lifts else seen[0]
 
-    def _between(self, state: Mapping[str, SX]) -> SX:
-        """Return where the points of hulls are [m], shape (3, n_points)."""
+    def _hull_points(self, state: Mapping[str, SX]) -> SX:
+        """Return the points of the hulls in the world [m], shape (3, n_points)."""
         bodies = _at_rest(self.mechanism, state).bodies if self.hulls else {}
         points = [bodies[hull.body].point_position(SX(ca.DM(point))) for hull in self.hulls for point in hull.points]
         return ca.horzcat(SX(3, 0), *points)
 
 
 def sphere_centres(mechanism: Mechanism, state: Mapping[str, SX]) -> SX:
-    """Return where the contact spheres of a robot are [m], shape (3, n_spheres); `dependent` is used if it is there."""
+    """Return the centres of the contact spheres in the world [m], shape (3, n_spheres).
+
+    Args:
+        mechanism: The robot.
+        state: `q`, and `dependent` for a robot that has it.
+    """
     bodies = _at_rest(mechanism, state).bodies
     points = [bodies[s.body].point_position(constant(np.array(s.position))) for s in mechanism.robot.contacts]
     return ca.horzcat(SX(3, 0), *points)
 
 
 def sphere_axes(mechanism: Mechanism, state: Mapping[str, SX]) -> SX:
-    """Return about what they move, those that do, in the world, shape (3, n_spheres)."""
+    """Return the rim axis of each contact in the world, shape (3, n_spheres); unused for contacts without a rim."""
     bodies = _at_rest(mechanism, state).bodies
     axes = [bodies[s.body].R @ constant(np.array(s.axis)) for s in mechanism.robot.contacts]
     return ca.horzcat(SX(3, 0), *axes)
@@ -108,12 +109,14 @@ def _at_rest(mechanism: Mechanism, state: Mapping[str, SX]) -> Kinematics:
 
 
 def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str, SX], seen: SX | None) -> SX:
-    """Return the springs' forces on the contacts [N], shape (n_touches,): what friction has to go by at first.
+    """Return the spring forces on the contacts of a robot at rest [N], shape (n_touches,).
+
+    The friction of the first sub-step uses these normal forces.
 
     Args:
         mechanism: The robot.
-        options: Its scene.
-        state: Of it, with the parameters that are declared.
+        options: The scene.
+        state: State of the robot, with `parameters` if the scene has any.
         seen: The buffer `SEEN`; None on flat ground.
     """
     parameters = state.get("parameters", SX(0, 1))
@@ -125,13 +128,3 @@ def resting_load(mechanism: Mechanism, options: StepOptions, state: Mapping[str,
             depth = reach(sphere.radius, sphere.rim, axes[:, i], *slopes) - above(centres[2, i], height, *slopes)
             load.append(stiffness * ca.fmax(depth, 0))
     return ca.vertcat(*load, SX(len(options.touches) - len(options.contacts), 1))
-
-
-def starting_place(curriculum: Curriculum, level: SX, sampler: Sampler) -> SX:
-    """Return where an episode begins, x and y [m]: about the middle of a tile of a level, or on a part of a map."""
-    terrain = curriculum.task.terrain
-    if "begin" in terrain:
-        return ca.vertcat(*[sampler.uniform(low, high) for low, high in terrain["begin"]])
-    column = ca.floor(sampler.uniform(0, terrain["columns"]))
-    middle = terrain["size"] * (ca.vertcat(level, column) + 0.5)
-    return middle + sampler.symmetric(2, PLATFORM / 2)

@@ -1,4 +1,4 @@
-"""Physical figures that are drawn anew for each episode."""
+"""Physical parameters that are drawn for each episode."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ FACTORS = (
     *("stiffness", "kp", "kd", "motor_strength", "rotor_inertia", "ratio"),
     *("motor_damping", "motor_friction", "drive_friction", "cogging", "battery_voltage", "battery_resistance"),
 )
-"""Figures whose ranges are factors on what the robot has."""
+"""Parameters whose ranges are factors on the value of the robot."""
 
 
 class Randomised:
-    """The figures of one robot that a task draws, in the order of the task.
+    """The parameters of one robot that a task draws, in the order of the task.
 
     Args:
         robot: The robot.
@@ -30,10 +30,10 @@ class Randomised:
 
     Attributes:
         parameters: Names of the parameters of the dynamics.
-        n_draws: Numbers in [0, 1) that they are made of, one for each of their values, stacked.
+        n_draws: Random numbers for each episode, one for each value of a parameter.
 
     Raises:
-        ValueError: If a name does not exist or a range is none.
+        ValueError: A parameter does not exist or its range is not valid.
     """
 
     def __init__(self, robot: Robot, ranges: Mapping[str, Range]) -> None:
@@ -48,16 +48,16 @@ class Randomised:
         self.parameters = tuple(names)
         self._ranges = tuple(ranges.values())
         self._defaults = list(parameter_defaults(robot, robot.material, names, "randomise").values())
-        for given, name, bounds, default in zip(ranges, names, self._ranges, self._defaults, strict=True):
+        for key, name, bounds, default in zip(ranges, names, self._ranges, self._defaults, strict=True):
             try:
                 check_parameter(robot, name, np.outer(bounds, default) if name in FACTORS else bounds)
             except ValueError as problem:
                 expected = str(problem).split("; ")[-1]
-                raise ValueError(f"randomise[{given!r}]=({bounds[0]}, {bounds[1]}); {expected}") from None
+                raise ValueError(f"randomise[{key!r}]=({bounds[0]}, {bounds[1]}); {expected}") from None
         self.n_draws = sum(len(default) for default in self._defaults)
 
     def values(self, draw: SX) -> SX:
-        """Return the parameters' values, stacked, for numbers in [0, 1), shape (n_draws,)."""
+        """Return the values of the parameters, stacked, for random numbers in [0, 1), shape (n_draws,)."""
         values, first = [SX(0, 1)], 0
         for name, (low, high), default in zip(self.parameters, self._ranges, self._defaults, strict=True):
             value = low + (high - low) * draw[first : first + len(default)]

@@ -1,7 +1,7 @@
 """Random numbers of a traced function.
 
-The kernel fills a buffer with uniform numbers from a counter-based stream. A function takes them one by one while it is
-traced; how many it has taken is the size of the buffer.
+A kernel fills a buffer with uniform numbers from a counter-based stream. While a function is traced, it draws numbers
+one by one; their count is the size of the buffer.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Sampler:
 
     @property
     def symbols(self) -> SX:
-        """What has been consumed so far, the function's input, shape (n,)."""
+        """Symbols of all numbers drawn so far, an input of the traced function, shape (n,)."""
         return ca.vertcat(*self._symbols)
 
     def unit(self) -> SX:

@@ -1,7 +1,6 @@
-"""Skills at the limits of robots as tasks, plain data: jumps, a landing, hopping on one leg, getting up, a backflip.
+"""Skills as tasks: jumps, a landing, hopping on one leg, getting up, a backflip.
 
-A skill exists for every robot; ids are registered for those of `SKILLED`, whose files say what differs. Motors are held
-to what they can give.
+Every robot can have every skill. The robots in `SKILLED` have ids, and their files adapt the tasks. Motors are limited.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ from types import MappingProxyType
 from ce_gym.envs.task.tasks import VELOCITY, Task
 
 SEEN = (*(name for name in VELOCITY.observations if name != "velocity_command"), "gait_phase")
-"""What policies of skills see; the clock goes round once in an episode, so that they know the time."""
+"""Observations of the skills. The gait clock has the period of an episode and so tells the time."""
 
 HIGH_JUMP = replace(
     VELOCITY,
     rewards={
         "new_height": 20.0,
-        "standing": {"weight": 10.0, "begin": 1.2},  # with 2 Mini Cheetah crouches at the end, with this Go2 stands
+        "standing": {"weight": 10.0, "begin": 1.2},  # with weight 2 Mini Cheetah ends in a crouch
         "survive": 0.5,
         "orientation": -2.0,
         "swerve": -0.1,

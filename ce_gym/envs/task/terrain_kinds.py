@@ -1,4 +1,4 @@
-"""Kinds of ground: heights of the places of square tiles, each about a platform that a robot starts on."""
+"""Kinds of terrain: heights of square tiles, each around a platform on which a robot starts."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ BORDER = 0.5
 
 @dataclass(frozen=True)
 class Tiles:
-    """All places of a field.
+    """All grid points of a field; arrays have one entry for each point.
 
     Attributes:
         size: Side of a tile [m].
-        difficulty: Of the tile of each place, from 0 to 1.
-        side: 1 where that is a pyramid, -1 where it is a pit.
-        x, y: Where the place is from the middle of its tile [m].
+        difficulty: Difficulty of the tile, from 0 to 1.
+        side: 1 on a pyramid, -1 in a pit.
+        x, y: Position relative to the middle of the tile [m].
     """
 
     size: float
@@ -40,58 +40,58 @@ class Tiles:
 
     @property
     def run(self) -> NDArray:
-        """How far a place is inside of the rim, at most as far as the platform [m]."""
+        """Distance inwards from the rim, at most up to the platform [m]."""
         return np.maximum(self.size / 2 - BORDER - np.maximum(self.from_middle, PLATFORM), 0.0)
 
     @property
     def course(self) -> NDArray:
-        """Whether a place is between platform and rim."""
+        """Whether a point lies between platform and rim."""
         return (self.from_middle > PLATFORM) & (self.from_middle < self.size / 2 - BORDER)
 
 
-Figures = Mapping[str, Any]
+Parameters = Mapping[str, Any]
 
 
-def _flat(tiles: Tiles, figures: Figures) -> NDArray:
+def _flat(tiles: Tiles, parameters: Parameters) -> NDArray:
     return np.zeros_like(tiles.difficulty)
 
 
-def _slope(tiles: Tiles, figures: Figures) -> NDArray:
-    return tiles.side * np.tan(figures["angle"] * tiles.difficulty) * tiles.run
+def _slope(tiles: Tiles, parameters: Parameters) -> NDArray:
+    return tiles.side * np.tan(parameters["angle"] * tiles.difficulty) * tiles.run
 
 
-def _rough(tiles: Tiles, figures: Figures) -> NDArray:
-    draw = np.random.default_rng(figures["seed"]).uniform(-1.0, 1.0, tiles.difficulty.shape)
-    return figures["amplitude"] * tiles.difficulty * draw
+def _rough(tiles: Tiles, parameters: Parameters) -> NDArray:
+    draw = np.random.default_rng(parameters["seed"]).uniform(-1.0, 1.0, tiles.difficulty.shape)
+    return parameters["amplitude"] * tiles.difficulty * draw
 
 
-def _stairs(tiles: Tiles, figures: Figures) -> NDArray:
-    return tiles.side * figures["rise"] * tiles.difficulty * np.ceil(tiles.run / figures["tread"] - 1e-9)
+def _stairs(tiles: Tiles, parameters: Parameters) -> NDArray:
+    return tiles.side * parameters["rise"] * tiles.difficulty * np.ceil(tiles.run / parameters["tread"] - 1e-9)
 
 
-def _boxes(tiles: Tiles, figures: Figures) -> NDArray:
-    """Squares side by side, each of a random height."""
-    row, column = (np.floor(along / figures["side"] + 1e-9).astype(int) for along in (tiles.x, tiles.y))
-    count = math.ceil(tiles.size / figures["side"]) + 2
-    heights = np.random.default_rng(figures["seed"]).uniform(-1.0, 1.0, (count, count))
-    return figures["height"] * tiles.difficulty * tiles.course * heights[row % count, column % count]
+def _boxes(tiles: Tiles, parameters: Parameters) -> NDArray:
+    """Squares side by side with random heights."""
+    row, column = (np.floor(along / parameters["side"] + 1e-9).astype(int) for along in (tiles.x, tiles.y))
+    count = math.ceil(tiles.size / parameters["side"]) + 2
+    heights = np.random.default_rng(parameters["seed"]).uniform(-1.0, 1.0, (count, count))
+    return parameters["height"] * tiles.difficulty * tiles.course * heights[row % count, column % count]
 
 
-def _gaps(tiles: Tiles, figures: Figures) -> NDArray:
-    """Trenches around the platform, one after each stretch of land; wider, not deeper, where it is difficult."""
-    gap = figures["gap"] * tiles.difficulty
-    along = np.mod(tiles.from_middle - PLATFORM, figures["land"] + gap)
-    return np.where(tiles.course & (along > figures["land"]), -figures["depth"], 0.0)
+def _gaps(tiles: Tiles, parameters: Parameters) -> NDArray:
+    """Trenches around the platform, one after each stretch of land; their width grows with difficulty."""
+    gap = parameters["gap"] * tiles.difficulty
+    along = np.mod(tiles.from_middle - PLATFORM, parameters["land"] + gap)
+    return np.where(tiles.course & (along > parameters["land"]), -parameters["depth"], 0.0)
 
 
-def _stones(tiles: Tiles, figures: Figures) -> NDArray:
-    """Squares to step on with gaps between, along x and along y."""
-    gap = figures["gap"] * tiles.difficulty
-    between = [np.mod(along, figures["stone"] + gap) > figures["stone"] for along in (tiles.x, tiles.y)]
-    return np.where(tiles.course & (between[0] | between[1]), -figures["depth"], 0.0)
+def _stones(tiles: Tiles, parameters: Parameters) -> NDArray:
+    """Square stepping stones with gaps along x and along y."""
+    gap = parameters["gap"] * tiles.difficulty
+    in_gap = [np.mod(along, parameters["stone"] + gap) > parameters["stone"] for along in (tiles.x, tiles.y)]
+    return np.where(tiles.course & (in_gap[0] | in_gap[1]), -parameters["depth"], 0.0)
 
 
-KINDS: dict[str, Callable[[Tiles, Figures], NDArray]] = {
+KINDS: dict[str, Callable[[Tiles, Parameters], NDArray]] = {
     "flat": _flat,
     "slope": _slope,
     "rough": _rough,
@@ -100,4 +100,4 @@ KINDS: dict[str, Callable[[Tiles, Figures], NDArray]] = {
     "gaps": _gaps,
     "stones": _stones,
 }
-"""Heights of all places of a field by kind; the lowest level of each is flat."""
+"""Heights of all grid points of a field, by kind; the lowest level of each kind is flat."""

@@ -1,4 +1,4 @@
-"""A height map as the ground of a task, and where episodes begin on it."""
+"""A height map as the ground of a task, with the range in which episodes start."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from ce_gym.sim.terrain import Terrain
 
 ARGUMENTS = ("field", "file", "cell", "height", "begin")
 MARGIN = 1.0
-"""Episodes begin that far inside of a map, or a quarter of its length if that is less [m]."""
+"""Default distance of the starting range from the edge of the map, at most a quarter of its length [m]."""
 
 
-def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
+def checked_map(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return the ground of a task on a map.
 
     Args:
-        given: `field`, a `Terrain`, or `file`, with `cell` and `height`: see `Terrain.from_file`. `begin`, where
-            episodes begin: ranges of x and of y [m].
+        arguments: `field`, a `Terrain`, or `file` with `cell` and `height`, see `Terrain.from_file`; `begin`, the
+            ranges of x and y in which episodes start [m].
 
     Returns:
         `kind`, `field` and `begin`.
 
     Raises:
-        ValueError: One line that names the argument, its value and what was expected.
+        ValueError: An argument is not valid; one line.
     """
-    for name, value in given.items():
+    for name, value in arguments.items():
         check(f"terrain[{name!r}]", value, name in ARGUMENTS, f"one of {listed_names(name, ARGUMENTS)} for 'map'")
-    field: Any = given.get("field")
-    file: Any = given.get("file")
-    one = (field is None) != (file is None)
-    check("terrain", {"kind": "map", **given}, one, "either a `field` or a `file` of a 'map'")
+    field: Any = arguments.get("field")
+    file: Any = arguments.get("file")
+    exactly_one = (field is None) != (file is None)
+    check("terrain", {"kind": "map", **arguments}, exactly_one, "either a `field` or a `file` of a 'map'")
     if field is None:
         check("terrain['file']", file, isinstance(file, str), "a path")
         check("terrain['file']", file, Path(file).is_file(), _where(file))
-        field = Terrain.from_file(file, given.get("cell", 0.1), given.get("height", 1.0))
+        field = Terrain.from_file(file, arguments.get("cell", 0.1), arguments.get("height", 1.0))
     check("terrain['field']", field, isinstance(field, Terrain), "a Terrain")
-    alone = file is not None or not {"cell", "height"} & given.keys()
-    check("terrain", {"kind": "map", **given}, alone, "`cell` and `height` with a `file` only")
-    begin = _inside(field) if given.get("begin") is None else given["begin"]
+    fits = file is not None or not {"cell", "height"} & arguments.keys()
+    check("terrain", {"kind": "map", **arguments}, fits, "`cell` and `height` with a `file` only")
+    begin = _inside(field) if arguments.get("begin") is None else arguments["begin"]
     check("terrain['begin']", begin, _are_ranges(begin), "two pairs (low, high), of x and of y [m]")
     for axis, (low, high), (first, last) in zip("xy", begin, _ends(field), strict=True):
         inside = first <= low and high <= last
@@ -50,10 +50,9 @@ def checked_map(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _where(file: str) -> str:
-    """Return what was expected of a file that is not there, and what to do."""
-    places = (
-        "" if Path(file).is_absolute() else f", looked for in {str(Path.cwd())!r} and beside a policy that names it"
-    )
+    """Return the expectation for a file that does not exist: where it was searched, and the remedy."""
+    searched = f", looked for in {str(Path.cwd())!r} and beside a policy that names it"
+    places = "" if Path(file).is_absolute() else searched
     return f"a file with a height map{places}; copy it there or name another `file`"
 
 
@@ -62,7 +61,7 @@ def _inside(field: Terrain) -> list[tuple[float, float]]:
 
 
 def _ends(field: Terrain) -> list[tuple[float, float]]:
-    """Return where the heights of a field begin and end along x and along y [m]."""
+    """Return the first and last position of the heights of a field, along x and along y [m]."""
     return [(low, low + field.cell * (n - 1)) for low, n in zip(field.origin, field.heights.shape, strict=True)]
 
 

@@ -1,8 +1,8 @@
-"""The ground of a task as data: a field of square tiles, a row of them for each level of difficulty.
+"""The ground of a task as data: a field of square tiles with one row for each level of difficulty.
 
-Robots start in the middle of a tile. On slopes and stairs that is the top of a pyramid or the bottom of a pit, by turns
-from column to column, so that they walk down or up whatever their heading is; tiles meet at height 0. The lowest level
-is flat, the highest has the figure that the task says.
+Robots start in the middle of a tile. Tiles of slopes and stairs alternate between pyramids and pits from column to
+column, so robots walk down or up in any direction. Tiles meet at height 0. The lowest level is flat, and the highest
+level has the parameters of the task.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ce_gym.sim.terrain.files import MOST_HEIGHTS
 
 COMMON: dict[str, Any] = {"levels": 6, "columns": 4, "size": 8.0, "cell": 0.1, "curriculum": True}
 FINE = {**COMMON, "cell": 0.05}
-OWN: dict[str, dict[str, Any]] = {
+DEFAULTS: dict[str, dict[str, Any]] = {
     "flat": {},
     "slope": {**COMMON, "angle": 0.35},
     "rough": {**COMMON, "amplitude": 0.04, "seed": 0},
@@ -32,56 +32,58 @@ OWN: dict[str, dict[str, Any]] = {
     "stones": {**FINE, "gap": 0.15, "stone": 0.4, "depth": 0.5},
     "mixed": {**COMMON, "columns": 8, "kinds": {}},
 }
-"""Arguments of each kind and what they are if not given; lengths [m], angles [rad]."""
+"""Arguments of each kind with their defaults; lengths [m], angles [rad]."""
 
 
 def checked_terrain(value: Any) -> dict[str, Any]:
     """Return the ground of a task with all its arguments.
 
     Args:
-        value: A kind; a mapping with `kind` and other arguments, see `OWN`; one with `kinds`, a mixture of columns: by
-            kind its share, or a mapping of `share` and arguments of its own; or a height map, see `checked_map`.
+        value: A kind; a mapping with `kind` and its arguments, see `DEFAULTS`; a mapping with `kinds` for a mixture of
+            columns, with a share for each kind or a mapping of `share` and arguments; or a height map, see
+            `checked_map`.
 
     Raises:
-        ValueError: One line that names the argument, its value and what was expected.
+        ValueError: An argument is not valid; one line.
     """
     value = {"kind": "map", "field": value} if isinstance(value, Terrain) else value
-    given = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
-    kind: Any = given.pop("kind", "mixed" if "kinds" in given else None)
-    known = isinstance(kind, str) and kind in (*OWN, "map")
-    check("terrain", value, known, f"{', '.join(map(repr, OWN))}, a Terrain, or a mapping with such a `kind` or 'map'")
+    arguments = {"kind": value} if isinstance(value, str) else dict(value) if isinstance(value, Mapping) else {}
+    kind: Any = arguments.pop("kind", "mixed" if "kinds" in arguments else None)
+    known = isinstance(kind, str) and kind in (*DEFAULTS, "map")
+    expected = f"{', '.join(map(repr, DEFAULTS))}, a Terrain, or a mapping with such a `kind` or 'map'"
+    check("terrain", value, known, expected)
     if kind == "map":
-        return checked_map(given)
-    _check_arguments("terrain", kind, given, OWN[kind])
+        return checked_map(arguments)
+    _check_arguments("terrain", kind, arguments, DEFAULTS[kind])
     if kind != "mixed":
-        return {"kind": kind, **OWN[kind], **given}
-    kinds = _checked_mixture(given.get("kinds"))
-    finest = min(OWN[name].get("cell", COMMON["cell"]) for name in kinds)
-    return {"kind": kind, **OWN[kind], "cell": finest, **given, "kinds": kinds}
+        return {"kind": kind, **DEFAULTS[kind], **arguments}
+    kinds = _checked_mixture(arguments.get("kinds"))
+    finest = min(DEFAULTS[name].get("cell", COMMON["cell"]) for name in kinds)
+    return {"kind": kind, **DEFAULTS[kind], "cell": finest, **arguments, "kinds": kinds}
 
 
-def _checked_mixture(given: Any) -> dict[str, dict[str, Any]]:
-    """Return the kinds of a mixture, each with its share and all arguments of its own."""
-    known = isinstance(given, Mapping) and bool(given) and set(given) <= set(OWN) - {"mixed"}
-    check("terrain['kinds']", given, known, f"shares by kind among {', '.join(list(OWN)[:-1])}")
+def _checked_mixture(shares: Any) -> dict[str, dict[str, Any]]:
+    """Return the kinds of a mixture, each with its share and all its arguments."""
+    known = isinstance(shares, Mapping) and bool(shares) and set(shares) <= set(DEFAULTS) - {"mixed"}
+    check("terrain['kinds']", shares, known, f"shares by kind among {', '.join(list(DEFAULTS)[:-1])}")
     kinds = {}
-    for name, value in given.items():
-        own = {key: default for key, default in OWN[name].items() if key not in COMMON}
-        figures = dict(value) if isinstance(value, Mapping) else {"share": value}
-        _check_arguments(f"terrain['kinds'][{name!r}]", name, figures, {"share": 1.0, **own})
-        kinds[name] = {"share": 1.0, **own, **figures}
+    for name, value in shares.items():
+        defaults = {"share": 1.0} | {key: x for key, x in DEFAULTS[name].items() if key not in COMMON}
+        chosen = dict(value) if isinstance(value, Mapping) else {"share": value}
+        _check_arguments(f"terrain['kinds'][{name!r}]", name, chosen, defaults)
+        kinds[name] = defaults | chosen
     return kinds
 
 
-def _check_arguments(place: str, kind: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
-    for name, figure in given.items():
+def _check_arguments(place: str, kind: str, arguments: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    for name, value in arguments.items():
         expected = f"one of {listed_names(name, known)}" if known else "no argument"
-        check(f"{place}[{name!r}]", figure, name in known, f"{expected} for {kind!r}")
+        check(f"{place}[{name!r}]", value, name in known, f"{expected} for {kind!r}")
         if name != "kinds":
-            _check(f"{place}[{name!r}]", name, figure)
+            _check_argument(f"{place}[{name!r}]", name, value)
 
 
-def _check(place: str, name: str, value: Any) -> None:
+def _check_argument(place: str, name: str, value: Any) -> None:
     number = is_number(value)
     smallest = {"levels": 2, "columns": 2, "size": 2 * (PLATFORM + BORDER) + 1.0, "cell": 0.01, "seed": 0}
     smallest |= {"tread": 0.1, "side": 0.1, "land": 0.1, "stone": 0.1}
@@ -100,48 +102,49 @@ def _check(place: str, name: str, value: Any) -> None:
 
 
 def make_field(terrain: Mapping[str, Any]) -> Terrain:
-    """Return the field of a task's ground; tile (level, column) has its middle at `(level + 1/2, column + 1/2) size`.
+    """Return the field of a task; the middle of tile (level, column) is at `(level + 1/2, column + 1/2) size`.
 
     Args:
-        terrain: What `checked_terrain` returns, neither flat nor a map.
+        terrain: Ground from `checked_terrain`, neither flat nor a map.
 
     Raises:
-        ValueError: If the field has more heights than a kernel takes.
+        ValueError: The field has more heights than a kernel supports.
     """
     levels, columns, size, cell = (terrain[name] for name in ("levels", "columns", "size", "cell"))
     x, y = (cell * np.arange(math.ceil(round(n * size / cell, 6)) + 1) for n in (levels, columns))
     if len(x) * len(y) > MOST_HEIGHTS:
         raise ValueError(f"terrain has {len(x) * len(y)} heights; expected at most {MOST_HEIGHTS}, so a longer `cell`")
     level, column = np.minimum(x // size, levels - 1)[:, None], np.minimum(y // size, columns - 1)[None, :].astype(int)
-    away = np.broadcast_arrays(x[:, None] - (level + 0.5) * size, y[None, :] - (column + 0.5) * size)
+    offset = np.broadcast_arrays(x[:, None] - (level + 0.5) * size, y[None, :] - (column + 0.5) * size)
     difficulty = level / (levels - 1) * np.ones_like(column)
     heights = np.zeros_like(difficulty)
-    for kind, figures, own in _columns(terrain):
-        turn = np.cumsum([number in own for number in range(columns)])[column]  # pyramids and pits by turns
-        tiles = Tiles(size, difficulty, np.where(turn % 2 == 1, 1.0, -1.0), away[0], away[1])
-        heights = np.where(np.isin(column, own), KINDS[kind](tiles, figures), heights)
+    for kind, parameters, chosen in _columns(terrain):
+        order = np.cumsum([number in chosen for number in range(columns)])[column]
+        pyramid_or_pit = np.where(order % 2 == 1, 1.0, -1.0)
+        tiles = Tiles(size, difficulty, pyramid_or_pit, offset[0], offset[1])
+        heights = np.where(np.isin(column, chosen), KINDS[kind](tiles, parameters), heights)
     return Terrain(np.pad(heights, 1, mode="edge"), cell, (-cell, -cell))
 
 
 def _columns(terrain: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], list[int]]]:
-    """Return the kinds of a field, their figures and the columns that are theirs, by largest remainders."""
+    """Return each kind of a field with its parameters and its columns, by the method of largest remainders."""
     count = terrain["columns"]
     if terrain["kind"] != "mixed":
         return [(terrain["kind"], terrain, list(range(count)))]
     kinds = terrain["kinds"]
-    shares = np.array([figures["share"] for figures in kinds.values()])
+    shares = np.array([parameters["share"] for parameters in kinds.values()])
     exact = count * shares / shares.sum()
     each = np.floor(exact).astype(int)
     each[np.argsort(each - exact, kind="stable")[: count - each.sum()]] += 1
     if not each.all():
         raise ValueError(f"terrain['columns']={count!r}; expected more, for a share of {shares.min():g} to be a column")
     ends = np.cumsum(each).tolist()
-    owned = [list(range(end - n, end)) for n, end in zip(each.tolist(), ends, strict=True)]
-    return [(name, kinds[name], own) for name, own in zip(kinds, owned, strict=True)]
+    columns = [list(range(end - n, end)) for n, end in zip(each.tolist(), ends, strict=True)]
+    return [(name, kinds[name], chosen) for name, chosen in zip(kinds, columns, strict=True)]
 
 
 def field_of(terrain: Mapping[str, Any]) -> Terrain | None:
-    """Return the field of a task's ground, None if that is flat; `terrain` is what `checked_terrain` returns."""
+    """Return the field of a ground from `checked_terrain`; None if the ground is flat."""
     if terrain["kind"] == "flat":
         return None
     return terrain["field"] if terrain["kind"] == "map" else make_field(terrain)

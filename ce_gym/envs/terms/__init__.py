@@ -1,1 +1,1 @@
-"""What a task may ask about a robot: rewards, observations, terminations and metrics, and the context they read."""
+"""Rewards, observations, terminations and metrics, and the context that they read."""

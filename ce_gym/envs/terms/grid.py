@@ -1,86 +1,68 @@
-"""Grids of points and pictures of rays by which a robot sees the ground, and what their parameters may be."""
+"""Grids of points and patterns of rays of the ground sensors, and checks of their parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from math import isfinite
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_POINTS = 2000
-"""In one scan."""
+from ce_gym.sim.arguments import check, is_number
+
+MAX_POINTS = 2000
+"""Largest number of points of a grid."""
 
 
 def grid_points(size: Sequence[float], spacing: float, centre: Sequence[float]) -> NDArray:
-    """Return points of a grid about its middle [m], shape (2, n), the second coordinate changing first.
+    """Return the points of a grid [m], shape (2, n); the second coordinate changes fastest.
 
     Raises:
-        ValueError: One line that names the parameter, its value and what was expected.
+        ValueError: A parameter of `height_scan` is not valid; one line.
     """
     for name, value, least in (("size", size, 0.0), ("centre", centre, -np.inf)):
-        numbers = isinstance(value, Sequence) and len(value) == 2 and all(_number(x) and x >= least for x in value)
-        check(name, value, numbers, "two lengths [m]")
-    check("spacing", spacing, spacing > 0, "a length above 0 m")
+        check_term("height_scan", name, value, are_numbers(value, 2) and min(value) >= least, "two lengths [m]")
+    check_term("height_scan", "spacing", spacing, spacing > 0, "a length above 0 m")
     counts = [int(round(length / spacing, 6)) + 1 for length in size]
-    check("size", size, counts[0] * counts[1] <= MOST_POINTS, f"at most {MOST_POINTS} points")
+    check_term("height_scan", "size", size, counts[0] * counts[1] <= MAX_POINTS, f"at most {MAX_POINTS} points")
     x, y = (spacing * (np.arange(n) - (n - 1) / 2) + c for n, c in zip(counts, centre, strict=True))
     return np.stack([along.ravel() for along in np.meshgrid(x, y, indexing="ij")])
 
 
-def check_of(term: str) -> Callable[[str, Any, bool, str], None]:
-    """Return what refuses a parameter of a term that is not valid, in one line."""
-
-    def refuse_unless(name: str, value: Any, valid: bool, expected: str) -> None:
-        if not valid:
-            raise ValueError(f"observation term {term!r}: {name}={value!r}; expected {expected}")
-
-    return refuse_unless
-
-
-check = check_of("height_scan")
-
-
 def ray_directions(rays: Sequence[int], view: Sequence[float], pattern: str) -> NDArray:
-    """Return unit vectors in the sensor's frame, rows from the top, columns from the left, shape (3, n).
+    """Return unit vectors of rays in the sensor's frame, shape (3, n): rows from the top, columns from the left.
 
     Raises:
-        ValueError: One line that names the parameter, its value and what was expected.
+        ValueError: A parameter of `range_scan` is not valid; one line.
     """
-    check = check_of("range_scan")
     whole = isinstance(rays, Sequence) and len(rays) == 2 and all(isinstance(n, int) and n >= 1 for n in rays)
-    check("rays", rays, whole, "two whole numbers from 1 on")
+    check_term("range_scan", "rays", rays, whole, "two whole numbers from 1 on")
     widest = np.pi if pattern == "camera" else 2 * np.pi
-    angles = numbers(view, 2) and all(0 <= x < widest + 1e-9 for x in view)
-    check("view", view, angles, f"two angles from 0 to {widest:.2f}")
-    check("pattern", pattern, pattern in ("lidar", "camera"), "'lidar' or 'camera'")
+    angles = are_numbers(view, 2) and all(0 <= x < widest + 1e-9 for x in view)
+    check_term("range_scan", "view", view, angles, f"two angles from 0 to {widest:.2f}")
+    check_term("range_scan", "pattern", pattern, pattern in ("lidar", "camera"), "'lidar' or 'camera'")
+    half = [np.tan(angle / 2) if pattern == "camera" else angle / 2 for angle in view]
+    up, left = (h * np.linspace(1, -1, n) if n > 1 else np.zeros(1) for h, n in zip(half, rays, strict=True))
+    up, left = (x.ravel() for x in np.meshgrid(up, left, indexing="ij"))
     if pattern == "camera":
-        up, left = (
-            np.tan(v / 2) * np.linspace(1, -1, n) if n > 1 else np.zeros(1) for v, n in zip(view, rays, strict=True)
-        )
-        z, y = (x.ravel() for x in np.meshgrid(up, left, indexing="ij"))
-        seen = np.stack([np.ones_like(y), y, z])
-        return seen / np.linalg.norm(seen, axis=0)
-    up, left = (v / 2 * np.linspace(1, -1, n) if n > 1 else np.zeros(1) for v, n in zip(view, rays, strict=True))
-    e, a = (x.ravel() for x in np.meshgrid(up, left, indexing="ij"))
-    return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        directions = np.stack([np.ones_like(left), left, up])
+        return directions / np.linalg.norm(directions, axis=0)
+    return np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)])
 
 
-def turned(rotation: Sequence[float]) -> NDArray:
-    """Rotation of roll, pitch and yaw [rad] about the link's fixed axes x, y, z, shape (3, 3)."""
+def rotation_matrix(rotation: Sequence[float]) -> NDArray:
+    """Return the rotation by roll, pitch and yaw [rad] about the link's fixed axes x, y, z, shape (3, 3)."""
     (a, b, c), (d, e, f) = np.cos(rotation), np.sin(rotation)
     about_x = np.array([[1, 0, 0], [0, a, -d], [0, d, a]])
     about_y = np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
     return np.array([[c, -f, 0], [f, c, 0], [0, 0, 1]]) @ about_y @ about_x
 
 
-def numbers(values: object, count: int) -> bool:
-    """Whether values are so many finite numbers."""
-    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
-        return False
-    return all(isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in values)
+def check_term(term: str, parameter: str, value: Any, valid: bool, expected: str) -> None:
+    """Raise a ValueError unless a parameter of an observation term is `valid`."""
+    check(f"observation term {term!r}: {parameter}", value, valid, expected)
 
 
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+def are_numbers(values: object, count: int) -> bool:
+    """Return whether `values` is a sequence of `count` finite numbers."""
+    return isinstance(values, Sequence) and len(values) == count and all(map(is_number, values))

@@ -1,4 +1,4 @@
-"""Figures to report beside rewards: free functions of a `TermContext`, averaged over each episode."""
+"""Metrics: functions of a `TermContext` that are reported as means over each episode, beside rewards."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def highest_base(s: TermContext) -> SX:
 
 
 def terrain_level(s: TermContext) -> SX:
-    """Level of the terrain on which the episode began, 0 the easiest."""
+    """Terrain level of the episode; 0 is the easiest."""
     return s.terrain_level
 
 
 def times_grown(s: TermContext) -> SX:
-    """How often the range of commands had grown when the episode began."""
+    """Growth steps of the command range before the episode."""
     return s.times_grown

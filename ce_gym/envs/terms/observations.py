@@ -1,6 +1,6 @@
-"""Observation blocks: free functions of a `TermContext` that return a vector of order one.
+"""Observation blocks: functions of a `TermContext` that return a vector of order one.
 
-Scales are those of legged_gym's velocity task, so that policies of similar make see similar numbers.
+Scales follow the velocity task of legged_gym.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from ce_gym.envs.terms.context import TermContext
 
 
 def base_linear_velocity(s: TermContext, scale: float = 2.0) -> SX:
-    """Base frame, times `scale`, 2 [m/s], shape (3,)."""
+    """Linear velocity of the base in its frame, times `scale`, 2 [m/s], shape (3,)."""
     return scale * s.base_linear_velocity
 
 
 def base_angular_velocity(s: TermContext, scale: float = 0.25) -> SX:
-    """Base frame, times `scale`, 0.25 [rad/s], shape (3,)."""
+    """Angular velocity of the base in its frame, times `scale`, 0.25 [rad/s], shape (3,)."""
     return scale * s.base_angular_velocity
 
 
@@ -33,12 +33,12 @@ def velocity_command(s: TermContext) -> SX:
 
 
 def joint_positions(s: TermContext) -> SX:
-    """Distance from the standing pose [rad], shape (n_joints,)."""
+    """Joint positions minus the standing pose [rad], shape (n_joints,)."""
     return s.joint_positions - s.standing_joints
 
 
 def joint_velocities(s: TermContext, scale: float = 0.05) -> SX:
-    """Times `scale`, 0.05 [rad/s], shape (n_joints,)."""
+    """Joint velocities, times `scale`, 0.05 [rad/s], shape (n_joints,)."""
     return scale * s.joint_velocities
 
 
@@ -53,7 +53,7 @@ def ball_velocities(s: TermContext, scale: float = 0.05) -> SX:
 
 
 def last_action(s: TermContext) -> SX:
-    """The action just carried out, shape (n_joints,)."""
+    """Action of this control step, clipped, shape (n_joints,)."""
     return s.action
 
 
@@ -63,7 +63,7 @@ def feet_in_contact(s: TermContext) -> SX:
 
 
 def gait_phase(s: TermContext) -> SX:
-    """Sine and cosine of the gait's clock, shape (2,)."""
+    """Sine and cosine of the phase of the gait clock, shape (2,)."""
     return ca.vertcat(ca.sin(s.phase), ca.cos(s.phase))
 
 
@@ -73,13 +73,13 @@ def base_height(s: TermContext) -> SX:
 
 
 def torques(s: TermContext) -> SX:
-    """Motor torques as shares of the joints' largest [-], shape (n_joints,)."""
+    """Motor torques at the joints over the torque limits of the joints [-], shape (n_joints,)."""
     limits = [s.mechanism.robot.body(name).joint.torque for name in s.mechanism.robot.commanded]
     return s.torque / np.array([limit if 0 < limit < np.inf else 100.0 for limit in limits])
 
 
 def contact_forces(s: TermContext) -> SX:
-    """Normal forces on the contacts over the robot's weight [-], shape (n_contacts,)."""
+    """Normal forces on the contacts over the weight of the robot [-], shape (n_contacts,)."""
     weight = -s.mechanism.robot.gravity[2] * s.mechanism.robot.total_mass
     return s.load / (weight if weight > 0 else 1.0)
 
@@ -90,5 +90,5 @@ def rotor_speeds(s: TermContext) -> SX:
 
 
 def parameters(s: TermContext) -> SX:
-    """The randomised figures of the episode, each scaled to [-1, 1] over its range, shape (n,)."""
+    """Randomised parameters of the episode, each scaled to [-1, 1] over its range, shape (n,)."""
     return s.scaled_parameters

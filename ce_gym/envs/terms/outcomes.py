@@ -1,7 +1,4 @@
-"""Metrics that say how an episode went as a whole: what is reported is the value at its end, not the mean.
-
-Free functions of a `TermContext`, as other metrics.
-"""
+"""Metrics of a whole episode: functions of a `TermContext` that are reported with their value at its end."""
 
 from __future__ import annotations
 
@@ -13,8 +10,8 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.skills import aloft, flown, risen, turned_back
 
-LEAN, NEAR, SLOW = math.radians(20), 0.2, 0.5
-"""Who stands leans by less [rad], is off its standing height by a smaller share of it, and moves slower [m/s]."""
+STANDING_LEAN, STANDING_HEIGHT_ERROR, STANDING_SPEED = math.radians(20), 0.2, 0.5
+"""Largest lean [rad], height error as a share of the standing height, and speed [m/s] of a robot that stands."""
 
 
 def apex(s: TermContext) -> SX:
@@ -35,24 +32,24 @@ def turn(s: TermContext) -> SX:
 def stands(s: TermContext) -> SX:
     """1 if the robot stands at the end: upright within 20 degrees, within 20 % of its height, below 0.5 m/s."""
     height = s.mechanism.robot.pose.height
-    tall = ca.logic_and(s.up[2] > math.cos(LEAN), ca.fabs(risen(s)) < NEAR * height)
-    return ca.logic_and(tall, ca.sumsqr(s.base_linear_velocity) < SLOW**2)
+    tall = ca.logic_and(s.up[2] > math.cos(STANDING_LEAN), ca.fabs(risen(s)) < STANDING_HEIGHT_ERROR * height)
+    return ca.logic_and(tall, ca.sumsqr(s.base_linear_velocity) < STANDING_SPEED**2)
 
 
 def flipped(s: TermContext) -> SX:
-    """1 if the robot stands at the end after one turn backwards, within a tenth of it."""
+    """1 if the robot stands at the end after one turn backwards, within a tenth of a turn."""
     return ca.logic_and(stands(s), ca.fabs(turned_back(s) / (2 * math.pi) - 1) < 0.1)
 
 
 def stood_after(s: TermContext) -> SX:
-    """Time from which on the robot stood without a break until the end [s]."""
+    """Time after which the robot stood without a break until the end [s]."""
     since = ca.if_else(stands(s), s.recall("since"), s.time + s.control_dt)
     s.keep("since", since)
     return since
 
 
 def flights(s: TermContext) -> SX:
-    """How often the robot has come down again after neither foot nor knee touched the ground."""
+    """Number of flights that have ended; in a flight neither foot nor knee touches the ground."""
     was, count = s.recall("aloft"), s.recall("count")
     now = aloft(s)
     count += ca.logic_and(was > 0.5, ca.logic_not(now))
@@ -62,7 +59,7 @@ def flights(s: TermContext) -> SX:
 
 
 def touch_down_pitch(s: TermContext) -> SX:
-    """How far the base was pitched from level, either way, where its longest flight ended [rad]; 0 without a flight."""
+    """Absolute pitch of the base at the end of its longest flight [rad]; 0 without a flight."""
     now, pitch = aloft(s), s.recall("pitch")
     lasted, longest = s.recall("lasted"), s.recall("longest")
     touched = ca.logic_and(ca.logic_not(now), lasted > longest)
@@ -74,10 +71,10 @@ def touch_down_pitch(s: TermContext) -> SX:
 
 
 def distance(s: TermContext) -> SX:
-    """Way of the base over the ground, turns included, in the direction in which it points [m]."""
-    way = s.recall("way") + s.control_dt * s.base_linear_velocity[0]
-    s.keep("way", way)
-    return way
+    """Distance that the base has travelled along its own heading [m]."""
+    travelled = s.recall("way") + s.control_dt * s.base_linear_velocity[0]
+    s.keep("way", travelled)
+    return travelled
 
 
 def _greatest(s: TermContext, value: SX) -> SX:

@@ -1,8 +1,8 @@
-"""Finding terms by name, the package's own and those a user adds, and tracing them with clear errors.
+"""Terms of the package and of users by name, and tracing them with clear errors.
 
 @ce_gym.reward
 def near_the_origin(s, width=1.0):
-return -(s.q[0] ** 2 + s.q[1] ** 2) / width**2
+    return -(s.q[0] ** 2 + s.q[1] ** 2) / width**2
 
 gymnasium.make("ce_gym/MiniCheetahVelocity-v0", rewards={"near_the_origin": {"weight": 0.5, "width": 2.0}})
 """
@@ -62,10 +62,10 @@ class Term:
 
     Attributes:
         kind: "reward", "observation", "termination" or "metric".
-        name: Of the function.
+        name: Name of the function.
         function: A function of a `TermContext` and of parameters with defaults.
-        parameters: Those that differ from the defaults.
-        weight: Of a reward.
+        parameters: Parameters that differ from the defaults.
+        weight: Weight of a reward.
     """
 
     kind: str
@@ -76,19 +76,19 @@ class Term:
 
     @property
     def added(self) -> bool:
-        """Whether it comes from a user."""
+        """Whether a user has added the term."""
         return self.name in _added[self.kind]
 
     @property
     def at_the_end(self) -> bool:
-        """Whether a metric reports its value at the end of an episode instead of the mean."""
+        """Whether a metric reports its final value instead of its mean over the episode."""
         return self.function.__module__ == outcomes.__name__
 
     def __call__(self, s: TermContext) -> SX:
         """Trace the term.
 
         Raises:
-            ValueError: If it cannot be traced; one line.
+            ValueError: The function cannot be traced; one line.
         """
         s.term = f"{self.kind}_{self.name}"
         try:
@@ -102,10 +102,10 @@ class Term:
             raise ValueError(f"{self.kind} term {self.name!r}: {_advice(error, s)}") from error
 
     def number(self, s: TermContext) -> SX:
-        """Trace a term that is one number.
+        """Trace a term that returns one number.
 
         Raises:
-            ValueError: If it is another shape.
+            ValueError: The function cannot be traced or returns another shape; one line.
         """
         value = self(s)
         if value.numel() != 1:
@@ -115,14 +115,14 @@ class Term:
 
 
 def _advice(error: Exception, s: TermContext) -> str:
-    """Return what to do about a name that does not exist or an error of CasADi's, or the first line of the error."""
+    """Return one line on an error in a term: the names that exist, the CasADi functions to use, or its own text."""
     if isinstance(error, AttributeError) and error.obj is s:
         known = [name for name in dir(TermContext) if not name.startswith("_")]
         return f"no attribute {error.name!r} of TermContext; expected one of {listed_names(error.name, known)}"
     if isinstance(error, KeyError):
         bodies = [body.name for body in s.mechanism.robot.bodies]
-        given = str(error.args[0]) if error.args else ""
-        return given if "has no body" in given else f"no key {given!r}; bodies are {listed_names(given, bodies)}"
+        key = str(error.args[0]) if error.args else ""
+        return key if "has no body" in key else f"no key {key!r}; bodies are {listed_names(key, bodies)}"
     if "truth value" in str(error):
         return "a condition on a traced value (Python's if, and, or, min, max); expected ca.if_else, ca.fmin, ca.fmax"
     text = str(error).strip().splitlines() or [type(error).__name__]
@@ -131,24 +131,24 @@ def _advice(error: Exception, s: TermContext) -> str:
     return f"{text[-1]}; expected arithmetic of CasADi expressions (ca.sqrt, ca.if_else, ca.dot, ...)"
 
 
-def terms_of(kind: str, given: Mapping[str, Any] | Iterable[str]) -> dict[str, Term]:
+def terms_of(kind: str, chosen: Mapping[str, Any] | Iterable[str]) -> dict[str, Term]:
     """Return the terms that a task names.
 
     Args:
         kind: "reward", "observation", "termination" or "metric".
-        given: Names; or parameters by name, for a reward its weight or parameters that `weight` is one of.
+        chosen: Names, or parameters by name. A reward has a weight, or parameters that include `weight`.
 
     Raises:
-        ValueError: If there is no such term or parameter; names those there are.
+        ValueError: There is no such term or parameter; the message lists the existing ones.
     """
-    return {name: _term(kind, name, given[name] if isinstance(given, Mapping) else {}) for name in given}
+    return {name: _term(kind, name, chosen[name] if isinstance(chosen, Mapping) else {}) for name in chosen}
 
 
-def _term(kind: str, name: str, given: Any) -> Term:
+def _term(kind: str, name: str, options: Any) -> Term:
     known = OWN[kind] | _added[kind]
     if name not in known:
         raise ValueError(f"no {kind} term {name!r}; expected one of {listed_names(name, sorted(known))}")
-    parameters = dict(given) if isinstance(given, Mapping) else {"weight": given}
+    parameters = dict(options) if isinstance(options, Mapping) else {"weight": options}
     weight = parameters.pop("weight", 1.0) if kind == "reward" else 1.0
     defaults = parameters_of(known[name])
     for key, value in parameters.items():
@@ -172,7 +172,7 @@ def reward(function: _F) -> _F:
     Further arguments, with defaults, are parameters that a task can set; see `TermContext.recall` for memory.
 
     Raises:
-        ValueError: If the package has a term of this name, or a parameter has no default.
+        ValueError: The package has a term of this name, or a parameter has no default.
     """
     return _add("reward", function)
 
@@ -188,7 +188,7 @@ def termination(function: _F) -> _F:
 
 
 def metric(function: _F) -> _F:
-    """Add a figure to report under the function's name: a function of a `TermContext` that returns one number."""
+    """Add a metric under the function's name: a function of a `TermContext` that returns one number."""
     return _add("metric", function)
 
 

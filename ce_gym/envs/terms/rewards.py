@@ -1,7 +1,7 @@
-"""Reward terms: free functions of a `TermContext` that return one number, to be weighted by a task.
+"""Reward terms: functions of a `TermContext` that return one number.
 
-Names and forms follow the widely used legged_gym velocity task (Rudin et al. 2022), so that scales carry over. A term
-is a rate: a task multiplies it by its weight and by the control step.
+Names and forms follow the velocity task of legged_gym (Rudin et al. 2022). A term is a rate: a task multiplies the term
+by its weight and by the length of the control step.
 """
 
 from __future__ import annotations
@@ -27,52 +27,52 @@ def track_angular_velocity(s: TermContext, width: float = 0.25) -> SX:
 
 
 def linear_velocity_error(s: TermContext) -> SX:
-    """Difference to the commanded horizontal velocity, squared [(m/s)^2]."""
+    """Squared error of the commanded horizontal velocity [(m/s)^2]."""
     return ca.sumsqr(s.command[:2] - s.base_linear_velocity[:2])
 
 
 def yaw_rate_error(s: TermContext) -> SX:
-    """Difference to the commanded yaw rate, squared [(rad/s)^2]."""
+    """Squared error of the commanded yaw rate [(rad/s)^2]."""
     return (s.command[2] - s.base_angular_velocity[2]) ** 2
 
 
 def linear_velocity_z(s: TermContext) -> SX:
-    """Vertical speed of the base, squared [(m/s)^2]."""
+    """Squared vertical speed of the base [(m/s)^2]."""
     return s.base_linear_velocity[2] ** 2
 
 
 def angular_velocity_xy(s: TermContext) -> SX:
-    """Roll and pitch rates, squared [(rad/s)^2]."""
+    """Sum of squared roll and pitch rates [(rad/s)^2]."""
     return ca.sumsqr(s.base_angular_velocity[:2])
 
 
 def orientation(s: TermContext) -> SX:
-    """How far the base leans, squared sine of the angle to upright."""
+    """Squared sine of the angle of the base to upright."""
     return ca.sumsqr(s.up[:2])
 
 
 def base_height(s: TermContext) -> SX:
-    """Distance of the base from its standing height, squared [m^2]."""
+    """Squared distance of the base from its standing height [m^2]."""
     return (s.base_height - s.mechanism.robot.pose.height) ** 2
 
 
 def torques(s: TermContext) -> SX:
-    """Motor torques at the joints, squared [(N m)^2]."""
+    """Sum of squared motor torques at the joints [(N m)^2]."""
     return ca.sumsqr(s.torque)
 
 
 def power(s: TermContext) -> SX:
-    """Mechanical power of the motors, positive and negative both counted [W]."""
+    """Sum over joints of the absolute mechanical power of the motors [W]."""
     return ca.sum1(ca.fabs(s.torque * s.joint_velocities))
 
 
 def action_rate(s: TermContext) -> SX:
-    """Change of the action since the last control step, squared."""
+    """Squared change of the action since the previous control step."""
     return ca.sumsqr(s.action - s.previous_action)
 
 
 def pose(s: TermContext) -> SX:
-    """Distance of the joints from the standing pose, squared [rad^2]."""
+    """Squared distance of the joints from the standing pose [rad^2]."""
     return ca.sumsqr(s.joint_positions - s.standing_joints)
 
 
@@ -82,9 +82,9 @@ def stand_still(s: TermContext) -> SX:
 
 
 def feet_air_time(s: TermContext, least: float = 0.1) -> SX:
-    """At each touchdown, how long the foot was in the air beyond `least` [s], while motion is commanded [s]."""
-    gained = ca.dot(s.air_time - least, s.landed) / s.control_dt  # an event, not a rate: the step cancels
-    return ca.if_else(s.commanded_to_move, gained, 0)
+    """At each touchdown, time that the foot was in the air minus `least`, while motion is commanded [s]."""
+    air_time = ca.dot(s.air_time - least, s.landed) / s.control_dt  # an event, not a rate: the step cancels
+    return ca.if_else(s.commanded_to_move, air_time, 0)
 
 
 def knee_contact(s: TermContext) -> SX:
@@ -93,7 +93,7 @@ def knee_contact(s: TermContext) -> SX:
 
 
 def joint_limits(s: TermContext, margin: float = 0.05) -> SX:
-    """How far joints are nearer to an end of their range than `margin` of its length [rad]."""
+    """Distance of joints into the outer `margin`, a share of their range, at each end [rad]."""
     total = SX(0)
     for i, name in enumerate(s.mechanism.robot.commanded):
         low, high = s.mechanism.robot.body(name).joint.position
@@ -104,29 +104,30 @@ def joint_limits(s: TermContext, margin: float = 0.05) -> SX:
 
 
 def alive(s: TermContext) -> SX:
-    """1 as long as the episode goes on."""
+    """1 in each step of the episode."""
     return SX(1)
 
 
 def survive(s: TermContext) -> SX:
-    """1 as long as the episode goes on, under the name of Gymnasium's MuJoCo environments."""
+    """1 in each step of the episode, as in Gymnasium's MuJoCo environments."""
     return SX(1)
 
 
 def forward(s: TermContext) -> SX:
-    """Forward speed of the base in its own heading [m/s]."""
+    """Forward speed of the base in its frame [m/s]."""
     return s.base_linear_velocity[0]
 
 
 def ctrl(s: TermContext) -> SX:
-    """Size of the action, squared."""
+    """Sum of squared actions."""
     return ca.sumsqr(s.action)
 
 
 def gait(s: TermContext) -> SX:
-    """How many feet are on the ground and off it as the gait's clock demands, minus those that are not.
+    """Number of feet in the contact state that the gait clock requires, minus the number of other feet.
 
-    Feet take turns: the first half of the cycle belongs to every second one. While no motion is commanded all stand.
+    Every second foot swings in the first half of the cycle, the others in the second half. Without a motion command all
+    feet must be on the ground.
     """
     swing = ca.vertcat(*[ca.sin(s.phase + np.pi * i) > 0 for i in range(s.foot_contact.numel())])
     wanted = ca.if_else(s.commanded_to_move, 1 - swing, 1)
@@ -134,10 +135,10 @@ def gait(s: TermContext) -> SX:
 
 
 def swing_height(s: TermContext, height: float = 0.06, offsets: Sequence[float] = (0.0, 0.5)) -> SX:
-    """Distances of feet from the heights that the gait's clock demands, squared [m^2].
+    """Sum of squared distances of feet from the heights that the gait clock requires [m^2].
 
-    A foot swings during half of the cycle, up to `height` [m] and down again; `offsets` are shares of the cycle by
-    which feet are ahead, the first one again after the last. While no motion is commanded all stand.
+    A foot swings in one half of the cycle, up to `height` [m] and down again. `offsets` are phase leads of the feet as
+    shares of the cycle, repeated for further feet. Without a motion command all feet must be on the ground.
     """
     total, moving = SX(0), s.commanded_to_move
     for i in range(s.foot_heights.numel()):
@@ -147,10 +148,10 @@ def swing_height(s: TermContext, height: float = 0.06, offsets: Sequence[float] 
 
 
 def feet_distance(s: TermContext, least: float = 0.2) -> SX:
-    """How much less than `least` [m] left feet are to the left of right ones, along the base's y-axis, squared [m^2].
+    """Squared shortfall from `least` [m] of the distance from right to left feet along the y axis of the base [m^2].
 
-    Left and right are those of the standing pose, where they are further apart than half of it. Keeps legs from
-    crossing: links pass through each other unless a scene has self-collisions.
+    Pairs are feet that are more than `least / 2` apart along y in the standing pose. The term keeps legs from crossing
+    in scenes without self-collisions.
     """
     total, y_axis = SX(0), s.kinematics.bodies[s.mechanism.robot.bodies[0].name].R[:, 1]
     feet = list(zip(s.foot_places, s.foot_sides, strict=True))
@@ -161,19 +162,19 @@ def feet_distance(s: TermContext, least: float = 0.2) -> SX:
 
 
 def foot_slip(s: TermContext) -> SX:
-    """Horizontal speeds of feet on the ground, squared [(m/s)^2]."""
+    """Sum of squared horizontal speeds of feet on the ground [(m/s)^2]."""
     return ca.dot(s.foot_contact, ca.sum1(s.foot_velocities[:2, :] ** 2).T)
 
 
 def foot_clearance(s: TermContext, height: float = 0.08) -> SX:
-    """How far feet in the air are below `height` [m], squared, times how fast they move, while motion is commanded."""
+    """Sum over feet of squared distance below `height` [m] times horizontal speed, while motion is commanded."""
     low = ca.fmax(0, height - s.foot_heights) ** 2
     speed = ca.sqrt(ca.sum1(s.foot_velocities[:2, :] ** 2).T + 1e-6)
     return ca.if_else(s.commanded_to_move, ca.sum1(low * speed), 0)
 
 
 def height(s: TermContext) -> SX:
-    """How far the base is above its standing height, during the second half of the gait's clock [m]."""
+    """Height of the base above its standing height, in the second half of the gait cycle [m]."""
     return ca.if_else(ca.sin(s.phase) < 0, ca.fmax(0, s.base_height - s.mechanism.robot.pose.height), 0)
 
 

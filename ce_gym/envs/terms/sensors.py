@@ -1,6 +1,6 @@
-"""Sensors that a robot carries, as observation terms: rate gyros, accelerometers, foot switches, encoders, currents.
+"""Sensors of the robot as observation terms: rate gyros, accelerometers, foot switches, encoders, motor currents.
 
-Errors that stay for an episode are the terms' own; noise is the task's, `noise={"gyro": 0.05}`.
+Terms add biases that are constant over an episode. The task adds noise, as in `noise={"gyro": 0.05}`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.actuation import actuated_clusters, effort_matrix, encoder_map
 from ce_gym.dynamics.recursion.kinematics import BodyState, constant
 from ce_gym.envs.terms.context import TermContext
+from ce_gym.envs.terms.grid import are_numbers, check_term
 from ce_gym.model.errors import listed_names
 
 
@@ -23,8 +24,8 @@ def gyro(s: TermContext, link: str = "", scale: float = 0.25, bias: float = 0.0)
     Args:
         s: The robot.
         link: Name of the link; "" for the base.
-        scale: What readings are multiplied by.
-        bias: Largest error of each axis in an episode [rad/s].
+        scale: Factor on the readings.
+        bias: Largest bias of each axis, drawn for each episode [rad/s].
     """
     reading = _link(s, "gyro", link).v[:3]
     return scale * (reading + bias * s.drift("bias", 3) if bias else reading)
@@ -33,63 +34,60 @@ def gyro(s: TermContext, link: str = "", scale: float = 0.25, bias: float = 0.0)
 def accelerometer(
     s: TermContext, link: str = "", position: Sequence[float] = (0.0, 0.0, 0.0), scale: float = 0.1, bias: float = 0.0
 ) -> SX:
-    """Specific force at a place of a link in its axes, times `scale`, 0.1 [m/s^2], shape (3,); upwards g at rest.
+    """Specific force at a place of a link in axes of the link, times `scale`, 0.1 [m/s^2], shape (3,); g up at rest.
 
-    It is the mean over the control step: the change of the place's velocity in the world over time, less gravity,
-    turned into the link's axes at the end. The first reading of an episode is that of a robot at rest.
+    The reading is a mean over the control step: the change of velocity in the world over time, minus gravity, in the
+    axes of the link at the end of the step. The first reading of an episode is the reading of a robot at rest.
 
     Args:
         s: The robot.
         link: Name of the link; "" for the base.
-        position: The place, in the link's frame [m].
-        scale: What readings are multiplied by.
-        bias: Largest error of each axis in an episode [m/s^2].
+        position: Place of the sensor in the link's frame [m].
+        scale: Factor on the readings.
+        bias: Largest bias of each axis, drawn for each episode [m/s^2].
     """
-    three = isinstance(position, Sequence) and not isinstance(position, str) and len(position) == 3
-    if not three or not all(isinstance(x, int | float) and np.isfinite(x) for x in position):
-        raise ValueError(f"observation term 'accelerometer': position={position!r}; expected three lengths [m]")
+    check_term("accelerometer", "position", position, are_numbers(position, 3), "three lengths [m]")
     body = _link(s, "accelerometer", link)
     velocity = body.R @ body.point_velocity(constant(np.array(position, dtype=float)))
-    before = ca.if_else(s.begins, velocity, s.recall("velocity", size=3))
+    previous = ca.if_else(s.begins, velocity, s.recall("velocity", size=3))
     s.keep("velocity", velocity)
-    force = (velocity - before) / s.control_dt - np.array(s.mechanism.robot.gravity)
+    force = (velocity - previous) / s.control_dt - np.array(s.mechanism.robot.gravity)
     reading = body.R.T @ force
     return scale * (reading + bias * s.drift("bias", 3) if bias else reading)
 
 
 def foot_contact_switches(s: TermContext, threshold: float = 5.0) -> SX:
-    """Whether the ground pushes at each foot by more than `threshold`, 5 N, in the last sub-step, 0 or 1, (n_feet,)."""
-    loads = s.foot_loads
-    return ca.vertcat(SX(0, 1), *loads) > threshold
+    """Whether the normal force on each foot in the last sub-step is above `threshold`, 5 N, 0 or 1, (n_feet,)."""
+    return ca.vertcat(SX(0, 1), *s.foot_loads) > threshold
 
 
 def joint_encoders(s: TermContext, counts: float = 4096, bias: float = 0.0) -> SX:
-    """Joint positions as encoders at the rotors tell them, distance from the standing pose [rad], shape (n_joints,).
+    """Joint positions minus the standing pose, measured by encoders at the rotors [rad], shape (n_joints,).
 
-    A rotor's angle is known to a count; joints follow from it through the transmission, where a count is the smaller
-    the larger the gear ratio is. What stretches in between is not seen. Joints without a motor have no encoder, and are
-    told as they are. Steps have no slope: for derivatives of environments it is 0.
+    An encoder rounds the angle of its rotor to a count, and the transmission gives the joint positions; the larger the
+    gear ratio, the smaller a count at the joint. Stretch of elastic transmissions is not measured. Joints without a
+    motor are measured exactly. Rounding has no gradient, so derivatives of environments use 0.
 
     Args:
         s: The robot.
-        counts: Of a turn of a rotor.
-        bias: Largest error of each joint in an episode [rad], as of a calibration.
+        counts: Counts for each turn of a rotor.
+        bias: Largest calibration error of each joint, drawn for each episode [rad].
     """
-    if not (isinstance(counts, int | float) and 1 <= counts < np.inf):
-        raise ValueError(f"observation term 'joint_encoders': counts={counts!r}; expected 1 or more of a turn")
+    valid = isinstance(counts, int | float) and 1 <= counts < np.inf
+    check_term("joint_encoders", "counts", counts, valid, "1 or more of a turn")
     robot, step = s.mechanism.robot, 2 * np.pi / counts
-    told = encoder_map(s.mechanism, s.kinematics) @ s.q[robot.layout.joints_q :]
+    measured = encoder_map(s.mechanism, s.kinematics) @ s.q[robot.layout.joints_q :]
     for cluster in actuated_clusters(s.mechanism, s.kinematics):
-        off = step * ca.floor(cluster.angles / step + 0.5) - cluster.angles
-        told[cluster.joints] += effort_matrix(cluster.W[:, : len(cluster.joints)]).T @ off
-    drift = bias * s.drift("bias", told.numel()) if bias else 0.0
-    return told - s.standing_joints + drift
+        rounding = step * ca.floor(cluster.angles / step + 0.5) - cluster.angles
+        measured[cluster.joints] += effort_matrix(cluster.W[:, : len(cluster.joints)]).T @ rounding
+    drift = bias * s.drift("bias", measured.numel()) if bias else 0.0
+    return measured - s.standing_joints + drift
 
 
 def motor_torques(s: TermContext) -> SX:
-    """Torque of each motor's windings, which its current is in proportion to, over its largest [-], shape (n_motors,).
+    """Electromagnetic torque of each motor, proportional to its current, over its limit [-], shape (n_motors,).
 
-    The mean over the last sub-step, before friction; what motors without a limit give is over 100 N m.
+    The torque is a mean over the last sub-step, before friction. For motors without a limit it is divided by 100 N m.
     """
     limits = [motor.torque for motor in s.mechanism.robot.motors]
     if not limits:
@@ -98,12 +96,12 @@ def motor_torques(s: TermContext) -> SX:
 
 
 def winding_temperatures(s: TermContext) -> SX:
-    """How much windings of motors that grow warm are warmer than the air [100 K], shape (n_warm,)."""
+    """Temperatures of windings above the ambient temperature, for motors with thermal data [100 K], shape (n_warm,)."""
     return s.motor_warmth[: s.motor_warmth.numel() // 2] / 100  # windings, then housings
 
 
 def battery_sag(s: TermContext) -> SX:
-    """How far the battery's voltage is below that without load, over the nominal one [-], shape (1,); () without."""
+    """Voltage drop of the battery under load over its nominal voltage [-], shape (1,); empty without a battery."""
     battery = s.mechanism.robot.battery
     return SX(0, 1) if battery is None or not s.battery_sag.numel() else s.battery_sag / battery.nominal
 

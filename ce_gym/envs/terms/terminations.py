@@ -12,7 +12,7 @@ from ce_gym.envs.terms.skills import turned_back
 
 
 def torso_contact(s: TermContext) -> SX:
-    """Any torso sphere touches the ground."""
+    """A contact sphere of the torso touches the ground."""
     return ca.sum1(s.touching("torso")) > 0
 
 
@@ -22,13 +22,13 @@ def fallen(s: TermContext, share: float = 0.6) -> SX:
 
 
 def other_foot(s: TermContext, foot: int = 0, grace: float = 0.5) -> SX:
-    """A foot besides one is on the ground, after a time of `grace` [s]."""
+    """A foot other than `foot` is on the ground, after a time of `grace` [s]."""
     others = [s.foot_contact[i] for i in range(s.foot_contact.numel()) if i != foot]
     return ca.logic_and(s.time > grace, ca.sum1(ca.vertcat(SX(0, 1), *others)) > 0)
 
 
 def turned_too_far(s: TermContext, most: float = 2 * math.pi + 0.8) -> SX:
-    """The base has turned backwards about its y-axis by more than `most` [rad], 0.8 more than once."""
+    """The base has turned backwards about its y axis by more than `most` [rad], one turn and 0.8 rad."""
     return turned_back(s) > most
 
 

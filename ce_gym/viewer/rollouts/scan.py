@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ce_gym.envs.runtime.program import TaskProgram
-from ce_gym.envs.terms.grid import grid_points, ray_directions, turned
+from ce_gym.envs.terms.grid import grid_points, ray_directions, rotation_matrix
 from ce_gym.envs.terms.height_scan import height_scan
 from ce_gym.envs.terms.range_scan import range_scan
 from ce_gym.model import Robot
@@ -47,7 +47,7 @@ def _grids(chosen: dict[str, Any], robot: Robot) -> list[Scan]:
 
 
 def _rays(chosen: dict[str, Any]) -> Scan:
-    along = turned(chosen["rotation"]) @ ray_directions(chosen["rays"], chosen["view"], chosen["pattern"])
+    along = rotation_matrix(chosen["rotation"]) @ ray_directions(chosen["rays"], chosen["view"], chosen["pattern"])
     at = [np.array(chosen["position"], float).tolist()]
     march = {"reach": float(chosen["reach"]), "steps": int(chosen["steps"])}
     return {"link": chosen["link"], "at": at, "rays": along.T.tolist(), **march}
