@@ -18,8 +18,8 @@ from job import Job, jobs, parser
 from networks import KINDS, make_work
 from regression import squared_error_gradient
 from settings import SettingsError, config_file, load_env_args, load_settings
-from test_fast_ppo import parameters
 from test_networks import close, make_network, run
+from toy import parameters
 
 import ce_gym
 from ce_gym.policies import PolicyError, load_policy

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from evaluate import evaluate
 from evaluate import main as evaluate_main
-from job import Job
 from point_mass import ID
 from ppo import train
 from saved import load_learner
-from settings import config_file, load_settings
+from toy import job
 
 import ce_gym
 from ce_gym.policies import ACTIVATIONS, LevelWarning, PolicyError, load_policy, read_actor
@@ -25,12 +24,11 @@ pytest.importorskip("onnxruntime")
 from export import main  # noqa: E402
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
-SMALL = ["num_envs=16", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]", "training={}"]
+SMALL = ["num_envs=16", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]"]
 
 
 def trained_policy(out: Path, *settings: str, env=ID, **env_kwargs) -> Path:
-    chosen = load_settings(config_file(env), [*SMALL, "steps=300", *settings])
-    return train(Job(env, chosen, out, env_kwargs=env_kwargs, tensorboard=False)).policy
+    return train(job(out, 300, env, [*SMALL, *settings], env_kwargs=env_kwargs)).policy
 
 
 @pytest.fixture(scope="module")

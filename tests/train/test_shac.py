@@ -16,8 +16,8 @@ from networks import KINDS, make_work, outputs
 from pathwise import back_through
 from settings import SettingsError, config_file, load_env_args, load_settings
 from shac import SHAC, Settings, train
-from test_fast_ppo import parameters
 from test_networks import close, make_network, run
+from toy import parameters
 from tripod import TRIPOD
 
 from ce_gym import environment_ids
