@@ -29,6 +29,13 @@ GROUPED = [pytest.param(page, marks=pytest.mark.xdist_group(name_of(page)), id=n
 """Each page by itself, so that workers share them."""
 ELSEWHERE = ("ray start", "python3 -m venv", "pip install torch onnx", "python -c", "source ")
 """Beginnings of commands that are not ours to check."""
+RUN = """
+import runpy
+from ce_gym.compile import machine_code
+
+machine_code.GENERATION = machine_code.OPTIMISATION = 0  # as in tests/conftest.py
+runpy.run_path("page.py", run_name="__main__")
+"""
 
 
 @pytest.mark.slow
@@ -41,7 +48,7 @@ def test_python_blocks_run(page: Path, tmp_path: Path):
     (tmp_path / "page.py").write_text(script(page), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     result = subprocess.run(
-        [sys.executable, "page.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", RUN], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, f"{name_of(page)}\n{result.stdout[-2000:]}\n{result.stderr[-3000:]}"
 
