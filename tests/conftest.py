@@ -11,8 +11,11 @@ from ce_gym.compile.cache import FOLDER_VARIABLE, cache_folder
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-QUICK = ("adapters", "docs", "envs", "policies", "train", "viewer")
-"""Folders of tests that compile much and step little; tests of `compile` and `sim` run optimised kernels."""
+OPTIMISED = (
+    *("bench", "compile", "house", "identify", "stress"),
+    *("test_adaptive", "test_failures", "test_simulator", "test_substeps", "test_terrain"),
+)
+"""Folders and files of tests that run optimised kernels, as users do."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -26,13 +29,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_kernels(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Compile without optimisation for the tests of QUICK: less than half the time, and the same results bit by bit.
+    """Compile without optimisation for all but OPTIMISED: less than half the time, and the same results bit by bit.
 
     Kernels are cached in a folder of their own, which all workers and later runs share.
     """
     folder = cache_folder()
     with pytest.MonkeyPatch.context() as patch:
-        if folder and request.path.parent.name in QUICK:
+        if folder and not {request.path.parent.name, request.path.stem} & set(OPTIMISED):
             patch.setenv(FOLDER_VARIABLE, str(folder / "quick"))
             patch.setattr(machine_code, "GENERATION", 0)
             patch.setattr(machine_code, "OPTIMISATION", 0)

@@ -176,17 +176,17 @@ def test_dry_friction_holds_without_a_nanometre(rubbing, dt: float):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.001, 0.01])
-@pytest.mark.parametrize("dt", [0.0005, 0.005, 0.01])
-def test_what_a_knee_loses_from_rest(friction: float, dt: float):
-    """A light rotor gets fast within a step: friction at the speed of its start was many times what it has."""
+def test_what_a_knee_loses_from_rest(friction: float):
+    """A light rotor accelerates within a step: its dry friction is still limited to the friction torque."""
     model = Model(lossy(load_robot("mini_cheetah"), friction=friction, velocity=np.inf))
-    step = stepper(model, dt, ("torque",), control="torque")
+    step = step_function(model.mechanism, StepOptions(None, control="torque", motors="limited"), ("torque",))
     knee = 2
     ratio = np.abs(model.actuator_matrix(model.standing_q)[..., 6 + knee]).max()
     asked = np.zeros(12)
     asked[knee] = 10.0
-    result = step(model.standing_q, np.zeros(model.nv), asked)
-    assert result["torque"][knee] == pytest.approx(10.0 - ratio * friction, abs=0.02 * ratio * friction)
+    for dt in (0.0005, 0.005, 0.01):
+        result = step(q=model.standing_q, v=np.zeros(model.nv), diverged=0.0, target=asked, dt=dt)
+        assert float(result["torque"][knee]) == pytest.approx(10.0 - ratio * friction, abs=0.02 * ratio * friction)
 
 
 @pytest.mark.parametrize("joint", [1, 3])
@@ -219,7 +219,7 @@ def lossy(robot: Robot, **changes) -> Robot:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid_leg", "mit_humanoid", "tello"])
+@pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid_leg", "tello"])
 def test_saturation_acts_at_the_motors(name: str):
     """Joint torques are shared out to the motors, clipped there, and carried back: `W^T clip(W^-T tau)`.
 

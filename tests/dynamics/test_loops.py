@@ -35,7 +35,6 @@ ROBOTS = {
     "rod_leg": rod_leg,
     "six_bar": lambda: load_robot("six_bar"),
     "tello": lambda: load_robot("tello"),
-    "tello_with_arms": lambda: load_robot("tello_with_arms"),
 }
 
 

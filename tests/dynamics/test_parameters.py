@@ -75,13 +75,6 @@ def with_inertial(robot: Robot, body: str, **changes) -> Robot:
     return replace(robot, bodies=tuple(bodies))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_a_default_changes_nothing(tripod: Robot, states, name: str):
-    values = parameter_defaults(tripod, tripod.material, (name,))
-    assert_same(results(tripod, states, values=values), results(tripod, states))
-
-
 @pytest.mark.parametrize("name", ["friction", "stiffness", "damping"])
 def test_contact_figures(tripod: Robot, states, name: str):
     value = 0.6 * getattr(tripod.material, name)
@@ -190,9 +183,11 @@ SHAPES = {"as it is": {}, "tilted": {"inertia": TILTED}, "eccentric": {"com": (0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("level", ["exact", "coupled", "armature"])
-@pytest.mark.parametrize("which", ["all", "one"])
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    ("level", "which", "shape"),
+    [*(("exact", which, shape) for which in ("all", "one") for shape in SHAPES)]
+    + [(level, *case) for level in ("coupled", "armature") for case in (("all", "eccentric"), ("one", "tilted"))],
+)
 def test_rotor_inertia_is_that_of_the_spin(tripod: Robot, states, level: str, which: str, shape: str):
     """The factor acts on what a rotor holds against being spun up; as a load of its carrier it stays what it is."""
     for rotor in tripod.rotors():
@@ -323,7 +318,7 @@ def test_rotor_inertia_means_nothing_where_rotors_do_not_spin(tripod: Robot, sta
 
 
 @pytest.mark.parametrize("level", ["exact", "armature"])
-def test_all_at_once(tripod: Robot, states, level: str):
+def test_defaults_change_nothing(tripod: Robot, states, level: str):
     defaults = parameter_defaults(tripod, tripod.material, tuple(NAMES))
     assert_same(results(tripod, states, level, defaults), results(tripod, states, level))
 

@@ -87,8 +87,9 @@ CASES = {
     **figures("random_revolute_rotor_chain_4"),
     **figures("random_revolute_rotor_pair_chain_4"),
 }
-GENERAL = [  # also with every rotor a body; the large humanoids are in test_more_vectors.py
-    *("mini_cheetah, our file", "mit_humanoid_leg, our file", "tello, our file", "tello, figures"),
+GENERAL = [  # also with every rotor a body
+    *("mit_humanoid, our file", "jvrc1_symmetric, our file", "mini_cheetah, our file"),
+    *("mit_humanoid_leg, our file", "tello, our file", "tello, figures"),
     *("random_revolute_rotor_pair_chain_4, figures", "bench_revolute_rotor_b2_d3, rule"),
     *("bench_revolute_rotor_pair_b2_d2, rule", "parallel_explicit_d5_l4, rule"),
 ]

@@ -74,7 +74,7 @@ class Differences:
 def dropped(n: int = 24) -> tuple[Simulator, np.ndarray]:
     """Robots that stand, slide, and fly, some time after a drop, and targets that not all motors can follow."""
     model = Model(TRIPOD)
-    sim = Simulator(model, n, contacts="foot", outputs=())
+    sim = Simulator(model, n, contacts="foot", outputs=("contact_forces",))
     rng = np.random.default_rng(5)
     q = np.tile(model.standing_q, (n, 1)) + rng.normal(0, 0.05, (n, model.nq)) * (np.arange(model.nq) > 6)
     q[:, 2] += np.linspace(-0.01, 0.05, n)
@@ -86,10 +86,10 @@ def dropped(n: int = 24) -> tuple[Simulator, np.ndarray]:
 
 
 def standing(n: int = 9) -> tuple[Simulator, np.ndarray]:
-    """Robots of many joints that all stand and sway, a little different from each other."""
-    model, rng = Model("mini_cheetah"), np.random.default_rng(7)
-    sim = Simulator(model, n, contacts="foot")
-    target = model.standing_q[7:] + rng.normal(0, 0.05, (n, 12))
+    """Robots that all stand and sway, a little different from each other."""
+    model, rng = Model(TRIPOD), np.random.default_rng(7)
+    sim = Simulator(model, n, contacts="foot", outputs=("contact_forces",))
+    target = model.standing_q[7:] + rng.normal(0, 0.05, (n, 2))
     sim.step(target, 100)
     sim.set_state(sim.q, sim.v + rng.normal(0, 0.02, (n, model.nv)))  # as if it had just been pushed
     sim.step(target, 10)

@@ -10,6 +10,7 @@ import threading
 
 import numpy as np
 import pytest
+from tripod import TRIPOD
 
 from ce_gym import Model, Simulator
 from ce_gym.sim import pieces
@@ -45,7 +46,7 @@ print("alive")
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return Model("mini_cheetah")
+    return Model(TRIPOD)
 
 
 def moving(model: Model, **options) -> Simulator:
@@ -176,7 +177,7 @@ def test_a_second_thread_is_refused(model: Model, call: str, monkeypatch: pytest
 
     watch(sim, monkeypatch, meanwhile=meanwhile)
     sim.step(model.standing_q[7:])
-    assert errors == ["Simulator of 12 mini_cheetah: called during another call, expected one call at a time"]
+    assert errors == ["Simulator of 12 tripod: called during another call, expected one call at a time"]
     for _ in range(2):
         twin.step(model.standing_q[7:])
     assert seen(sim) == seen(twin)
