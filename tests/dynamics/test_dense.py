@@ -116,7 +116,7 @@ def test_forces(case: Case):
 
 
 def test_transmissions_neither_make_nor_lose_power(case: Case):
-    """What the ties of each cluster do to its joints adds up to no power, whichever joints are driven."""
+    """The constraint forces of each cluster have no power, whichever joints are driven."""
     drive = np.random.default_rng(12).normal(0, 5, case.G.shape[:2])
     vdot = case.model.forward_dynamics(case.q, case.v, np.einsum("bij,bi->bj", case.G, drive))
     accelerations = case.model.spanning_acceleration(case.q, case.v, vdot)

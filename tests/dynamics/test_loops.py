@@ -98,7 +98,7 @@ def test_velocity_terms_follow_from_the_mass_matrix(model: Model, level: str):
 
 
 def test_armature_is_the_diagonal_of_coupled(model: Model):
-    """In clusters with one independent joint that is all of it, velocity terms included."""
+    """In clusters with one independent joint both levels are equal, velocity terms included."""
     q, v = states(model, 3)
     coupled, armature, none = (Model(model.robot, level) for level in ("coupled", "armature", "none"))
     added, diagonal = (x.mass_matrix(q) - none.mass_matrix(q) for x in (coupled, armature))
