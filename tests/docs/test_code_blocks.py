@@ -122,7 +122,7 @@ def check_script(path: Path, words: list[str]) -> None:
     """The script exists, and so do its options and environments; it is read, not imported, because torch is slow."""
     script = ast.parse(path.read_text())
     beside = [path.with_name(f"{n.module}.py") for n in ast.walk(script) if isinstance(n, ast.ImportFrom)]
-    beside.append(ROOT / "ce_gym" / "policies" / "arguments.py")  # --env and --env-arg of all of them
+    beside.append(ROOT / "ce_gym" / "policies" / "arguments.py")  # --env and --env-arg of all scripts
     trees = [script, *(ast.parse(file.read_text()) for file in beside if file.exists())]
     calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
     adding = [c for c in calls if isinstance(c.func, ast.Attribute) and c.func.attr == "add_argument"]

@@ -64,13 +64,13 @@ def seen(sim: Simulator) -> bytes:
 
 
 def watch(sim: Simulator, monkeypatch: pytest.MonkeyPatch, interrupted: int = 0, meanwhile=lambda: None) -> list[int]:
-    """Have calls made in pieces of three sub-steps, and Ctrl-C come in one of them.
+    """Split calls into pieces of three sub-steps, and send Ctrl-C during one piece.
 
     Args:
         sim: What makes the calls.
         monkeypatch: Undoes it.
         interrupted: Number of the piece, from 1.
-        meanwhile: What else to do in each piece.
+        meanwhile: Called in each piece.
 
     Returns:
         The lengths of the pieces, to be looked at later.
@@ -91,7 +91,7 @@ def watch(sim: Simulator, monkeypatch: pytest.MonkeyPatch, interrupted: int = 0,
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are sent otherwise here")
 def test_no_memory_is_freed_that_a_thread_still_writes_to():
-    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}  # what is freed is gone at once
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}  # freed memory is returned immediately
     command = [sys.executable, "-c", FREED_TOO_EARLY]
     finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (finished.returncode, finished.stdout) == (0, "alive\n"), finished.stderr

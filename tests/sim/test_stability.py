@@ -19,7 +19,7 @@ def cheetah() -> Model:
 
 @pytest.mark.slow
 def test_a_chain_of_many_rods_swings():
-    """For half a second from horizontal, on undamped joints: Euler's gain of energy stays below a tenth of it."""
+    """For half a second from horizontal, on undamped joints: Euler's gain of energy stays below a tenth of its fall."""
     n = 40
     sim = mechanisms.simulator(mechanisms.chain(n), 0.002, outputs=())
     q = np.zeros(n)

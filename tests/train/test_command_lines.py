@@ -22,7 +22,7 @@ from ce_gym.policies.actor import Actor
 
 
 def one_line(argv, capsys, run=main) -> str:
-    """What a mistake prints; it ends with exit code 2."""
+    """The error message of a command line that ends with exit code 2."""
     try:
         code = run(argv)
     except SystemExit as leaving:

@@ -1,4 +1,4 @@
-"""The student: its gradient against torch, what the teacher is shown, that it learns, and goes on as it was."""
+"""The student: its gradient against torch, the teacher's observation, learning, and resuming."""
 
 import json
 import os
@@ -57,7 +57,7 @@ def test_the_gradient_is_that_of_torch(kind):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_a_teacher_sees_the_very_numbers_of_its_own_environment(path):
+def test_a_teacher_sees_the_numbers_of_its_own_environment(path):
     """Of shipped files, whose students see late, noisy, in the wrong place: the teacher is shown the truth."""
     settings, kwargs = load_settings(path, kind=Settings), load_env_args(path)
     assert settings.num_envs * settings.rollout % settings.minibatches == 0
@@ -74,7 +74,7 @@ def test_a_teacher_sees_the_very_numbers_of_its_own_environment(path):
     there, here = his.unwrapped.batch, mine.unwrapped.batch
     for name, row in there.schema.items():
         if not row.dtype and name in here.schema and here.schema[name].size == row.size:
-            here.write(name, there.rows(name))  # the state, but for what each one's sensors remember
+            here.write(name, there.rows(name))  # the state without the memory of sensors
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (4, 12)).astype(F)
     theirs, (seen, *_) = his.step(actions)[0], mine.step(actions)
     theirs = theirs["policy"] if isinstance(theirs, dict) else theirs
@@ -93,10 +93,10 @@ def test_blocks_of_the_critic_are_named_in_order():
 
 
 def test_the_student_acts_and_the_teacher_labels(tmp_path):
-    """What is kept is the student's own states, and what the teacher does in each."""
+    """Samples are the student's own states, and the teacher's action in each."""
     task = job(tmp_path)
     learner = Distiller(environments(task), task)
-    learner.theta[:] = 0  # it asks for nothing
+    learner.theta[:] = 0  # its mean action is 0
     given, step = [], learner.envs.step
 
     def watched(actions):
@@ -155,7 +155,7 @@ def test_interrupted_and_resumed_is_as_if_it_never_stopped(tmp_path, monkeypatch
 
 
 def columns(teacher, known=None, **scan):
-    """Where a teacher finds its observation in that of Mini Cheetah on stairs: other sizes, another `height_scan`."""
+    """Columns of a teacher's observation, for Mini Cheetah on stairs with other sizes and another `height_scan`."""
     policy, kwargs = load_policy(teacher), load_env_args(Settings.folder / "mini_cheetah_stairs.yaml")
     sizes = {block["name"]: block["size"] for block in policy.record["policy_spec"]["observation"]["blocks"]}
     kwargs["observations"]["height_scan"] |= scan
@@ -186,7 +186,7 @@ def test_columns_are_in_the_order_of_the_teacher():
         ("mini_cheetah_rough", None, {}, "mini_cheetah_rough: history=3; expected a teacher that sees the present"),
     ],
 )
-def test_what_a_teacher_cannot_see_is_one_line(teacher, known, scan, said):
+def test_a_teacher_without_its_observation_is_refused_in_one_line(teacher, known, scan, said):
     with pytest.raises(PolicyError, match=said) as caught:
         columns(teacher, known, **scan)
     assert "\n" not in str(caught.value)

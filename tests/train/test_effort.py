@@ -1,4 +1,4 @@
-"""What the motors do, against the simulator's own motors; pushes that some survive."""
+"""Torques and speeds of motors against the simulator's own; pushes that some robots survive."""
 
 import math
 from dataclasses import replace
@@ -41,7 +41,7 @@ def test_motors_turn_and_work_as_in_the_simulator(robot, stepped, level):
     yd, tau = sim.v[:, 6:], sim.torque
     torque, speed = drives.at_motors(sim.model, before, yd, tau)
     np.testing.assert_allclose(speed, sim.motor_speed, rtol=1e-9, atol=1e-9)
-    if stepped == "exact":  # what stretches takes part of it
+    if stepped == "exact":  # springs take part of the power
         np.testing.assert_allclose((torque * speed).sum(1), (tau * yd).sum(1), rtol=1e-9)
     assert np.abs(torque).max() < 0.5 * np.abs(tau).max()  # gears make motors faster and weaker
 
@@ -60,7 +60,7 @@ def test_an_unknown_motor_has_no_largest_power():
 
 
 def policy(target, **kwargs):
-    """Holds one action; its record is that of an environment."""
+    """A policy that holds one action, with the record of an environment."""
     native = make_sb3_vec_env(WALKING, 1, **kwargs).envs.unwrapped
     size = native.policy_spec()["observation"]["size"]
     record = {"env": WALKING, "policy_spec": native.policy_spec(), "observation_size": size}

@@ -1,4 +1,4 @@
-"""Policies as files: ONNX acts as the learner does, a specification says what it sees, and no file runs code."""
+"""Policies as files: ONNX acts as the learner does, and a specification describes its observation."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the fast learner does beyond the reference: same bits on any threads and when resumed, costs of falls, noise."""
+"""The fast learner alone: the same bits on any number of threads and when resumed, costs of falls, noise."""
 
 import json
 import os
@@ -69,7 +69,7 @@ def _stopped_after(iterations, task):
     return result
 
 
-def test_a_critic_may_see_more_and_the_noise_ends_where_it_shall(tmp_path):
+def test_a_critic_may_see_more_and_the_noise_ends_at_its_setting(tmp_path):
     result = train(job(tmp_path, 30_000, settings=["final_std=0.05"], env_kwargs={"obs_mode": "dict"}))
     assert evaluate(result.model, ID, episodes=16, obs_mode="dict")["forward_error"] < 0.2
     with np.load(result.policy.with_suffix(".learner.npz")) as arrays:
@@ -79,8 +79,8 @@ def test_a_critic_may_see_more_and_the_noise_ends_where_it_shall(tmp_path):
     assert np.exp(theta[actor]) == pytest.approx(0.05, rel=0.2)  # the last update may still change it
 
 
-def test_a_fall_costs_what_it_shall_and_reaching_the_end_of_time_nothing(tmp_path):
-    """Two learners alike but for that: their rewards differ by the cost, where an episode failed, and nowhere else."""
+def test_a_fall_has_its_cost_and_a_time_out_has_none(tmp_path):
+    """Two learners that differ in the cost alone: their rewards differ by it where an episode failed."""
     wide = job(tmp_path, 30_000, settings=["initial_std=5", "rollout=120"])
     rewards, fallen = [], []
     for cost in (0.0, 7.0):

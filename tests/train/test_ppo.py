@@ -1,4 +1,4 @@
-"""What the reference learner does beyond the contract of all learners: what it resumes from, seeds, evaluation."""
+"""The reference learner alone: resuming from files, seeds, evaluation."""
 
 import base64
 import contextlib

@@ -52,7 +52,7 @@ def test_the_way_back_through_a_network_is_that_of_torch(kind, hidden):
 
 
 class Window:
-    """What a policy is worth: discounted rewards of a window and the value of its end, the noise being the same."""
+    """The objective of a policy: discounted rewards of a window and the value of its end, with the same noise."""
 
     def __init__(self, learner: SHAC) -> None:
         native = learner.envs.unwrapped

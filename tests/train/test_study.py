@@ -76,7 +76,7 @@ def test_runs_are_made_seed_by_seed_and_judged_in_every_way(made):
 
 
 def test_the_same_command_makes_what_is_missing(made, trainings):
-    """A row that is gone is judged again from the policy; a policy that is gone is trained again, to the same bits."""
+    """A missing row is evaluated again from the policy; a missing policy is trained again, to the same bits."""
     folder, argv = made
     text = (folder / "toy.csv").read_text()
     assert main(argv) == 0
