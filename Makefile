@@ -35,10 +35,10 @@ demo: .venv/installed
 	@$(BIN)/python train/demo.py
 
 test: .venv/installed
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 quick: .venv/installed
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow and not stress"
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m "not slow and not stress"
 
 arm: .venv/installed
 	tests/arm.sh
@@ -48,7 +48,7 @@ lint: .venv/installed
 	$(BIN)/ruff format --check .
 
 types: .venv/installed
-	for system in Linux Darwin Windows; do $(BIN)/pyright --pythonplatform $$system || exit 1; done
+	printf '%s\n' Linux Darwin Windows | xargs -P 3 -I {} $(BIN)/pyright --pythonplatform {}
 
 docs: .venv/installed
 	$(BIN)/python -m sphinx -W --keep-going --nitpicky -q -b html docs docs/_build/html

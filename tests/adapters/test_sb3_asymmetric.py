@@ -1,4 +1,4 @@
-"""Dictionaries of observations reach Stable-Baselines3, and the critic sees what the actor does not."""
+"""Dictionaries of observations reach Stable-Baselines3, and the critic sees more than the actor."""
 
 from __future__ import annotations
 

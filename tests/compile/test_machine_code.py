@@ -4,8 +4,10 @@ import platform
 from functools import partial
 
 import casadi as ca
+import gymnasium
 import numpy as np
 import pytest
+from tripod import TRIPOD
 
 from ce_gym.compile import Buffer, Call, Program, load_kernel, machine_code
 
@@ -49,3 +51,22 @@ def test_every_cpu_gives_the_same_bits(dtype, monkeypatch):
         np.testing.assert_array_equal(output, outputs[0])
     assert [b"\0fma" in code for code in codes[2:]] == [False, False, True, True]
     assert all_passes == 3 * [True, False]
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_kernels_without_optimisation_give_the_same_bits(dtype, monkeypatch, tmp_path):
+    """Compiled as tests/conftest.py asks for: an environment's steps, randomisation and resets."""
+    episodes = []
+    for optimised in (True, False):
+        if not optimised:
+            monkeypatch.setenv("CE_GYM_CACHE_DIR", str(tmp_path))
+            monkeypatch.setattr(machine_code, "GENERATION", 0)
+            monkeypatch.setattr(machine_code, "OPTIMISATION", 0)
+        options = {"robot": TRIPOD, "dtype": dtype, "max_episode_steps": 20, "randomise": {"friction": [0.5, 1.2]}}
+        envs = gymnasium.make_vec("ce_gym/MiniCheetahVelocity-v0", num_envs=21, terrain="rough", **options)
+        rng, seen = np.random.default_rng(0), [envs.reset(seed=0)[0]]
+        for _ in range(50):
+            seen += envs.step(rng.uniform(-1, 1, envs.action_space.shape).astype(np.float32))[:2]
+        episodes.append(np.concatenate([np.ravel(part) for part in seen]))
+        envs.close()
+    np.testing.assert_array_equal(*episodes)

@@ -1,4 +1,4 @@
-"""What the pages say, cut into pieces: code blocks by language, commands, links. Knows the Markdown that we use."""
+"""The pages in pieces: code blocks by language, commands, links. Knows the Markdown that we use."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def script(page: Path) -> str:
 
 
 def commands(page: Path) -> Iterator[str]:
-    """Iterate over the commands of a page: lines of its shell blocks, and what is set as code and begins like one."""
+    """Iterate over the commands of a page: lines of its shell blocks, and inline code that begins like one."""
     text = page.read_text(encoding="utf-8")
     for block in blocks(page):
         if block.language == "sh":
@@ -96,5 +96,5 @@ def anchors(page: Path) -> set[str]:
 
 
 def addresses(text: str) -> list[str]:
-    """Return the web addresses in a text, and what was meant to be one."""
+    """Return the web addresses in a text, and malformed ones."""
     return [found.rstrip(".,;:") for found in re.findall(r"(?:\b(?!file:)\w+://|\bwww\.)[^\s<>\"'`)\]]*", text)]

@@ -25,12 +25,21 @@ from ce_gym import __main__ as command_line
 from ce_gym.bench import __main__ as benchmarks
 
 WITH_CODE = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
+GROUPED = [pytest.param(page, marks=pytest.mark.xdist_group(name_of(page)), id=name_of(page)) for page in WITH_CODE]
+"""Each page by itself, so that workers share them."""
 ELSEWHERE = ("ray start", "python3 -m venv", "pip install torch onnx", "python -c", "source ")
 """Beginnings of commands that are not ours to check."""
+RUN = """
+import runpy
+from ce_gym.compile import machine_code
+
+machine_code.GENERATION = machine_code.OPTIMISATION = 0  # as in tests/conftest.py
+runpy.run_path("page.py", run_name="__main__")
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
+@pytest.mark.parametrize("page", GROUPED)
 def test_python_blocks_run(page: Path, tmp_path: Path):
     for command in commands(page):
         if command.startswith("cp "):
@@ -39,7 +48,7 @@ def test_python_blocks_run(page: Path, tmp_path: Path):
     (tmp_path / "page.py").write_text(script(page), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     result = subprocess.run(
-        [sys.executable, "page.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", RUN], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, f"{name_of(page)}\n{result.stdout[-2000:]}\n{result.stderr[-3000:]}"
 
@@ -113,7 +122,7 @@ def check_script(path: Path, words: list[str]) -> None:
     """The script exists, and so do its options and environments; it is read, not imported, because torch is slow."""
     script = ast.parse(path.read_text())
     beside = [path.with_name(f"{n.module}.py") for n in ast.walk(script) if isinstance(n, ast.ImportFrom)]
-    beside.append(ROOT / "ce_gym" / "policies" / "arguments.py")  # --env and --env-arg of all of them
+    beside.append(ROOT / "ce_gym" / "policies" / "arguments.py")  # --env and --env-arg of all scripts
     trees = [script, *(ast.parse(file.read_text()) for file in beside if file.exists())]
     calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
     adding = [c for c in calls if isinstance(c.func, ast.Attribute) and c.func.attr == "add_argument"]

@@ -65,7 +65,7 @@ def test_links_into_the_web_are_well_formed():
 
 @pytest.mark.parametrize("url", BAD)
 def test_what_is_not_well_formed(url: str):
-    """The judge of addresses can say no, and the reader of pages finds these."""
+    """Bad addresses are found in a page and refused."""
     assert not is_well_formed(url)
     assert addresses(f"see [this]({url}).") == [url]
 

@@ -1,4 +1,4 @@
-"""What the pages say of the robots that ship with the package is what the robots' files say.
+"""Statements of the pages about shipped robots agree with the robots' files.
 
 Each row is a sentence with its figures worked out from the robot: it fails if page or file changes without the other.
 """

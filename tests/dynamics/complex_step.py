@@ -1,6 +1,6 @@
 """Derivatives by complex steps: an SX function evaluated on complex numbers, instruction by instruction.
 
-An imaginary part of 1e-30 comes out multiplied by the derivative, without any difference being taken. Comparisons go by
+An imaginary part of 1e-30 comes out multiplied by the derivative, without any difference being taken. Comparisons use
 real parts.
 """
 

@@ -1,4 +1,4 @@
-"""Dynamics of a robot by numpy alone, to judge the package by: spanning tree, constraint rows, one dense solve.
+"""Dynamics of a robot by numpy alone, as a reference: spanning tree, constraint rows, one dense solve.
 
 Nothing of the package is used but the description. World axes and classical accelerations throughout, Jacobians joint
 by joint, no recursion over inertias and no spatial vectors, so that a mistake is unlikely to be made twice.

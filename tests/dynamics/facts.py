@@ -98,7 +98,7 @@ def _crank(name: str, parent: str, position: tuple[float, float, float]) -> Body
 
 
 def _hip(tie: dict, name: str) -> tuple[list[Body], list[Constraint]]:
-    """Two cranks of 80 mm on the clamp, 155 mm rods to the thigh: what the published `phi` says, in millimetres."""
+    """Two cranks of 80 mm on the clamp, 155 mm rods to the thigh, as in the published `phi`, in millimetres."""
     clamp = name.replace("differential", "clamp")
     cranks, ties = [], []
     for i, side in ((1, 1.0), (2, -1.0)):

@@ -1,6 +1,6 @@
 """Random robots for hypothesis: any tree, rotors on any carrier, gears, belts, differentials, four-bars and rods.
 
-Hypothesis draws what a robot is made of and shrinks it to the smallest that fails; figures come from a seed.
+Hypothesis draws the parts of a robot and shrinks a failing robot to the smallest one; figures come from a seed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PIVOT = 0.2
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a robot is made of.
+    """The parts of a robot.
 
     Attributes:
         floating: Whether its base floats.
@@ -122,7 +122,7 @@ class _Builder:
         self.start[body.name] = self.rng.uniform(-1.0, 1.0) if at is None else at
 
     def body(self, name: str, parent: str | None, joint: str | Joint, **fields: object) -> Body:
-        """A body with random figures, or those of `fields`."""
+        """A body with random figures, except the ones in `fields`."""
         spread = self.rng.uniform(0.01, 0.03, 3)
         A = np.eye(3) if self.recipe.aligned else self.rotation()
         inertia = A @ (np.diag(spread.sum() - spread)) @ A.T
@@ -164,7 +164,7 @@ class _Builder:
         ratios = self.rng.uniform(1.5, 8.0, 2) * self.rng.choice([-1.0, 1.0], 2)
         if kind == "coupling":
             if any(isinstance(tie, LinearConstraint) and tie.name.startswith("coupling") for tie in self.ties):
-                return  # two of them could lock a robot
+                return  # two couplings could lock a robot
             self.tie(name, {chosen[0]: 1.0, chosen[1]: ratios[0] / 4.0})
             return
         for sign in (1.0, -1.0) if kind == "differential" else (1.0,):

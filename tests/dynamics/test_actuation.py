@@ -100,7 +100,7 @@ def test_friction_of_the_motor(speed: float):
 
 @pytest.mark.parametrize("dt", [1e-4, 0.01, 0.1])
 def test_a_motor_runs_up_to_its_no_load_speed_and_not_beyond(dt: float):
-    """On the line it is a linear damper, and a step of it the implicit Euler step of the exponential, exactly."""
+    """On its torque-speed line a motor is a linear damper, and a step is the implicit Euler step of an exponential."""
     stall, velocity = 2.0, 60.0
     step = stepper(Model(turntable(Motor("rotor", torque=stall, velocity=velocity))), dt, control="torque")
     q, v, speed, rate = [0.0], np.zeros(1), 0.0, RATIO**2 * stall / (velocity * WHOLE)
@@ -146,8 +146,8 @@ def coulomb(v: float, load: float, time: float) -> tuple[float, float]:
 @pytest.mark.parametrize("dt", [0.0005, 0.002, 0.01])
 @pytest.mark.parametrize("load", [0.3, 0.99, 1.01, 2.0, -5.0])
 @pytest.mark.parametrize("v", [0.0, 2.0, -0.3])
-def test_dry_friction_takes_what_it_has(rubbing, dt: float, load: float, v: float):
-    """From rest, from speed and through reversals, against the closed form: within 2 % of all that friction takes.
+def test_dry_friction_follows_coulombs_law(rubbing, dt: float, load: float, v: float):
+    """From rest, from speed and through reversals, against the closed form: within 2 % of the friction impulse.
 
     The step in which the speed reverses may take friction for one direction or for the other, a part of one step.
     """
@@ -165,7 +165,7 @@ def test_dry_friction_takes_what_it_has(rubbing, dt: float, load: float, v: floa
 
 @pytest.mark.parametrize("dt", [0.0005, 0.01])
 def test_dry_friction_holds_without_a_nanometre(rubbing, dt: float):
-    """At 0.99 of what it has nothing moves at all, however long; at 1.01 it does at once."""
+    """A load of 0.99 of the dry friction moves nothing, however long; a load of 1.01 moves the joint."""
     for load, moves in ((0.99, False), (-0.99, False), (1.01, True)):
         q, v = np.array([0.3]), np.zeros(1)
         for _ in range(300):
@@ -176,17 +176,17 @@ def test_dry_friction_holds_without_a_nanometre(rubbing, dt: float):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.001, 0.01])
-@pytest.mark.parametrize("dt", [0.0005, 0.005, 0.01])
-def test_what_a_knee_loses_from_rest(friction: float, dt: float):
-    """A light rotor gets fast within a step: friction at the speed of its start was many times what it has."""
+def test_what_a_knee_loses_from_rest(friction: float):
+    """A light rotor accelerates within a step: its dry friction is still limited to the friction torque."""
     model = Model(lossy(load_robot("mini_cheetah"), friction=friction, velocity=np.inf))
-    step = stepper(model, dt, ("torque",), control="torque")
+    step = step_function(model.mechanism, StepOptions(None, control="torque", motors="limited"), ("torque",))
     knee = 2
     ratio = np.abs(model.actuator_matrix(model.standing_q)[..., 6 + knee]).max()
     asked = np.zeros(12)
     asked[knee] = 10.0
-    result = step(model.standing_q, np.zeros(model.nv), asked)
-    assert result["torque"][knee] == pytest.approx(10.0 - ratio * friction, abs=0.02 * ratio * friction)
+    for dt in (0.0005, 0.005, 0.01):
+        result = step(q=model.standing_q, v=np.zeros(model.nv), diverged=0.0, target=asked, dt=dt)
+        assert float(result["torque"][knee]) == pytest.approx(10.0 - ratio * friction, abs=0.02 * ratio * friction)
 
 
 @pytest.mark.parametrize("joint", [1, 3])
@@ -219,7 +219,7 @@ def lossy(robot: Robot, **changes) -> Robot:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid_leg", "mit_humanoid", "tello"])
+@pytest.mark.parametrize("name", ["mini_cheetah", "mit_humanoid_leg", "tello"])
 def test_saturation_acts_at_the_motors(name: str):
     """Joint torques are shared out to the motors, clipped there, and carried back: `W^T clip(W^-T tau)`.
 
@@ -248,7 +248,7 @@ def test_saturation_acts_at_the_motors(name: str):
 
 @pytest.mark.parametrize("name", ["mit_humanoid", "tello"])
 def test_power_balance(name: str):
-    """What the joints receive is what the motors' windings give, less what their friction takes."""
+    """The power of the joints is the power of the windings less the losses of the motors' friction."""
     robot = lossy(load_robot(name), damping=2e-4, friction=0.05)
     model = Model(robot)
     step = stepper(model, MOMENT, ("torque", "power", "motor_speed"), control="torque")

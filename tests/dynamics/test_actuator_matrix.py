@@ -1,4 +1,4 @@
-"""`actuator_matrix` where motors are not one to a joint: on dependent joints of loops, and more of them than freedoms.
+"""`actuator_matrix` where motors are not one to a joint: on dependent joints of loops, and more motors than freedoms.
 
 Velocities of actuators are checked against differences of their positions, forces against the work that they do.
 """
@@ -146,7 +146,7 @@ def test_any_joint_may_be_driven(name: str):
 
 
 def test_motors_of_the_legs_determine_their_joints():
-    """A robot with as many motors as joints, none of them at a joint: torques go both ways."""
+    """A robot with as many motors as joints, no motor at a joint: torques can be mapped both ways."""
     model = Model("tello")
     q, v = states(model)
     W = model.actuator_matrix(q)[..., 6:]

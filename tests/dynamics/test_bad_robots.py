@@ -115,7 +115,7 @@ def test_impossible_robots(bad: Robot, says: str):
 
 
 FUNCTIONS = {
-    # what the function returns, and what becomes of `c, d tied by it` when it is explicit and when it is implicit
+    # the function, and the error if its constraint is explicit and if it is implicit
     "index": (lambda q: [q[5]], "fails with IndexError: list index out of range", None),
     "none": (lambda q: None, "fails with TypeError", None),
     "text": (lambda q: "a", "returned 'a': expected numbers and expressions", None),

@@ -1,4 +1,4 @@
-"""Ball joints in the tree: Pinocchio's equations, slopes in the tangent space, and what a ball joint cannot be."""
+"""Ball joints in the tree: Pinocchio's equations, slopes in the tangent space, and refused uses of ball joints."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def with_joint(name: str, joint: Joint):
         (with_joint("a", Joint("screw")), "expected one of free, ball, revolute, prismatic"),  # type: ignore[arg-type]
     ],
 )
-def test_what_cannot_be(robot, words: str):
+def test_wrong_uses_are_refused(robot, words: str):
     with pytest.raises(RobotError, match=r"^with_balls: [^\n]*$") as error:
         check_robot(robot)
     assert words in str(error.value)

@@ -58,7 +58,7 @@ def test_a_slow_point_sticks():
 
 
 def test_a_fast_point_slips_with_the_true_slope():
-    """At the edge of the cone, no slope along the slip, and across it that of a force that turns with the velocity."""
+    """At the edge of the cone, no slope along the slip, and across it a force that turns with the velocity."""
     point = contact([FAST, 0, 0])
     assert slopes(point) == pytest.approx((0.0, STICKING / 5))
     np.testing.assert_allclose(tangential(point), [-CONE, 0], rtol=1e-9)
@@ -105,7 +105,7 @@ def test_a_change_of_the_active_set_is_noticed(velocity, gain, changed):
 @pytest.mark.parametrize("gain", [(0, 0, 0), (FAST, 0, 0), (-2 * FAST, 0, 0), (0, FAST, 0)])
 @pytest.mark.parametrize("velocity", [[SLOW, 0, 0], [FAST, 0, 0]])
 def test_the_secant_never_asks_for_another_iteration(velocity, gain):
-    """It goes by the velocity at the start, which no iteration changes; motors may still ask for one."""
+    """It uses the velocity at the start, which no iteration changes; motors may still need one."""
     point = contact(velocity, friction="secant")
     assert not numbers(point.check(motion(gain)))
     again = contact(velocity, gain=gain, slip=(1, 0, 0), count=1, friction="secant")

@@ -16,8 +16,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 TOLERANCE = 1e-9
 LINKAGES = {"crank-rocker": four_bar, "spatial four-bar": spatial_four_bar, "rod leg": rod_leg}
 STATES = 6
-# As Mini Cheetah, in other figures; MuJoCo checks those.
-SERIAL = ("go1", "go2", "anymal_c", "h1", "t1", "berkeley_humanoid")
+ALIKE = ("go1", "go2", "anymal_c", "h1", "t1", "berkeley_humanoid", "tello_with_arms")
+"""Robots with the structure of Mini Cheetah or of Tello; tests of their files check their figures."""
 
 NARROW = {"dr_legs": 0.1}
 """How far from the standing pose loops close that a quarter of a radian opens [rad]."""
@@ -51,7 +51,7 @@ class Case:
         return spread
 
 
-@pytest.fixture(scope="module", params=[*sorted(set(robots()) - set(SERIAL)), *LINKAGES, "awkward"])
+@pytest.fixture(scope="module", params=[*sorted(set(robots()) - set(ALIKE)), *LINKAGES, "awkward"])
 def case(request: pytest.FixtureRequest, awkward_robot) -> Case:
     if request.param == "awkward":
         return Case(awkward_robot(lopsided=1e-4))
@@ -116,7 +116,7 @@ def test_forces(case: Case):
 
 
 def test_transmissions_neither_make_nor_lose_power(case: Case):
-    """What the ties of each cluster do to its joints adds up to no power, whichever joints are driven."""
+    """The constraint forces of each cluster have no power, whichever joints are driven."""
     drive = np.random.default_rng(12).normal(0, 5, case.G.shape[:2])
     vdot = case.model.forward_dynamics(case.q, case.v, np.einsum("bij,bi->bj", case.G, drive))
     accelerations = case.model.spanning_acceleration(case.q, case.v, vdot)

@@ -1,4 +1,4 @@
-"""Derivatives of the dynamics against complex steps, Pinocchio's, and what they must satisfy."""
+"""Derivatives of the dynamics against complex steps, against Pinocchio, and identities between them."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_energy_s_gradient_is_gravity_and_momentum():
     [(TRIPOD, "rotor_inertia", 1), (TRIPOD, "ratio", 1), ("planar_leg_linkage", "gravity", 3)],
 )
 def test_figures_against_changed_robots(name: str, figure: str, size: int):
-    """Gravity enters linearly, rotors through J r^2: what a robot with another figure does, by Richardson's rule."""
+    """Against robots with another figure, by Richardson's rule: gravity enters linearly, rotors through J r^2."""
     import casadi as ca
 
     from ce_gym.dynamics.functions import FUNCTIONS

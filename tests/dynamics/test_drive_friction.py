@@ -1,6 +1,6 @@
 """Friction of drives under load and near rest: M1 to M6 as published, and in closed form.
 
-Figures are those of a servo (Dynamixel MX-106) that the authors of the models publish, torques and speeds at its
+The authors of the models publish figures of a servo (Dynamixel MX-106), torques and speeds at its
 output: github.com/Rhoban/bam, bam/params/mx106 at 1b5a1ce. Here they are taken through a gear to a rotor.
 """
 
@@ -285,7 +285,7 @@ def test_gradients_at_rest_are_finite(exponent: float):
 
 
 def test_torques_go_to_the_rotors_of_a_differential():
-    """Two rotors that turn two joints together: what the load does to each is its torque through the inverse."""
+    """Two rotors that turn two joints together: the load of each rotor is the joint torque through the inverse."""
     robot = differential()
     drive = DriveFriction(load_motor=0.1, load_external=0.1)
     motors = tuple(replace(motor, friction=10.0, drive_friction=drive) for motor in robot.motors)

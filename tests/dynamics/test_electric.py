@@ -33,7 +33,7 @@ def table(stuck: float = 0.0, **figures: Any) -> Robot:
 
 
 def run(robot: Robot, target: list[float], dt: float, steps: int, outputs: tuple[str, ...] = (), **start: Any):
-    """States and outputs after each step, by name; of limited motors asked for torques at the joints."""
+    """States and outputs after each step, by name; limited motors, controlled by joint torques."""
     parameters = tuple(start.pop("parameters", {}).items())
     model = Model(robot)
     options = StepOptions(control="torque", motors="limited", parameters=tuple(name for name, _ in parameters))
@@ -74,7 +74,7 @@ def test_a_stuck_motor_warms_along_the_closed_form():
 
 
 def test_heat_balances_in_every_step():
-    """What is lost is in winding and housing or has gone to the air, to rounding."""
+    """All lost power heats winding and housing or goes to the air, to rounding."""
     dt, torque = 0.01, 0.3
     found = run(table(heat=HEAT), [torque * RATIO], dt, 400, ("motor_torque",))
     (w, h), tau = found["motor_warmth"].T, found["motor_torque"][:, 0]
@@ -85,7 +85,7 @@ def test_heat_balances_in_every_step():
 
 
 def test_a_hot_motor_holds_back_and_comes_to_the_temperature_at_which_it_does():
-    """Asked for all it has for an hour: the torque that is left makes just the heat that flows out."""
+    """At full command for an hour: the heat of the remaining torque is the heat that flows out."""
     across = HEAT.winding_to_housing + HEAT.housing_to_ambient
 
     def excess(w: float) -> float:
@@ -113,7 +113,7 @@ def test_a_warm_winding_has_more_resistance_on_its_line():
 
 
 def circuit(torque: Any, speed: float, motors: int = 1, warm: float = 1.0) -> float:
-    """Voltage of the battery [V] at which it gives what motors draw; torque as a function of the voltage."""
+    """Voltage [V] at which the battery delivers the power of the motors; torque as a function of the voltage."""
 
     def missing(voltage: float) -> float:
         tau = torque(voltage)
@@ -136,7 +136,7 @@ def test_a_stuck_motor_sags_the_battery_as_the_circuit_does(asked):
 
 
 def test_motors_share_a_battery():
-    """The other motor's current makes a motor weaker, both in what the circuit says."""
+    """The other motor's current makes a motor weaker, by as much as the circuit equations say."""
     motors = [Motor(name, 1.0, 100.0, motor_constant=K, friction=10.0) for name in ("sum", "difference")]
     both = replace(differential(), motors=tuple(motors), battery=BATTERY)
     expected = circuit(lambda v: v / BATTERY.nominal, 0.0, motors=2)
@@ -220,7 +220,7 @@ def test_stiff_teeth_do_not_throw_a_rotor_in_long_steps():
     stiffness = 84 * 20.0 * 0.005**2 * RATIO**2 / Model(table()).mass_matrix(np.zeros(1))[0, 0]
     assert stiffness > 100
     assert np.abs(RATIO * held["q"]).max() < 0.0051
-    assert (held["energy"] < -20 / 84 * np.cos(84 * 0.005)).all()  # what it had at first
+    assert (held["energy"] < -20 / 84 * np.cos(84 * 0.005)).all()  # the initial energy
     assert np.abs(RATIO * held["q"][-1]).max() < 1e-4
 
 
@@ -264,7 +264,7 @@ def test_a_gear_that_turns_backwards_mirrors_its_motor(asked):
 
 
 def test_ideal_motors_and_plain_ones_cost_what_they_did():
-    """Neither of them is traced where motors are ideal, and nothing of them where a robot has none."""
+    """Heat, battery and cogging are not traced for ideal motors, nor for robots without them."""
     plain = table(stuck=0.1, drive_friction=DriveFriction(load_motor=0.1))
     full = with_motor(replace(plain, battery=BATTERY), heat=HEAT, cogging=TEETH)
 

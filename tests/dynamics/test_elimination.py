@@ -1,4 +1,4 @@
-"""Rotors eliminated exactly against the general cluster algorithm, and what the levels keep."""
+"""Rotors eliminated exactly against the general cluster algorithm, and the approximations of each level."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def assert_same_dynamics(special: Model, general: Model, random_state, tolerance
     assert np.abs(ours - theirs).max() <= tolerance * np.abs(theirs).max()
     (kinetic, potential), (expected_kinetic, expected_potential) = special.energy(q, v), general.energy(q, v)
     np.testing.assert_allclose(kinetic, expected_kinetic, rtol=tolerance)
-    shift = potential - expected_potential  # constant: that of eliminated rotors on the world
+    shift = potential - expected_potential  # constant: the potential energy of eliminated rotors on the world
     np.testing.assert_allclose(shift, shift[0], atol=tolerance * np.abs(potential).max())
 
 

@@ -1,6 +1,6 @@
 """Dry friction of joints, dependent ones too, against virtual work and against MuJoCo's `frictionloss`.
 
-How it takes what it has, holds and lets go, is tested with that of rotors, in test_actuation.py.
+Sticking and sliding are tested with the friction of rotors, in test_actuation.py.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ SMOOTH = four_bar(gravity=(0, 0, 0))
 ROUGH = rubbing(SMOOTH, FRICTION)
 
 
-def test_joints_of_a_loop_take_what_they_have_as_virtual_work_says():
+def test_friction_of_joints_in_a_loop_follows_virtual_work():
     """`sum |dq_i / dy| f_i` against the motion, q_i dependent or not; the rotor's too, where the level has no rotor."""
     model, moment = Model(SMOOTH), 1e-6
     q = model.standing_q
@@ -66,8 +66,8 @@ def test_joints_of_a_loop_take_what_they_have_as_virtual_work_says():
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.01])
-def test_joints_of_a_loop_hold_it(dt: float):
-    """The sum of what they have holds the crank, which then does not move at all, or lets it go."""
+def test_friction_of_joints_in_a_loop_holds(dt: float):
+    """The crank does not move at all below the sum of all friction torques, and slides above it."""
     model, step = Model(ROUGH), stepper(ROUGH)
     most = np.abs(turning(model, model.standing_q)) @ list(FRICTION.values())
     for load, moves in ((0.3, False), (0.99, False), (-0.99, False), (1.01, True)):
@@ -101,7 +101,7 @@ def test_sliding_joints_accelerate_as_mujoco_s():
 
 
 def test_no_joint_of_many_takes_more_than_it_has():
-    """Six joints that stick, slip, let go and reverse under random torques; what friction took, by inverse dynamics."""
+    """Six joints that stick, slip and reverse under random torques; friction torques by inverse dynamics."""
     axes = [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.6, 0.8, 0.0)] * 2
     names = [f"link{i}" for i in range(6)]
     bodies = [link(name, names[i - 1] if i else None, (0.2, 0.0, 0.0), axes[i]) for i, name in enumerate(names)]

@@ -16,7 +16,7 @@ CHEETAH = {level: Model("mini_cheetah", level) for level in ("exact", "armature"
 
 
 def test_no_motion_of_the_leg_is_worse_than_the_worst_case():
-    """Torques come from inverse dynamics at rest, less gravity; the norm is that of the kinetic energy."""
+    """Torques come from inverse dynamics at rest, less gravity; the norm is the kinetic energy."""
     leg = {level: Model("mit_humanoid_leg", level) for level in LEVELS}
     exact, q = leg["exact"], leg["exact"].standing_q
     still, rng = np.zeros(5), np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Friction under load from step to step: what it goes by in a first step, and in steps made of several."""
+"""Load-dependent friction from step to step: its load in a first step, and in steps of several stages."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ DRIVE = DriveFriction(efficiency=0.7, backdriving_efficiency=0.5, load_motor=0.1
 
 
 @pytest.mark.parametrize("method", ["euler", "extrapolated"])
-def test_a_first_step_from_motion_is_no_blow(method: str):
-    """Nobody knows yet what motors carry: a step of 10 us changes velocities as little as one whose loads are known."""
+def test_a_first_step_from_motion_applies_no_impulse(method: str):
+    """With unknown loads of the motors, a step of 10 us changes velocities as little as with known loads."""
     robot = load_robot("mit_humanoid_leg")
     model = Model(replace(robot, motors=tuple(replace(motor, drive_friction=DRIVE) for motor in robot.motors)))
     function = step_function(model.mechanism, StepOptions(control="torque", motors="limited", method=method))

@@ -35,7 +35,6 @@ ROBOTS = {
     "rod_leg": rod_leg,
     "six_bar": lambda: load_robot("six_bar"),
     "tello": lambda: load_robot("tello"),
-    "tello_with_arms": lambda: load_robot("tello_with_arms"),
 }
 
 
@@ -99,7 +98,7 @@ def test_velocity_terms_follow_from_the_mass_matrix(model: Model, level: str):
 
 
 def test_armature_is_the_diagonal_of_coupled(model: Model):
-    """In clusters with one independent joint that is all of it, velocity terms included."""
+    """In clusters with one independent joint both levels are equal, velocity terms included."""
     q, v = states(model, 3)
     coupled, armature, none = (Model(model.robot, level) for level in ("coupled", "armature", "none"))
     added, diagonal = (x.mass_matrix(q) - none.mass_matrix(q) for x in (coupled, armature))

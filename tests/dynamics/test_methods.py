@@ -1,4 +1,4 @@
-"""Time-stepping methods: the order of each by a slope, what they conserve, and what friction does in a step."""
+"""Time-stepping methods: the order of each, conserved quantities, and friction within a step."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_order(method: str, exact):
 
 
 def test_extrapolation_keeps_its_order_where_a_foot_slides_and_turns():
-    """Friction goes by the load of the step before: the whole's and the halves' have to be off in the same way."""
+    """Friction uses the load of the previous step, with the same error in the whole step and in its halves."""
     material = ContactMaterial(1e4, 100.0, 0.5, 1e-3)
     inertial = Inertial(1.0, (0.0, 0.0, 0.0), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)))
     rod = Body("rod", "link", None, Placement(), Joint("free"), inertial)

@@ -1,6 +1,6 @@
 """Laws of mechanics on random mechanisms, drawn by hypothesis (mechanisms.py).
 
-Every robot is judged at states near its reference pose: eliminated rotors against rotors as bodies, both against dense
+Every robot is checked at states near its reference pose: eliminated rotors against rotors as bodies, both against dense
 numpy, forward against inverse dynamics, mass matrix and power.
 """
 
@@ -33,7 +33,7 @@ def within_reach(model: Model, q: np.ndarray) -> bool:
         raise
 
 
-def judge(recipe: Recipe) -> None:
+def check_dynamics(recipe: Recipe) -> None:
     robot = build(recipe)
     check_robot(robot)
     assume(all(c.independent or c.bodies == ("base",) for c in cluster_tree(robot).clusters))  # no part is locked
@@ -81,10 +81,10 @@ def judge(recipe: Recipe) -> None:
 @settings(REPEATABLE, max_examples=25)
 @given(recipes(loops=False))
 def test_trees_with_transmissions(recipe: Recipe):
-    judge(recipe)
+    check_dynamics(recipe)
 
 
 @settings(REPEATABLE, max_examples=20)
 @given(recipes(loops=True))
 def test_closed_loops(recipe: Recipe):
-    judge(recipe)
+    check_dynamics(recipe)

@@ -1,4 +1,4 @@
-"""The transmission report: figures that can be checked by hand, and errors that are really those of the levels."""
+"""The transmission report: figures that can be checked by hand, and errors of the levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motors at their limits in long steps: what they give is what is asked for at the end of the step, or the limit."""
+"""Motors at their limits in long steps: the torque is the commanded one at the end of the step, or the limit."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_on_the_torque_speed_line_too(inertia: float, target: float):
 @pytest.mark.slow
 @pytest.mark.parametrize(("robot", "level"), [("mini_cheetah", "exact"), ("tello", "none"), ("tello", "exact")])
 def test_no_robot_exceeds_its_limits_or_stays_below_for_nothing(robot: str, level: str):
-    """Thrown about by random targets: every torque is what is asked for at the end of the step, clipped."""
+    """Under random targets every torque is the commanded one at the end of the step, clipped."""
     model, n = Model(robot, level), 64
     sim = ce_gym.Simulator(model, n, outputs=("torque",))
     names = model.robot.independent

@@ -60,7 +60,7 @@ def test_pendulum_falls_below_its_weight_times_height_and_stands_above(tmp_path:
 
 
 def test_what_would_carry_it(tmp_path: Path) -> None:
-    """A bit less than half of what it takes: the first factor above 2 does, and it falls as a pendulum does."""
+    """With 0.45 of the necessary stiffness the first factor above 2 suffices; else the pole falls as a pendulum."""
     report = report_standing(Model(pole(tmp_path, 0.45 * TOPPLING)))
     assert report.ankles == ("foot",)
     assert report.toppling == pytest.approx(TOPPLING, rel=1e-9)

@@ -1,4 +1,4 @@
-"""Clusters whose transmissions stretch: elimination from the last coordinate on, and what it costs."""
+"""Clusters whose transmissions stretch: elimination from the last coordinate on, and its cost."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_elimination_solves_for_accelerations_and_what_is_felt(d: int):
 
 
 def test_where_links_may_touch_motion_is_the_same():
-    """With pairs of links a cluster is solved in the other order, for what is left of it is not known before."""
+    """With pairs of links, clusters are solved in the other order, because pair forces are not known before."""
     model, dt = Model("mini_cheetah", "elastic"), 0.005
     first, standing = model.robot.layout.joints_q, model.standing_q
     targets = standing[first : first + len(model.joint_links)] + np.random.default_rng(0).uniform(-0.2, 0.2, (4, 12))

@@ -1,4 +1,4 @@
-"""Motors whose torque follows what it is asked for with a finite bandwidth, against closed forms."""
+"""Motors whose torque follows its command with a finite bandwidth, against closed forms."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def run(robot: Robot, target: list[float], dt: float, steps: int, control: str) 
 
 
 def test_a_torque_rises_as_a_lag_of_first_order():
-    """In each step it goes `h / (T + h)` of what is left: `1 - exp(-t / T)` to first order."""
+    """Each step covers `h / (T + h)` of the remaining difference: `1 - exp(-t / T)` to first order."""
     dt, asked = 1e-3, 0.8
     torque = run(table(), [asked], dt, 60, "torque")["motor_torque"][:, 0]
     lag, k = 1 / (2 * np.pi * BANDWIDTH), np.arange(1, 61)
@@ -51,7 +51,7 @@ def test_a_torque_rises_as_a_lag_of_first_order():
     np.testing.assert_allclose(torque, asked / RATIO * (1 - np.exp(-k * dt / lag)), atol=0.05 * asked / RATIO)
 
 
-def test_it_goes_no_further_than_the_motor():
+def test_it_stays_within_the_torque_limit():
     torque = run(table(torque=0.05), [0.8], 1e-3, 60, "torque")["motor_torque"][:, 0]
     assert torque.max() == pytest.approx(0.05, rel=1e-12)
     assert (np.diff(torque) >= 0).all()
@@ -75,8 +75,8 @@ def test_position_control_through_it_is_that_of_the_linear_system():
     assert 1.7 < errors[1] / errors[2] < 2.3
 
 
-def test_what_it_follows_is_asked_for_at_the_end_of_the_step():
-    """However stiff: the torque goes its part of the way to what position control asks for where the step ends."""
+def test_the_command_is_that_of_the_end_of_the_step():
+    """However stiff: the torque covers its share of the way to the command at the end of the step."""
     model = Model(table())
     options = StepOptions(control="position", motors="limited")
     function = step_function(model.mechanism, options, ("motor_torque",))
@@ -90,7 +90,7 @@ def test_what_it_follows_is_asked_for_at_the_end_of_the_step():
 
 
 def test_motors_of_a_differential_lag_each_by_itself():
-    """Two rotors on two joints, of two bandwidths: torques at the joints rise as those of the motors do."""
+    """Two rotors on two joints, of two bandwidths: torques at the joints rise with the torques of the motors."""
     robot = differential()
     robot = replace(robot, motors=(Motor("sum", bandwidth=10.0), Motor("difference", bandwidth=40.0)))
     asked, dt = np.array([0.9, -0.5]), 1e-3

@@ -1,4 +1,4 @@
-"""Motors on their torque-speed lines, forwards and backwards: how what a battery gives follows from its voltage."""
+"""Motors on their torque-speed lines, forwards and backwards: how the power of a battery depends on its voltage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BATTERY = Battery(24.0, 0.4, 24.0, idle=12.0)
 
 
 def torque(voltage: float, speed: float, side: int) -> float:
-    """Of a motor on a line at a speed, up to what the current allows."""
+    """Torque of a motor on its line at a speed, up to the current limit."""
     return side * min(TORQUE, STALL * (voltage / BATTERY.nominal - side * speed / FREE))
 
 

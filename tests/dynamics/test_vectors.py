@@ -3,7 +3,7 @@
 Robots are taken from wherever the package has them: its own files, the authors' URDF+ files, the rules that make the
 scaling chains, and the published figures for robots that it does not ship. The library's own algorithms agree to 2e-12
 at worst on these states, so 1e-9 is the bar everywhere. It is needed next to singularities of small loops, where the
-library's positions are what they are to 1e-12; robots with formulas far from that, or gears only, are held to 1e-12.
+library's positions have an error of 1e-12; robots with formulas far from that, or gears only, are held to 1e-12.
 Errors are relative to the largest entry of a state, or to 1.
 """
 
@@ -87,8 +87,9 @@ CASES = {
     **figures("random_revolute_rotor_chain_4"),
     **figures("random_revolute_rotor_pair_chain_4"),
 }
-GENERAL = [  # also with every rotor a body; the large humanoids are in test_more_vectors.py
-    *("mini_cheetah, our file", "mit_humanoid_leg, our file", "tello, our file", "tello, figures"),
+GENERAL = [  # also with every rotor a body
+    *("mit_humanoid, our file", "jvrc1_symmetric, our file", "mini_cheetah, our file"),
+    *("mit_humanoid_leg, our file", "tello, our file", "tello, figures"),
     *("random_revolute_rotor_pair_chain_4, figures", "bench_revolute_rotor_b2_d3, rule"),
     *("bench_revolute_rotor_pair_b2_d2, rule", "parallel_explicit_d5_l4, rule"),
 ]

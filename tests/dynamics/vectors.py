@@ -1,4 +1,4 @@
-"""The reference states of one file in tests/data/vectors, and models of the same robot assembled like each of them.
+"""The reference states of one file in tests/data/vectors, and models of the robot assembled as in each state.
 
 The paper authors' library has its own order of bodies and its own choice of independent coordinates; both are taken
 care of here, so that a test compares like with like: positions and velocities by name, and
@@ -75,7 +75,7 @@ class Vectors:
         return np.array([state[key] for state in self.states if key in state])
 
     def is_short(self, key: str) -> bool:
-        """Whether the file does not have a quantity; only those of the scaling chains may lack some."""
+        """Whether the file lacks a quantity, which only files of scaling chains may."""
         missing = len(self[key]) == 0
         assert not missing or self.name.startswith(("bench_", "parallel_"))
         return missing

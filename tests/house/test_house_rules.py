@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -35,10 +36,16 @@ MAY_IMPORT = {
 MAY_IMPORT_THE_PACKAGE = ("viewer", "bench", "adapters")
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
 def imported_modules(path: Path) -> set[str]:
     """Return the modules that a file imports anywhere, also inside functions and for type checkers only."""
     modules = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -102,12 +109,12 @@ def test_folders_import_only_what_lies_below():
 
 
 def test_every_file_says_what_it_is():
-    assert [str(path) for path in FILES if not ast.get_docstring(ast.parse(path.read_text()))] == []
+    assert [str(path) for path in FILES if not ast.get_docstring(parsed(path))] == []
 
 
 def strings_in_code(path: Path) -> list[str]:
     """Every string of a file that is not a docstring."""
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     constants = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
     return [node.value for node in constants if id(node) not in prose]
@@ -126,7 +133,7 @@ def test_only_one_file_uses_what_some_operating_systems_lack():
     for path in [*FILES, *TRAIN.glob("*.py")]:
         if path == PACKAGE / "compile" / "system.py":
             continue
-        called = {node.attr for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute)}
+        called = {node.attr for node in ast.walk(parsed(path)) if isinstance(node, ast.Attribute)}
         assert not called & lacking, path
         assert not imported_modules(path) & modules, path
         assert not [text for text in strings_in_code(path) if "/proc/" in text], path

@@ -1,6 +1,6 @@
 """What people install: sdist and wheel are whole and small, and the wheel works by itself.
 
-The wheel goes into an empty environment, next to links to what it says it depends on and nothing else, and is used from
+The wheel goes into an empty environment, next to links to its declared dependencies and nothing else, and is used from
 another folder with its files read-only. Knows the files of the repository; `ce_gym` only as others see it.
 """
 
@@ -79,7 +79,7 @@ def sources(folder: str) -> set[str]:
 
 
 def test_wheel_has_all_code_and_assets_and_is_small(built: Path):
-    """At most 5 MB; robots and trained policies come along, benchmarks stay with the repository."""
+    """At most 5 MB; robots and trained policies are part of the wheel, benchmarks are not."""
     wheel = only(built, "*.whl")
     assert wheel.stat().st_size <= 5e6
     names = {name for name in files_of(wheel) if ".dist-info/" not in name}
@@ -94,7 +94,7 @@ def test_sdist_and_checkout_make_the_same_wheel(built: Path):
 
 
 def test_sdist_has_what_the_readme_names(built: Path):
-    """All that README links to or runs, and what these need; what a user of the checkout has written stays away."""
+    """All files that README links to or runs, and their dependencies; no files of a user of the checkout."""
     with tarfile.open(only(built, "*.tar.gz")) as archive:
         names = {name.split("/", 1)[1] for name in archive.getnames()}
     assert {name for name in names if "/" not in name} == {
@@ -113,7 +113,7 @@ def test_sdist_has_what_the_readme_names(built: Path):
 
 
 def dependencies(of: Distribution, extra: str = "", found: dict[str, Distribution] | None = None) -> dict:
-    """What a distribution needs with an extra or without, and what that needs, distributions by name."""
+    """All dependencies of a distribution, direct and indirect, with or without an extra, by name."""
     found = {} if found is None else found
     for requirement in map(Requirement, of.requires or ()):
         wanted = requirement.marker is None or requirement.marker.evaluate({"extra": extra})
@@ -141,7 +141,7 @@ def everything(folder: Path) -> dict[str, int]:
 
 @pytest.fixture(scope="module")
 def python(built: Path, tmp_path_factory) -> Iterator[Path]:
-    """Interpreter of an environment with the wheel, read-only, and what it depends on."""
+    """Interpreter of an environment with the wheel, read-only, and its dependencies."""
     venv = tmp_path_factory.mktemp("user") / "venv"
     checked([sys.executable, "-m", "venv", "--without-pip", venv])
     interpreter = venv / "bin" / "python"
@@ -180,7 +180,7 @@ def test_the_wheel_steps_an_environment(python: Path, elsewhere: dict, home: Pat
 
 
 def linked(python: Path, extra: str, folder: Path) -> str:
-    """A folder with links to what an extra asks for."""
+    """A folder with links to the packages of an extra."""
     folder.mkdir()
     site = only(python.parents[1], "lib/python*/site-packages")
     for one in dependencies(Distribution.at(only(site, "ce_gym-*.dist-info")), extra).values():
@@ -189,7 +189,7 @@ def linked(python: Path, extra: str, folder: Path) -> str:
 
 
 def test_the_wheel_trains(python: Path, elsewhere: dict, tmp_path: Path):
-    """As the page about other learners does it, with what the extra asks for."""
+    """As the page about other learners does it, with the packages of the extra."""
     pytest.importorskip("stable_baselines3")
     elsewhere["env"]["PYTHONPATH"] = linked(python, "train", tmp_path / "extra")
     (code,) = (

@@ -1,4 +1,4 @@
-"""Steps that adapt: the error that is asked for, robots that do not know of each other, nothing that never ends."""
+"""Adaptive steps: the error meets the tolerance, robots do not affect each other, and every step ends."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_a_robot_in_the_air_makes_few_steps_while_another_lands():
 
 
 def test_who_cannot_meet_the_tolerance_is_counted_and_goes_on():
-    """In single precision rounding alone is more than is asked for; steps end at the shortest length."""
+    """In single precision rounding alone exceeds the tolerance; steps end at the shortest length."""
     heights = np.array([0.0, 1.0])
     sim = Simulator(ball(), 2, INTERVAL, "float32", method="adaptive", tolerance=1e-9, outputs=())
     falling(sim, heights)
@@ -143,7 +143,7 @@ def test_who_diverges_is_frozen_and_no_step_hangs():
 
 
 def test_means_are_over_the_whole_interval():
-    """What the ground gave is the change of momentum, through an impact in steps of many lengths."""
+    """The mean contact force is the change of momentum, through an impact in steps of many lengths."""
     sim = Simulator(ball(100.0), 1, INTERVAL, method="adaptive", tolerance=1e-5)
     falling(sim, np.array([0.01]))
     gained = 0.0
@@ -174,7 +174,7 @@ def test_copies_go_on_alike():
 
 
 def test_a_state_that_is_set_begins_with_a_step_of_its_own():
-    """What was before does not count."""
+    """Earlier steps have no effect."""
     model, target = Model(TRIPOD), Model(TRIPOD).standing_q[7:] + 0.2
     sim = Simulator(model, 1, INTERVAL, method="adaptive")
     q, v, ends = sim.q, sim.v, []

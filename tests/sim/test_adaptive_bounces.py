@@ -85,7 +85,7 @@ class Bounces:
         return state
 
     def simulator(self, tolerance: float) -> Simulator:
-        """Return all of them at the start."""
+        """Return a simulator of all bodies at the start."""
         inertia = tuple(tuple(row) for row in self.inertia * np.eye(3))
         body = Body("body", "link", None, Placement(), Joint("free"), Inertial(1.0, (0.0, 0.0, 0.0), inertia))  # type: ignore[arg-type]
         contacts = tuple(ContactSphere(f"sphere_{x}", "body", (x, 0.0, 0.0), RADIUS) for x in self.spheres)

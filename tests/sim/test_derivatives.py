@@ -37,7 +37,7 @@ def apart(q: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 class Differences:
-    """Central differences of steps with everything that a robot carries."""
+    """Central differences of steps with the whole state of a robot."""
 
     def __init__(self, sim: Simulator, target: np.ndarray, n_substeps: int = 1) -> None:
         self.sim, self.target, self.n = sim, target, n_substeps
@@ -74,7 +74,7 @@ class Differences:
 def dropped(n: int = 24) -> tuple[Simulator, np.ndarray]:
     """Robots that stand, slide, and fly, some time after a drop, and targets that not all motors can follow."""
     model = Model(TRIPOD)
-    sim = Simulator(model, n, contacts="foot", outputs=())
+    sim = Simulator(model, n, contacts="foot", outputs=("contact_forces",))
     rng = np.random.default_rng(5)
     q = np.tile(model.standing_q, (n, 1)) + rng.normal(0, 0.05, (n, model.nq)) * (np.arange(model.nq) > 6)
     q[:, 2] += np.linspace(-0.01, 0.05, n)
@@ -86,10 +86,10 @@ def dropped(n: int = 24) -> tuple[Simulator, np.ndarray]:
 
 
 def standing(n: int = 9) -> tuple[Simulator, np.ndarray]:
-    """Robots of many joints that all stand and sway, a little different from each other."""
-    model, rng = Model("mini_cheetah"), np.random.default_rng(7)
-    sim = Simulator(model, n, contacts="foot")
-    target = model.standing_q[7:] + rng.normal(0, 0.05, (n, 12))
+    """Robots that all stand and sway, a little different from each other."""
+    model, rng = Model(TRIPOD), np.random.default_rng(7)
+    sim = Simulator(model, n, contacts="foot", outputs=("contact_forces",))
+    target = model.standing_q[7:] + rng.normal(0, 0.05, (n, 2))
     sim.step(target, 100)
     sim.set_state(sim.q, sim.v + rng.normal(0, 0.02, (n, model.nv)))  # as if it had just been pushed
     sim.step(target, 10)
@@ -192,7 +192,7 @@ def test_linearizations_of_the_whole_state_chain_through_contact():
     differences.restore()
     chain, without = chained(derivatives, target, 20)
     assert errors(chain[:, : 2 * nv, : 2 * nv], theirs).max() < 1e-5
-    assert errors(without, theirs).max() > 0.1  # loads held as they are
+    assert errors(without, theirs).max() > 0.1  # loads held constant
 
 
 def chained(derivatives: StepDerivatives, target: np.ndarray, n_substeps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -234,7 +234,7 @@ def test_dry_friction_of_joints_that_stick_and_slip():
     sim = Simulator(model, 11, control="torque", outputs=())
     q, target = model.standing_q + rng.normal(0, 0.1, (11, 2)), rng.normal(0, 2, (11, 2))
     v = rng.choice([-1.0, 1.0], (11, 2)) * rng.uniform(0.5, 3, (11, 2))
-    v[:5] = 0.0  # these stick, or have just been let go
+    v[:5] = 0.0  # these stick, or have just been released
     sim.set_state(q, v)
     differences, derivatives = Differences(sim, target), StepDerivatives(sim)
     moved = np.abs(differences.center[0] - q).max(1)
@@ -333,7 +333,7 @@ def test_linearize_on_a_slope():
     assert errors(A, np.stack(theirs, axis=2)).max() < 1e-6
 
 
-def test_what_is_not_kept_is_made_again():
+def test_dropped_records_are_recomputed():
     every, some = (StepDerivatives(sliding_block(), keep_every=k) for k in (1, 4))
     for derivatives in (every, some):
         derivatives.step(np.zeros(0), 6)
@@ -350,7 +350,7 @@ def test_what_is_not_kept_is_made_again():
     assert ours["q"][0].any()
 
 
-def test_what_cannot_be_differentiated_is_said():
+def test_bad_arguments_are_named():
     model = Model("planar_leg_linkage")
     with pytest.raises(ValueError, match="keep_every=0; expected a whole number, at least 1"):
         StepDerivatives(Simulator(model), keep_every=0)

@@ -1,4 +1,4 @@
-"""`Simulator(device=...)`: what a GPU would compute, by the processor from the emitted source: the same numbers."""
+"""`Simulator(device=...)`: the emitted CUDA source, run by the processor, computes the same numbers."""
 
 import numpy as np
 import pytest

@@ -26,7 +26,7 @@ def held_leg(share: float) -> Model:
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_leg_is_held_to_the_bit(dtype: str):
-    """At 0.99 of what friction has nothing moves in ten minutes; at 1.01 the leg falls."""
+    """At 0.99 of the dry friction nothing moves in ten minutes; at 1.01 the leg falls."""
     sim = Simulator(held_leg(0.99), 1, DT, dtype, control="torque", motors="limited", outputs=())
     start = sim.q.copy()
     sim.step(np.zeros(5), 60_000)
@@ -42,7 +42,7 @@ def test_a_leg_is_held_to_the_bit(dtype: str):
 def test_a_stretching_leg_comes_to_rest_and_stays(share: float, method: str):
     """Rotors stand; joints settle on their springs, and then nothing moves in a minute.
 
-    Methods that extrapolate leave in `v` what the equilibria of a whole step and of its halves differ by.
+    With extrapolation `v` keeps the difference between the equilibria of a whole step and of its halves.
     """
     robot = held_leg(share).robot
     stretches = tuple(Elasticity(motor.rotor, 20.0, 0.05) for motor in robot.motors)
@@ -68,7 +68,7 @@ def loaded_leg(share: float) -> tuple[Model, np.ndarray]:
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_leg_is_held_by_friction_under_load(dtype: str):
-    """Motors at half of what it takes, and friction that takes the other half: the same bars, from the first step."""
+    """Motors carry half of the load and friction the other half: the same bounds, from the first step."""
     model, half = loaded_leg(0.99)
     sim = Simulator(model, 1, DT, dtype, control="torque", motors="limited", outputs=())
     start = sim.q.copy()
@@ -83,7 +83,7 @@ def test_a_leg_is_held_by_friction_under_load(dtype: str):
 
 @pytest.mark.parametrize("method", ["euler", "extrapolated", "adaptive"])
 def test_robots_with_friction_under_load_keep_to_themselves(method: str):
-    """In a batch, whose tiles iterate together, each does what it does alone, bit for bit; held, slipping, driven."""
+    """In a batch, whose tiles iterate together, each robot moves as alone, bit for bit: held, slipping, driven."""
     model, half = loaded_leg(0.99)
     rng = np.random.default_rng(0)
     targets = half * rng.uniform(0.0, 2.5, (8, 5))

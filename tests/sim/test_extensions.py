@@ -124,7 +124,7 @@ def wheel() -> Model:
 
 
 def test_a_motor_model(monkeypatch: pytest.MonkeyPatch):
-    """A wheel runs up to the speed at which its motor loses all that is asked for."""
+    """A wheel runs up to the speed at which its motor loses the whole commanded torque."""
     monkeypatch.setitem(MOTORS, "windage", Windage())
     sim = Simulator(wheel(), 1, DT, control="torque", motors="windage")
     sim.step([0.9], 2000)
@@ -161,7 +161,7 @@ def test_an_integrator(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_changed_law_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
-    """Kernels of laws of others are kept by what the laws trace to, not by their names."""
+    """Kernels of user-defined laws are cached by their expressions, not by their names."""
     keys = []
     for drag in (1.0, 2.0, 1.0):
         law = Windage()

@@ -54,7 +54,7 @@ def test_a_bad_number_anywhere_is_flagged_and_stays_in_its_lane(model: Model, na
 def test_a_robot_out_of_bounds_is_frozen_at_its_last_good_state(model: Model):
     sim = in_the_air(model)
     v = sim.v
-    v[BAD, 3] = 9.9e3  # m/s, and a spin that turns the whole of it into accelerations
+    v[BAD, 3] = 9.9e3  # m/s, and a spin that turns this speed into accelerations
     v[BAD, 0] = 9.9e3
     sim.set_state(sim.q, v)
     target = model.standing_q[7:]
@@ -90,7 +90,7 @@ def alone_in_parts(model: Model, q: np.ndarray, v: np.ndarray, dt: float, smalle
 
 @pytest.mark.parametrize("method", ["euler", "extrapolated", "rk4"])
 def test_a_robot_that_goes_too_far_makes_its_step_in_parts(model: Model, method: str):
-    """It does, to the last bit, what it would do alone with steps of those lengths; the others notice nothing."""
+    """It moves, to the last bit, as alone with steps of those lengths; the other robots do not change."""
     target = model.standing_q[7:]
     sims = [in_the_air(model, dt=0.01, method=method, retry=retry) for retry in (4, 0)]
     for sim in sims:

@@ -10,6 +10,7 @@ import threading
 
 import numpy as np
 import pytest
+from tripod import TRIPOD
 
 from ce_gym import Model, Simulator
 from ce_gym.sim import interruptible_runs
@@ -45,7 +46,7 @@ print("alive")
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return Model("mini_cheetah")
+    return Model(TRIPOD)
 
 
 def moving(model: Model, **options) -> Simulator:
@@ -63,13 +64,13 @@ def seen(sim: Simulator) -> bytes:
 
 
 def watch(sim: Simulator, monkeypatch: pytest.MonkeyPatch, interrupted: int = 0, meanwhile=lambda: None) -> list[int]:
-    """Have calls made in pieces of three sub-steps, and Ctrl-C come in one of them.
+    """Split calls into pieces of three sub-steps, and send Ctrl-C during one piece.
 
     Args:
         sim: What makes the calls.
         monkeypatch: Undoes it.
         interrupted: Number of the piece, from 1.
-        meanwhile: What else to do in each piece.
+        meanwhile: Called in each piece.
 
     Returns:
         The lengths of the pieces, to be looked at later.
@@ -90,7 +91,7 @@ def watch(sim: Simulator, monkeypatch: pytest.MonkeyPatch, interrupted: int = 0,
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are sent otherwise here")
 def test_no_memory_is_freed_that_a_thread_still_writes_to():
-    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}  # what is freed is gone at once
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}  # freed memory is returned immediately
     command = [sys.executable, "-c", FREED_TOO_EARLY]
     finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (finished.returncode, finished.stdout) == (0, "alive\n"), finished.stderr
@@ -176,7 +177,7 @@ def test_a_second_thread_is_refused(model: Model, call: str, monkeypatch: pytest
 
     watch(sim, monkeypatch, meanwhile=meanwhile)
     sim.step(model.standing_q[7:])
-    assert errors == ["Simulator of 12 mini_cheetah: called during another call, expected one call at a time"]
+    assert errors == ["Simulator of 12 tripod: called during another call, expected one call at a time"]
     for _ in range(2):
         twin.step(model.standing_q[7:])
     assert seen(sim) == seen(twin)

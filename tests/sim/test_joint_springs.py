@@ -87,7 +87,7 @@ def test_a_passive_joint_has_its_stops():
 
 @pytest.mark.parametrize(("speed", "furthest"), [(8.0, 0.2), (-8.0, -0.1)])
 def test_a_dependent_joint_has_its_stops(speed: float, furthest: float):
-    """Those of the fast wheel are the slow one's at a third of the angle, and nine times as stiff."""
+    """A stop of the fast wheel acts on the slow one at a third of the angle, nine times as stiff."""
     at_slow = thrown_against_stops(speed, {"position": (-0.1, 0.2), "torque": 18.0}, {})
     at_fast = thrown_against_stops(speed, {}, {"position": (-0.3, 0.6), "torque": 2.0})
     np.testing.assert_allclose(at_fast, at_slow, rtol=1e-12, atol=1e-12)

@@ -53,7 +53,7 @@ def test_where_no_joint_has_a_torque_those_with_springs_are_passive():
 @pytest.mark.parametrize("control", ["position", "torque", "motor_position", "motor_torque"])
 @pytest.mark.parametrize("motors", ["ideal", "limited"])
 def test_no_target_moves_it(level: str, control: Control, motors: str):
-    """It swings as in closed form whatever it is told, even by a gain that is declared; the arm does as it is told."""
+    """It swings as in closed form for any target and any declared gain; the arm follows its target."""
     model = ce_gym.Model(pair(), level)
     parameters = ("kp",) if control == "position" else ()
     options: dict[str, Any] = {
@@ -90,7 +90,7 @@ def test_mjcf_has_no_actuator_of_it():
 
 
 def test_it_is_passive_again_when_mjcf_is_read_back(tmp_path):
-    """So is every joint that no actuator of a file drives, with or without a spring; without any actuator, none is."""
+    """Every joint without an actuator is passive, with or without a spring; in a file without actuators no joint is."""
     pytest.importorskip("mujoco")
     path = tmp_path / "pair.xml"
     path.write_text(to_mjcf(pair(), "none"))

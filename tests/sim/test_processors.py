@@ -27,11 +27,11 @@ for robot, dtype in itertools.product(({tripod!r}, "six_bar"), ("float64", "floa
 """
 
 HASWELL = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"}
-"""What makes numpy and its linear algebra do as on a processor of 2013."""
+"""Makes numpy and its linear algebra compute as on a processor of 2013."""
 
 
 def hashes(folder, cpu="", **environment):
-    """What the script prints in a process of its own: one line for each robot and type."""
+    """Output of the script in a process of its own: one line for each robot and type."""
     given = os.environ | {"CE_GYM_CACHE_DIR": str(folder)} | environment
     code = SCRIPT.format(tripod=TRIPOD, cpu=cpu)
     done = subprocess.run([sys.executable, "-c", code], env=given, capture_output=True, text=True, timeout=300)

@@ -160,9 +160,9 @@ def test_a_block_on_a_slope_does_not_creep():
 
 
 def largest_gain(robot: Robot, time: float, method: str) -> float:
-    """Return how far an undamped mechanism rises above its energy at 1 ms, as a share of what it can lose.
+    """Return how far an undamped mechanism rises above its energy at 1 ms, as a share of its potential energy.
 
-    It is let go with its first two joints at a right angle to gravity.
+    It is released with its first two joints at a right angle to gravity.
     """
     sim = simulator(robot, 0.001, method=method)
     n = len(robot.independent)

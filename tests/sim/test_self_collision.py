@@ -1,4 +1,4 @@
-"""Links that push each other apart, against dense solves, closed forms and balances; and what is near alone."""
+"""Links that push each other apart, against dense solves, closed forms and balances."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_two_balls_rebound_as_a_reduced_mass_on_a_spring():
 
 
 def test_forces_of_several_pairs_against_a_dense_solve():
-    """From rest: M v+ = dt J^T lam with lam = k d - (c + dt k) J v+, J by differences; no momentum comes of it."""
+    """From rest: M v+ = dt J^T lam with lam = k d - (c + dt k) J v+, J by differences; momentum is conserved."""
     dt = 0.004
     first = tripod()
     robot = tripod(beside_the_hand(first, -0.004, (1, 0.3, 0.2), 0.02), beside_the_hand(first, -0.002, (0.2, -1, 0.1)))

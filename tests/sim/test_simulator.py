@@ -95,22 +95,6 @@ def test_single_precision_follows_double(model: Model, start):
     assert np.abs(double.q - single.q).max() < 1e-3
 
 
-def test_a_bad_number_stays_in_its_lane(model: Model, start):
-    q, v, target = start
-    clean = run(model, start)
-    sim = Simulator(model, len(q))
-    sim.set_state(q, v)
-    sim._arrays["v"][1, 7, 3] = np.nan  # lane 11 in double precision
-    sim.step(target, 10)
-    assert np.flatnonzero(sim.diverged).tolist() == [11]
-    others = np.arange(len(q)) != 11
-    np.testing.assert_array_equal(sim.q[others], clean.q[others])
-    sim.reset(sim.diverged)
-    assert not sim.diverged.any()
-    sim.step(target, 10)
-    assert np.isfinite(sim.q).all()
-
-
 def test_partial_reset_leaves_the_others(model: Model, start):
     sim = run(model, start)
     before = sim.q
@@ -128,12 +112,8 @@ def test_state_is_a_copy(model: Model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("robot", "dt", "stiffness", "dtype"),
-    [*itertools.product((TRIPOD,), (0.0005, 0.01), (1e4, 1e6), DTYPES), ("mini_cheetah", 0.01, 1e6, "float32")],
-)
-def test_dropped_robots_come_to_rest(robot: str, dt: float, stiffness: float, dtype: str):
-    model = Model(robot)
+@pytest.mark.parametrize(("dt", "stiffness", "dtype"), itertools.product((0.0005, 0.01), (1e4, 1e6), DTYPES))
+def test_dropped_robots_come_to_rest(model: Model, dt: float, stiffness: float, dtype: str):
     sim = Simulator(model, 8, dt=dt, dtype=dtype, material=ContactMaterial(stiffness, 500.0, 0.8))
     q = np.tile(model.standing_q, (8, 1))
     q[:, 2] += np.linspace(0.01, 0.3, 8)

@@ -24,7 +24,7 @@ def model() -> Model:
 
 @pytest.fixture(scope="module")
 def sim(model: Model) -> Simulator:
-    """Robots under way, one of them frozen; with parameters, and on a field."""
+    """Moving robots, one frozen; with parameters, and on a field."""
     sim = Simulator(model, 11, terrain=Terrain.rough(0, 0.02), parameters=("friction", "kp"), retry=1)
     sim.set_parameter("friction", np.linspace(0.4, 0.9, 11)[:, None])
     v = np.random.default_rng(0).normal(0, 0.5, (11, model.nv))
@@ -36,7 +36,7 @@ def sim(model: Model) -> Simulator:
 
 
 def goes_on_like(one: Simulator, other: Simulator) -> None:
-    """Both step on alike; the count of failures and what was set are the same too."""
+    """Both step on alike; counts of failures and parameters are the same too."""
     target = one.model.standing_q[7:] + 0.1
     for each in (one, other):
         each.step(target, 5)
@@ -105,7 +105,7 @@ def test_the_schema_is_what_the_kernel_has(robot: str):
 
 
 def test_the_schema_is_what_the_sub_steps_need(sim: Simulator, model: Model):
-    """Likewise with parameters, on a field, with an error estimate, before anything is compiled."""
+    """With parameters, on a field, with an error estimate, before anything is compiled."""
     outputs = ("torque", "error")
     sizes, *_ = substeps(model.mechanism, sim.options, outputs)
     rows = {row.name: row.size for row in physics_rows(model, sim.options, outputs, sim.dt)}

@@ -44,7 +44,7 @@ def simulator(robot: Robot, dt: float, **options) -> ce_gym.Simulator:
 def test_weight_rests_on_a_stop(
     kind: Literal["revolute", "prismatic"], torque: float, sag: float, mass: float, length: float, dt: float
 ):
-    """However it came there, let go or thrown, it comes to rest where the stop's stiffness says."""
+    """Released or thrown, it comes to rest where the stop's stiffness carries the weight."""
     sim, n = simulator(arm(kind, mass, length, torque), dt), round(3.0 / dt)
     stiffness, _ = stop_springs(sim.model.mechanism)["arm"]
     for speed in (0.0, 5.0):

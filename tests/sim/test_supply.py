@@ -73,7 +73,7 @@ def test_explicit_methods_are_refused():
 
 
 def test_extrapolation_agrees_with_short_steps():
-    """What follows a step at its end is that of its last stage."""
+    """Heat and battery are updated once per step, from its last stage."""
     coarse, fine = simulator(method="extrapolated", n=1), simulator(n=1)
     target = coarse.model.standing_q[: len(coarse.model.joint_links)] + 0.1
     coarse.step(target, 20)

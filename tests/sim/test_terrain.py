@@ -1,4 +1,4 @@
-"""Ground that is not flat: the surface, what the kernel makes of it, slopes, rolling, standing, bad arguments."""
+"""Ground that is not flat: the surface, its look-up in kernels, slopes, rolling, standing, bad arguments."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_function_is_sampled_where_it_should_be():
     np.testing.assert_allclose(terrain.at(x, y)[:, 0], 0.3 * x - 0.2 * y + 0.05 * x * y, atol=1e-12)
 
 
-# What the kernel makes of it
+# Look-up in kernels
 
 
 def start(count: int, terrain: Terrain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -226,8 +226,8 @@ def test_a_block_slides_and_sticks_as_coulomb_says(angle: float):
 def test_bumps_give_no_energy(radius: float, mu: float):
     """Points and balls that bounce and roll over many cells, from patch to patch.
 
-    The ground under a contact is a plane for the length of a step, so what energy it can gain on a curve falls with the
-    step; and it is a small part of what a ball has.
+    The ground under a contact is a plane for the length of a step, so the energy gained on a curve falls with the
+    step; and it is a small part of the ball's energy.
     """
     terrain, model = Terrain.rough(1, 0.02, cell=0.1, size=12.0), Model(ball(radius, mu))
     gains = []

@@ -31,7 +31,7 @@ SOUND, REFUSED = "sound robot", "refused in one line"
 
 
 def case(seed: int, folder: Path) -> tuple[str, str]:
-    """Write the files of one case and load them; returns the format and what became of it."""
+    """Write the files of one case and load them; returns the format and the outcome."""
     rng = random.Random(seed)
     kind = rng.choice(tuple(FORMATS))
     path = FORMATS[kind](rng, folder)
@@ -39,7 +39,7 @@ def case(seed: int, folder: Path) -> tuple[str, str]:
 
 
 def outcome_of(path: Path) -> str:
-    """Load a robot and judge it."""
+    """Load a robot and check its dynamics."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

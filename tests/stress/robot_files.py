@@ -70,7 +70,7 @@ def outcome(path: Path) -> Outcome:
 
 
 def _is_gear(robot: Robot, tie: str) -> bool:
-    """Whether a tie is that of a rotor which the reader has made of armature."""
+    """Whether a constraint belongs to a rotor that the reader has made from armature."""
     return any(rotor.name == tie and rotor.inertial.mass == 0.0 for rotor in robot.rotors())
 
 
@@ -111,7 +111,7 @@ def _mujoco(path: Path, robot: Robot, q: Array, v: Array, tau: Array) -> Dynamic
     mujoco.mj_fullM(mj, data, M)
     M = to_theirs.T @ M @ to_theirs
     acceleration = np.linalg.solve(M, tau - to_theirs.T @ data.qfrc_bias)
-    if free:  # ours is that of the body's own frame
+    if free:  # our acceleration is in the body's own frame
         acceleration[3:6] -= np.cross(v[:3], v[3:6])
     moving = [b for b in range(1, mj.nbody) if mj.body_weldid[b] != 0]
     return float(sum(mj.body_mass[moving])), M, acceleration

@@ -1,7 +1,7 @@
 """Calls in any order on a batch of robots, beside some of the robots in batches of their own: the states are the same.
 
-Steps, resets and states of some robots, divergence, refused calls, snapshots, copies. Whatever is asked of one robot,
-the others go on as if they were alone; nothing but NaN at the input of a refused call is ever not finite.
+Steps, resets and states of some robots, divergence, refused calls, snapshots, copies. Calls on one robot do not affect
+the others; nothing but NaN at the input of a refused call is ever not finite.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Beside:
     """A batch of robots and those that are watched by themselves; each operation is done to both.
 
     Args:
-        batch: All of them.
-        alone: Batches of one, by the place in the large one.
+        batch: All robots.
+        alone: Batches of one robot, by the place in the large one.
     """
 
     OF_CALLS: tuple[str, ...] = ()
@@ -120,7 +120,7 @@ class Simulators(Beside):
         self.place(rng, TOO_FAST)
 
     def refused(self, rng: np.random.Generator) -> None:
-        """Ask for what is refused."""
+        """Make calls that must be refused."""
         expect_refusal(lambda: self.batch.step(np.full(len(self.model.robot.independent), np.nan)))
         expect_refusal(lambda: self.batch.set_state(np.zeros(self.model.nq + 1), np.zeros(self.model.nv)))
 
@@ -172,7 +172,7 @@ class Environments(Beside):
             envs.batch.write("v", v)
 
     def refused(self, rng: np.random.Generator) -> None:
-        """Ask for what is refused."""
+        """Make calls that must be refused."""
         expect_refusal(lambda: self.batch.step(np.full(self.batch.action_space.shape, np.nan)))
         expect_refusal(lambda: self.batch.reset(options={"reset_mask": np.ones(N + 1, bool)}))
 
@@ -204,7 +204,7 @@ def carry_out(beside: Beside, calls: Sequence[tuple[str, int]]) -> None:
     """Carry out operations by name from the beginning, each with a seed, and compare after each.
 
     Raises:
-        AssertionError: If a robot of the batch is not as it is alone.
+        AssertionError: If a robot of the batch differs from the robot alone.
     """
     beside.begin()
     for name, seed in calls:

@@ -35,13 +35,13 @@ class Case:
     """Something that steps, and its twin.
 
     Attributes:
-        name: Of what it is, and on how many threads.
-        pair: What is interrupted, and its twin.
-        step: Makes a step of one of them, given what is random about it.
-        look: Returns all that can be seen of its state, by name.
-        draw: Draws what is random about a step.
-        before, after: How often a call had not been made after Ctrl-C, and how often it had.
-        complaints: What was not as it should be, one line each.
+        name: Name, with the number of threads.
+        pair: The interrupted simulator or environment, and its twin.
+        step: Makes a step of either, given random inputs.
+        look: Returns its visible state, by name.
+        draw: Draws random inputs of a step.
+        before, after: Interrupted calls that were undone, and calls that were completed.
+        complaints: Errors found, one line each.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Case:
     complaints: list[str] = field(default_factory=list)
 
     def interrupt(self, rng: np.random.Generator) -> None:
-        """Interrupt one step at a random moment, and judge what it has left behind."""
+        """Interrupt one step at a random moment, and check the state that it leaves."""
         subject, twin = self.pair
         before, given = self.look(twin), self.draw(rng)
         started = time.perf_counter()
@@ -103,7 +103,7 @@ def long_steps(threads: int) -> Case:
 
 
 def simulators(name: str, threads: int, n_substeps: int) -> Case:
-    """Return two simulators of a robot that is asked for random positions about its standing pose."""
+    """Return two simulators of a robot under random targets about its standing pose."""
     from ce_gym import Model, Simulator
 
     model = Model(ROBOT)

@@ -1,10 +1,10 @@
 """Random actions on every environment in turn, for minutes, with failures put in; memory and counts must stay right.
 
 Every environment gets a batch with episodes short enough to end by every cause: time, falls, and divergence, which is
-put in by writing a number that is not one into the velocity of a robot now and then. Checked are, beside that nothing
-raises: all that comes out is finite; exactly the robots that were spoilt are flagged, and the counts agree; sums and
-lengths belong to the episodes; and after three rounds through all environments the process does not grow any more, nor
-hold more threads and files (sockets are files), though every other environment is dropped without `close`.
+put in by writing a number that is not one into the velocity of a robot now and then. Nothing
+may raise, and all results must be finite. Exactly the robots made to diverge are flagged, and counts agree. Sums and
+lengths belong to their episodes. After three rounds through all environments the process no longer grows, nor holds
+more threads and files (sockets are files), though every other environment is dropped without `close`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Account:
         episodes: Episodes that have ended.
         spoilt: Robots that were made to diverge.
         diverged: Robots that were flagged.
-        complaints: What was not as it should be, one line each.
+        complaints: Errors found, one line each.
     """
 
     steps: int = 0
@@ -69,7 +69,7 @@ def test_an_environment_for_seconds():
 
 
 def soaked(accounts: dict[str, Account], minutes: float) -> None:
-    """Go through environments until time is up, at least `WARM_UP + 1` times, and judge what came of it."""
+    """Go through environments until time is up, at least `WARM_UP + 1` times, and check all accounts."""
     rng, memory, held = np.random.default_rng(0), list[float](), list[int]()
     end = time.monotonic() + 60 * minutes
     while len(memory) <= WARM_UP or time.monotonic() < end:
@@ -91,7 +91,7 @@ def resident_memory() -> float:
 
 
 def soak(env_id: str, steps: int, rng: np.random.Generator, account: Account) -> None:
-    """Take `steps` control steps in a fresh batch of one environment, and keep account of them."""
+    """Take `steps` control steps in a fresh batch of one environment, and count errors and episodes."""
     mode = str(rng.choice(["SameStep", "NextStep"]))
     made: dict[str, Any] = {"num_envs": NUM_ENVS, "max_episode_steps": EPISODE, "num_threads": int(rng.integers(1, 3))}
     envs: Any = gymnasium.make_vec(env_id, autoreset_mode=mode, **made).unwrapped
@@ -119,7 +119,7 @@ def soak(env_id: str, steps: int, rng: np.random.Generator, account: Account) ->
     account.diverged += diverged
     if envs.n_diverged != diverged:
         account.complaints.append(f"{env_id}: n_diverged is {envs.n_diverged} after {diverged} flags")
-    if rng.random() < 0.5:  # others are dropped as they are
+    if rng.random() < 0.5:  # others are dropped without closing
         envs.close()
 
 
@@ -135,7 +135,7 @@ def spoil(envs: Any, rng: np.random.Generator, spared: NDArray[np.bool_]) -> NDA
 def inconsistent(
     terms: dict[str, NDArray], over: NDArray[np.bool_], length: NDArray, spoilt: NDArray[np.bool_]
 ) -> list[str]:
-    """Return what is wrong with the statistics of the episodes that have just ended."""
+    """Return errors in the statistics of the episodes that have just ended."""
     wrong = []
     if not np.array_equal(terms["length"], length * over):
         wrong.append(f"lengths {terms['length'][over]} of episodes of {length[over]}")

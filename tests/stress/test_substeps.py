@@ -42,7 +42,7 @@ class Case:
         robot, level, dtype, control: Which.
         steps: Sub-steps of robots.
         diverged: Robots that diverged and were not made to.
-        complaints: What was not as it should be, one line each.
+        complaints: Errors found, one line each.
     """
 
     robot: str
@@ -86,7 +86,7 @@ class Case:
         return rng.uniform(low, high, (NUM_ENVS, len(joints)))
 
     def look(self, batch: Any, alone: Any) -> None:
-        """Judge what a call has left."""
+        """Check the state after a call."""
         for name in ("q", "v", "torque", "contact_forces", "diverged"):
             whole, part = getattr(batch, name), getattr(alone, name)
             if not np.isfinite(whole).all():

@@ -10,7 +10,7 @@ from torch import distributed
 
 
 class Watched(AveragedPPO):
-    """Keeps what it averages, before and after."""
+    """Keeps gradients before and after averaging."""
 
     def average(self, values):
         before = values.copy()
@@ -26,7 +26,7 @@ def free_port():
 
 
 def learn(job, port, rank, count, iterations):
-    """Learn for some iterations, go on from what came of it for another; return what a test wants to see."""
+    """Learn for some iterations, restore the result into another learner; return both for a test."""
     point, patience = f"tcp://127.0.0.1:{port}", timedelta(seconds=120)
     distributed.init_process_group("gloo", init_method=point, rank=rank, world_size=count, timeout=patience)
     mine = share(job, rank, count)

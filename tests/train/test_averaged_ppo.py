@@ -8,27 +8,15 @@ import numpy as np
 import pytest
 from averaged_ppo import share
 from fast_ppo import FastPPO
-from job import Job
 from meeting import free_port, learn
-from point_mass import ID
 from run_learner import environments
-from settings import SettingsError, config_file, load_settings
-
-SMALL = [
-    "num_envs=64",
-    "rollout=16",
-    "hidden=[16]",
-    "epochs=4",
-    "minibatches=2",
-    "learning_rate=1e-2",
-    "target_kl=0.02",
-]
-SMALL += ["gamma=0.9", "training={}", "steps=20480"]
+from settings import SettingsError
+from toy import job as toy_job
 
 
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
-    return Job(ID, load_settings(config_file(ID), SMALL), tmp_path_factory.mktemp("run"), {})
+    return toy_job(tmp_path_factory.mktemp("run"), 20480, settings=["target_kl=0.02"])
 
 
 @pytest.fixture(scope="module")

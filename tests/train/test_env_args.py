@@ -30,7 +30,7 @@ def arguments_of(*words):
 
 
 def test_arguments_of_the_command_line_hold_while_training():
-    """Mappings are merged with those of the settings file, by key; another value takes their place."""
+    """Mappings are merged with the settings file by key; other values replace its values."""
     words = ["--set", "training={rewards: {near: 2.0, gait: 1.0}, push_period: 2.0, latency: [0, 1]}"]
     words += ["--env-arg", "rewards={near: 0.5}", "--env-arg", "push_period=0"]
     (job,) = jobs(parser().parse_args(["--env", ID, *words]))

@@ -1,4 +1,4 @@
-"""Iterative LQR: what it finds is stationary, its feedback helps, and a jump of a small robot is planned and shown."""
+"""Iterative LQR: its plan is stationary, its feedback helps, and a jump of a small robot is planned and shown."""
 
 import json
 

@@ -38,7 +38,7 @@ def run(layers, kind, x):
 
 
 def close(layers, gradient, sizes):
-    """Whether a vector of derivatives is that of torch, and is zero where it is padded."""
+    """Check that a vector of derivatives equals torch's, and is zero where it is padded."""
     rest = gradient.copy()
     for (weight, bias), (w, b) in zip(layers_of(rest, sizes), layers, strict=True):
         np.testing.assert_allclose(weight, w.grad.numpy(), atol=2e-5, rtol=2e-4)

@@ -1,4 +1,4 @@
-"""The settings for RL Zoo are understood by the learner and are those of our own settings files."""
+"""The settings for RL Zoo are understood by the learner and equal our own settings files."""
 
 from pathlib import Path
 

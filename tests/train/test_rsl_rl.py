@@ -12,12 +12,10 @@ from evaluate import main as evaluate_main
 from point_mass import ID
 from rsl_rl_ppo import actor_of, main, record_of, train
 from settings import config_file, load_settings
+from toy import SMALL
 
 from ce_gym.adapters.rsl_rl import make_rsl_rl_vec_env
 from ce_gym.policies import Policy, load_policy
-
-SMALL = ["num_envs=64", "rollout=16", "hidden=[16]", "epochs=4", "minibatches=2", "learning_rate=1e-2", "target_kl=0"]
-SMALL += ["gamma=0.9"]
 
 
 @pytest.fixture(autouse=True)

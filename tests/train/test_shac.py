@@ -16,8 +16,8 @@ from networks import KINDS, make_work, outputs
 from pathwise import back_through
 from settings import SettingsError, config_file, load_env_args, load_settings
 from shac import SHAC, Settings, train
-from test_fast_ppo import parameters
 from test_networks import close, make_network, run
+from toy import parameters
 from tripod import TRIPOD
 
 from ce_gym import environment_ids
@@ -52,7 +52,7 @@ def test_the_way_back_through_a_network_is_that_of_torch(kind, hidden):
 
 
 class Window:
-    """What a policy is worth: discounted rewards of a window and the value of its end, the noise being the same."""
+    """The objective of a policy: discounted rewards of a window and the value of its end, with the same noise."""
 
     def __init__(self, learner: SHAC) -> None:
         native = learner.envs.unwrapped

@@ -1,4 +1,4 @@
-"""A policy acts in MuJoCo: same start, same observations, same commands, same judgement."""
+"""A policy acts in MuJoCo: same start, same observations, same commands, same evaluation."""
 
 import json
 import sys
@@ -143,7 +143,7 @@ def ball(stiffness, damping, mass):
 def depths_of(robot, speed, steps):
     """How deep a ball that lands at a speed [m/s] is after every step of 1 ms [m]."""
     twin, depths = MujocoTwin(robot, "exact", 1), []
-    touching = [[0.0, 0.0, 0.1 - 1e-9, 1.0, 0.0, 0.0, 0.0]]  # MuJoCo's contacts are those of the start of a step
+    touching = [[0.0, 0.0, 0.1 - 1e-9, 1.0, 0.0, 0.0, 0.0]]  # MuJoCo finds contacts at the start of a step
     twin.start(np.array(touching), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -speed]]))
     for _ in range(steps):
         twin.step(np.zeros((1, 0)), 0.001)
@@ -233,7 +233,7 @@ def test_commands_last_a_period_and_stay_in_range():
 
 
 def test_judgement_ends_with_a_fall():
-    """Robot 1 falls at the third step; what it does then does not count."""
+    """Robot 1 falls at the third step; later steps do not count."""
     step = iter(range(100))
 
     def stepped(action, command):

@@ -1,4 +1,4 @@
-"""What policies are judged on: the seed that nobody chose, suites of commands and pushes, levels of the ground."""
+"""Evaluation of policies: the seed from their weights, suites of commands and pushes, levels of the ground."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ def test_the_seed_is_of_the_weights_and_of_nothing_else():
 
 
 class Recorder:
-    """Environments that write down what a driver does to them."""
+    """Environments that record the calls of a driver."""
 
     def __init__(self, n):
         self.num_envs, self.metadata = n, {"render_fps": 1 / DT}
@@ -94,7 +94,7 @@ def test_a_shipped_policy_is_judged_by_suite(capsys):
 
 
 class OnLevels(PointMassVectorEnv):
-    """Three levels of ground by turns."""
+    """Three levels of ground in turn."""
 
     def _ending(self, done):
         infos = super()._ending(done)

@@ -10,7 +10,7 @@ from fast_ppo import main
 from fast_ppo import train as fast_train
 from point_mass import ID
 from ppo import train as reference_train
-from test_fast_ppo import FAST, job
+from toy import FAST, job
 from training_page import PRESENT, Present, TrainingPage
 
 from ce_gym.policies import load_policy
@@ -18,12 +18,12 @@ from ce_gym.policies import load_policy
 
 @pytest.mark.parametrize("train", [fast_train, reference_train])
 def test_learners_write_their_present_policy_if_asked(train, tmp_path):
-    trained = train(job(tmp_path / "with", 3000, tensorboard=False, page=True))
+    trained = train(job(tmp_path / "with", 3000, page=True))
     present = load_policy(tmp_path / "with" / PRESENT)
     assert present.record["env"] == trained.record["env"]
     assert present.record["steps"] < trained.record["steps"]
     assert not present.record["finished"]
-    train(job(tmp_path / "without", 3000, tensorboard=False))
+    train(job(tmp_path / "without", 3000))
     assert not (tmp_path / "without" / PRESENT).exists()
 
 

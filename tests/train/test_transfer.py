@@ -1,4 +1,4 @@
-"""Train on one level, judge on all: what is trained again, what is not, and what the figures say."""
+"""Train on one level, evaluate on all: runs that are trained again, and the figures of the summary."""
 
 import json
 from types import SimpleNamespace
@@ -24,7 +24,7 @@ def runs(tmp_path_factory):
 
 @pytest.fixture
 def trainings(monkeypatch):
-    """What is trained during a test: level and seed."""
+    """The training runs begun during a test: level and seed."""
     begun = []
 
     def train(job):

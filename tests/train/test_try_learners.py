@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import try_learners
-from try_learners import LEARNERS, Missing, main, progress, train
+from try_learners import Missing, main, progress, train
 
 OTHERS = Path(try_learners.__file__).parent / "others"
 
@@ -52,8 +52,3 @@ def test_what_cannot_be_installed_is_skipped(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         main(["sk"])
     assert "'sk': expected some of rl_zoo," in capsys.readouterr().err
-
-
-def test_all_files_are_there():
-    files = [word for _, words in LEARNERS.values() for word in words if word.endswith((".py", ".yml"))]
-    assert all((OTHERS.parent / file).is_file() for file in files)
