@@ -291,7 +291,8 @@ class StepDerivatives:
         self, arrays: Mapping[str, NDArray], target: NDArray, now: dict[str, NDArray], others: dict[str, NDArray]
     ) -> None:
         """Overwrite the gradient after a sub-step, in tiles, by the gradient before, and write that of `others`."""
-        gradients = self._weight_variables.named(now) | self._input_gradients.named(others)
+        gradients = self._weight_variables.named(now)
+        gradients |= self._input_gradients.named({name: others[name] for name in self._input_gradients})
         every = {**arrays, **gradients, **self.simulator._batch.tables, "target": target}
         self._kernel(every, len(target), num_threads=self.simulator.num_threads)
 
