@@ -178,20 +178,11 @@ class Damper(ForceLaw):
     parameters = (Parameter("drag", "damping of the base along x", "N s/m", "1", lambda robot, _: [0.0]),)
     outputs = (Output("drag_force", "N", "force on the base along x"),)
 
-    @property
-    def acts(self) -> bool:
-        """Whether the scene has it."""
-        return "drag" in self.options.parameters
-
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """The lagging speed."""
-        return (Field("lagging_speed", 1, "m/s", "speed of the base along x, with a lag"),)
-
-    @property
-    def output_sizes(self) -> dict[str, int]:
-        """One force."""
-        return {"drag_force": 1}
+    def declare(self) -> None:
+        """Act in scenes with the parameter; remember the lagging speed."""
+        self.acts = "drag" in self.options.parameters
+        self.fields = (Field("lagging_speed", 1, "m/s", "speed of the base along x, with a lag"),)
+        self.output_sizes = {"drag_force": 1}
 
     def place(self, start: Start) -> LaggingDamper:
         """Return the force at the start of a step."""
