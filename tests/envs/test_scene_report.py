@@ -43,7 +43,7 @@ def always(program: TaskProgram) -> dict[str, int]:
 def test_lines_add_up_to_the_kernel(report: SceneReport):
     """The calls of the very program that an environment is compiled from."""
     counts, n = always(report.program), report.program.task.n_substeps
-    assert report.sub_step == sum(counts[name] for name in (*AROUND, "iteration", "zeros"))
+    assert report.sub_step == sum(counts[name] for name in (*AROUND, "iteration", "assign"))
     assert report.env_step == n * report.sub_step + counts["act"] + counts["evaluate"]
     assert sum(group.instructions for group in report.groups) == counts["act"] + counts["evaluate"]
     assert {item.name: item.instructions for item in report.sometimes} == {
@@ -61,7 +61,7 @@ def test_lines_add_up_whatever_a_task_asks_for():
         friction="secant",
     )  # fmt: skip
     counts, n = always(report.program), report.program.task.n_substeps
-    assert report.sub_step == sum(counts[name] for name in (*AROUND, "iteration", "zeros"))
+    assert report.sub_step == sum(counts[name] for name in (*AROUND, "iteration", "assign"))
     once = counts["act"] + counts["evaluate"] + n * counts["arrive"] + counts["arrived"]
     assert report.env_step == n * report.sub_step + once
     layers_there = {item.name: item.instructions for item in report.layers}
