@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.constraints.closure import Closure, closures
 from ce_gym.dynamics.constraints.cluster_constraints import linear_solution
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.errors import RobotError, bad
+from ce_gym.model.errors import RobotError, invalid_value
 from ce_gym.model.frames import rotation_matrix
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, skew
 
@@ -60,7 +60,7 @@ def check_standing(mechanism: Mechanism) -> None:
         (lower, upper), angle = body.joint.position, standing.q.get(body.name, 0.0)
         if not lower - FURTHEST_BEYOND <= angle <= upper + FURTHEST_BEYOND:
             expected = f"a standing pose that keeps every joint within its limits, here {lower:g} to {upper:g}"
-            raise bad(file, f"joint {body.name!r} in the standing pose", angle, expected)
+            raise invalid_value(file, f"joint {body.name!r} in the standing pose", angle, expected)
     _check_mass_matrix(mechanism, mass_matrix(mechanism, standing), file)
     placed = mechanism.robot.floating and mechanism.robot.pose.height != 0.0  # a height of 0 is one that nobody gave
     for contact in mechanism.robot.contacts if placed else ():
@@ -68,7 +68,7 @@ def check_standing(mechanism: Mechanism) -> None:
         lean = float(np.hypot(*(standing.R[contact.body] @ np.array(contact.axis))[:2]))
         if centre[2] - contact.radius - contact.rim * lean < -DEEPEST_CONTACT:
             expected = f"a height that keeps contact {contact.name!r}, now {centre[2]:.3g} m high, above ground"
-            raise bad(file, "pose.height", mechanism.robot.pose.height, expected)
+            raise invalid_value(file, "pose.height", mechanism.robot.pose.height, expected)
 
 
 def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:

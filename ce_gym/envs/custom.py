@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ce_gym.envs.registration import ids_of, register
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError, bad
+from ce_gym.model.errors import RobotError, invalid_value
 from ce_gym.model.load import load_robot
 
 
@@ -41,7 +41,7 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
     if not isinstance(path, str | os.PathLike):
         value = repr(path.name) if isinstance(path, Robot) else repr(path)
         expected = "the path of a file, which worker processes can read, too"
-        raise bad("register_robot", "path", f"{type(path).__name__} {value}", expected)
+        raise invalid_value("register_robot", "path", f"{type(path).__name__} {value}", expected)
     file = Path(path).resolve()
     robot = load_robot(file)
     if problems := missing(robot):
@@ -56,17 +56,18 @@ def missing(robot: Robot) -> list[RobotError]:
     file = robot.source or robot.name
     problems = []
     if not robot.floating:
-        problems.append(bad(file, "base", "fixed", "a floating base, because tasks are about walking"))
+        problems.append(invalid_value(file, "base", "fixed", "a floating base, because tasks are about walking"))
     if not any(contact.group == "foot" for contact in robot.contacts):
-        problems.append(bad(file, "contacts of group 'foot'", None, "at least one contact sphere in this group"))
+        problems.append(invalid_value(file, "contacts of group 'foot'", None, "at least one contact sphere in this group"))
     if not robot.independent:
-        problems.append(bad(file, "independent", (), "at least one joint"))
+        problems.append(invalid_value(file, "independent", (), "at least one joint"))
     for joint, gain in robot.gains.kp:  # a robot without gains needs torques as actions
         if not gain > 0.0:
             expected = "a position gain above 0 (actions are targets), or none at all"
-            problems.append(bad(file, f"gains.kp.{joint}", gain, expected))
+            problems.append(invalid_value(file, f"gains.kp.{joint}", gain, expected))
     if not robot.pose.height > 0.0:
-        problems.append(bad(file, "pose.height", robot.pose.height, "the height of the standing base above 0 [m]"))
+        expected = "the height of the standing base above 0 [m]"
+        problems.append(invalid_value(file, "pose.height", robot.pose.height, expected))
     return problems
 
 
@@ -93,5 +94,5 @@ def id_stem(robot: Robot, name: str | None = None) -> str:
     """
     stem = "".join(word[:1].upper() + word[1:] for word in re.split(r"[\W_]+", name or robot.name))
     if not stem:
-        raise bad(robot.source, "name", name or robot.name, "a name with letters or digits in it")
+        raise invalid_value(robot.source, "name", name or robot.name, "a name with letters or digits in it")
     return f"ce_gym/{stem}"

@@ -8,7 +8,7 @@ import gymnasium
 
 from ce_gym.envs.task.skills import SKILLED, SKILLS
 from ce_gym.envs.task.tasks import TASKS
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 ROBOTS = (
@@ -75,7 +75,8 @@ def register(ids: Mapping[str, Mapping[str, str]]) -> None:
     for name, arguments in ids.items():
         if name in gymnasium.registry:
             if dict(gymnasium.registry[name].kwargs) != arguments:
-                raise bad(arguments["robot"], "environment id", name, "an id that no other robot has; give it a `name`")
+                expected = "an id that no other robot has; give it a `name`"
+                raise invalid_value(arguments["robot"], "environment id", name, expected)
             continue
         gymnasium.register(
             name,

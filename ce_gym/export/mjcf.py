@@ -18,7 +18,7 @@ from ce_gym.export.mjcf_equalities import MJCF_JOINTS, add_ties, check_expressib
 from ce_gym.export.mjcf_mechanism import SMALLEST_INERTIA, largest_ratio, mjcf_mechanism
 from ce_gym.export.mjcf_text import quaternion, text
 from ce_gym.model.description import ContactSphere, Robot, Shape
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.mechanism import ELASTIC, MovingBody
 
 Array = NDArray[np.float64]
@@ -88,7 +88,8 @@ def to_mjcf(
             left out but independent or part of a loop, or the varying diagonal of `armature`.
     """
     if transmission == ELASTIC:
-        raise bad(robot.source or robot.name, "transmission", transmission, "another level: MJCF has no such drives")
+        expected = "another level: MJCF has no such drives"
+        raise invalid_value(robot.source or robot.name, "transmission", transmission, expected)
     mechanism = mjcf_mechanism(robot, transmission)
     ties = joint_ties(mechanism)
     check_expressible(mechanism, ties)

@@ -23,7 +23,7 @@ from ce_gym.identify.separable import correlation_time, covariance_of, held_of, 
 from ce_gym.identify.shots import Settings, Shots
 from ce_gym.identify.windows import PARTS, Windows, cut, guesses, noise_of_encoders
 from ce_gym.model import Robot, RobotError, load_robot
-from ce_gym.model.errors import unknown
+from ce_gym.model.errors import unknown_name
 
 Array = NDArray[np.float64]
 LARGEST_ANGLE = 12.6
@@ -178,7 +178,7 @@ def _check_names(robot: Robot, log: Log) -> None:
     rotors = {rotor.name for rotor in robot.rotors()}
     for name in (*log.commanded, *(name for _, name in log.measured)):
         if name not in names:
-            raise unknown(str(log.source), "column", name, names, "a joint, by the link that it moves, or a rotor")
+            raise unknown_name(str(log.source), "column", name, names, "a joint, by the link that it moves, or a rotor")
     for (kind, name), column in zip(log.measured, log.values.T, strict=True):
         if kind == "angle" and name not in rotors and (most := np.abs(column).max()) > LARGEST_ANGLE:
             raise LogError(f"{log.source}: angle:{name}: up to {most:.4g}: expected radians, {LARGEST_ANGLE:g} at most")

@@ -16,7 +16,7 @@ from ce_gym.identify.held import held_model
 from ce_gym.identify.log import Log
 from ce_gym.identify.shots import Settings, Shots
 from ce_gym.model import Robot, load_robot
-from ce_gym.model.errors import unknown
+from ce_gym.model.errors import unknown_name
 
 Array = NDArray[np.float64]
 ENCODERS = "joints", "rotors", "both"
@@ -106,7 +106,7 @@ def encoders_at(model: Model, where: str) -> tuple[tuple[str, str], ...]:
         where: One of `ENCODERS`.
     """
     if where not in ENCODERS:
-        raise unknown("simulate_log", "encoders", where, ENCODERS, "where encoders are")
+        raise unknown_name("simulate_log", "encoders", where, ENCODERS, "where encoders are")
     rotors = tuple(rotor.name for rotor in model.robot.rotors())
     names = {"joints": model.joint_links, "rotors": rotors, "both": (*model.joint_links, *rotors)}[where]
     return tuple(("angle", name) for name in names)
@@ -117,5 +117,5 @@ def _planted(robot: Robot, planted: Mapping[str, float], measured: Sequence[tupl
     known = {figure.name: figure for figure in sought(robot, kinds, measured=measured)} if kinds else {}
     for name in planted:
         if name not in known:
-            raise unknown("simulate_log", "planted", name, known, "the name of a figure")
+            raise unknown_name("simulate_log", "planted", name, known, "the name of a figure")
     return [replace(known[name], start=value) for name, value in planted.items()]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from ce_gym.identify.held import limbs_of
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import ELASTIC_FACTORS
-from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.errors import RobotError, invalid_value, unknown_name
 
 KINDS = {
     "rotor_inertia": "factor on each rotor's spin inertia",
@@ -131,9 +131,9 @@ def sought(
 def _check_listed(key: str, names: Sequence[str], known: Sequence[str] | dict[str, str], what: str) -> None:
     for i, name in enumerate(names):
         if name not in known:
-            raise unknown("identify", key, name, known, what)
+            raise unknown_name("identify", key, name, known, what)
         if name in names[:i]:
-            raise bad("identify", key, name, "each name once")
+            raise invalid_value("identify", key, name, "each name once")
 
 
 def _of_kind(robot: Robot, kind: str, longest_delay: float, measured: Sequence[tuple[str, str]] = ()) -> list[Figure]:

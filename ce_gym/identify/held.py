@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ce_gym.dynamics.model import Model
 from ce_gym.model.description import Body, Pose, Robot
-from ce_gym.model.errors import RobotError, unknown
+from ce_gym.model.errors import RobotError, unknown_name
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.frames import Placement
 from ce_gym.model.mechanism import ELASTIC, LEVELS
@@ -25,7 +25,7 @@ def held_model(robot: Robot, names: Collection[str], transmission: str) -> Model
         RobotError: There is no such level, or a joint turns about all axes.
     """
     if transmission not in (levels := (*LEVELS, ELASTIC)):
-        raise unknown("identify", "transmission", transmission, levels, "a transmission level")
+        raise unknown_name("identify", "transmission", transmission, levels, "a transmission level")
     model = Model(held(robot, names), transmission)
     if model.nq != model.nv:
         raise RobotError(f"{robot.name}: identify: expected joints about or along one axis, no ball joints")

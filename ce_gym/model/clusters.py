@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 from ce_gym.model.constraints import Constraint
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,8 @@ def _constraint_span(constraint: Constraint, parents: dict[str, str | None], rob
     span = _between(constraint.ends, constraint.ends, parents)
     if not span:
         key = f"constraint {constraint.name!r}"
-        raise bad(robot.source or robot.name, key, constraint.ends, "two bodies that can move against each other")
+        expected = "two bodies that can move against each other"
+        raise invalid_value(robot.source or robot.name, key, constraint.ends, expected)
     return span
 
 
@@ -166,7 +167,7 @@ def _cluster(
         expected = f"a tie that does not reach across the {free[0].joint.type} joint of {free[0].name}"
         if free[0].joint.type == "ball":
             expected += ", which in a loop is three revolute joints (ce_gym.model.coincident_hinges)"
-        raise bad(robot.source or robot.name, f"constraint {names}", tuple(group), expected)
+        raise invalid_value(robot.source or robot.name, f"constraint {names}", tuple(group), expected)
     output = parents[group[0]]
     return Cluster(
         bodies=tuple(group),

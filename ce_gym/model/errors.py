@@ -30,7 +30,7 @@ class LossyImportWarning(UserWarning):
     """A file says things that a `Robot` cannot; the message is a short list, `Robot.notes` has all of them."""
 
 
-def bad(file: str, key: str, value: object, expected: str) -> RobotError:
+def invalid_value(file: str, key: str, value: object, expected: str) -> RobotError:
     """Return the error for one bad value: file, key, value, and what was expected.
 
     Args:
@@ -42,9 +42,9 @@ def bad(file: str, key: str, value: object, expected: str) -> RobotError:
     return RobotError(f"{file}: {key} is {shown(value)}: expected {expected}")
 
 
-def unknown(file: str, key: str, value: object, known: Iterable[str], what: str) -> RobotError:
+def unknown_name(file: str, key: str, value: object, known: Iterable[str], what: str) -> RobotError:
     """Return the error for a name in a file that does not exist, with those that do."""
-    return bad(file, key, value, f"{what}: {listed_names(value, known)}")
+    return invalid_value(file, key, value, f"{what}: {listed_names(value, known)}")
 
 
 def check_names(

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from ce_gym.model.constraints import Constraint, LinearConstraint, LoopConstraint
 from ce_gym.model.description import Body, Inertial, Joint, Pose, Robot
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.frames import Placement, Vec3
 
 GEAR_RATIO = 6.0
@@ -221,4 +221,4 @@ def _rotor(name: str, parent: str) -> Body:
 
 def _require(name: str, key: str, value: int, met: bool, expected: str) -> None:
     if not met:
-        raise bad(name, key, value, expected)
+        raise invalid_value(name, key, value, expected)

@@ -8,7 +8,7 @@ from pathlib import Path
 from ce_gym.model.assets import assets_folder, robots
 from ce_gym.model.clusters import cluster_tree
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.errors import RobotError, invalid_value, unknown_name
 from ce_gym.model.formats.collections import downloaded, is_in_collection
 from ce_gym.model.formats.mjcf.robot import robot_from_mjcf
 from ce_gym.model.formats.reading import read_yaml
@@ -54,7 +54,7 @@ def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = 
     if kind == ".urdf":
         return _from_urdf(path, floating)
     if floating is not None:
-        raise bad(str(path), "floating", floating, "None, because the file itself says what its base is")
+        raise invalid_value(str(path), "floating", floating, "None, because the file itself says what its base is")
     if kind in (".yaml", ".yml"):
         return robot_from_yaml(path)
     if kind == ".xml":
@@ -73,7 +73,7 @@ def _from_urdf(path: Path, floating: bool | None) -> Robot:
 
 def _asset(name: str) -> Path:
     if name not in robots():
-        raise unknown(str(assets_folder()), "robot", name, robots(), "the name of a robot")
+        raise unknown_name(str(assets_folder()), "robot", name, robots(), "the name of a robot")
     return assets_folder() / name / f"{name}.yaml"
 
 

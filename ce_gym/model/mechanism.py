@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Inertial, Joint, Robot
-from ce_gym.model.errors import RobotError, bad
+from ce_gym.model.errors import RobotError, invalid_value
 
 Level = Literal["exact", "coupled", "armature", "none"]
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -176,7 +176,7 @@ def with_stretches(robot: Robot) -> Robot:
     """
     if not robot.elastic:
         expected = f"the stiffness of at least one transmission, for transmission {ELASTIC!r}"
-        raise bad(robot.source or robot.name, "elastic", None, expected)
+        raise invalid_value(robot.source or robot.name, "elastic", None, expected)
     of = {elastic.rotor: elastic.stretch for elastic in robot.elastic}
     still = (0.0, 0.0, 0.0)
     bodies, massless = [], Inertial(0.0, still, (still, still, still))

@@ -19,7 +19,7 @@ from ce_gym.envs.task.checks import checked_value, merged_rewards
 from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError, bad, listed_names, unknown
+from ce_gym.model.errors import RobotError, invalid_value, listed_names, unknown_name
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.sim.arguments import check, check_choice, check_whole
 from ce_gym.sim.devices import Device, device_named
@@ -105,7 +105,7 @@ def make_program(
     figures = changed_task(figures, changes)
     if figures.actions.endswith("_pd") and not model.robot.gains.kp:
         file, expected = model.robot.source or model.robot.name, f"gains, because actions={figures.actions!r} need them"
-        raise bad(file, "gains.kp", None, expected)
+        raise invalid_value(file, "gains.kp", None, expected)
     program = TaskProgram(model, figures, contact_forces)
     program.stages  # noqa: B018  (traces the terms, which finds wrong ones)
     return program
@@ -120,7 +120,7 @@ def own_task(robot: Robot, task: str) -> Task:
     file = robot.source or robot.name
     for name, _ in robot.tasks:
         if name not in KNOWN:
-            raise unknown(file, "tasks", name, KNOWN, "the name of a task")
+            raise unknown_name(file, "tasks", name, KNOWN, "the name of a task")
     own = {key: _thawed(key, value) for name, group in robot.tasks if name == task for key, value in group}
     wanted, groups = KNOWN[task].contacts, {contact.group for contact in robot.contacts}
     if not isinstance(wanted, str):  # tasks ask for knees, too, but not every robot has some

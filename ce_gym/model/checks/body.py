@@ -12,7 +12,7 @@ import numpy as np
 
 from ce_gym.model.coordinates import SIZES
 from ce_gym.model.description import SCREWS, Body, Joint
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 
 RELATIVE_TOLERANCE = 1e-9
 LARGEST_FIGURE = 1e12
@@ -28,33 +28,34 @@ def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
     mass = body.inertial.mass
     massless = body.kind == "rotor" or (may_be_massless and not np.any(body.inertial.inertia))
     if not math.isfinite(mass) or mass < 0.0 or (mass == 0.0 and not massless):
-        raise bad(file, f"{where} mass", mass, "a mass of 0 or more" if massless else "a mass above 0 [kg]")
+        raise invalid_value(file, f"{where} mass", mass, "a mass of 0 or more" if massless else "a mass above 0 [kg]")
     check_finite(file, f"{where} mass", (mass,))
     check_finite(file, f"{where} centre of mass", body.inertial.com)
     _check_inertia(file, f"{where} inertia", np.array(body.inertial.inertia))
     check_finite(file, f"{where} position", body.placement.position)
     rotation = np.array(body.placement.rotation)
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0.0:
-        raise bad(file, f"{where} rotation", body.placement.rotation, "a rotation matrix")
+        raise invalid_value(file, f"{where} rotation", body.placement.rotation, "a rotation matrix")
     if body.joint.type != "free":
         _check_joint(file, where, body.joint)
 
 
 def _check_joint(file: str, where: str, joint: Joint) -> None:
     if joint.type not in (*SIZES, *SCREWS):
-        raise bad(file, f"{where} joint type", joint.type, f"one of {', '.join((*SIZES, *SCREWS))}")
+        raise invalid_value(file, f"{where} joint type", joint.type, f"one of {', '.join((*SIZES, *SCREWS))}")
     if joint.type == "ball" and joint.friction:
-        raise bad(file, f"{where} joint friction", joint.friction, "0, because ball joints have no dry friction")
+        expected = "0, because ball joints have no dry friction"
+        raise invalid_value(file, f"{where} joint friction", joint.friction, expected)
     if joint.type == "ball" and not (joint.position[0] == -math.inf and joint.position[1] > 0.0):
-        raise bad(file, f"{where} joint limits", joint.position, "no lower one, and an angle above 0 [rad]")
+        raise invalid_value(file, f"{where} joint limits", joint.position, "no lower one, and an angle above 0 [rad]")
     if len(joint.axis) != 3 or not math.isclose(math.hypot(*joint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
-        raise bad(file, f"{where} joint axis", joint.axis, "a unit axis")
+        raise invalid_value(file, f"{where} joint axis", joint.axis, "a unit axis")
     lower, upper = joint.position
     if not lower <= upper:
-        raise bad(file, f"{where} joint limits", joint.position, "a lower limit that is not above the upper")
+        raise invalid_value(file, f"{where} joint limits", joint.position, "a lower limit that is not above the upper")
     for name, value in (("torque", joint.torque), ("velocity", joint.velocity)):
         if not value >= 0.0:
-            raise bad(file, f"{where} joint {name}", value, "0 or more")
+            raise invalid_value(file, f"{where} joint {name}", value, "0 or more")
     check_not_negative(file, f"{where} joint damping", joint.damping)
     check_not_negative(file, f"{where} joint friction", joint.friction)
     check_not_negative(file, f"{where} joint stiffness", joint.stiffness)
@@ -64,24 +65,24 @@ def _check_joint(file: str, where: str, joint: Joint) -> None:
 def check_finite(file: str, key: str, values: Iterable[float]) -> None:
     """Check that all values are finite numbers of a usable size."""
     if not all(abs(value) <= LARGEST_FIGURE for value in values):
-        raise bad(file, key, tuple(values), f"finite numbers, up to {LARGEST_FIGURE:g} in size")
+        raise invalid_value(file, key, tuple(values), f"finite numbers, up to {LARGEST_FIGURE:g} in size")
 
 
 def check_not_negative(file: str, key: str, value: float, unit: str = "") -> None:
     """Check that a value is 0 or more, and of a usable size."""
     if not 0.0 <= value <= LARGEST_FIGURE:
-        raise bad(file, key, value, f"0 or more{unit}, up to {LARGEST_FIGURE:g}")
+        raise invalid_value(file, key, value, f"0 or more{unit}, up to {LARGEST_FIGURE:g}")
 
 
 def _check_inertia(file: str, key: str, inertia: np.ndarray) -> None:
     if inertia.shape != (3, 3):
-        raise bad(file, key, inertia.tolist(), "3 x 3 finite numbers")
+        raise invalid_value(file, key, inertia.tolist(), "3 x 3 finite numbers")
     check_finite(file, key, inertia.ravel().tolist())
     scale = np.abs(inertia).max()
     if np.abs(inertia - inertia.T).max() > RELATIVE_TOLERANCE * scale:
-        raise bad(file, key, inertia.tolist(), "a symmetric matrix")
+        raise invalid_value(file, key, inertia.tolist(), "a symmetric matrix")
     if scale > 0.0 and np.linalg.eigvalsh(inertia / scale)[0] < -RELATIVE_TOLERANCE:
-        raise bad(file, key, inertia.tolist(), "a positive semidefinite matrix")
+        raise invalid_value(file, key, inertia.tolist(), "a positive semidefinite matrix")
 
 
 def violates_triangle_inequality(body: Body) -> bool:

@@ -21,7 +21,7 @@ from ce_gym.model.constraints import (
     constraint_function,
 )
 from ce_gym.model.description import Body, Robot
-from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.errors import RobotError, invalid_value, unknown_name
 
 
 def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
@@ -30,9 +30,9 @@ def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
     names = {body.name: body for body in robot.bodies}
     for body in constraint.bodies:
         if body not in names:
-            raise unknown(file, key, body, names, "the name of a body")
+            raise unknown_name(file, key, body, names, "the name of a body")
     if constraint.ends and len(set(constraint.ends)) < len(constraint.ends):
-        raise bad(file, key, constraint.ends, "two different bodies")
+        raise invalid_value(file, key, constraint.ends, "two different bodies")
     if not constraint.ends:
         _check_joints(constraint, names, key, file)
     CHECKS[type(constraint)](constraint, key, file)
@@ -42,30 +42,31 @@ def _check_joints(constraint: Constraint, names: Mapping[str, Body], key: str, f
     """Check the bodies of a constraint that ties joint coordinates."""
     for body in constraint.bodies:
         if names[body].joint.nv > 1:
-            raise bad(file, key, body, "a body whose joint has one degree of freedom")
+            raise invalid_value(file, key, body, "a body whose joint has one degree of freedom")
     if len(set(constraint.bodies)) < 2 or len(set(constraint.bodies)) < len(constraint.bodies):
-        raise bad(file, key, constraint.bodies, "at least two different bodies, each once")
+        raise invalid_value(file, key, constraint.bodies, "at least two different bodies, each once")
 
 
 def _check_linear(constraint: LinearConstraint, key: str, file: str) -> None:
     for body, coefficient in constraint.coefficients:
         if not 0.0 < abs(coefficient) <= LARGEST_FIGURE:
             expected = f"a finite number other than 0, up to {LARGEST_FIGURE:g} in size"
-            raise bad(file, f"{key} coefficient of {body!r}", coefficient, expected)
+            raise invalid_value(file, f"{key} coefficient of {body!r}", coefficient, expected)
     check_finite(file, f"{key} offset", (constraint.offset,))
 
 
 def _check_polynomial(constraint: PolynomialConstraint, key: str, file: str) -> None:
     check_finite(file, f"{key} coefficients", constraint.coefficients)
     if not any(constraint.coefficients[1:]):
-        raise bad(file, f"{key} coefficients", constraint.coefficients, "one of a power of at least 1 that is not 0")
+        expected = "one of a power of at least 1 that is not 0"
+        raise invalid_value(file, f"{key} coefficients", constraint.coefficients, expected)
 
 
 def _check_loop(constraint: LoopConstraint, key: str, file: str) -> None:
     if constraint.joint not in ("revolute", "ball"):
-        raise bad(file, f"{key} joint", constraint.joint, "revolute or ball")
+        raise invalid_value(file, f"{key} joint", constraint.joint, "revolute or ball")
     if not math.isclose(math.hypot(*constraint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
-        raise bad(file, f"{key} axis", constraint.axis, "a unit axis")
+        raise invalid_value(file, f"{key} axis", constraint.axis, "a unit axis")
     for placement in (constraint.first_placement, constraint.second_placement):
         check_finite(file, f"{key} placement", (*placement.position, *[x for row in placement.rotation for x in row]))
 
@@ -73,12 +74,12 @@ def _check_loop(constraint: LoopConstraint, key: str, file: str) -> None:
 def _check_rod(constraint: RodConstraint, key: str, file: str) -> None:
     check_finite(file, f"{key} points", (*constraint.first_point, *constraint.second_point))
     if not 0.0 < constraint.length <= LARGEST_FIGURE:
-        raise bad(file, f"{key} length", constraint.length, f"a length above 0 [m], up to {LARGEST_FIGURE:g}")
+        raise invalid_value(file, f"{key} length", constraint.length, f"a length above 0 [m], up to {LARGEST_FIGURE:g}")
 
 
 def _check_function(constraint: FunctionConstraint, key: str, file: str) -> None:
     if not constraint.arguments:
-        raise bad(file, f"{key} arguments", constraint.arguments, "at least one body")
+        raise invalid_value(file, f"{key} arguments", constraint.arguments, "at least one body")
     try:
         constraint_function(constraint.function)
     except RobotError as error:

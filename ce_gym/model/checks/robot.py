@@ -30,7 +30,7 @@ from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.coordinates import UNIT_TOLERANCE
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import DriveFriction
-from ce_gym.model.errors import InertiaWarning, bad, listed_names, unknown
+from ce_gym.model.errors import InertiaWarning, invalid_value, listed_names, unknown_name
 
 MOST_BODIES = 500
 """Most bodies of a robot: what is done with them takes more than in proportion, and none has as many."""
@@ -70,7 +70,7 @@ def check_robot(robot: Robot) -> None:
 def _check_names(robot: Robot, file: str) -> None:
     """Names can be printed, on one line: an escape sequence in a file moves nobody's cursor."""
     if len(robot.bodies) > MOST_BODIES:
-        raise bad(file, "number of bodies", len(robot.bodies), f"at most {MOST_BODIES}")
+        raise invalid_value(file, "number of bodies", len(robot.bodies), f"at most {MOST_BODIES}")
     names = {"name": [robot.name], "task": [name for name, _ in robot.tasks]}
     names |= {f"{kind} name": [body.name for body in robot.bodies if body.kind == kind] for kind in ("link", "rotor")}
     names["constraint name"] = [constraint.name for constraint in robot.constraints]
@@ -79,7 +79,7 @@ def _check_names(robot: Robot, file: str) -> None:
     for key, given in names.items():
         for name in given:
             if not name or not name.isprintable() or len(name) > LONGEST_NAME:
-                raise bad(file, key, name, f"1 to {LONGEST_NAME} characters that can be printed")
+                raise invalid_value(file, key, name, f"1 to {LONGEST_NAME} characters that can be printed")
 
 
 def _check_inertia(robot: Robot, file: str) -> None:
@@ -89,7 +89,7 @@ def _check_inertia(robot: Robot, file: str) -> None:
     for pattern in robot.kept_inertia:
         if not any(fnmatchcase(name, pattern) for name in impossible):
             expected = f"one of {listed_names(pattern, impossible)}" if impossible else "none: no inertia is impossible"
-            raise bad(file, "kept_inertia", pattern, expected)
+            raise invalid_value(file, "kept_inertia", pattern, expected)
     unknowing = [name for name in impossible if not any(fnmatchcase(name, pattern) for pattern in robot.kept_inertia)]
     if unknowing:
         _warn_of_inertia(robot.name, tuple(unknowing))
@@ -104,17 +104,19 @@ def _dependent(robot: Robot) -> set[str]:
 def _check_tree(robot: Robot, file: str) -> None:
     """Names are unique, parents come first, and only the first body may be free."""
     if not robot.bodies:
-        raise bad(file, "bodies", (), "at least one body that moves: a moving joint, or a root link with mass")
+        expected = "at least one body that moves: a moving joint, or a root link with mass"
+        raise invalid_value(file, "bodies", (), expected)
     seen: list[str] = []
     for body in robot.bodies:
         if body.name in seen:
-            raise bad(file, "body name", body.name, "a name that no other body has")
+            raise invalid_value(file, "body name", body.name, "a name that no other body has")
         if body.parent is not None and body.parent not in seen:
-            raise unknown(file, f"{body.kind} {body.name!r} parent", body.parent, seen, "a body listed before it")
+            raise unknown_name(file, f"{body.kind} {body.name!r} parent", body.parent, seen, "a body listed before it")
         if body.joint.type in ("ball", "prismatic") and body.kind == "rotor":
-            raise bad(file, f"rotor {body.name!r} joint type", body.joint.type, "revolute, because rotors spin")
+            expected = "revolute, because rotors spin"
+            raise invalid_value(file, f"rotor {body.name!r} joint type", body.joint.type, expected)
         if body.joint.type == "free" and (seen or body.parent is not None):
-            raise bad(
+            raise invalid_value(
                 file, f"{body.kind} {body.name!r} joint type", "free", "free only for the first body, on the world"
             )
         seen.append(body.name)
@@ -130,7 +132,8 @@ def _check_independent(robot: Robot, file: str) -> None:
     names = [body.name for body in robot.bodies if body.joint.nv == 1]
     for joint in robot.independent:
         if joint not in names:
-            raise unknown(file, "independent", joint, names, "the name of a body whose joint has one degree of freedom")
+            expected = "the name of a body whose joint has one degree of freedom"
+            raise unknown_name(file, "independent", joint, names, expected)
     _check_unique(file, "independent", robot.independent)
     for cluster in cluster_tree(robot).clusters:
         if cluster.linear and robot.body(cluster.bodies[0]).joint.nv == 1:
@@ -144,14 +147,17 @@ def _check_determined(cluster: Cluster, file: str) -> None:
     key = f"independent joints among {', '.join(cluster.bodies)}"
     if count < 1:
         ties = tuple(constraint.name for constraint in cluster.constraints)
-        raise bad(file, f"constraints among {', '.join(cluster.bodies)}", ties, "fewer constraints than bodies")
+        expected = "fewer constraints than bodies"
+        raise invalid_value(file, f"constraints among {', '.join(cluster.bodies)}", ties, expected)
     if len(cluster.independent) != count:
-        raise bad(file, key, cluster.independent, f"{count} of them, because {len(rows)} constraints tie the rest")
+        expected = f"{count} of them, because {len(rows)} constraints tie the rest"
+        raise invalid_value(file, key, cluster.independent, expected)
     dependent = [body for body in cluster.bodies if body not in cluster.independent]
     K = np.array([[row.get(body, 0.0) for body in dependent] for row in rows]).reshape(len(rows), len(rows))
     scale = np.abs(K).max(axis=1, initial=0.0, keepdims=True)
     if (scale == 0.0).any() or np.linalg.matrix_rank(K / scale) < len(rows):
-        raise bad(file, key, cluster.independent, f"joints that determine {', '.join(dependent)}; these do not")
+        expected = f"joints that determine {', '.join(dependent)}; these do not"
+        raise invalid_value(file, key, cluster.independent, expected)
 
 
 def _check_something_moves(robot: Robot, file: str) -> None:
@@ -160,7 +166,7 @@ def _check_something_moves(robot: Robot, file: str) -> None:
     for body in robot.bodies:
         if body.name not in tied | {other.parent for other in robot.bodies} and not moves_inertia(body):
             expected = "a mass or an inertia that its joint moves"
-            raise bad(file, f"{body.kind} {body.name!r} inertia", body.inertial.inertia, expected)
+            raise invalid_value(file, f"{body.kind} {body.name!r} inertia", body.inertial.inertia, expected)
 
 
 def _check_contacts(robot: Robot, file: str) -> None:
@@ -169,21 +175,21 @@ def _check_contacts(robot: Robot, file: str) -> None:
     for contact in robot.contacts:
         key = f"contacts.{contact.name}"
         if contact.body not in names:
-            raise unknown(file, f"{key}.body", contact.body, names, "the name of a body")
+            raise unknown_name(file, f"{key}.body", contact.body, names, "the name of a body")
         if robot.body(contact.body).kind == "rotor":
-            raise bad(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
+            raise invalid_value(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
         check_finite(file, f"{key}.position", contact.position)
         check_not_negative(file, f"{key}.radius", contact.radius, " [m]")
         check_not_negative(file, f"{key}.rim", contact.rim, " [m]")
         if len(contact.axis) != 3 or not math.isclose(math.hypot(*contact.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
-            raise bad(file, f"{key}.axis", contact.axis, "a unit axis")
+            raise invalid_value(file, f"{key}.axis", contact.axis, "a unit axis")
     _check_capsules(robot, file)
     for name in ("stiffness", "damping", "friction", "bristle", "dissipation"):
         value = getattr(robot.material, name)
         if value is not None:
             check_not_negative(file, f"material.{name}", value)
     if not 0.0 < robot.material.slip_speed < math.inf:
-        raise bad(file, "material.slip_speed", robot.material.slip_speed, "more than 0 [m/s]")
+        raise invalid_value(file, "material.slip_speed", robot.material.slip_speed, "more than 0 [m/s]")
 
 
 def _check_capsules(robot: Robot, file: str) -> None:
@@ -191,20 +197,21 @@ def _check_capsules(robot: Robot, file: str) -> None:
     for capsule in robot.capsules:
         key = f"capsules.{capsule.body}"
         if capsule.body not in links:
-            raise unknown(file, key, capsule.body, links, "the name of a link")
+            raise unknown_name(file, key, capsule.body, links, "the name of a link")
         check_finite(file, key, (*capsule.start, *capsule.end))
         if not 0.0 < capsule.radius < math.inf:
-            raise bad(file, f"{key} radius", capsule.radius, "more than 0 [m]")
+            raise invalid_value(file, f"{key} radius", capsule.radius, "more than 0 [m]")
     _check_unique(file, "self_collisions", [" and ".join(sorted(pair)) for pair in robot.self_collisions])
     for pair in robot.self_collisions:
         for name in pair:
             if name not in links:
-                raise unknown(file, "self_collisions", name, links, "the name of a link")
+                raise unknown_name(file, "self_collisions", name, links, "the name of a link")
             if not capsules_of(robot, name):
-                raise bad(file, "self_collisions", name, "a link with a box, cylinder, sphere, or one of `capsules`")
+                expected = "a link with a box, cylinder, sphere, or one of `capsules`"
+                raise invalid_value(file, "self_collisions", name, expected)
         one, other = robot.body(pair[0]), robot.body(pair[1])
         if adjacent(one, other):
-            raise bad(file, "self_collisions", pair, "two links of which none carries the other")
+            raise invalid_value(file, "self_collisions", pair, "two links of which none carries the other")
 
 
 def _check_motors(robot: Robot, file: str) -> None:
@@ -212,17 +219,17 @@ def _check_motors(robot: Robot, file: str) -> None:
     _check_unique(file, "motors", [motor.rotor for motor in robot.motors])
     for motor in robot.motors:
         if motor.rotor not in rotors:
-            raise unknown(file, "motors", motor.rotor, rotors, "the name of a rotor")
+            raise unknown_name(file, "motors", motor.rotor, rotors, "the name of a rotor")
         for name in ("torque", "velocity", "stall", "damping", "friction"):
             value = getattr(motor, name)
             if name in ("damping", "friction"):
                 check_not_negative(file, f"motors.{motor.rotor}.{name}", value)
             elif value is not None and not value >= 0.0:
-                raise bad(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
+                raise invalid_value(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
         if motor.velocity == 0.0:
-            raise bad(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
+            raise invalid_value(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
         if not motor.bandwidth > 0.0:
-            raise bad(file, f"motors.{motor.rotor}.bandwidth", motor.bandwidth, "more than 0 [Hz]")
+            raise invalid_value(file, f"motors.{motor.rotor}.bandwidth", motor.bandwidth, "more than 0 [Hz]")
         if motor.drive_friction is not None:
             _check_drive_friction(motor.drive_friction, file, f"motors.{motor.rotor}.friction")
 
@@ -232,15 +239,16 @@ def _check_drive_friction(friction: DriveFriction, file: str, key: str) -> None:
         value, name = getattr(friction, field.name), f"{key}.{field.name}"
         if field.name.endswith("efficiency"):
             if not 0.0 <= value <= 1.0 or (field.name == "efficiency" and value == 0.0):
-                raise bad(file, name, value, "a share of at most 1")
+                raise invalid_value(file, name, value, "a share of at most 1")
         elif field.name in ("stribeck_speed", "stribeck_exponent"):
             if not value > 0.0:
-                raise bad(file, name, value, "more than 0")
+                raise invalid_value(file, name, value, "more than 0")
         else:
             check_not_negative(file, name, value)
     at_rest = [f.name for f in fields(friction) if f.name.startswith("stribeck") and f.default == 0.0]
     if math.isinf(friction.stribeck_speed) and any(getattr(friction, name) for name in at_rest):
-        raise bad(file, f"{key}.stribeck_speed", None, "the speed at which what is added at rest falls [rad/s]")
+        expected = "the speed at which what is added at rest falls [rad/s]"
+        raise invalid_value(file, f"{key}.stribeck_speed", None, expected)
 
 
 def _check_elastic(robot: Robot, file: str) -> None:
@@ -250,22 +258,22 @@ def _check_elastic(robot: Robot, file: str) -> None:
     for elastic in robot.elastic:
         key = f"elastic.{elastic.rotor}"
         if elastic.rotor not in rotors:
-            raise unknown(file, "elastic", elastic.rotor, rotors, "the name of a rotor")
+            raise unknown_name(file, "elastic", elastic.rotor, rotors, "the name of a rotor")
         ties = [tie for tie in robot.constraints if elastic.rotor in tie.bodies]
         if len(ties) != 1 or not ties[0].linear or elastic.rotor in robot.independent:
-            raise bad(
+            raise invalid_value(
                 file, key, elastic.rotor, "a rotor that follows from joints by one linear tie, and nothing from it"
             )
         if elastic.stretch in (body.name for body in robot.bodies):
-            raise bad(file, "body name", elastic.stretch, f"another one: {elastic.rotor!r} is elastic")
+            raise invalid_value(file, "body name", elastic.stretch, f"another one: {elastic.rotor!r} is elastic")
         if not 0.0 < elastic.stiffness < math.inf:
-            raise bad(file, f"{key}.stiffness", elastic.stiffness, "more than 0 [N m/rad]")
+            raise invalid_value(file, f"{key}.stiffness", elastic.stiffness, "more than 0 [N m/rad]")
         check_not_negative(file, f"{key}.damping", elastic.damping, " [N m s/rad]")
         check_not_negative(file, f"{key}.backlash", elastic.backlash, " [rad]")
         if not elastic.preload > 0.0:
-            raise bad(file, f"{key}.preload", elastic.preload, "more than 0 [N m]")
+            raise invalid_value(file, f"{key}.preload", elastic.preload, "more than 0 [N m]")
         if elastic.backlash and math.isfinite(elastic.preload):
-            raise bad(file, f"{key}.preload", elastic.preload, "none where there is backlash")
+            raise invalid_value(file, f"{key}.preload", elastic.preload, "none where there is backlash")
 
 
 def _check_pose_and_gains(robot: Robot, file: str) -> None:
@@ -275,10 +283,10 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
     _check_unique(file, "pose.balls", [name for name, _ in robot.pose.balls])
     for name, quaternion in robot.pose.balls:
         if name not in robot.balls:
-            raise unknown(file, "pose.balls", name, robot.balls, "the name of a body on a ball joint")
+            raise unknown_name(file, "pose.balls", name, robot.balls, "the name of a body on a ball joint")
         if len(quaternion) != 4 or not abs(math.hypot(*quaternion) - 1.0) <= UNIT_TOLERANCE:
             expected = f"a quaternion (w, x, y, z) of norm 1 within {UNIT_TOLERANCE:g}: divide it by its norm"
-            raise bad(file, f"pose.balls.{name}", quaternion, expected)
+            raise invalid_value(file, f"pose.balls.{name}", quaternion, expected)
     _check_within_limits(robot, file)
     _check_assembly(robot, file)
     for key, pairs in (("gains.kp", robot.gains.kp), ("gains.kd", robot.gains.kd)):
@@ -286,10 +294,10 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
         for joint, gain in pairs:
             check_not_negative(file, f"{key}.{joint}", gain)
             if joint in robot.passive:
-                raise bad(file, f"{key}.{joint}", gain, "none for a passive joint, whose largest torque is 0")
+                raise invalid_value(file, f"{key}.{joint}", gain, "none for a passive joint, whose largest torque is 0")
         for joint in robot.driven:
             if pairs and joint not in dict(pairs):
-                raise bad(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")
+                raise invalid_value(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")
 
 
 def _check_within_limits(robot: Robot, file: str) -> None:
@@ -298,7 +306,7 @@ def _check_within_limits(robot: Robot, file: str) -> None:
         (lower, upper), angle = limits[joint], pose.get(joint, 0.0)
         if not lower - LIMIT_TOLERANCE <= angle <= upper + LIMIT_TOLERANCE:
             expected = f"a standing pose within the joint's limits, {lower:g} to {upper:g}"
-            raise bad(file, f"pose.joints.{joint}", angle, expected)
+            raise invalid_value(file, f"pose.joints.{joint}", angle, expected)
 
 
 def _check_assembly(robot: Robot, file: str) -> None:
@@ -306,7 +314,7 @@ def _check_assembly(robot: Robot, file: str) -> None:
     _check_unique(file, "assembly", [joint for joint, _ in robot.assembly])
     for joint, value in robot.assembly:
         if joint not in dependent:
-            raise unknown(file, "assembly", joint, dependent, "the name of a dependent joint")
+            raise unknown_name(file, "assembly", joint, dependent, "the name of a dependent joint")
         check_finite(file, f"assembly.{joint}", (value,))
 
 
@@ -314,7 +322,7 @@ def _check_joint_values(robot: Robot, file: str, key: str, pairs: tuple[tuple[st
     _check_unique(file, key, [joint for joint, _ in pairs])
     for joint, value in pairs:
         if joint not in robot.independent:
-            raise unknown(file, key, joint, robot.independent, "the name of an independent joint")
+            raise unknown_name(file, key, joint, robot.independent, "the name of an independent joint")
         check_finite(file, f"{key}.{joint}", (value,))
 
 
@@ -322,7 +330,7 @@ def _check_unique(file: str, key: str, names: Iterable[str]) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise bad(file, key, name, "a name that is used once")
+            raise invalid_value(file, key, name, "a name that is used once")
         seen.add(name)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from ce_gym.model.errors import RobotError, unknown
+from ce_gym.model.errors import RobotError, unknown_name
 from ce_gym.model.formats.text_file import one_line
 
 
@@ -47,7 +47,7 @@ def downloaded(name: str) -> Path:
 
 def _of_menagerie(module: ModuleType, name: str, robot: str) -> Path:
     if robot not in module.names():
-        raise unknown(name, "robot", robot, module.names(), "the name of a robot of Menagerie")
+        raise unknown_name(name, "robot", robot, module.names(), "the name of a robot of Menagerie")
     found = module.get(robot)
     return Path(found.xml(found.default_model))
 
@@ -55,7 +55,7 @@ def _of_menagerie(module: ModuleType, name: str, robot: str) -> Path:
 def _of_descriptions(module: ModuleType, name: str, robot: str) -> Path:
     known = sorted(path.stem for path in Path(module.__path__[0]).glob("*_description.py"))
     if robot not in known:
-        raise unknown(name, "robot", robot, known, "the name of a description")
+        raise unknown_name(name, "robot", robot, known, "the name of a description")
     description = importlib.import_module(f"{module.__name__}.{robot}")  # downloads
     return Path(getattr(description, "URDF_PATH", None) or description.MJCF_PATH)
 

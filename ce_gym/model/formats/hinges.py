@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ce_gym.model.description import Body, Inertial, Joint
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.frames import ORIGIN, ZERO, Vec3
 
 _MASSLESS = Inertial(0.0, ZERO, (ZERO, ZERO, ZERO))
@@ -34,9 +34,9 @@ def coincident_hinges(body: Body, along: Vec3) -> tuple[Body, Body, Body]:
         RobotError: The joint is no ball joint, or the axis has no length.
     """
     if body.joint.type != "ball":
-        raise bad(body.name, "joint type", body.joint.type, "ball")
+        raise invalid_value(body.name, "joint type", body.joint.type, "ball")
     if not 0.0 < math.hypot(*along) < math.inf:
-        raise bad(body.name, "axis of the spin", along, "an axis of length other than 0")
+        raise invalid_value(body.name, "axis of the spin", along, "an axis of length other than 0")
     spin = np.array(along) / math.hypot(*along)
     first = np.cross(spin, np.eye(3)[int(np.argmin(np.abs(spin)))])
     first = first / np.linalg.norm(first)

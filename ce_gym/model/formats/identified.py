@@ -13,7 +13,7 @@ import numpy as np
 
 from ce_gym.model.description import Body, Robot
 from ce_gym.model.drives import ELASTIC_FACTORS
-from ce_gym.model.errors import bad, unknown
+from ce_gym.model.errors import invalid_value, unknown_name
 from ce_gym.model.formats.placement import mat3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.mechanism import spin_inertia
@@ -35,9 +35,10 @@ def with_identified(robot: Robot, section: Section) -> Robot:
     for kind, part in sorted(section.sections(), key=lambda named: KINDS.index(named[0])):
         for name, value in part.numbers():
             if name not in (known := _owners(robot, kind)):
-                raise unknown(section.file, part.path, name, known, "what has such a figure")
+                raise unknown_name(section.file, part.path, name, known, "what has such a figure")
             if kind != "added_mass" and not (value > 0 or (value == 0 and kind in MAY_VANISH)):
-                raise bad(section.file, part.key(name), value, "more than 0, or 0 for friction, damping and backlash")
+                expected = "more than 0, or 0 for friction, damping and backlash"
+                raise invalid_value(section.file, part.key(name), value, expected)
             robot = _with(robot, kind, name, value)
     return robot
 

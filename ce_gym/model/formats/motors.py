@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ce_gym.model.assets import assets_folder
 from ce_gym.model.drives import Heat
-from ce_gym.model.errors import bad, unknown
+from ce_gym.model.errors import unknown_name
 from ce_gym.model.formats.reading import Section, read_yaml
 from ce_gym.model.table import table_text
 
@@ -80,7 +80,7 @@ def motor_type(name: str, file: str, key: str) -> MotorType:
     """
     library = motor_types()
     if name not in library:
-        raise unknown(file, key, name, library, "the name of a motor in the library")
+        raise unknown_name(file, key, name, library, "the name of a motor in the library")
     return library[name]
 
 
@@ -108,6 +108,6 @@ def _motor(name: str, section: Section) -> MotorType:
     figures = {key: section.number(key, None) if key in _OPTIONAL else section.number(key) for key in _NUMBERS}
     for key, value in figures.items():
         if value is not None and not value > 0.0:
-            raise bad(section.file, section.key(key), value, "more than 0")
+            raise section.invalid(key, value, "more than 0")
     heat = heat_of(section.section("heat")) if "heat" in section else None
     return MotorType(name, **figures, heat=heat, source=section.text("source"))  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import yaml
 import yaml.composer
 import yaml.constructor
 
-from ce_gym.model.errors import RobotError, bad, unknown
+from ce_gym.model.errors import RobotError, invalid_value, unknown_name
 from ce_gym.model.formats.text_file import one_line, read_text
 
 _REQUIRED: Any = object()
@@ -110,10 +110,10 @@ class Section:
     def __init__(self, file: str, path: str, data: object):
         self.file, self.path = file, path
         if not isinstance(data, dict):
-            raise bad(file, path or "top level", data, "a mapping")
+            raise invalid_value(file, path or "top level", data, "a mapping")
         for key in data:
             if not isinstance(key, str):
-                raise bad(file, f"{self.key(key)}", key, "a name; put quotes around it")
+                raise self.invalid(key, key, "a name; put quotes around it")
         self.data: dict[str, Any] = data
 
     def __contains__(self, key: str) -> bool:
@@ -126,11 +126,19 @@ class Section:
         """Return the full name of a key, for messages."""
         return f"{self.path}.{key}" if self.path else str(key)
 
+    def invalid(self, key: object, value: object, expected: str) -> RobotError:
+        """Return the error for a value under a key, see `errors.invalid_value`."""
+        return invalid_value(self.file, self.key(key), value, expected)
+
+    def unknown(self, key: str, name: object, known: Iterable[str], expected: str) -> RobotError:
+        """Return the error for a name under a key, or in the mapping itself for an empty key."""
+        return unknown_name(self.file, self.key(key) if key else self.path or "top level", name, known, expected)
+
     def allow(self, *keys: str) -> Section:
         """Refuse keys other than these; return the section itself."""
         for key in self.data:
             if key not in keys:
-                raise unknown(self.file, self.path or "top level", key, keys, "a key that exists")
+                raise self.unknown("", key, keys, "a key that exists")
         return self
 
     def get(self, key: str, default: Any = _REQUIRED, expected: str = "a value") -> Any:
@@ -138,7 +146,7 @@ class Section:
         if key in self.data:
             return self.data[key]
         if default is _REQUIRED:
-            raise bad(self.file, self.key(key), None, expected)
+            raise self.invalid(key, None, expected)
         return default
 
     def section(self, key: str) -> Section:
@@ -155,9 +163,9 @@ class Section:
         if value is default:
             return value
         if not isinstance(value, str) or not value.strip():
-            raise bad(self.file, self.key(key), value, "text")
+            raise self.invalid(key, value, "text")
         if choices and value not in choices:
-            raise unknown(self.file, self.key(key), value, choices, "one of")
+            raise self.unknown(key, value, choices, "one of")
         return value
 
     def number(self, key: str, default: Any = _REQUIRED) -> float:
@@ -171,7 +179,7 @@ class Section:
         if value is default:
             return value
         if not isinstance(value, list) or len(value) != count:
-            raise bad(self.file, self.key(key), value, f"a list of {count} numbers")
+            raise self.invalid(key, value, f"a list of {count} numbers")
         return tuple(finite(self.file, f"{self.key(key)}[{i}]", item) for i, item in enumerate(value))
 
     def items(self) -> dict[str, Any]:
@@ -198,7 +206,7 @@ class Section:
                 continue
             fitting = [name for name in names if fnmatchcase(name, key)]
             if not fitting:
-                raise unknown(self.file, self.path, key, names, "a pattern that fits a name")
+                raise self.unknown("", key, names, "a pattern that fits a name")
             found |= dict.fromkeys(fitting, key)
         return found | {key: key for key in self if not set(key) & set("*?[")}
 
@@ -206,14 +214,14 @@ class Section:
         """Return a list, empty if the key is missing."""
         value = self.get(key, [])
         if not isinstance(value, list):
-            raise bad(self.file, self.key(key), value, "a list")
+            raise self.invalid(key, value, "a list")
         return value
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Return a list of texts, empty if the key is missing."""
         for i, item in enumerate(self.list(key)):
             if not isinstance(item, str):
-                raise bad(self.file, f"{self.key(key)}[{i}]", item, "text")
+                raise invalid_value(self.file, f"{self.key(key)}[{i}]", item, "text")
         return tuple(self.list(key))
 
 
@@ -225,7 +233,7 @@ def finite(file: str, key: str, value: object) -> float:
                 return float(value)
         except OverflowError:  # an integer beyond the range of floats
             value = "a number with hundreds of digits"
-    raise bad(file, key, value, "a finite number")
+    raise invalid_value(file, key, value, "a finite number")
 
 
 def frozen(value: Any) -> Any:

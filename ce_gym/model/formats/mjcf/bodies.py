@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ce_gym.model.description import Body, Inertial, Joint, Shape
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.formats.hinges import coincident_hinges
 from ce_gym.model.formats.mjcf.scenes import robot_hint
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement, rotation
@@ -87,12 +87,12 @@ def read_bodies(
         _add_body(source, tree, index, locked, hinged, apart)
     if not tree.bodies:
         hint = robot_hint(Path(source.file))
-        raise bad(source.file, "bodies that move", (), f"a robot, which has a body with a joint{hint}")
+        raise invalid_value(source.file, "bodies that move", (), f"a robot, which has a body with a joint{hint}")
     _report_forces(source)
     tree.bodies.sort(key=lambda body: body.joint.type != "free")
     free = [body.name for body in tree.bodies if body.joint.type == "free"]
     if len(free) > 1:
-        raise bad(
+        raise invalid_value(
             source.file,
             "bodies that move freely",
             tuple(free),

@@ -14,7 +14,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from ce_gym.model.errors import RobotError, bad
+from ce_gym.model.errors import RobotError, invalid_value
 from ce_gym.model.formats.text_file import check_regular, one_line, read_bytes
 
 MOST_ELEMENTS = 10_000
@@ -54,9 +54,11 @@ def check_file(path: Path) -> None:
         for element, copies in _elements(root):
             total += copies * (largest if element.tag == "attach" else 1)
             if total > MOST_ELEMENTS:
-                raise bad(str(page), f"<{element.tag}>", f"{copies} copies", f"at most {MOST_ELEMENTS} elements in all")
+                expected = f"at most {MOST_ELEMENTS} elements in all"
+                raise invalid_value(str(page), f"<{element.tag}>", f"{copies} copies", expected)
             if element.tag == "attach" and page != path:
-                raise bad(str(page), "<attach>", element.get("model"), "attached models that attach no others")
+                expected = "attached models that attach no others"
+                raise invalid_value(str(page), "<attach>", element.get("model"), expected)
             _check_figures(str(page), element)
             _check_assets(str(page), element, folders)
 
@@ -69,7 +71,7 @@ def _read_pages(path: Path, main: Path, pages: dict[Path, Element]) -> None:
         if element.tag in ("include", "model") and file:
             for other in {main / file, path.parent / file}:
                 if len(pages) >= MOST_FILES:
-                    raise bad(str(path), f"<{element.tag} file>", file, f"at most {MOST_FILES} files")
+                    raise invalid_value(str(path), f"<{element.tag} file>", file, f"at most {MOST_FILES} files")
                 if other not in pages and os.path.lexists(other):  # of others, MuJoCo says what is wrong
                     _read_pages(other, main, pages)
 
@@ -83,7 +85,7 @@ def _parsed(path: Path) -> Element:
         raise RobotError(f"{path}: cannot be read: expected an MJCF file in UTF-8, comments apart")
     start = re.search(r"<([^\s/>]*)", text)
     if start is None or start[1] not in ("mujoco", "mujocoinclude"):
-        raise bad(str(path), "root element", start and start[1], "<mujoco>")
+        raise invalid_value(str(path), "root element", start and start[1], "<mujoco>")
     try:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:
@@ -124,19 +126,20 @@ def _check_figures(file: str, element: Element) -> None:
         words = value.lower().split()
         largest = LARGEST_SIZE if key in _SIZES else _LARGEST.get(key, LARGEST_SIZE) if element.tag == "size" else None
         if largest is not None and any(word.isdigit() and (len(word) > 9 or int(word) > largest) for word in words):
-            raise bad(file, key, value, f"at most {largest}")
+            raise invalid_value(file, key, value, f"at most {largest}")
         if key != "name" and any(word.lstrip("+-") == "nan" for word in words):
-            raise bad(file, key, value, "finite numbers")
+            raise invalid_value(file, key, value, "finite numbers")
         if key.endswith("range"):
             _check_range(file, f"<{element.tag}> {key}", value)
     for keys in _PAIRS:
         sides = [int(word) for key in keys for word in _words(element, key) if _whole(word)]
         if math.prod(sides) > LARGEST_PICTURE:
-            raise bad(file, f"<{element.tag}> {' x '.join(keys)}", sides, f"at most {LARGEST_PICTURE} together")
+            expected = f"at most {LARGEST_PICTURE} together"
+            raise invalid_value(file, f"<{element.tag}> {' x '.join(keys)}", sides, expected)
     memory = element.get("memory", "").upper()
     digits, unit = memory.rstrip("KMGTPE"), memory[-1:]
     if element.tag == "size" and _whole(digits) and int(digits) * _UNITS.get(unit, 1) > LARGEST_MEMORY:
-        raise bad(file, "<size> memory", memory, f"at most {LARGEST_MEMORY} bytes")
+        raise invalid_value(file, "<size> memory", memory, f"at most {LARGEST_MEMORY} bytes")
 
 
 def _check_range(file: str, key: str, value: str) -> None:
@@ -146,7 +149,7 @@ def _check_range(file: str, key: str, value: str) -> None:
     except ValueError:
         return  # MuJoCo says what is wrong
     if low > high:
-        raise bad(file, key, value, "a lower limit that is not above the upper")
+        raise invalid_value(file, key, value, "a lower limit that is not above the upper")
 
 
 def _check_assets(file: str, element: Element, folders: set[Path]) -> None:

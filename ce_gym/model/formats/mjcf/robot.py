@@ -25,7 +25,7 @@ import numpy as np
 
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.description import Pose, Robot
-from ce_gym.model.errors import LossyImportWarning, bad, unknown
+from ce_gym.model.errors import LossyImportWarning
 from ce_gym.model.formats.mjcf.actuators import read_actuators
 from ce_gym.model.formats.mjcf.balls import balls_in_loops
 from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, shapes
@@ -126,9 +126,9 @@ def _ratios(gears: Section, tree: MjcfTree, driven: Collection[str]) -> dict[str
     joints = [body for body in tree.moved_by.values() if body not in driven]
     for joint, ratio in (ratios := gears.figures(joints)).items():
         if joint not in joints:
-            raise unknown(gears.file, gears.path, joint, joints, "the name of a joint that no rotor is given for")
+            raise gears.unknown("", joint, joints, "the name of a joint that no rotor is given for")
         if ratio == 0.0:
-            raise bad(gears.file, gears.key(joint), ratio, "a number other than 0")
+            raise gears.invalid(joint, ratio, "a number other than 0")
     return ratios
 
 

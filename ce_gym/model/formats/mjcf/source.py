@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ce_gym.model.checks.body import LARGEST_FIGURE
 from ce_gym.model.checks.robot import MOST_BODIES
-from ce_gym.model.errors import RobotError, bad, printable
+from ce_gym.model.errors import RobotError, invalid_value, printable
 from ce_gym.model.formats.mjcf.limits import check_file
 from ce_gym.model.formats.mjcf.scenes import scene_hint
 from ce_gym.model.formats.placement import exact_right_angles, vec3
@@ -195,12 +195,13 @@ def _check_figures(file: str, model: Any) -> None:
         values = np.asarray(getattr(model, name))
         usable = np.isfinite(values) & ((np.abs(values) <= LARGEST_FIGURE) | (name in _LIMITS))
         if not usable.all():
-            raise bad(file, name, float(values[~usable][0]), f"finite numbers, up to {LARGEST_FIGURE:g} in size")
+            expected = f"finite numbers, up to {LARGEST_FIGURE:g} in size"
+            raise invalid_value(file, name, float(values[~usable][0]), expected)
     if (model.dof_armature < 0.0).any():
-        raise bad(file, "armature", float(model.dof_armature.min()), "0 or more [kg m^2 or kg]")
+        raise invalid_value(file, "armature", float(model.dof_armature.min()), "0 or more [kg m^2 or kg]")
     if max(model.nbody - 1, model.nv) > MOST_BODIES:
         found = f"{model.nbody - 1} bodies with {model.nv} degrees of freedom"
-        raise bad(file, "size", found, f"at most {MOST_BODIES} of each")
+        raise invalid_value(file, "size", found, f"at most {MOST_BODIES} of each")
 
 
 def placement(position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> Placement:

@@ -12,7 +12,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
-from ce_gym.model.errors import RobotError, bad
+from ce_gym.model.errors import RobotError, invalid_value
 from ce_gym.model.formats.text_file import one_line, read_bytes
 
 XACRO_DEFINITIONS = ("xacro:property", "xacro:arg")
@@ -52,7 +52,7 @@ def parse_urdf(path: Path) -> Element:
             raise
         raise RobotError(f"{path}: malformed XML: expected a URDF file ({one_line(error)})") from None
     if root.tag != "robot":
-        raise bad(str(path), "root element", root.tag, "<robot>")
+        raise invalid_value(str(path), "root element", root.tag, "<robot>")
     _refuse_xacro(str(path), root)
     return root
 
@@ -83,4 +83,4 @@ def _refuse_xacro(file: str, root: Element) -> None:
         value = next((text for text in texts if "${" in text or "$(" in text), None)
         if wants or (value is not None and not element.tag.startswith("xacro:")):
             found = f"<{element.tag}>" if wants else value
-            raise bad(file, "xacro", found, "a plain URDF; expand it first: xacro FILE > robot.urdf")
+            raise invalid_value(file, "xacro", found, "a plain URDF; expand it first: xacro FILE > robot.urdf")

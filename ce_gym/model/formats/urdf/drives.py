@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import UNKNOWN_RATIO, Body, Joint
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.formats.rotor_links import disc, without_rotors
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.graph import UrdfGraph
@@ -155,7 +155,7 @@ def _motors(file: str, where: str, transmission: Element) -> Iterator[tuple[floa
         for inertia in _figures(file, where, parts, "inertia"):
             ratios = {*_figures(file, where, parts, "ratio"), *_figures(file, where, others, "ratio")}
             if 0.0 in ratios and inertia:
-                raise bad(file, f"{where} <mechanicalReduction>", 0.0, "a ratio other than 0")
+                raise invalid_value(file, f"{where} <mechanicalReduction>", 0.0, "a ratio other than 0")
             if inertia:
                 yield inertia, sorted(ratios - {1.0}) or [1.0]
 
@@ -171,7 +171,8 @@ def _figures(file: str, where: str, parts: Iterable[Element], key: str) -> list[
             value = math.nan
         negative = value < 0.0 and key == "inertia"
         if not math.isfinite(value) or negative:
-            raise bad(file, f"{where} <{element.tag}>", text, "a finite number" + (" that is not negative" * negative))
+            expected = "a finite number" + (" that is not negative" * negative)
+            raise invalid_value(file, f"{where} <{element.tag}>", text, expected)
         found.append(value)
     return found
 
@@ -186,6 +187,6 @@ def _added_inertias(graph: UrdfGraph) -> Iterator[Drive]:
         dynamics = joint.element.find("dynamics")
         reflected = read.number(graph.file, joint.where, dynamics, "rotor_inertia", 0.0)
         if reflected < 0.0:
-            raise bad(graph.file, f"{joint.where} <dynamics rotor_inertia>", reflected, "0 or more [kg m^2]")
+            raise invalid_value(graph.file, f"{joint.where} <dynamics rotor_inertia>", reflected, "0 or more [kg m^2]")
         if reflected:
             yield Drive(f"{joint.where} <dynamics rotor_inertia>", link, reflected / UNKNOWN_RATIO**2, UNKNOWN_RATIO)

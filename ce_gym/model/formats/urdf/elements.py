@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ce_gym.model.description import Inertial, Joint, Shape
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.formats.placement import exact_right_angles, rotation_from_rpy, symmetric, transform_inertial, vec3
 from ce_gym.model.frames import Placement, Vec3, rotation_matrix
 
@@ -34,13 +34,13 @@ def numbers(file: str, where: str, element: Element, attribute: str, count: int)
     expected = "a finite number" if count == 1 else f"{count} finite numbers"
     key = f"{where} <{element.tag} {attribute}>"
     if text is None:
-        raise bad(file, key, None, expected)
+        raise invalid_value(file, key, None, expected)
     try:
         values = tuple(float(word) for word in text.split())
     except ValueError:
-        raise bad(file, key, text, expected) from None
+        raise invalid_value(file, key, text, expected) from None
     if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise bad(file, key, text, expected)
+        raise invalid_value(file, key, text, expected)
     return values
 
 
@@ -55,7 +55,7 @@ def required(file: str, where: str, element: Element, tag: str) -> Element:
     """Return the child element called `tag`."""
     child = element.find(tag)
     if child is None:
-        raise bad(file, f"{where} <{tag}>", None, f"a <{tag}> element in <{element.tag}>")
+        raise invalid_value(file, f"{where} <{tag}>", None, f"a <{tag}> element in <{element.tag}>")
     return child
 
 
@@ -63,7 +63,7 @@ def name_of(file: str, element: Element, attribute: str = "name", where: str = "
     """Return a name that must be there and must not be empty."""
     name = element.get(attribute)
     if not name:
-        raise bad(file, f"{where} <{element.tag} {attribute}>".strip(), name, "a name")
+        raise invalid_value(file, f"{where} <{element.tag} {attribute}>".strip(), name, "a name")
     return name
 
 
@@ -88,7 +88,7 @@ def inertial(file: str, where: str, link: Element) -> Inertial | None:
         return None
     mass = numbers(file, where, required(file, where, element, "mass"), "value", 1)[0]
     if mass < 0.0:
-        raise bad(file, f"{where} <mass value>", mass, "a mass that is not negative [kg]")
+        raise invalid_value(file, f"{where} <mass value>", mass, "a mass that is not negative [kg]")
     matrix = required(file, where, element, "inertia")
     entries = [numbers(file, where, matrix, entry, 1)[0] for entry in _INERTIA_ENTRIES]
     about_com = Inertial(mass, (0.0, 0.0, 0.0), symmetric(*entries))
@@ -119,7 +119,7 @@ def unit_axis(file: str, key: str, axis: tuple[float, ...]) -> Vec3:
     """Return `axis` with length one; its sign is kept."""
     length = math.hypot(*axis)
     if length < 1e-9:
-        raise bad(file, key, axis, "an axis of length other than 0")
+        raise invalid_value(file, key, axis, "an axis of length other than 0")
     return vec3([x / length + 0.0 for x in axis])
 
 
@@ -153,7 +153,7 @@ def shape(file: str, where: str, visual: Element, colors: dict[str, Color]) -> S
             if not any(size):
                 return None
             if min(size) <= 0.0:
-                raise bad(file, f"{where} <{kind.tag}> size", size, "lengths above 0 [m]")
+                raise invalid_value(file, f"{where} <{kind.tag}> size", size, "lengths above 0 [m]")
             return Shape(kind.tag, size, pose, color)  # type: ignore[arg-type]
     return None
 

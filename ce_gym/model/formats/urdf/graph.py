@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from ce_gym.model.errors import bad, unknown
+from ce_gym.model.errors import invalid_value, unknown_name
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.document import parse_urdf
 
@@ -91,12 +91,12 @@ class UrdfGraph:
         for element in self.robot.findall("link"):
             name = read.name_of(self.file, element)
             if name in links:
-                raise bad(self.file, "link name", name, "a name that no other link has")
+                raise invalid_value(self.file, "link name", name, "a name that no other link has")
             links[name] = element
         if len(links) > MOST_LINKS:
-            raise bad(self.file, "number of links", len(links), f"at most {MOST_LINKS}")
+            raise invalid_value(self.file, "number of links", len(links), f"at most {MOST_LINKS}")
         if not links:
-            raise bad(self.file, "<robot>", None, "at least one <link>")
+            raise invalid_value(self.file, "<robot>", None, "at least one <link>")
         return links
 
     def _joints(self) -> list[UrdfJoint]:
@@ -105,10 +105,10 @@ class UrdfGraph:
         for element in self.robot.findall("joint"):
             joint = self._joint(element)
             if joint.name in joints:
-                raise bad(self.file, "joint name", joint.name, "a name that no other joint has")
+                raise invalid_value(self.file, "joint name", joint.name, "a name that no other joint has")
             if joint.child in moved_by:
                 both = f"{moved_by[joint.child]!r} and {joint.name!r}"
-                raise bad(
+                raise invalid_value(
                     self.file, f"link {joint.child!r} parents", both, "one joint; close a loop by a constraint instead"
                 )
             joints[joint.name] = joint
@@ -144,12 +144,12 @@ class UrdfGraph:
         where = f"joint {name!r}"
         kind = element.get("type")
         if kind not in (*MOVING, "fixed"):
-            raise bad(self.file, f"{where} type", kind, f"one of {', '.join((*MOVING, 'fixed'))}")
+            raise invalid_value(self.file, f"{where} type", kind, f"one of {', '.join((*MOVING, 'fixed'))}")
         ends = {}
         for end in ("parent", "child"):
             link = read.name_of(self.file, read.required(self.file, where, element, end), "link", where)
             if link not in self.links:
-                raise unknown(self.file, f"{where} <{end} link>", link, self.links, "the name of a link")
+                raise unknown_name(self.file, f"{where} <{end} link>", link, self.links, "the name of a link")
             ends[end] = link
         return UrdfJoint(name, kind, ends["parent"], ends["child"], element)
 
@@ -157,14 +157,15 @@ class UrdfGraph:
         """Order the links so that parents come before children; the first is the only root."""
         roots = [link for link in self.links if link not in self.joints]
         if len(roots) > 1:
-            raise bad(self.file, "root links", roots, "one link that is no joint's child")
+            raise invalid_value(self.file, "root links", roots, "one link that is no joint's child")
         order: dict[str, None] = {}
         for link in self.links:
             chain = [link]
             while (joint := self.joints.get(chain[-1])) is not None and chain[-1] not in order:
                 if joint.parent in chain:
                     cycle = " -> ".join([*reversed(chain[chain.index(joint.parent) :]), joint.parent])
-                    raise bad(self.file, "joints", cycle, "a tree; a cycle needs a constraint in place of one joint")
+                    expected = "a tree; a cycle needs a constraint in place of one joint"
+                    raise invalid_value(self.file, "joints", cycle, expected)
                 chain.append(joint.parent)
             order.update(dict.fromkeys(reversed(chain)))
         return list(order)

@@ -23,7 +23,7 @@ from xml.etree.ElementTree import Element
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.constraints import LinearConstraint, LoopConstraint
 from ce_gym.model.description import Body, Pose, Robot
-from ce_gym.model.errors import bad, unknown
+from ce_gym.model.errors import invalid_value, unknown_name
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.formats.rotor_rule import with_rotors
 from ce_gym.model.formats.standing import with_limits
@@ -78,7 +78,7 @@ def _independent(graph: UrdfGraph, tree: UrdfTree) -> Iterator[str]:
         joint = graph.joints[body.name]
         text = joint.element.get("independent", "false" if body.name in mimics else "true")
         if text.lower() not in _TRUTH:
-            raise bad(graph.file, f"{joint.where} independent", text, "true or false")
+            raise invalid_value(graph.file, f"{joint.where} independent", text, "true or false")
         if _TRUTH[text.lower()]:
             yield body.name
 
@@ -90,10 +90,11 @@ def _couplings(graph: UrdfGraph, tree: UrdfTree) -> Iterator[LinearConstraint]:
         ends = [_end(graph.file, where, element, tag, tree.frames)[0] for tag in ("predecessor", "successor")]
         ratio = read.numbers(graph.file, where, read.required(graph.file, where, element, "ratio"), "value", 1)[0]
         if ratio == 0.0:
-            raise bad(graph.file, f"{where} <ratio value>", ratio, "a ratio other than 0")
+            raise invalid_value(graph.file, f"{where} <ratio value>", ratio, "a ratio other than 0")
         predecessors, successors = _branches(ends[0], ends[1], tree.bodies)
         if not predecessors or not successors:
-            raise bad(graph.file, where, tuple(ends), "two links that move, neither of which carries the other")
+            expected = "two links that move, neither of which carries the other"
+            raise invalid_value(graph.file, where, tuple(ends), expected)
         pairs = [*((body, 1.0) for body in successors), *((body, -ratio) for body in predecessors)]
         yield LinearConstraint(name, tuple(pairs))
 
@@ -119,10 +120,12 @@ def _loops(graph: UrdfGraph, tree: UrdfTree) -> Iterator[LoopConstraint]:
         where = f"{element.tag} {name!r}"
         kind = element.get("type", "")
         if kind not in _LOOP_TYPES:
-            raise unknown(graph.file, f"{where} type", element.get("type"), _LOOP_TYPES, "a joint that closes a loop")
+            expected = "a joint that closes a loop"
+            raise unknown_name(graph.file, f"{where} type", element.get("type"), _LOOP_TYPES, expected)
         predecessor, successor = _ends(graph, where, element, tree.frames)
         if predecessor[0] == successor[0]:
-            raise bad(graph.file, where, predecessor[0] or "the world", "two links that can move against each other")
+            expected = "two links that can move against each other"
+            raise invalid_value(graph.file, where, predecessor[0] or "the world", expected)
         yield LoopConstraint(
             name=name,
             joint=_LOOP_TYPES[kind],
@@ -145,10 +148,10 @@ def _ends(graph: UrdfGraph, where: str, element: Element, frames: dict[str, Fram
         return first, second
     if all(joint.element.get("independent") is None for joint in graph.joints.values()):
         expected = 'independent="false" on each joint that the loops determine, or the loop as <connect> in MJCF'
-        raise bad(file, f"<{element.tag}> {where.split(' ', 1)[1]}", "without independent joints", expected)
+        raise invalid_value(file, f"<{element.tag}> {where.split(' ', 1)[1]}", "without independent joints", expected)
     ends = [end for end in element if end.tag in ("link1", "link2")]
     if len(ends) != 2:
-        raise bad(file, f"{where} ends", len(ends), "a <link1> and a <link2>")
+        raise invalid_value(file, f"{where} ends", len(ends), "a <link1> and a <link2>")
     first, second = (_frame(file, where, end, end, frames) for end in ends)
     return first, second
 
@@ -163,6 +166,6 @@ def _frame(file: str, where: str, end: Element, origin: Element | None, frames: 
     """Return the body that a link belongs to, and a pose given in the link's frame in the body's."""
     link = read.name_of(file, end, "link", where)
     if link not in frames:
-        raise unknown(file, f"{where} <{end.tag} link>", link, frames, "the name of a link")
+        raise unknown_name(file, f"{where} <{end.tag} link>", link, frames, "the name of a link")
     body, pose = frames[link]
     return body, compose(pose, read.pose_of(file, where, origin))

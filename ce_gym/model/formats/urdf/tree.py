@@ -20,7 +20,7 @@ import numpy as np
 from ce_gym.model.checks.body import check_body
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Inertial, Joint, Shape
-from ce_gym.model.errors import LossyImportWarning, bad, unknown
+from ce_gym.model.errors import LossyImportWarning, invalid_value, unknown_name
 from ce_gym.model.formats.placement import compose, mat3, merge_inertials, transform_inertial
 from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.urdf import elements as read
@@ -85,7 +85,8 @@ def read_urdf(
     """
     graph = UrdfGraph(path)
     if graph.is_plus:
-        raise bad(graph.file, "<loop>, <coupling> or independent", "URDF+", "a plain URDF; load the URDF+ file itself")
+        expected = "a plain URDF; load the URDF+ file itself"
+        raise invalid_value(graph.file, "<loop>, <coupling> or independent", "URDF+", expected)
     tree = read_tree(graph, base, apart, tied)
     warn_of_held_joints(graph.file, tree)
     for body in tree.bodies:
@@ -189,10 +190,11 @@ class _Reader:
         for joint in floating:
             if joint.parent != self.graph.root or base == "fixed":
                 expected = "a joint with one degree of freedom; fixed for a frame, floating only on a root without mass"
-                raise bad(self.file, f"{joint.where} type", "floating", expected)
+                raise invalid_value(self.file, f"{joint.where} type", "floating", expected)
         mass = added(part.mass for link in self.graph.welded_to(self.graph.root) if (part := self.inertials[link]))
         if floating and mass:
-            raise bad(self.file, f"link {self.graph.root!r} mass", mass, "none, because a floating joint hangs on it")
+            expected = "none, because a floating joint hangs on it"
+            raise invalid_value(self.file, f"link {self.graph.root!r} mass", mass, expected)
         if base is not None:
             return bool(floating) or base == "fixed"
         return self.graph.root == WORLD or mass == 0.0
@@ -225,7 +227,7 @@ class _Reader:
         inertial = self.inertials[link]
         if carried is not None or inertial is None:
             value, expected = (carried, "nothing: a rotor carries no link") if carried else (None, "mass and inertia")
-            raise bad(self.file, f"what rotor {link!r} {'carries' if carried else 'has'}", value, expected)
+            raise invalid_value(self.file, f"what rotor {link!r} {'carries' if carried else 'has'}", value, expected)
         return FixedLink(*self.frames[link], inertial, tuple(self._shapes(link, Placement())))
 
     def _body(self, link: str) -> Body:
@@ -235,7 +237,8 @@ class _Reader:
         ]
         joint = self.joints.get(link)
         if not inertials and (joint is None or joint.type == "floating"):
-            raise bad(self.file, f"link {link!r} <inertial>", None, "mass and inertia, because the link moves")
+            expected = "mass and inertia, because the link moves"
+            raise invalid_value(self.file, f"link {link!r} <inertial>", None, expected)
         if not inertials:
             self.notes.append(f"link {link!r} moves and has no <inertial>: its mass is 0")
             inertials = [Inertial(0.0, ZERO, mat3(np.zeros((3, 3))))]
@@ -266,7 +269,7 @@ class _Reader:
                 continue
             other = by_name.get(mimic.get("joint", ""))
             if other is None:
-                raise unknown(
+                raise unknown_name(
                     self.file, f"{joint.where} <mimic joint>", mimic.get("joint"), by_name, "the name of a joint"
                 )
             ratio, offset = (read.number(self.file, joint.where, mimic, key, value) for key, value in MIMIC_DEFAULTS)

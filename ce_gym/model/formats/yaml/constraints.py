@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator
 
 from ce_gym.model.constraints import Constraint, FunctionConstraint, LinearConstraint, LoopConstraint, RodConstraint
 from ce_gym.model.description import Body
-from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform_point, vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.urdf.elements import unit_axis
@@ -32,7 +31,7 @@ def frame_named(section: Section, key: str, frames: dict[str, Frame]) -> Frame:
     """Return the body that carries the frame named under `key`, and the frame's pose in that body."""
     name = section.text(key)
     if name not in frames and name != WORLD:
-        raise unknown(section.file, section.key(key), name, frames, "the name of a body")
+        raise section.unknown(key, name, frames, "the name of a body")
     return frames.get(name, (None, Placement()))
 
 
@@ -40,9 +39,9 @@ def coefficients(section: Section, names: list[str]) -> tuple[tuple[str, float],
     """Return pairs of a body and a number other than 0."""
     for body in section:
         if body not in names:
-            raise unknown(section.file, section.path, body, names, "the name of a body")
+            raise section.unknown("", body, names, "the name of a body")
         if section.number(body) == 0.0:
-            raise bad(section.file, section.key(body), 0.0, "a number other than 0")
+            raise section.invalid(body, 0.0, "a number other than 0")
     return section.numbers()
 
 
@@ -56,7 +55,7 @@ def _loop(entry: Section, names: list[str], frames: dict[str, Frame]) -> LoopCon
     entry.allow("name", "type", "joint", "axis", "first", "second")
     joint = entry.text("joint", choices=("revolute", "ball"))
     if joint == "ball" and "axis" in entry:
-        raise bad(entry.file, entry.key("axis"), entry.get("axis"), "no axis, because a ball joint has none")
+        raise entry.invalid("axis", entry.get("axis"), "no axis, because a ball joint has none")
     axis = unit_axis(entry.file, entry.key("axis"), entry.vector("axis", 3, (0.0, 0.0, 1.0)))
     (first, first_placement), (second, second_placement) = (
         _loop_end(entry, end, frames) for end in ("first", "second")

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ce_gym.model.description import Capsule, ContactSphere, Shape
-from ce_gym.model.errors import bad, unknown
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.formats.contact_shapes import FACES, on_face, rims_of, spheres_of
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform_point, vec3
 from ce_gym.model.formats.reading import Section
@@ -31,7 +31,7 @@ def read_contacts(section: Section, links: Links) -> Iterator[ContactSphere]:
     for name, entry in section.sections():
         body, frame = frame_named(entry, "body", links.frames)
         if body is None:
-            raise bad(entry.file, entry.key("body"), entry.text("body"), "a body that moves")
+            raise entry.invalid("body", entry.text("body"), "a body that moves")
         group, kind = entry.text("group", "foot"), entry.text("shape", "sphere", ("sphere", *SIZES, "collision"))
         if kind == "sphere":
             entry.allow("body", "shape", "position", "radius", "group", "rolls")
@@ -53,7 +53,7 @@ def read_capsules(section: Section, links: Links) -> Iterator[Capsule]:
     """Iterate over what links are to each other: a capsule, or several, under the name of each."""
     for link in section:
         if links.frames.get(link, (None, None))[0] is None:
-            raise unknown(section.file, section.path, link, links.frames, "the name of a body that moves")
+            raise section.unknown("", link, links.frames, "the name of a body that moves")
         body, frame = links.frames[link]
         entries = section.list(link) if isinstance(section.get(link), list) else [section.get(link)]
         for i, entry in enumerate(entries):
@@ -69,10 +69,10 @@ def read_pairs(file: Section, links: Links) -> tuple[tuple[str, str], ...]:
     for i, pair in enumerate(file.list("self_collisions")):
         key = f"{file.key('self_collisions')}[{i}]"
         if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(name, str) for name in pair)):
-            raise bad(file.file, key, pair, "a list of two links")
+            raise file.invalid(key, pair, "a list of two links")
         for name in pair:
             if links.frames.get(name, (None, None))[0] is None:
-                raise unknown(file.file, key, name, links.frames, "the name of a body that moves")
+                raise file.unknown(key, name, links.frames, "the name of a body that moves")
         pairs.append((str(links.frames[pair[0]][0]), str(links.frames[pair[1]][0])))
     return tuple(pairs)
 
@@ -81,7 +81,7 @@ def _primitive(entry: Section, kind: str) -> Shape:
     entry.allow("body", "shape", "size", "position", "rpy", "radius", "face", "rim", "rolls", "group")
     size = entry.vector("size", SIZES[kind])
     if min(size) < 0.0 or (kind != "capsule" and min(size) == 0.0):
-        raise bad(entry.file, entry.key("size"), list(size), "lengths above 0 [m]")
+        raise entry.invalid("size", list(size), "lengths above 0 [m]")
     turned = rotation_from_rpy(*entry.vector("rpy", 3, (0.0, 0.0, 0.0)))
     return Shape(kind, size, Placement(vec3(entry.vector("position", 3, (0.0, 0.0, 0.0))), turned))  # type: ignore[arg-type]
 
@@ -90,11 +90,11 @@ def _rolls(entry: Section, kind: str) -> bool:
     """Return whether contacts move around the rims of a cylinder."""
     rolls = entry.get("rolls", False)
     if not isinstance(rolls, bool):
-        raise bad(entry.file, entry.key("rolls"), rolls, "true or false")
+        raise entry.invalid("rolls", rolls, "true or false")
     if rolls and kind != "cylinder":
-        raise bad(entry.file, entry.key("rolls"), rolls, f"`shape: cylinder` with it, and not {kind}")
+        raise entry.invalid("rolls", rolls, f"`shape: cylinder` with it, and not {kind}")
     if rolls and "rim" in entry:
-        raise bad(entry.file, entry.key("rim"), entry.get("rim"), "none: with `rolls`, each rim is one contact")
+        raise entry.invalid("rim", entry.get("rim"), "none: with `rolls`, each rim is one contact")
     return rolls
 
 
@@ -105,7 +105,8 @@ def _collisions(entry: Section, links: Links) -> Iterator[Shape]:
     shapes = links.collisions.get(link, ())
     if not shapes or None in shapes:
         told, expected = ("a mesh", "primitives") if shapes else (None, "some in its URDF file")
-        raise bad(entry.file, f"{entry.path} <collision> of {link!r}", told, f"{expected}: box, cylinder or sphere")
+        expected = f"{expected}: box, cylinder or sphere"
+        raise invalid_value(entry.file, f"{entry.path} <collision> of {link!r}", told, expected)
     return (shape for shape in shapes if shape)
 
 
@@ -115,12 +116,12 @@ def _spheres(entry: Section, shape: Shape) -> list[tuple[str, np.ndarray, float]
     most = {"box": min(shape.size) / 2, "cylinder": min(shape.size[0], shape.size[-1] / 2)}.get(shape.type, 0.0)
     if not 0.0 <= radius <= most and "radius" in entry:
         expected = f"from 0 to {most:g} [m], by which edges are rounded" if most else "none: its size has it"
-        raise bad(entry.file, entry.key("radius"), radius, expected)
+        raise entry.invalid("radius", radius, expected)
     if rim not in range(3, MOST_ON_RIM + 1):
-        raise bad(entry.file, entry.key("rim"), rim, f"a whole number from 3 to {MOST_ON_RIM}, of spheres on a rim")
+        raise entry.invalid("rim", rim, f"a whole number from 3 to {MOST_ON_RIM}, of spheres on a rim")
     face = entry.text("face", "", FACES)
     if _rolls(entry, shape.type):
         if face not in ("", "+z", "-z"):
-            raise bad(entry.file, entry.key("face"), face, "+z or -z: one of the two rims of what rolls")
+            raise entry.invalid("face", face, "+z or -z: one of the two rims of what rolls")
         return on_face(rims_of(shape.size, radius), face)
     return on_face(list(spheres_of(shape.type, shape.size, radius, int(rim))), face)

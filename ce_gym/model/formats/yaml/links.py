@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Robot, Shape
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.formats.mjcf.robot import read_robot
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink
@@ -52,12 +52,12 @@ def read_links(path: Path, file: Section) -> Links:
     """
     if ("urdf" in file) == ("mjcf" in file):
         value = None if "urdf" not in file else "both"
-        raise bad(file.file, "urdf or mjcf", value, "one of them, the file that says what the links are")
+        raise invalid_value(file.file, "urdf or mjcf", value, "one of them, the file that says what the links are")
     rotors = file.section("rotors")
     driven = {joint for _, rotor in rotors.sections() for joint in names_in(rotor, "ratios")}
     if "urdf" in file:
         if "gears" in file:
-            raise bad(file.file, "gears", "given", "none: a URDF has no armature; give `rotors`")
+            raise file.invalid("gears", "given", "none: a URDF has no armature; give `rotors`")
         base: Base | None = file.text("base", None, choices=("floating", "fixed"))  # type: ignore[assignment]
         tied = {word for key in _TIES for word in _words(file.data.get(key))}
         tree = read_urdf(path.parent / file.text("urdf"), base, rotors.data, tied)
@@ -65,7 +65,7 @@ def read_links(path: Path, file: Section) -> Links:
         robot = Robot(tree.name, tree.bodies, tree.constraints, independent, notes=tree.notes)
         return Links(robot, dict(tree.frames), tree.fixed, tree.collisions, tree.drives, driven)
     if "base" in file:
-        raise bad(file.file, "base", file.get("base"), "none, because an MJCF file says itself what its base is")
+        raise file.invalid("base", file.get("base"), "none, because an MJCF file says itself what its base is")
     robot, frames, fixed = read_robot(path.parent / file.text("mjcf"), file.section("gears"), driven, rotors.data)
     return Links(robot, frames, fixed, {})
 

@@ -16,7 +16,6 @@ from ce_gym.model.assets import assets_folder
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.constraints import Constraint
 from ce_gym.model.description import Body, ContactMaterial, Gains, Pose, Robot
-from ce_gym.model.errors import bad, unknown
 from ce_gym.model.formats.identified import with_identified
 from ce_gym.model.formats.placement import vec3
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
@@ -90,9 +89,9 @@ def _over(path: Path, file: Section) -> Robot:
     beside = path.parent / name if name.endswith((".yaml", ".yml")) else assets_folder() / name / f"{name}.yaml"
     if not beside.is_file():
         known = sorted(file.stem for file in assets_folder().glob("*/*.yaml") if file.stem == file.parent.name)
-        raise unknown(file.file, "robot", name, known, "a robot of the package or a YAML file beside this one")
+        raise file.unknown("robot", name, known, "a robot of the package or a YAML file beside this one")
     if beside.resolve() == path.resolve() or "identified" in read_yaml(beside):
-        raise bad(file.file, "robot", name, "a robot file without identified figures of its own")
+        raise file.invalid("robot", name, "a robot file without identified figures of its own")
     robot = with_identified(robot_from_yaml(beside), file.section("identified"))
     robot = replace(robot, source=str(path), notes=(*robot.notes, *file.texts("notes")))
     check_robot(robot)
@@ -106,7 +105,7 @@ def _with_joint_figures(file: Section, bodies: tuple[Body, ...]) -> tuple[Body, 
         given = dict(_for_each(file, key, joints)) if key in file else {}
         for name in given:
             if name not in joints:
-                raise unknown(file.file, key, name, joints, "a link with a joint about or along one axis")
+                raise file.unknown(key, name, joints, "a link with a joint about or along one axis")
         bodies = tuple(
             replace(body, joint=replace(body.joint, **{figure: given[body.name]})) if body.name in given else body
             for body in bodies
@@ -120,10 +119,10 @@ def _without_actuators(file: Section, bodies: tuple[Body, ...], independent: tup
     for pattern in file.texts("passive"):
         matches = {name for name in independent if fnmatchcase(name, pattern)}
         if not matches:
-            raise unknown(file.file, "passive", pattern, independent, "the name of an independent joint, or a pattern")
+            raise file.unknown("passive", pattern, independent, "the name of an independent joint, or a pattern")
         passive |= matches
     if passive and passive == set(independent):
-        raise bad(file.file, "passive", tuple(passive), "at least one independent joint that is not passive")
+        raise file.invalid("passive", tuple(passive), "at least one independent joint that is not passive")
     return tuple(
         replace(body, joint=replace(body.joint, torque=0.0)) if body.name in passive else body for body in bodies
     )
@@ -135,7 +134,7 @@ def _independent(file: Section, below: Robot, ties: tuple[Constraint, ...]) -> t
         return file.texts("independent")
     if not all(tie.linear for tie in ties):
         expected = "the joints whose coordinates are independent, because loops and functions do not say which are"
-        raise bad(file.file, "independent", None, expected)
+        raise file.invalid("independent", None, expected)
     solved = {tie.bodies[0] for tie in ties if tie.bodies}
     return tuple(joint for joint in below.independent if joint not in solved)
 

@@ -14,7 +14,7 @@ from typing import Any
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Inertial, Joint
 from ce_gym.model.drives import DriveFriction, Elasticity, Motor
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.formats.motors import MotorType, motor_type
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, symmetric, vec3
 from ce_gym.model.formats.reading import Section
@@ -59,7 +59,7 @@ def _friction(motor: Section) -> dict[str, Any]:
     for both in (key for key in _BOTH_KEYS if key in section):
         for key in (f"{both}_motor", f"{both}_external"):
             if key in section:
-                raise bad(section.file, section.key(key), section.get(key), f"none beside {both!r}, which is both")
+                raise section.invalid(key, section.get(key), f"none beside {both!r}, which is both")
             figures[key] = section.number(both)
     more = {"drive_friction": DriveFriction(**figures)} if figures else {}
     return {"friction": section.number("coulomb", 0.0)} | more
@@ -93,7 +93,7 @@ def add_rotors(
     for name, rotor in section.sections():
         rotor.allow(*_KEYS)
         if name in links.frames and name not in links.fixed:
-            raise bad(rotor.file, section.key(name), name, "a name that no other body has")
+            raise invalid_value(rotor.file, section.key(name), name, "a name that no other body has")
         body, is_counted = _rotor(rotor, name, links, library.get(name))
         links.frames[name] = (name, Placement())
         rotors.append(body)
@@ -105,7 +105,7 @@ def add_rotors(
             if rest is None:
                 names = ", ".join(rotor.name for rotor in counted[body.name])
                 expected = "less inertia at rest than the body that carries them has"
-                raise bad(section.file, f"{section.path} on {body.name!r}", names, expected)
+                raise invalid_value(section.file, f"{section.path} on {body.name!r}", names, expected)
             bodies[i] = replace(body, inertial=rest)
     everything = _interleaved(tuple(bodies), tuple(rotors), section)
     return everything, tuple(_gears(section, everything, library))
@@ -123,10 +123,10 @@ def _rotor(rotor: Section, name: str, links: Links, motor: MotorType | None) -> 
         return Body(name, "rotor", carrier, pose, Joint("revolute", axis), inertial), False
     for key in ("mass", "com"):
         if key in rotor:
-            raise bad(rotor.file, rotor.key(key), rotor.get(key), "none: with one moment of inertia the carrier has it")
+            raise rotor.invalid(key, rotor.get(key), "none: with one moment of inertia the carrier has it")
     moment = motor.inertia if inertia is None and motor is not None else rotor.number("inertia")
     if not moment > 0.0:
-        raise bad(rotor.file, rotor.key("inertia"), moment, "more than 0 [kg m^2]")
+        raise rotor.invalid("inertia", moment, "more than 0 [kg m^2]")
     return Body(name, "rotor", carrier, pose, Joint("revolute", axis), disc(moment, axis)), True
 
 
@@ -135,7 +135,7 @@ def _fixed(rotor: Section, name: str, link: FixedLink) -> Body:
     for key in rotor:
         if key not in ("axis", "ratios"):
             expected = f"axis and ratios alone, because {name!r} is a link that has the rest"
-            raise bad(rotor.file, rotor.key(key), rotor.get(key), expected)
+            raise rotor.invalid(key, rotor.get(key), expected)
     axis = unit_axis(rotor.file, rotor.key("axis"), rotor.vector("axis", 3))
     return Body(name, "rotor", link.carrier, link.placement, Joint("revolute", axis), link.inertial, link.shapes)
 
@@ -146,7 +146,7 @@ def _mount(rotor: Section, links: Links) -> tuple[str | None, Placement, Vec3]:
     if "parent" not in rotor and len(driven) == 1 and driven[0] in links.robot.joints:
         for key in ("xyz", "rpy", "axis"):
             if key in rotor:
-                raise bad(rotor.file, rotor.key("parent"), None, f"the body that carries the rotor, because of {key!r}")
+                raise rotor.invalid("parent", None, f"the body that carries the rotor, because of {key!r}")
         body = links.robot.body(driven[0])
         return body.parent, body.placement, body.joint.axis
     carrier, mount = frame_named(rotor, "parent", links.frames)
@@ -171,9 +171,9 @@ def _gears(section: Section, bodies: Iterable[Body], library: Mapping[str, Motor
         ratios = _with_gearbox(figures, library.get(rotor)) if isinstance(figures.get("ratios", {}), list) else figures
         ratios = ratios.section("ratios")
         if not ratios.data:
-            raise bad(figures.file, figures.key("ratios"), {}, "at least one link and its gear ratio")
+            raise figures.invalid("ratios", {}, "at least one link and its gear ratio")
         if rotor in ratios:
-            raise bad(figures.file, ratios.key(rotor), rotor, "a link other than the rotor itself")
+            raise invalid_value(figures.file, ratios.key(rotor), rotor, "a link other than the rotor itself")
         pairs = coefficients(ratios, names)
         yield LinearConstraint(rotor, ((rotor, 1.0), *((link, -ratio) for link, ratio in pairs)))
 
@@ -183,5 +183,5 @@ def _with_gearbox(rotor: Section, motor: MotorType | None) -> Section:
     joints = rotor.texts("ratios")
     if motor is None:
         expected = "a mapping from joints to gear ratios, or a motor of the library under `motors`, whose ratio it is"
-        raise bad(rotor.file, rotor.key("ratios"), list(joints), expected)
+        raise rotor.invalid("ratios", list(joints), expected)
     return Section(rotor.file, rotor.path, {**rotor.data, "ratios": dict.fromkeys(joints, motor.ratio)})

@@ -6,7 +6,7 @@ from dataclasses import fields
 from typing import Any
 
 from ce_gym.model.drives import Battery
-from ce_gym.model.errors import bad
+from ce_gym.model.errors import invalid_value
 from ce_gym.model.formats.motors import MotorType, heat_of
 from ce_gym.model.formats.reading import Section, finite
 
@@ -28,7 +28,7 @@ def read_heat(motor: Section, used: MotorType | None) -> dict[str, Any]:
     if motor.get("heat") == "library":
         if used is None or used.heat is None:
             expected = "figures, or `use` of a motor of the library that has them"
-            raise bad(motor.file, motor.key("heat"), "library", expected)
+            raise motor.invalid("heat", "library", expected)
         return {"heat": used.heat}
     return {"heat": heat_of(motor.section("heat"))}
 
@@ -39,9 +39,10 @@ def read_cogging(motor: Section) -> dict[str, Any]:
     for i, item in enumerate(motor.list("cogging")):
         key = f"{motor.key('cogging')}[{i}]"
         if not isinstance(item, list) or len(item) not in (2, 3):
-            raise bad(motor.file, key, item, "order in a turn of the rotor, torque [N m] and perhaps phase [rad]")
+            expected = "order in a turn of the rotor, torque [N m] and perhaps phase [rad]"
+            raise invalid_value(motor.file, key, item, expected)
         order, torque, phase = (finite(motor.file, f"{key}[{j}]", x) for j, x in enumerate([*item, 0.0][:3]))
         if not (order > 0 and order == int(order)):
-            raise bad(motor.file, f"{key}[0]", order, "a whole number of periods in a turn of the rotor")
+            raise invalid_value(motor.file, f"{key}[0]", order, "a whole number of periods in a turn of the rotor")
         found.append((int(order), torque, phase))
     return {"cogging": tuple(found)} if found else {}
