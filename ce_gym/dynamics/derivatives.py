@@ -1,11 +1,11 @@
 """Derivatives of the quantities of a mechanism: Jacobians, and products with them in forward and reverse mode.
 
 Positions are differentiated in their tangent space, in the order of `v`: base rotation, base translation, both in base
-axes, rotations of ball joints in the axes of the bodies that turn, then the other joints. Closed loops move with the
+axes, rotations of ball joints in the axes of the moving bodies, then the other joints. Closed loops move with the
 independent joints: dependent coordinates that Newton's method found are differentiated through its iterations, which
 start from the solution and so give its exact derivative.
 
-The Jacobians of forward dynamics follow from those of inverse dynamics,
+The Jacobians of inverse dynamics give the Jacobians of forward dynamics,
 
     d vdot / dx = -M^-1 d ID(q, v, vdot) / dx,    d vdot / d tau = M^-1,
 
@@ -16,10 +16,12 @@ Source: Carpentier, Mansard, "Analytical Derivatives of Rigid Body Dynamics Algo
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.dynamics.algebra.spatial import SX, quaternion_product, quaternion_to_rotation
 from ce_gym.dynamics.algebra.tracing import traced
@@ -30,12 +32,86 @@ from ce_gym.model.coordinates import Layout
 from ce_gym.model.errors import check_names, listed_names
 from ce_gym.model.mechanism import Mechanism
 
-PLAIN_FIGURES, BODY_FIGURES = ("gravity", "rotor_inertia", "ratio"), ("added_mass", "com_shift")
-"""Parameters that are figures of the mechanism, not of a scene: of the whole, and of each link."""
+Array = NDArray[np.float64]
+
+ROBOT_PARAMETERS = ("gravity", "rotor_inertia", "ratio")
+"""Parameters of the whole mechanism."""
+LINK_PARAMETERS = ("added_mass", "com_shift")
+"""Parameters of each link of the mechanism."""
+
+
+class Derivatives:
+    """Derivatives of one quantity; made by `Model.derivatives`.
+
+    Positions are differentiated in their tangent space: rotation of the base, translation of the base, both in base
+    axes, rotations of ball joints, then the other joints. Parameters are differentiated at the robot's own values.
+
+    Args:
+        mechanism: The mechanism.
+        name: Name of the quantity.
+        wrt: Inputs and parameters with respect to which the quantity is differentiated.
+        evaluate: `Model.evaluate` of the mechanism.
+    """
+
+    def __init__(
+        self, mechanism: Mechanism, name: str, wrt: tuple[str, ...], evaluate: Callable[..., list[Array]]
+    ) -> None:
+        if not wrt:
+            raise ValueError(f"derivatives of {name} with respect to nothing; expected names of inputs or figures")
+        self.name, self.wrt = name, wrt
+        self._mechanism, self._evaluate = mechanism, evaluate
+        self._quantity = make_quantity(mechanism, name, wrt)
+        self._functions: dict[str, ca.Function] = {}
+
+    def casadi_function(self, kind: str) -> ca.Function:
+        """Return a derivative as a CasADi SX function: "jacobian", "product" or "gradient"."""
+        if kind not in self._functions:
+            if kind == "jacobian" and self.name == "forward_dynamics":
+                self._functions[kind] = _forward_dynamics_jacobian(self._mechanism, self.wrt)
+            else:
+                make = {"jacobian": jacobian_function, "product": product_function, "gradient": gradient_function}
+                self._functions[kind] = make[kind](self._quantity, self.wrt)
+        return self._functions[kind]
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs of the quantity."""
+        return tuple(self._quantity.outputs)
+
+    def jacobian(self, *arguments: ArrayLike) -> dict[tuple[str, str], Array]:
+        """Return the Jacobian of each output by each input or parameter, shape (..., n_output, n_input) each.
+
+        Args:
+            arguments: Inputs of the quantity, shape (..., n) each.
+        """
+        results = self._evaluate(self.casadi_function("jacobian"), *arguments)
+        return dict(zip([(output, x) for output in self.outputs for x in self.wrt], results, strict=True))
+
+    def product(self, *arguments: ArrayLike, directions: Mapping[str, ArrayLike]) -> dict[str, Array]:
+        """Return the derivative of each output along a direction, shape (..., n_output) each: forward mode.
+
+        Args:
+            arguments: Inputs of the quantity, shape (..., n) each.
+            directions: Direction for each of `wrt`, tangents for positions, shape (..., n_input) each.
+        """
+        columns = [directions[x] for x in self.wrt]
+        results = self._evaluate(self.casadi_function("product"), *arguments, *columns)
+        return {name: result[..., 0] for name, result in zip(self.outputs, results, strict=True)}
+
+    def gradient(self, *arguments: ArrayLike, weights: Mapping[str, ArrayLike]) -> dict[str, Array]:
+        """Return the gradient of the weighted sum of all outputs, shape (..., n_input) each: reverse mode.
+
+        Args:
+            arguments: Inputs of the quantity, shape (..., n) each.
+            weights: Weights of all outputs, shape (..., n_output) each.
+        """
+        columns = [weights[name] for name in self.outputs]
+        results = self._evaluate(self.casadi_function("gradient"), *arguments, *columns)
+        return {name: result[..., 0] for name, result in zip(self.wrt, results, strict=True)}
 
 
 def tangent_basis(q: SX, layout: Layout) -> SX:
-    """Return how positions (nq,) change with their tangent, shape (nq, nv)."""
+    """Return the derivative of positions (nq,) by their tangent, shape (nq, nv)."""
     turning = [_turning(q[i : i + 4]) for i, _ in layout.turns]
     if layout.floating:
         turning[0] = ca.blockcat([[SX(3, 3), quaternion_to_rotation(q[3:7])], [turning[0], SX(4, 3)]])
@@ -43,103 +119,98 @@ def tangent_basis(q: SX, layout: Layout) -> SX:
 
 
 def _turning(quaternion: SX) -> SX:
-    """Return how a quaternion changes with a rotation about the axes of what it turns, shape (4, 3)."""
+    """Return the derivative of a quaternion by a rotation about the axes of its body, shape (4, 3)."""
     return ca.horzcat(*[quaternion_product(quaternion, ca.vertcat(0, SX.eye(3)[:, i])) / 2 for i in range(3)])
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity as expressions of its inputs, which figures of the mechanism may be among.
+    """A quantity as expressions of its inputs and of parameters of the mechanism.
 
     Attributes:
-        inputs: Symbols by name, in the order of the function; positions, if there are any, are "q".
-        figures: Symbols of figures by name, with the values that the robot has.
+        inputs: Symbols by name, in the order of the function; positions are "q".
+        parameters: Symbols of parameters by name, with the robot's own values.
         outputs: Expressions by name.
         layout: Which rows of `q` are what.
     """
 
     inputs: dict[str, SX]
-    figures: dict[str, tuple[SX, np.ndarray]]
+    parameters: dict[str, tuple[SX, np.ndarray]]
     outputs: dict[str, SX]
     layout: Layout
 
     def along(self, name: str) -> tuple[SX, SX]:
-        """Return the symbol of an input or figure, and how it changes with its tangent."""
-        x = self.inputs[name] if name in self.inputs else self.figures[name][0]
+        """Return the symbol of an input or parameter, and its derivative by its tangent."""
+        x = self.inputs[name] if name in self.inputs else self.parameters[name][0]
         return x, tangent_basis(x, self.layout) if name == "q" else SX.eye(x.numel())
 
-    def function(self, name: str, given: dict[str, SX], results: list[SX]) -> ca.Function:
-        """Trace expressions at the robot's own figures; a guess of dependent coordinates stays the last input."""
-        symbols = [symbol for symbol, _ in self.figures.values()]
-        results = ca.substitute(results, symbols, [SX(ca.DM(value)) for _, value in self.figures.values()])
+    def function(self, name: str, more_inputs: dict[str, SX], results: list[SX]) -> ca.Function:
+        """Trace expressions at the robot's own parameters; a guess of dependent coordinates stays the last input."""
+        symbols = [symbol for symbol, _ in self.parameters.values()]
+        results = ca.substitute(results, symbols, [SX(ca.DM(value)) for _, value in self.parameters.values()])
         inputs = dict(self.inputs)
         guess = {"guess": inputs.pop("guess")} if "guess" in inputs else {}
-        return traced(name, inputs | given | guess, {f"result{i}": result for i, result in enumerate(results)})
+        return traced(name, inputs | more_inputs | guess, {f"result{i}": result for i, result in enumerate(results)})
 
 
 def make_quantity(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> Quantity:
-    """Return a quantity whose inputs, and figures among `wrt`, are symbols.
+    """Return a quantity whose inputs, and parameters among `wrt`, are symbols.
 
     Args:
         mechanism: The mechanism.
-        name: Of the quantity, one of `FUNCTIONS`.
-        wrt: Inputs of it by name, and figures of the mechanism by their names as parameters.
+        name: Name of the quantity, one of `FUNCTIONS`.
+        wrt: Names of inputs of the quantity and of parameters of the mechanism.
 
     Raises:
-        ValueError: If there is no such quantity, or it depends on no such thing.
+        ValueError: If there is no such quantity, input or parameter.
     """
     if name not in FUNCTIONS:
         raise ValueError(f"derivatives of {name!r}; expected one of {listed_names(name, FUNCTIONS)}")
-    plain = FUNCTIONS[name](mechanism).name_in()
-    figures = tuple(x for x in wrt if x not in plain or x == "guess")
-    bodies = [body.name for body in mechanism.robot.bodies if body.kind == "link"]
-    known = {*PLAIN_FIGURES, *(f"{figure}:{body}" for figure in BODY_FIGURES for body in bodies)}
-    given = [x for x in plain if x != "guess"]
-    listed = ", ".join([*given, *PLAIN_FIGURES, *(f"{figure}:BODY" for figure in BODY_FIGURES)])
-    check_names(f"derivatives of {name}: wrt", wrt, [*given, *known], "some of", listed=f"{listed}, BODY being a link")
-    defaults = parameter_defaults(mechanism.robot, mechanism.robot.material, figures)
-    symbols = {x: SX.sym("figure", len(value)) for x, value in defaults.items()}
-    named = with_parameters(mechanism, symbols) if figures else mechanism
+    arguments = [x for x in FUNCTIONS[name](mechanism).name_in() if x != "guess"]
+    parameters = tuple(x for x in wrt if x not in arguments)
+    links = [body.name for body in mechanism.robot.bodies if body.kind == "link"]
+    known = {*ROBOT_PARAMETERS, *(f"{parameter}:{link}" for parameter in LINK_PARAMETERS for link in links)}
+    listed = ", ".join([*arguments, *ROBOT_PARAMETERS, *(f"{parameter}:BODY" for parameter in LINK_PARAMETERS)])
+    expected = f"{listed}, BODY being a link"
+    check_names(f"derivatives of {name}: wrt", wrt, [*arguments, *known], "some of", listed=expected)
+    defaults = parameter_defaults(mechanism.robot, mechanism.robot.material, parameters)
+    symbols = {x: SX.sym("parameter", len(value)) for x, value in defaults.items()}
+    named = with_parameters(mechanism, symbols) if symbols else mechanism
     function = FUNCTIONS[name](named)
     inputs = {x: SX.sym(x, function.numel_in(i)) for i, x in enumerate(function.name_in())}
     outputs = dict(zip(function.name_out(), function.call(list(inputs.values())), strict=True))
     return Quantity(inputs, {x: (symbols[x], defaults[x]) for x in symbols}, outputs, mechanism.robot.layout)
 
 
-def jacobian_function(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> ca.Function:
-    """Trace Jacobians of a quantity: of each output, with respect to each of `wrt`, in the tangent space of positions.
+def jacobian_function(quantity: Quantity, wrt: tuple[str, ...]) -> ca.Function:
+    """Trace the Jacobian of each output with respect to each of `wrt`, in the tangent space of positions.
 
     Returns:
-        Function of the quantity's inputs -> matrices, of the same output one after the other.
+        Function of the quantity's inputs -> Jacobians, output by output.
     """
-    if name == "forward_dynamics":
-        return _forward_dynamics_jacobian(mechanism, wrt)
-    quantity = make_quantity(mechanism, name, wrt)
     return quantity.function("jacobian", {}, _jacobians(quantity, wrt))
 
 
-def product_function(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> ca.Function:
-    """Trace how a quantity changes along a direction (forward mode): at most two to three times its work.
+def product_function(quantity: Quantity, wrt: tuple[str, ...]) -> ca.Function:
+    """Trace the derivative of a quantity along a direction (forward mode): at most two to three times its work.
 
     Returns:
-        Function (*inputs, direction of each of `wrt`) -> change of each output, as a column.
+        Function (*inputs, direction of each of `wrt`) -> derivative of each output, as a column.
     """
-    quantity = make_quantity(mechanism, name, wrt)
     x, basis = (list(parts) for parts in zip(*[quantity.along(name) for name in wrt], strict=True))
     directions = [SX.sym("direction", tangent.shape[1]) for tangent in basis]
     moved = ca.vertcat(*[tangent @ direction for tangent, direction in zip(basis, directions, strict=True)])
     changes = [ca.jtimes(ca.vec(output), ca.vertcat(*x), moved) for output in quantity.outputs.values()]
-    given = {f"direction{i}": direction for i, direction in enumerate(directions)}
-    return quantity.function("product", given, changes)
+    inputs = {f"direction{i}": direction for i, direction in enumerate(directions)}
+    return quantity.function("product", inputs, changes)
 
 
-def gradient_function(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> ca.Function:
+def gradient_function(quantity: Quantity, wrt: tuple[str, ...]) -> ca.Function:
     """Trace the gradient of a weighted sum of all outputs (reverse mode): about three times their work, whatever `wrt`.
 
     Returns:
         Function (*inputs, weights of each output) -> gradient with respect to each of `wrt`.
     """
-    quantity = make_quantity(mechanism, name, wrt)
     x, basis = (list(parts) for parts in zip(*[quantity.along(name) for name in wrt], strict=True))
     weights = {f"weights{i}": SX.sym("weights", out.numel()) for i, out in enumerate(quantity.outputs.values())}
     stacked = ca.vertcat(*[ca.vec(output) for output in quantity.outputs.values()])
@@ -165,4 +236,4 @@ def _forward_dynamics_jacobian(mechanism: Mechanism, wrt: tuple[str, ...]) -> ca
     at = [vdot if name == "vdot" else inputs[name] for name in inverse.inputs]
     results = ca.substitute([to_acceleration @ forces[x] for x in others], list(inverse.inputs.values()), at)
     results = [-results[others.index(x)] if x in others else to_acceleration for x in wrt]
-    return Quantity(inputs, inverse.figures, {}, mechanism.robot.layout).function("jacobian", {}, results)
+    return Quantity(inputs, inverse.parameters, {}, mechanism.robot.layout).function("jacobian", {}, results)

@@ -1,36 +1,42 @@
 """`Model`: one robot at one transmission level, and its dynamics on numpy arrays.
 
-The methods take arrays with any leading batch shape, see `ce_gym.dynamics.evaluation`. Thousands of states at a time,
-or steps in time, are the business of `ce_gym.Simulator`.
+Each quantity is traced once, on first use, into a CasADi function. The methods take arrays with any leading batch
+shape. To step thousands of robots in time, use `ce_gym.Simulator`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.dynamics.constraints.closure import loop_report
-from ce_gym.dynamics.evaluation import Evaluator
+from ce_gym.dynamics.algebra.batched import call_on_batch
+from ce_gym.dynamics.constraints.closure import closures, loop_report, reference_guess
+from ce_gym.dynamics.constraints.continuation import follow
+from ce_gym.dynamics.derivatives import Derivatives
+from ce_gym.dynamics.functions import FUNCTIONS
 from ce_gym.dynamics.standing import check_standing
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
-from ce_gym.model.errors import check_names
+from ce_gym.model.coordinates import unit_quaternions
+from ce_gym.model.errors import check_names, listed_names
 from ce_gym.model.frames import added
 from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
 
 
-class Model(Evaluator):
+class Model:
     """The dynamics of one robot at one transmission level.
 
     `q = [base position (3) [m], base quaternion wxyz (4), quaternion of each ball joint (4), independent joint
     positions]`, `v = [base angular (3) [rad/s], base linear (3) [m/s], angular velocity of each ball joint (3) [rad/s],
-    joint velocities]`, both base velocities in the base frame, those of ball joints against the parent in the axes of
-    the body that turns; a fixed base has only the joints. `vdot` is the time derivative of `v`, component by component.
+    joint velocities]`. Base velocities are in the base frame. The angular velocity of a ball joint is relative to the
+    parent, in the axes of the moving body. A fixed base has only the joints. `vdot` is the time derivative of `v`.
     Quaternions whose norm is within 1e-3 of 1 are scaled to unit length; others are refused with a ValueError.
 
     Args:
@@ -41,6 +47,9 @@ class Model(Evaluator):
             total mass is the same at every level. False deletes them, as the paper does in its figures.
         eliminate_rotors: Whether rotors that need no body are eliminated at the exact level. False runs the general
             algorithm, with every rotor a body: the same result, for more work.
+
+    Attributes:
+        guess: Dependent coordinates that no formula gives, at the reference pose [rad or m], shape (n_guess,).
 
     Raises:
         RobotError: If the robot file or the level is not valid, or the robot cannot stand in its standing pose: its
@@ -66,13 +75,33 @@ class Model(Evaluator):
         self.transmission = transmission
         self.locked_rotors = locked_rotors
         self.eliminated = eliminate_rotors
-        super().__init__(
-            build_mechanism(described, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors)
+        self.mechanism = build_mechanism(
+            described, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors
         )
+        self.robot = self.mechanism.robot
+        self.guess = reference_guess(self.mechanism)
+        self._has_loops = any(closures(self.mechanism))
+        self._functions: dict[str, ca.Function] = {}
+        self._derivatives: dict[tuple[str, tuple[str, ...]], Derivatives] = {}
         check_standing(self.mechanism)
 
     def __repr__(self) -> str:
         return f"Model({self.robot.name!r}, transmission={self.transmission!r}, nq={self.nq}, nv={self.nv})"
+
+    @property
+    def nv(self) -> int:
+        """Number of independent velocities, six for a floating base included."""
+        return self.robot.layout.nv
+
+    @property
+    def nq(self) -> int:
+        """Number of position coordinates, seven for a floating base included."""
+        return self.robot.layout.nq
+
+    @cached_property
+    def standing_q(self) -> Array:
+        """The standing pose, upright at the origin, shape (nq,)."""
+        return np.array(self.robot.standing_q)
 
     @property
     def joint_links(self) -> tuple[str, ...]:
@@ -105,6 +134,64 @@ class Model(Evaluator):
         """The contact spheres, in the order of contact outputs."""
         return tuple(contact.name for contact in self.robot.contacts)
 
+    def casadi_function(self, name: str) -> ca.Function:
+        """Return a quantity as a CasADi SX function of column vectors.
+
+        Args:
+            name: The quantity.
+
+                - "forward_dynamics": (q, v, tau) -> vdot.
+                - "inverse_dynamics": (q, v, vdot) -> tau.
+                - "mass_matrix": q -> M.
+                - "bias_force": (q, v) -> tau at vdot = 0.
+                - "spanning": (q, v) -> q_span, v_span.
+                - "implicit_constraint": (q, v) -> K, k.
+                - "body_poses": q -> positions (3, n), rotations (3, 3 n).
+                - "body_velocities": (q, v) -> angular (3, n), linear (3, n).
+                - "contact_points": (q, v) -> positions (3, n), velocities (3, n).
+                - "contact_accelerations": (q, v, vdot) -> accelerations (3, n).
+                - "energy": (q, v) -> kinetic, potential.
+
+        Robots with loops that no formula closes have one more input, see `dependent_guess`. Quaternions in `q` must
+        have unit length: a traced function neither checks nor scales them.
+
+        Raises:
+            KeyError: If there is no such quantity.
+        """
+        if name not in self._functions:
+            if name not in FUNCTIONS:
+                raise KeyError(f"no function {name!r}; expected one of {listed_names(name, FUNCTIONS)}")
+            self._functions[name] = FUNCTIONS[name](self.mechanism)
+        return self._functions[name]
+
+    def n_instructions(self, name: str) -> int:
+        """Return the number of instructions of a traced quantity, the cost measure of the paper."""
+        return self.casadi_function(name).n_instructions()
+
+    def evaluate(self, function: str | ca.Function, *arguments: ArrayLike) -> list[Array]:
+        """Evaluate a function of `q`, among others, on arrays that share leading batch dimensions.
+
+        Args:
+            function: Name of a quantity, see `casadi_function`, or a function of column vectors.
+            arguments: Its inputs but for the guess of dependent coordinates, shape (..., n) each.
+
+        Returns:
+            Its outputs, shape (..., rows, columns).
+
+        Raises:
+            ValueError: If a shape is wrong, or a loop does not close at `q`.
+        """
+        traced: ca.Function = self.casadi_function(function) if isinstance(function, str) else function
+        arrays = [np.asarray(a, dtype=float) for a in arguments]
+        arrays = [self.unit(a) if name == "q" else a for name, a in zip(traced.name_in(), arrays, strict=False)]
+        if "guess" in traced.name_in():
+            arrays.append(self.dependent_guess(arrays[0]))
+        results = call_on_batch(traced, arrays)
+        has_nan = any(np.isnan(r).any() for r in results) and not any(np.isnan(a).any() for a in arrays)
+        if self._has_loops and traced.name() != "loops" and has_nan:
+            raise ValueError(f"{traced.name()}: the loops of {self.robot.name} cannot be closed at this q")
+        return results
+
     def forward_dynamics(
         self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: dict[str, ArrayLike] | None = None
     ) -> Array:
@@ -130,23 +217,23 @@ class Model(Evaluator):
             -9.81 m/s²
         """
         if wrenches is None:
-            return self._evaluate("forward_dynamics", q, v, tau)[0][..., 0]
+            return self.evaluate("forward_dynamics", q, v, tau)[0][..., 0]
         check_names("wrenches", wrenches, self.body_names, f"the name of a body of {self.robot.name}:")
         each = [np.asarray(wrenches.get(name, np.zeros(6)), dtype=float) for name in self.body_names]
         stacked = np.concatenate(np.broadcast_arrays(*each), axis=-1)
-        return self._evaluate("forward_dynamics_with_wrenches", q, v, tau, stacked)[0][..., 0]
+        return self.evaluate("forward_dynamics_with_wrenches", q, v, tau, stacked)[0][..., 0]
 
     def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
         """Return the generalised force, shape (..., nv) [N m or N], that produces the acceleration `vdot` (..., nv)."""
-        return self._evaluate("inverse_dynamics", q, v, vdot)[0][..., 0]
+        return self.evaluate("inverse_dynamics", q, v, vdot)[0][..., 0]
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         """Return the mass matrix of the independent coordinates, shape (..., nv, nv)."""
-        return self._evaluate("mass_matrix", q)[0]
+        return self.evaluate("mass_matrix", q)[0]
 
     def bias_force(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return Coriolis, centrifugal, gyroscopic and gravity forces, `M vdot + bias = tau`, shape (..., nv)."""
-        return self._evaluate("bias_force", q, v)[0][..., 0]
+        return self.evaluate("bias_force", q, v)[0][..., 0]
 
     def spanning(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Return positions and velocities of every joint, rotors included, in the order of `robot.bodies`.
@@ -154,7 +241,7 @@ class Model(Evaluator):
         A floating base has 7 positions and 6 velocities, a ball joint 4 and 3: shapes (..., nq_span) and
         (..., nv_span). `robot.spanning_rows` has the rows of each joint.
         """
-        q_span, v_span = self._evaluate("spanning", q, v)
+        q_span, v_span = self.evaluate("spanning", q, v)
         return q_span[..., 0], v_span[..., 0]
 
     def from_spanning(self, q_span: ArrayLike, v_span: ArrayLike) -> tuple[Array, Array]:
@@ -181,7 +268,7 @@ class Model(Evaluator):
 
     def spanning_acceleration(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
         """Return accelerations of every joint, in the order of `spanning` velocities, shape (..., nv_span)."""
-        return self._evaluate("spanning_acceleration", q, v, vdot)[0][..., 0]
+        return self.evaluate("spanning_acceleration", q, v, vdot)[0][..., 0]
 
     def explicit_constraint(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Return `G` and `g`, which give the motion of every joint: `v_span = G v`, `vdot_span = G vdot + g`.
@@ -199,14 +286,14 @@ class Model(Evaluator):
         Source: arXiv:2311.13732, explicit constraints; the base's six velocities have ones in `G` and zeros in `g`.
         """
         g = self.spanning_acceleration(q, v, np.zeros(self.nv))
-        G = self._evaluate("spanning_jacobian", q)[0]
+        G = self.evaluate("spanning_jacobian", q)[0]
         return np.broadcast_to(G, (*g.shape[:-1], *G.shape[-2:])), g
 
     def implicit_constraint(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-        """Return `K` and `k`, which say what ties the joints: `K v_span = 0`, `K vdot_span = k`.
+        """Return `K` and `k` of the constraints among all joints: `K v_span = 0`, `K vdot_span = k`.
 
-        One row for each tie that is not implied by the others, cluster by cluster, linear ties of a cluster first:
-        away from singularities `K` has full rank, and its null space is the column space of `G`.
+        One row for each constraint that the others do not imply, cluster by cluster, the linear ones first. Away from
+        singularities `K` has full rank, and its null space is the column space of `G`.
 
         Args:
             q: Positions, shape (..., nq).
@@ -221,7 +308,7 @@ class Model(Evaluator):
 
         Source: arXiv:2311.13732, implicit constraints `phi(q_span) = 0`.
         """
-        K, k = self._evaluate("implicit_constraint", q, v)
+        K, k = self.evaluate("implicit_constraint", q, v)
         return K, k[..., 0]
 
     def actuator_matrix(self, q: ArrayLike, actuated: Sequence[str] | None = None) -> Array:
@@ -240,7 +327,7 @@ class Model(Evaluator):
         chosen = [motor.rotor for motor in self.robot.motors] if actuated is None else actuated
         expected = f"the name of a body with a joint of {self.robot.name}:"
         check_names("actuated", chosen, self.spanning_names, expected)
-        G = self._evaluate("spanning_jacobian", q)[0]
+        G = self.evaluate("spanning_jacobian", q)[0]
         return G[..., [row for name in chosen for row in self.robot.spanning_rows[name][1]], :]
 
     def body_poses(self, q: ArrayLike) -> tuple[Array, Array]:
@@ -249,7 +336,7 @@ class Model(Evaluator):
         Returns:
             Origins in the world [m], shape (..., n, 3), and rotations body to world, shape (..., n, 3, 3).
         """
-        positions, rotations = self._evaluate("body_poses", q)
+        positions, rotations = self.evaluate("body_poses", q)
         n = positions.shape[-1]
         stacked = rotations.reshape(*rotations.shape[:-1], n, 3)  # (..., row, body, column)
         return np.swapaxes(positions, -1, -2), np.moveaxis(stacked, -2, -3)
@@ -260,15 +347,15 @@ class Model(Evaluator):
         Returns:
             Angular velocities [rad/s] and velocities of the origins [m/s], world axes, each shape (..., n, 3).
         """
-        angular, linear = self._evaluate("body_velocities", q, v)
+        angular, linear = self.evaluate("body_velocities", q, v)
         return np.swapaxes(angular, -1, -2), np.swapaxes(linear, -1, -2)
 
     def contact_points(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Return centres [m] and velocities [m/s] of the contact spheres in the world, each shape (..., n, 3).
 
-        Of one that moves around a rim, those of the rim's centre.
+        For a sphere that moves around a rim, the centre and velocity of the rim.
         """
-        position, velocity = self._evaluate("contact_points", q, v)
+        position, velocity = self.evaluate("contact_points", q, v)
         return np.swapaxes(position, -1, -2), np.swapaxes(velocity, -1, -2)
 
     def contact_accelerations(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
@@ -276,12 +363,103 @@ class Model(Evaluator):
 
         Second derivatives of their positions, for the acceleration `vdot` (..., nv): a robot at rest has none.
         """
-        return np.swapaxes(self._evaluate("contact_accelerations", q, v, vdot)[0], -1, -2)
+        return np.swapaxes(self.evaluate("contact_accelerations", q, v, vdot)[0], -1, -2)
 
     def energy(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Return kinetic and potential energy [J], each shape (...)."""
-        kinetic, potential = self._evaluate("energy", q, v)
+        kinetic, potential = self.evaluate("energy", q, v)
         return kinetic[..., 0, 0], potential[..., 0, 0]
+
+    def derivatives(self, name: str, wrt: Sequence[str]) -> Derivatives:
+        """Return the derivatives of a quantity, traced on first use.
+
+        Args:
+            name: Name of the quantity, see `casadi_function`.
+            wrt: Names of its inputs, and parameters of the robot: "gravity", "rotor_inertia", "ratio",
+                "added_mass:BODY" or "com_shift:BODY", see `ce_gym.dynamics.laws.scene_laws.PARAMETERS`.
+
+        Raises:
+            ValueError: If there is no such quantity, input or parameter.
+
+        Examples:
+            The effect of heavier rotors on the acceleration:
+
+            >>> model = ce_gym.Model("mini_cheetah")
+            >>> derivatives = model.derivatives("forward_dynamics", wrt=["rotor_inertia"])
+            >>> derivatives.jacobian(model.standing_q, np.zeros(18), np.ones(18))["vdot", "rotor_inertia"].shape
+            (18, 1)
+        """
+        check_names("wrt", wrt, wrt, "an input among")
+        key = name, tuple(wrt)
+        if key not in self._derivatives:
+            self._derivatives[key] = Derivatives(self.mechanism, *key, self.evaluate)
+        return self._derivatives[key]
+
+    def forward_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return the derivatives of `vdot` of `forward_dynamics` by `q`, `v` and `tau`, each shape (..., nv, nv).
+
+        Derivatives by `q` are in its tangent space: rotation of the base, translation of the base, both in base axes,
+        rotations of ball joints, then the other joints. The derivative by `tau` is the inverse of the mass matrix.
+        """
+        inputs = ("q", "v", "tau")
+        jacobians = self.derivatives("forward_dynamics", inputs).jacobian(q, v, tau)
+        return jacobians["vdot", "q"], jacobians["vdot", "v"], jacobians["vdot", "tau"]
+
+    def inverse_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return the derivatives of `tau` of `inverse_dynamics` by `q`, `v` and `vdot`, each shape (..., nv, nv).
+
+        Derivatives by `q` are in its tangent space, see `forward_dynamics_derivatives`. The derivative by `vdot` is the
+        mass matrix.
+        """
+        inputs = ("q", "v", "vdot")
+        jacobians = self.derivatives("inverse_dynamics", inputs).jacobian(q, v, vdot)
+        return jacobians["tau", "q"], jacobians["tau", "v"], jacobians["tau", "vdot"]
+
+    def loop_gap(self, q: ArrayLike) -> Array:
+        """Return the norm of the residuals of all loops, rods and functions, redundant rows included, shape (...).
+
+        In metres for loops and rods; 0 if there are none, not a number where loops cannot be closed by their formulas.
+        """
+        return self.evaluate("loops", q)[1][..., 0, 0]
+
+    def nearness(self, q: ArrayLike) -> Array:
+        """Return how far a configuration is from a singularity of the independent joints, shape (...).
+
+        It is 1 at the reference pose, and smaller or negative nearer to or beyond a singularity: the smallest
+        determinant among the blocks of the constraint Jacobian of the dependent joints, relative to that pose. It is -1
+        where the loops cannot be closed.
+        """
+        return self.evaluate("loops", q)[2][..., 0, 0]
+
+    def dependent_guess(self, q: ArrayLike) -> Array:
+        """Return the dependent coordinates that no formula gives, followed from the reference pose to `q`.
+
+        Args:
+            q: Positions, shape (..., nq).
+
+        Returns:
+            The input `guess` of the traced functions [rad or m], shape (..., n_guess).
+
+        Raises:
+            ValueError: If a loop does not close at `q` or on the straight way there.
+        """
+        q = np.asarray(q, dtype=float)
+        if q.ndim == 0 or q.shape[-1] != self.nq:
+            raise ValueError(f"q has shape {q.shape}; expected (..., {self.nq})")
+        flat = self.unit(q).reshape(-1, self.nq)
+        if self.guess.size == 0 or len(flat) == 0:
+            return np.zeros((*q.shape[:-1], len(self.guess)))
+        guess, gap, nearness = follow(self.casadi_function("loops"), self.standing_q, self.guess, flat)
+        if not nearness > 0.0:
+            raise ValueError(f"the loops of {self.robot.name} pass a singularity on the way to this q")
+        if not gap < 1e-9:
+            raise ValueError(f"the loops of {self.robot.name} do not close at this q: gap {gap:.2g}")
+        return guess.reshape(*q.shape[:-1], len(self.guess))
+
+    def unit(self, q: Array) -> Array:
+        """Return positions, shape (..., nq), with quaternions of unit length; ValueError if they are far from it."""
+        fits = q.ndim > 0 and q.shape[-1] == self.nq  # other shapes are refused where they are used
+        return unit_quaternions(q, [i for i, _ in self.robot.layout.turns]) if fits else q
 
     def loop_report(self) -> str:
         """Return one line for each cluster with closed loops: how it is solved and how well it is conditioned."""

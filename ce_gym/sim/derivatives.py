@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import aligned_copy
-from ce_gym.dynamics.algebra.batched import evaluate
+from ce_gym.dynamics.algebra.batched import call_on_batch
 from ce_gym.dynamics.algebra.tracing import output_names
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import MOVED
@@ -365,7 +365,7 @@ def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray
         tried = {step.tried[name].name: read_rows(after[name], n) for name in step.start}
         joints = tried[step.tried["v"].name][:, model.robot.layout.base_nv :]
         tried[step.tried[MOVED].name] = length * np.abs(joints).max(axis=1, initial=0.0, keepdims=True)
-        results = evaluate(subdivide, [(values | tried)[name] for name in subdivide.name_in()])
+        results = call_on_batch(subdivide, [(values | tried)[name] for name in subdivide.name_in()])
         updates = {name: rows[..., 0] for name, rows in zip(output_names(subdivide), results, strict=True)}
         parts.append(_Part(before, (updates[LEFT.name] < values[LEFT.name])[:, 0]))
         values |= updates | {variable.name: updates[step.tried[part].name] for part, variable in step.start.items()}

@@ -1,4 +1,4 @@
-"""A traced function on numpy arrays with any leading batch shape."""
+"""Calls of a traced function on numpy arrays with any leading batch shape."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def evaluate(function: ca.Function, arguments: Sequence[Array]) -> list[Array]:
-    """Evaluate a function of column vectors on arrays that share leading batch dimensions.
+def call_on_batch(function: ca.Function, arguments: Sequence[Array]) -> list[Array]:
+    """Call a function of column vectors on arrays that share leading batch dimensions.
 
     Args:
         function: The function; its inputs are columns (n,).
