@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ce_gym.bench.chains import rod_parallel_chain
 from ce_gym.diagnostics.transmission import LEAST_NEARNESS, random_states, report_transmissions
 from ce_gym.diagnostics.transmission_text import transmission_report
 from ce_gym.dynamics import Model
 from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Placement, Pose, Robot, load_robot
-from ce_gym.model.generators import rod_parallel_chain
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 

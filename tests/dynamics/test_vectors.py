@@ -19,8 +19,9 @@ import pytest
 from facts import robot_from_facts
 from vectors import DATA, FILES, Group, Vectors
 
+from ce_gym.bench import chains
 from ce_gym.dynamics import Model
-from ce_gym.model import Robot, generators, load_robot
+from ce_gym.model import Robot, load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -71,12 +72,12 @@ CASES = {
     **urdf_plus("mit_humanoid_leg"),
     **urdf_plus("mit_humanoid_leg", "mit_humanoid_leg_urdf"),
     **urdf_plus("four_bar"),
-    **rule(generators.link_and_rotor_chain, "bench_revolute_rotor_b2_d3", 2, 3),
-    **rule(generators.belt_pair_chain, "bench_revolute_rotor_pair_b2_d2", 2, 2),
-    **rule(generators.four_bar_chain, "bench_four_bar_b2_d2", 2, 2),
-    **rule(generators.transmission_parallel_chain, "parallel_explicit_d5_l4", 5, 4),
-    **rule(generators.transmission_parallel_chain, "parallel_explicit_d10_l12", 10, 12),
-    **rule(generators.rod_parallel_chain, "parallel_implicit_d5_l5", 5, 5),
+    **rule(chains.link_and_rotor_chain, "bench_revolute_rotor_b2_d3", 2, 3),
+    **rule(chains.belt_pair_chain, "bench_revolute_rotor_pair_b2_d2", 2, 2),
+    **rule(chains.four_bar_chain, "bench_four_bar_b2_d2", 2, 2),
+    **rule(chains.transmission_parallel_chain, "parallel_explicit_d5_l4", 5, 4),
+    **rule(chains.transmission_parallel_chain, "parallel_explicit_d10_l12", 10, 12),
+    **rule(chains.rod_parallel_chain, "parallel_implicit_d5_l5", 5, 5),
     **figures("jvrc1"),
     **figures("tello"),
     **figures("bench_four_bar_b2_d2"),

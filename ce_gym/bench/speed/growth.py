@@ -13,13 +13,13 @@ from collections.abc import Collection
 
 import numpy as np
 
+from ce_gym.bench.chains import link_and_rotor_chain
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import interleaved
 from ce_gym.bench.peers import stand
 from ce_gym.bench.speed import competitors
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Pose, Robot, load_robot
-from ce_gym.model.generators import link_and_rotor_chain
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.viewer.console import shown
 

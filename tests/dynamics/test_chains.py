@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ce_gym.bench import chains
 from ce_gym.dynamics import Model
 from ce_gym.model import Robot
-from ce_gym.model import generators as g
 
 
 @pytest.mark.parametrize(
-    "robot", [g.four_bar_chain(1, 2), *map(g.rod_parallel_chain, (3, 3), (3, 7))], ids=lambda r: r.name
+    "robot", [chains.four_bar_chain(1, 2), *map(chains.rod_parallel_chain, (3, 3), (3, 7))], ids=lambda r: r.name
 )
 def test_standing_pose_closes_the_loops(robot: Robot):
     model = Model(robot)

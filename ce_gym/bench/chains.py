@@ -1,4 +1,4 @@
-"""Robots of any size made by rule: the scaling chains of the constraint-embedding paper.
+"""Robots of any size: the scaling chains of the constraint-embedding paper.
 
 Two families, both planar about z. *Branched chains* hang on a floating base: several equal branches, each a row of
 equal units (a link with its rotor, a pair of links with two belts, a four-bar). *Parallel chains* stand on the ground
