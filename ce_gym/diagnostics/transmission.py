@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ce_gym.dynamics.model import Model
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.mechanism import LEVELS, Spin, is_axisymmetric
+from ce_gym.model.mechanism import LEVELS, EliminatedRotor, is_axisymmetric
 
 Array = NDArray[np.float64]
 
@@ -142,11 +142,11 @@ def report_levels(models: Mapping[str, Model], states: int = 200, seed: int = 0)
 
 
 def cluster_figures(exact: Model, coupled: Model) -> tuple[ClusterFigures, ...]:
-    """Return the figures of every cluster with rotors, base to tip; the coupled model knows every rotor as a spin."""
+    """Return the figures of every cluster with rotors, base to tip; the coupled model eliminates every rotor."""
     G = jacobian(exact)
     M = exact.mass_matrix(exact.standing_q)
-    pairs = zip(coupled.cluster_tree.clusters, coupled.mechanism.spins, strict=True)
-    return tuple(_figures(exact, cluster, spins, G, M) for cluster, spins in pairs if spins)
+    pairs = zip(coupled.cluster_tree.clusters, coupled.mechanism.eliminated_rotors, strict=True)
+    return tuple(_figures(exact, cluster, eliminated, G, M) for cluster, eliminated in pairs if eliminated)
 
 
 def jacobian(model: Model) -> dict[str, Array]:
@@ -205,22 +205,24 @@ def _closes(model: Model, q: Array) -> bool:
         return False
 
 
-def _figures(model: Model, cluster: Cluster, spins: tuple[Spin, ...], G: dict[str, Array], M: Array) -> ClusterFigures:
+def _figures(
+    model: Model, cluster: Cluster, eliminated: tuple[EliminatedRotor, ...], G: dict[str, Array], M: Array
+) -> ClusterFigures:
     first = model.nv - len(model.joint_links)
     columns = [first + model.joint_links.index(joint) for joint in cluster.independent]
-    rows = np.array([G[spin.rotor][columns] for spin in spins])
+    rows = np.array([G[rotor.name][columns] for rotor in eliminated])
     rotors = tuple(
         RotorFigures(
-            spin.rotor,
-            spin.carrier,
-            spin.inertia,
+            rotor.name,
+            rotor.carrier,
+            rotor.inertia,
             {joint: float(ratio) for joint, ratio in zip(cluster.independent, row, strict=True) if ratio != 0.0},
-            is_axisymmetric(model.robot.body(spin.rotor)),
-            spin.rotor not in model.robot.unknown_ratios,
+            is_axisymmetric(model.robot.body(rotor.name)),
+            rotor.name not in model.robot.unknown_ratios,
         )
-        for spin, row in zip(spins, rows, strict=True)
+        for rotor, row in zip(eliminated, rows, strict=True)
     )
-    inertias = np.diag([spin.inertia for spin in spins])
+    inertias = np.diag([rotor.inertia for rotor in eliminated])
     return ClusterFigures(cluster.independent, rotors, rows.T @ inertias @ rows, M[np.ix_(columns, columns)])
 
 

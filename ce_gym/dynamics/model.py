@@ -74,7 +74,7 @@ class Model:
         described = robot if isinstance(robot, Robot) else load_robot(robot)
         self.transmission = transmission
         self.locked_rotors = locked_rotors
-        self.eliminated = eliminate_rotors
+        self.eliminate_rotors = eliminate_rotors
         self.mechanism = build_mechanism(
             described, transmission, locked_rotors=locked_rotors, eliminate=eliminate_rotors
         )
@@ -469,7 +469,7 @@ class Model:
         """Return a readable account of the robot: figures, and its cluster tree as text."""
         base, rotors = "floating" if self.robot.floating else "fixed", sum(1 for _ in self.robot.rotors())
         bodies = sum(body.kind != "stretch" for body in self.robot.bodies)
-        eliminated = sum(len(spins) for spins in self.mechanism.spins)
+        eliminated = sum(map(len, self.mechanism.eliminated_rotors))
         lines = [
             f"{self.robot.name}: {base} base, {len(self.joint_links)} joints, "
             f"{bodies} bodies of which {rotors} rotors, {len(self.cluster_tree.clusters)} clusters, "

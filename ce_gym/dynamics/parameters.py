@@ -19,7 +19,7 @@ from ce_gym.dynamics.recursion.kinematics import constant
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
 from ce_gym.model.drives import ELASTIC_FACTORS, Elasticity, Motor
-from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, smallest_spin_factor, spin_inertia
+from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody, smallest_spin_factor, spin_inertia
 
 
 @dataclass(frozen=True)
@@ -212,10 +212,10 @@ def with_parameters(mechanism: Mechanism, given: Mapping[str, SX]) -> Mechanism:
     """
     bodies = {name: _with_ballast(body, mechanism.robot, given) for name, body in mechanism.bodies.items()}
     _scale_spins(bodies, mechanism.robot, given)
-    spins = tuple(tuple(_with_factor(spin, given) for spin in group) for group in mechanism.spins)
+    rotors = tuple(tuple(_with_factor(rotor, given) for rotor in group) for group in mechanism.eliminated_rotors)
     ratio, gravity = given.get("ratio", mechanism.ratio), given.get("gravity", mechanism.gravity)
     robot = with_drives(mechanism.robot, given)
-    return replace(mechanism, robot=robot, bodies=bodies, spins=spins, gravity=gravity, ratio=ratio)
+    return replace(mechanism, robot=robot, bodies=bodies, eliminated_rotors=rotors, gravity=gravity, ratio=ratio)
 
 
 def with_drives(robot: Robot, given: Mapping[str, SX]) -> Robot:
@@ -293,10 +293,10 @@ def _with_factors(elastic: Elasticity, given: Mapping[str, SX]) -> Elasticity:
     return replace(elastic, **figures, play=elastic.play * play)  # type: ignore[arg-type]
 
 
-def _with_factor(spin: Spin, given: Mapping[str, SX]) -> Spin:
-    for factor in _spin_factors(spin.rotor, given):
-        spin = replace(spin, inertia=spin.inertia * factor)
-    return spin
+def _with_factor(rotor: EliminatedRotor, given: Mapping[str, SX]) -> EliminatedRotor:
+    for factor in _spin_factors(rotor.name, given):
+        rotor = replace(rotor, inertia=rotor.inertia * factor)
+    return rotor
 
 
 def _spin_factors(rotor: str, given: Mapping[str, SX]) -> list[SX]:

@@ -16,7 +16,7 @@ from ce_gym.dynamics.constraints.cluster_constraints import linear_solution
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.errors import RobotError, invalid_value
 from ce_gym.model.frames import rotation_matrix
-from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, skew
+from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody, skew
 
 Array = NDArray[np.float64]
 
@@ -158,25 +158,25 @@ def mass_matrix(mechanism: Mechanism, standing: Standing) -> Array:
     with np.errstate(all="ignore"):
         bodies = [standing.J[name].T @ body.inertia @ standing.J[name] for name, body in mechanism.bodies.items()]
         M = np.sum(bodies, axis=0)
-        for spins in mechanism.spins:
-            M = M + _reflected(mechanism, spins, standing)
+        for rotors in mechanism.eliminated_rotors:
+            M = M + _reflected(mechanism, rotors, standing)
     return M
 
 
-def _reflected(mechanism: Mechanism, spins: tuple[Spin, ...], standing: Standing) -> Array:
+def _reflected(mechanism: Mechanism, rotors: tuple[EliminatedRotor, ...], standing: Standing) -> Array:
     """Return what the rotors of a cluster add that are no bodies of the recursion, at the level of the mechanism."""
     nv = len(standing.J[None][0])
-    if mechanism.level == "none" or not spins:
+    if mechanism.level == "none" or not rotors:
         return np.zeros((nv, nv))
-    G = np.array([standing.G[spin.rotor] for spin in spins])
-    reflected = G.T @ (np.array([[spin.inertia] for spin in spins]) * G)
+    G = np.array([standing.G[rotor.name] for rotor in rotors])
+    reflected = G.T @ (np.array([[rotor.inertia] for rotor in rotors]) * G)
     if not mechanism.exact:
         return np.diag(np.diag(reflected)) if mechanism.level == "armature" else reflected
-    for spin, row in zip(spins, G, strict=True):
-        w = standing.J[spin.carrier][:3]
-        coupling = spin.inertia * np.outer(row, spin.axis @ w)
-        e = turned(spin.axis, standing.q[spin.rotor]) @ spin.heavy_axis
-        n = np.cross(spin.axis, e)
-        transverse = spin.transverse * (np.outer(e, e) - np.outer(n, n))
+    for rotor, row in zip(rotors, G, strict=True):
+        w = standing.J[rotor.carrier][:3]
+        coupling = rotor.inertia * np.outer(row, rotor.axis @ w)
+        e = turned(rotor.axis, standing.q[rotor.name]) @ rotor.heavy_axis
+        n = np.cross(rotor.axis, e)
+        transverse = rotor.transverse * (np.outer(e, e) - np.outer(n, n))
         reflected = reflected + coupling + coupling.T + w.T @ transverse @ w
     return reflected

@@ -35,7 +35,7 @@ from ce_gym.model.constraints import Constraint, LoopConstraint, RodConstraint
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError
 from ce_gym.model.frames import Placement
-from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
+from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody
 
 Array = NDArray[np.float64]
 
@@ -73,10 +73,10 @@ def check_expressible(mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:
         if name not in mechanism.bodies and name in ties[name].ratios:
             what = f"rotor {name!r}, which {level!r} leaves out, is an independent joint"
             raise _error(robot, what, "transmission 'exact', or independent links, for MJCF")
-    for spin in _spins(mechanism):
-        by_loops = [name for name in ties[spin.rotor].ratios if name not in robot.independent]
+    for rotor in _eliminated_rotors(mechanism):
+        by_loops = [name for name in ties[rotor.name].ratios if name not in robot.independent]
         if level == "armature" and by_loops:
-            what = f"the inertia that {level!r} reflects from rotor {spin.rotor!r} through {by_loops[0]!r} varies"
+            what = f"the inertia that {level!r} reflects from rotor {rotor.name!r} through {by_loops[0]!r} varies"
             raise _error(robot, what, "transmission 'exact', 'coupled' or 'none' for MJCF")
 
 
@@ -85,30 +85,30 @@ def joint_armature(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, f
 
     At "armature" that is the diagonal of the reflected inertia.
     """
-    armature = {name: spin.inertia for name, (_, spin) in held_rotors(mechanism, ties).items()}
-    for spin in _spins(mechanism):
-        ratios = ties[spin.rotor].ratios
+    armature = {name: rotor.inertia for name, (_, rotor) in held_rotors(mechanism, ties).items()}
+    for rotor in _eliminated_rotors(mechanism):
+        ratios = ties[rotor.name].ratios
         if mechanism.level == "armature" or (_reflects_all(mechanism) and len(ratios) == 1):
             for joint, ratio in ratios.items():
-                armature[joint] = armature.get(joint, 0.0) + spin.inertia * ratio**2
+                armature[joint] = armature.get(joint, 0.0) + rotor.inertia * ratio**2
     return armature
 
 
-def held_rotors(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, tuple[MovingBody, Spin]]:
+def held_rotors(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, tuple[MovingBody, EliminatedRotor]]:
     """Return the left-out rotors that need a body, without mass, to carry their reflected inertia; by name.
 
     The coordinate of that body is the rotor's angle over its largest ratio, since MuJoCo's smallest inertia times the
     square of a ratio is no longer small.
     """
-    held: dict[str, tuple[MovingBody, Spin]] = {}
-    for spin in _spins(mechanism) if _reflects_all(mechanism) else ():
-        if len(ties[spin.rotor].ratios) > 1 and not _one_chain(mechanism, ties[spin.rotor].ratios):
-            rotor = mechanism.robot.body(spin.rotor)
-            rotation, position = np.array(rotor.placement.rotation), np.array(rotor.placement.position)
-            axis, nothing = np.array(rotor.joint.axis), np.zeros((6, 6))
-            moving = MovingBody(rotor.name, rotor.parent, rotation, position, rotor.joint, axis, nothing)
-            inertia = spin.inertia * largest_ratio(ties[spin.rotor]) ** 2
-            held[rotor.name] = moving, replace(spin, inertia=inertia)
+    held: dict[str, tuple[MovingBody, EliminatedRotor]] = {}
+    for rotor in _eliminated_rotors(mechanism) if _reflects_all(mechanism) else ():
+        if len(ties[rotor.name].ratios) > 1 and not _one_chain(mechanism, ties[rotor.name].ratios):
+            body = mechanism.robot.body(rotor.name)
+            rotation, position = np.array(body.placement.rotation), np.array(body.placement.position)
+            axis, nothing = np.array(body.joint.axis), np.zeros((6, 6))
+            moving = MovingBody(body.name, body.parent, rotation, position, body.joint, axis, nothing)
+            inertia = rotor.inertia * largest_ratio(ties[rotor.name]) ** 2
+            held[body.name] = moving, replace(rotor, inertia=inertia)
     return held
 
 
@@ -129,8 +129,8 @@ def _reflects_all(mechanism: Mechanism) -> bool:
     return mechanism.level in ("exact", "coupled")
 
 
-def _spins(mechanism: Mechanism) -> Iterator[Spin]:
-    return (spin for cluster in mechanism.spins for spin in cluster)
+def _eliminated_rotors(mechanism: Mechanism) -> Iterator[EliminatedRotor]:
+    return (rotor for cluster in mechanism.eliminated_rotors for rotor in cluster)
 
 
 def add_ties(
@@ -162,10 +162,10 @@ def add_ties(
         if not constraint.linear:
             EXPORTS[type(constraint)](elements, tendons, equalities, constraint, solver)
     if _reflects_all(mechanism):
-        for spin in _spins(mechanism):
-            if len(ties[spin.rotor].ratios) > 1 and spin.rotor not in held:
-                tendon = _fixed_tendon(tendons, spin.rotor, ties[spin.rotor].ratios)
-                tendon.set("armature", text(spin.inertia))
+        for rotor in _eliminated_rotors(mechanism):
+            if len(ties[rotor.name].ratios) > 1 and rotor.name not in held:
+                tendon = _fixed_tendon(tendons, rotor.name, ties[rotor.name].ratios)
+                tendon.set("armature", text(rotor.inertia))
     root.extend(element for element in (tendons, equalities) if len(element))
 
 

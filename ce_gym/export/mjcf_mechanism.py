@@ -38,9 +38,9 @@ def mjcf_mechanism(robot: Robot, level: str) -> Mechanism:
         if rotor.parent is not None:
             carrier = bodies[rotor.parent]
             bodies[rotor.parent] = replace(carrier, inertia=carrier.inertia + seen_from_parent(rotor))
-    reflected = build_mechanism(robot, "coupled").spins
-    spins = tuple(tuple(spin for spin in cluster if spin.rotor in light) for cluster in reflected)
-    return replace(mechanism, bodies=bodies, spins=spins)
+    reflected = build_mechanism(robot, "coupled").eliminated_rotors
+    rotors = tuple(tuple(rotor for rotor in cluster if rotor.name in light) for cluster in reflected)
+    return replace(mechanism, bodies=bodies, eliminated_rotors=rotors)
 
 
 def largest_ratio(tie: Tie) -> float:

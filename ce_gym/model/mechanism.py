@@ -13,8 +13,8 @@ body that carries it, so total mass and limits are the same at every level, and 
 
 At `exact`, a rotor that spins about a principal axis through its centre of mass never has to become a body of the
 recursion: its mass, its axial and its mean transverse inertia are constant in its carrier's frame. Its spin, and the
-difference of its transverse moments if it is not symmetric, enter as a `Spin`. Any other rotor stays a body of its
-cluster. That is decided here, rotor by rotor.
+difference of its transverse moments if it is not symmetric, enter as an `EliminatedRotor`. Any other rotor stays a body
+of its cluster. `build_mechanism` decides rotor by rotor.
 
 A transmission that stretches is a rigid one with a term more, `rotor = sum(ratio * joint) + stretch`, of a joint that
 moves nothing: recursions and constraints need not know of it.
@@ -46,12 +46,12 @@ AXISYMMETRY_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class Spin:
-    """The spin of a rotor whose inertia at rest has been merged into its carrier, all but `transverse`.
+class EliminatedRotor:
+    """A rotor that is no body of the recursion: its inertia at rest is merged into its carrier, all but `transverse`.
 
     Attributes:
-        rotor: Name of the rotor.
-        carrier: Name of the body it is mounted on; None is the world.
+        name: Name of the rotor.
+        carrier: Name of the body on which the rotor is mounted; None for the world.
         axis: Unit spin axis in the carrier's frame, shape (3,).
         inertia: Moment of inertia about the axis [kg m^2].
         transverse: Half the difference of the two transverse principal moments [kg m^2], where it has not been merged
@@ -60,7 +60,7 @@ class Spin:
             shape (3,); any transverse axis if `transverse` is 0.
     """
 
-    rotor: str
+    name: str
     carrier: str | None
     axis: Array
     inertia: float
@@ -100,7 +100,7 @@ class Mechanism:
         level: Transmission level.
         tree: Clusters of the robot, including eliminated rotors.
         bodies: The bodies that take part in the recursion, by name, parents first.
-        spins: Spins of eliminated or approximated rotors, in each cluster.
+        eliminated_rotors: For each cluster, its rotors that are no bodies of the recursion.
         gravity: Acceleration of free fall in the world [m/s^2], shape (3,).
         ratio: Factor on the angles of all rotors, if their gears are not what the robot says.
     """
@@ -109,7 +109,7 @@ class Mechanism:
     level: str
     tree: ClusterTree
     bodies: dict[str, MovingBody]
-    spins: tuple[tuple[Spin, ...], ...]
+    eliminated_rotors: tuple[tuple[EliminatedRotor, ...], ...]
     gravity: Array
     ratio: float | None = None
 
@@ -161,11 +161,11 @@ def build_mechanism(
         if rotor.parent is not None and (locked_rotors or exact):
             inertias[rotor.parent] = inertias[rotor.parent] + seen_from_parent(rotor)
     bodies = {b.name: _moving_body(b, inertias[b.name]) for b in robot.bodies if b.name in kept}
-    spins = tuple(
-        tuple(_spin(robot.body(name), merged[name]) for name in cluster.bodies if name in merged)
+    rotors = tuple(
+        tuple(_eliminated_rotor(robot.body(name), merged[name]) for name in cluster.bodies if name in merged)
         for cluster in tree.clusters
     )
-    return Mechanism(robot, level, tree, bodies, spins, np.array(robot.gravity))
+    return Mechanism(robot, level, tree, bodies, rotors, np.array(robot.gravity))
 
 
 def with_stretches(robot: Robot) -> Robot:
@@ -221,8 +221,8 @@ def has_principal_axis(rotor: Body) -> bool:
 
 def is_axisymmetric(rotor: Body) -> bool:
     """Whether a rotor's inertia is symmetric about its spin axis and its centre of mass lies on it."""
-    spin, inertia = skew(np.array(rotor.joint.axis)), np.array(rotor.inertial.inertia)
-    asymmetry = float(np.abs(spin @ inertia - inertia @ spin).max())
+    cross_axis, inertia = skew(np.array(rotor.joint.axis)), np.array(rotor.inertial.inertia)
+    asymmetry = float(np.abs(cross_axis @ inertia - inertia @ cross_axis).max())
     return has_principal_axis(rotor) and asymmetry <= AXISYMMETRY_TOLERANCE * float(np.abs(inertia).max())
 
 
@@ -297,13 +297,13 @@ def _averaged(rotor: Body) -> Body:
     return replace(rotor, inertial=replace(rotor.inertial, inertia=tuple(map(tuple, mean.tolist()))))
 
 
-def _spin(rotor: Body, merged: Body) -> Spin:
-    """Return the spin of a rotor of which `merged` stays with its carrier."""
+def _eliminated_rotor(rotor: Body, merged: Body) -> EliminatedRotor:
+    """Return a rotor for the recursion; `merged` is the part of its inertia that stays with the carrier."""
     axis = np.array(rotor.joint.axis)
     moments, axes = np.linalg.eigh(np.array(rotor.inertial.inertia) - np.array(merged.inertial.inertia))
     to_carrier = np.array(rotor.placement.rotation)
-    return Spin(
-        rotor=rotor.name,
+    return EliminatedRotor(
+        name=rotor.name,
         carrier=rotor.parent,
         axis=snapped(to_carrier @ axis),
         inertia=spin_inertia(rotor),

@@ -24,7 +24,7 @@ SOURCES = ("ce_gym.model", "ce_gym.dynamics", "ce_gym.sim")
 def model_key(model: Model) -> str:
     """Return a text that is equal for equal models, for cache keys; the file of the robot does not matter."""
     robot = replace(model.robot, source="", notes=(), tasks=())
-    options = f"{model.transmission} {model.locked_rotors} {model.eliminated}"
+    options = f"{model.transmission} {model.locked_rotors} {model.eliminate_rotors}"
     return f"{source_fingerprint(*SOURCES)} {robot!r} {options} {_functions(robot)}"
 
 

@@ -70,7 +70,7 @@ def robot_page(name: str, folder: Path) -> str:
 
 def _facts(robot: Robot, model: Model) -> list[tuple[str, str]]:
     rotors = list(robot.rotors())
-    eliminated = sum(len(spins) for spins in model.mechanism.spins)
+    eliminated = sum(map(len, model.mechanism.eliminated_rotors))
     return [
         ("**Base**", "floating" if robot.floating else "fixed"),
         ("**Mass**", f"{robot.total_mass:.3f} kg"),

@@ -8,8 +8,8 @@ rigid-body algorithm and projected by the constraint Jacobian `G`,
 
 which equals `S^T IA S`, `IA S` and `tau - S^T pA` of the paper's Alg. 1 because `IA` is block diagonal, and costs less.
 
-A rotor eliminated exactly is a `Spin` with momentum `h thd` along a constant axis of its carrier c (`h = [J u; 0]`, a
-pure couple). With `thd = G_r yd`, `a_c = X_c a + S_c ydd + z_c` it adds
+An `EliminatedRotor` has momentum `h thd` along a constant axis of its carrier c (`h = [J u; 0]`, a pure couple). With
+`thd = G_r yd`, `a_c = X_c a + S_c ydd + z_c` it adds
 
     D += G_r^T J G_r + S_c^T h G_r + (S_c^T h G_r)^T     U += X_c^T h G_r
     u -= G_r^T (J g_r + h^T z_c) + S_c^T f               p += X_c^T f,   f = h g_r + v_c x* h thd
@@ -41,7 +41,7 @@ from ce_gym.dynamics.recursion.reflected import diagonal_bias
 from ce_gym.dynamics.recursion.rotors import transverse_inertia
 from ce_gym.dynamics.recursion.stretched import Stretched, stretches
 from ce_gym.model.clusters import Cluster
-from ce_gym.model.mechanism import Mechanism, MovingBody, Spin, snapped
+from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody, snapped
 
 
 @dataclass
@@ -125,7 +125,7 @@ def inward_inertia_pass(
             articulation.base = IA[base], joints.tau[rows] - pA[base]
             continue
         transverse_bias = _add_transverse_inertias(mechanism, kinematics, k, IA, pA)
-        handle = _handle_body(mechanism, cluster, mechanism.spins[k])
+        handle = _handle_body(mechanism, cluster, mechanism.eliminated_rotors[k])
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
         D = mirrored(condensed.D + joints.slope[rows, rows])
         U, u = condensed.U, joints.tau[rows] - condensed.bias - transverse_bias
@@ -159,13 +159,13 @@ def _add_transverse_inertias(
     """Add the transverse inertia of a cluster's rotors to their carriers, in place; return the cluster's bias, (d,)."""
     bias = SX(len(kinematics.rows[k]), 1)
     coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
-    for spin in mechanism.spins[k]:
-        if spin.carrier is not None:
-            row = coordinates.index[spin.rotor]
-            w = kinematics.bodies[spin.carrier].v[:3]
-            transverse = transverse_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
-            IA[spin.carrier] += symmetric_blocks(transverse.inertia, SX(3, 3), SX(3, 3))
-            pA[spin.carrier] += ca.vertcat(transverse.couple, SX(3, 1))
+    for rotor in mechanism.eliminated_rotors[k]:
+        if rotor.carrier is not None:
+            row = coordinates.index[rotor.name]
+            w = kinematics.bodies[rotor.carrier].v[:3]
+            transverse = transverse_inertia(rotor, coordinates.q[row], coordinates.qd[row], w)
+            IA[rotor.carrier] += symmetric_blocks(transverse.inertia, SX(3, 3), SX(3, 3))
+            pA[rotor.carrier] += ca.vertcat(transverse.couple, SX(3, 1))
             bias += coordinates.G[row, :].T * transverse.torque
     return bias
 
@@ -225,7 +225,7 @@ def _parent_acceleration(body: MovingBody, a: dict[str, SX], gravity: SX) -> SX:
     return a[body.parent] if body.parent is not None else ca.vertcat(SX(3, 1), -gravity)
 
 
-def _handle_body(mechanism: Mechanism, cluster: Cluster, spins: tuple[Spin, ...]) -> MovingBody | None:
+def _handle_body(mechanism: Mechanism, cluster: Cluster, rotors: tuple[EliminatedRotor, ...]) -> MovingBody | None:
     """Return the body whose frame can serve as the cluster's handle, if there is one.
 
     That is its only base body, provided that every rotor on the output body spins parallel to that body's joint, so
@@ -236,8 +236,8 @@ def _handle_body(mechanism: Mechanism, cluster: Cluster, spins: tuple[Spin, ...]
     if len(roots) != 1 or roots[0].joint.type not in ("revolute", "ball"):
         return None
     axis = roots[0].rotation @ roots[0].axis
-    on_output = [spin for spin in spins if spin.carrier == cluster.output_body]
-    parallel = all(np.linalg.norm(np.cross(spin.axis, axis)) < 1e-12 for spin in on_output)
+    on_output = [rotor for rotor in rotors if rotor.carrier == cluster.output_body]
+    parallel = all(np.linalg.norm(np.cross(rotor.axis, axis)) < 1e-12 for rotor in on_output)
     return roots[0] if parallel else None
 
 
@@ -257,7 +257,7 @@ class _Condenser:
 
     def __init__(self, mechanism: Mechanism, kinematics: Kinematics, k: int, handle: MovingBody | None) -> None:
         self.mechanism, self.states, self.handle = mechanism, kinematics.bodies, handle
-        self.cluster, self.spins = mechanism.tree.clusters[k], mechanism.spins[k]
+        self.cluster, self.rotors = mechanism.tree.clusters[k], mechanism.eliminated_rotors[k]
         self.coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         self.moving = mechanism.moving(self.cluster)
         self.inside = {body.name: body for body in self.moving}
@@ -284,8 +284,8 @@ class _Condenser:
                 at_handle += in_parent
         G, H, F = ca.sparsify(G), mirrored(_lower_to_upper(H)), ca.sparsify(F)
         condensed = _Condensed(G.T @ H @ G, F @ G, G.T @ bias, at_handle, force_at_handle)
-        for spin in self.spins:
-            self._add_spin(condensed, spin, zeta)
+        for rotor in self.rotors:
+            self._add_rotor(condensed, rotor, zeta)
         return condensed
 
     def _transform(self, body: MovingBody) -> Transform:
@@ -311,9 +311,9 @@ class _Condenser:
                 return force, torques
             body = self.inside[body.parent]
 
-    def _add_spin(self, condensed: _Condensed, spin: Spin, zeta: dict[str, SX]) -> None:
+    def _add_rotor(self, condensed: _Condensed, rotor: EliminatedRotor, zeta: dict[str, SX]) -> None:
         """Add a rotor's spin in place, at the transmission level of the mechanism."""
-        G, row, J = self.coordinates.G, self.coordinates.index[spin.rotor], spin.inertia
+        G, row, J = self.coordinates.G, self.coordinates.index[rotor.name], rotor.inertia
         G_r, g_r, thd = G[row, :], self.coordinates.g[row], self.coordinates.qd[row]
         level = self.mechanism.level
         if level == "none":
@@ -328,12 +328,12 @@ class _Condenser:
         condensed.bias += G_r.T * (J * g_r)
         if level == "coupled":
             return
-        axis, w = self._spin_frame(spin)
+        axis, w = self._rotor_frame(rotor)
         couple = ca.vertcat(axis, SX(3, 1))  # h = J couple
         f = ca.vertcat(axis * (J * g_r) + cross(w, axis * (J * thd)), SX(3, 1))
-        if spin.carrier in self.inside:
-            carrier = self.inside[spin.carrier]
-            condensed.bias += momentum.T * ca.dot(couple, zeta[spin.carrier])
+        if rotor.carrier in self.inside:
+            carrier = self.inside[rotor.carrier]
+            condensed.bias += momentum.T * ca.dot(couple, zeta[rotor.carrier])
             couple, coupling = self._to_handle(carrier, couple)
             f, torques = self._to_handle(carrier, f)
             condensed.D += G.T @ coupling @ momentum + (G.T @ coupling @ momentum).T
@@ -341,14 +341,14 @@ class _Condenser:
         condensed.U += couple @ momentum
         condensed.force += f
 
-    def _spin_frame(self, spin: Spin) -> tuple[SX, SX]:
+    def _rotor_frame(self, rotor: EliminatedRotor) -> tuple[SX, SX]:
         """Spin axis and angular velocity of the carrier; of an output body, in the frame of the handle."""
-        if spin.carrier in self.inside:
-            return constant(spin.axis), self.states[spin.carrier].v[:3]
+        if rotor.carrier in self.inside:
+            return constant(rotor.axis), self.states[rotor.carrier].v[:3]
         if self.handle is not None:  # the axis is parallel to the handle's joint: constant, and so is cross(w, axis)
-            return constant(snapped(self.handle.rotation.T @ spin.axis)), self.states[self.handle.name].v[:3]
-        w = self.states[spin.carrier].v[:3] if spin.carrier is not None else SX(3, 1)
-        return constant(spin.axis), w
+            return constant(snapped(self.handle.rotation.T @ rotor.axis)), self.states[self.handle.name].v[:3]
+        w = self.states[rotor.carrier].v[:3] if rotor.carrier is not None else SX(3, 1)
+        return constant(rotor.axis), w
 
 
 def _lower_to_upper(m: SX) -> SX:

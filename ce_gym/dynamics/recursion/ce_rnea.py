@@ -79,12 +79,12 @@ def inward_force_pass(
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         spanning = SX(coordinates.qd.numel(), 1)
         if mechanism.exact:
-            for spin in mechanism.spins[k]:
-                row, J = coordinates.index[spin.rotor], spin.inertia
+            for rotor in mechanism.eliminated_rotors[k]:
+                row, J = coordinates.index[rotor.name], rotor.inertia
                 spanning[row] = J * qdd[k][row]
-                if spin.carrier is not None:
-                    h, w, wd = J * constant(spin.axis), kinematics.bodies[spin.carrier].v[:3], a[spin.carrier][:3]
-                    transverse = transverse_inertia(spin, coordinates.q[row], coordinates.qd[row], w)
+                if rotor.carrier is not None:
+                    h, w, wd = J * constant(rotor.axis), kinematics.bodies[rotor.carrier].v[:3], a[rotor.carrier][:3]
+                    transverse = transverse_inertia(rotor, coordinates.q[row], coordinates.qd[row], w)
                     spanning[row] += ca.dot(h, wd) + transverse.torque
                     couple = (
                         h * qdd[k][row]
@@ -92,7 +92,7 @@ def inward_force_pass(
                         + transverse.inertia @ wd
                         + transverse.couple
                     )
-                    f[spin.carrier] += ca.vertcat(couple, SX(3, 1))
+                    f[rotor.carrier] += ca.vertcat(couple, SX(3, 1))
         _to_parents(mechanism, kinematics, k, f, spanning)
         tau[rows] = coordinates.G.T @ spanning
         if mechanism.level in ("coupled", "armature"):
@@ -108,14 +108,14 @@ def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qd
     G, index, cluster = coordinates.G, coordinates.index, mechanism.tree.clusters[k]
     own = [index[name] for name in cluster.independent]
     torque = SX(G.shape[1], 1)
-    for spin in mechanism.spins[k]:
-        row = index[spin.rotor]
+    for rotor in mechanism.eliminated_rotors[k]:
+        row = index[rotor.name]
         G_r = G[row, :]
         if mechanism.level == "armature":
-            torque += spin.inertia * (ca.vec(G_r) ** 2 * qdd[own])
-            torque += diagonal_bias(coordinates, coordinates.qd[own], row, spin.inertia)
+            torque += rotor.inertia * (ca.vec(G_r) ** 2 * qdd[own])
+            torque += diagonal_bias(coordinates, coordinates.qd[own], row, rotor.inertia)
         else:
-            torque += spin.inertia * (G_r.T * qdd[row])
+            torque += rotor.inertia * (G_r.T * qdd[row])
     return torque
 
 

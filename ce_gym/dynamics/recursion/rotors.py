@@ -26,7 +26,7 @@ import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, cross, mirrored
 from ce_gym.dynamics.recursion.kinematics import constant
-from ce_gym.model.mechanism import Spin
+from ce_gym.model.mechanism import EliminatedRotor
 
 
 @dataclass
@@ -44,18 +44,18 @@ class TransverseInertia:
     torque: SX
 
 
-def transverse_inertia(spin: Spin, angle: SX, rate: SX, w: SX) -> TransverseInertia:
+def transverse_inertia(rotor: EliminatedRotor, angle: SX, rate: SX, w: SX) -> TransverseInertia:
     """Evaluate a rotor that has a carrier.
 
     Args:
-        spin: The rotor.
+        rotor: The rotor.
         angle: Its joint coordinate [rad].
         rate: Its speed [rad/s].
         w: Angular velocity of the carrier [rad/s], carrier's frame, shape (3,).
     """
-    e, n = spin.heavy_axis, np.cross(spin.axis, spin.heavy_axis)
+    e, n = rotor.heavy_axis, np.cross(rotor.axis, rotor.heavy_axis)
     at_zero, at_quarter = np.outer(e, e) - np.outer(n, n), np.outer(e, n) + np.outer(n, e)
-    c, s = spin.transverse * ca.cos(2 * angle), spin.transverse * ca.sin(2 * angle)
+    c, s = rotor.transverse * ca.cos(2 * angle), rotor.transverse * ca.sin(2 * angle)
     inertia = ca.sparsify(mirrored(c * constant(at_zero) + s * constant(at_quarter)))
-    momentum, axis = ca.sparsify(inertia @ w), constant(spin.axis)
+    momentum, axis = ca.sparsify(inertia @ w), constant(rotor.axis)
     return TransverseInertia(inertia, cross(w + 2 * rate * axis, momentum), ca.dot(axis, cross(w, momentum)))
