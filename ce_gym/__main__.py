@@ -131,7 +131,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _list(args: argparse.Namespace) -> int:
     from ce_gym import environment_ids, shipped_policies
-    from ce_gym.model.formats.motors import motor_table
+    from ce_gym.model.formats.motor_library import motor_table
     from ce_gym.model.load import robot_table
 
     names = [name for name in environment_ids() if name.count("-") == 1]

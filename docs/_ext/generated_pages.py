@@ -27,7 +27,7 @@ from ce_gym import InertiaWarning, Model, load_robot, robots
 from ce_gym.envs.registration import ROBOTS, tasks_of
 from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS
-from ce_gym.model.formats.motors import motor_types
+from ce_gym.model.formats.motor_library import motor_types
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

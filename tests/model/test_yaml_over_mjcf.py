@@ -8,7 +8,7 @@ from mjcf_files import GEOMS, lump
 
 from ce_gym.dynamics import Model
 from ce_gym.model import RobotError, assets_folder, load_robot
-from ce_gym.model.formats.motors import motor_table, motor_types
+from ce_gym.model.formats.motor_library import motor_table, motor_types
 
 LEG = GEOMS.replace('name="hip"', 'name="hip" armature="0.01"')
 KEY = '<keyframe><key qpos="0 0 0.43 1 0 0 0 0.25"/></keyframe>'

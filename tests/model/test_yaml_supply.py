@@ -10,7 +10,7 @@ import pytest
 
 from ce_gym.model import Battery, Heat, Robot, RobotError, load_robot
 from ce_gym.model.assets import assets_folder
-from ce_gym.model.formats.motors import motor_types
+from ce_gym.model.formats.motor_library import motor_types
 
 ROBOT = "mit_humanoid_leg"
 HEAT = "winding_capacity: 16, housing_capacity: 500, winding_to_housing: 1, housing_to_ambient: 2"

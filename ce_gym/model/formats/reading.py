@@ -1,6 +1,6 @@
-"""YAML text -> plain values, each checked for type and finiteness as it is taken out.
+"""YAML text -> plain values, each checked for type and finiteness.
 
-A file of any content is read in a time that its size bounds: values are counted as they are read, aliases included.
+The size of a file bounds the time to read it: values are counted during reading, aliases included.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _REQUIRED: Any = object()
 
 
 LARGEST_TREE = 50_000
-"""Most values that a file may hold, those that aliases repeat counted each time."""
+"""Most values in a file; values that aliases repeat count each time."""
 LONGEST_SCALAR = 10_000
 """Most characters of one value."""
 
@@ -71,10 +71,10 @@ def _refused(event: yaml.Event, problem: str) -> yaml.composer.ComposerError:
 
 
 def parse_yaml(text: str) -> Any:
-    """Return what a text of YAML says; JSON is YAML, too.
+    """Return the content of a YAML or JSON text.
 
     Raises:
-        ValueError: It is malformed or too large; one line that says where.
+        ValueError: The text is malformed or too large; one line with the place.
     """
     try:
         return yaml.load(text, _Loader)
@@ -105,7 +105,7 @@ def _problem(error: Exception) -> str:
 
 
 class Section:
-    """A mapping in a file, together with where it stands; every value that is taken out is checked."""
+    """A mapping in a file with its path of keys; every value is checked when it is read."""
 
     def __init__(self, file: str, path: str, data: object):
         self.file, self.path = file, path
@@ -182,33 +182,29 @@ class Section:
             raise self.invalid(key, value, f"a list of {count} numbers")
         return tuple(finite(self.file, f"{self.key(key)}[{i}]", item) for i, item in enumerate(value))
 
-    def items(self) -> dict[str, Any]:
-        """Return the whole section as it is."""
-        return self.data
-
     def numbers(self) -> tuple[tuple[str, float], ...]:
         """Return all pairs of a mapping from names to finite numbers."""
         return tuple((key, self.number(key)) for key in self.data)
 
-    def figures(self, names: Collection[str]) -> dict[str, float]:
-        """Return a number for each name in a mapping, in which a key such as "*_hip" stands for all that fit it.
+    def numbers_for(self, names: Collection[str]) -> dict[str, float]:
+        """Return a number for each name in a mapping whose keys may be patterns such as "*_hip".
 
-        A name that is written out goes before a pattern, and a pattern before those above it. Keys that are neither a
-        pattern nor one of `names` are kept, for the checks to see.
+        A full name goes before patterns, a later pattern before an earlier one. Keys that are neither a pattern nor one
+        of `names` are kept, for `check_robot` to report.
         """
-        return {name: self.number(key) for name, key in self.keys_of(names).items()}
+        return {name: self.number(key) for name, key in self.keys_for(names).items()}
 
-    def keys_of(self, names: Collection[str]) -> dict[str, str]:
-        """Return under which key a mapping has something for each name, see `figures`."""
-        found: dict[str, str] = {}
+    def keys_for(self, names: Collection[str]) -> dict[str, str]:
+        """Return the key that applies to each name, see `numbers_for`."""
+        keys: dict[str, str] = {}
         for key in self:
             if not set(key) & set("*?["):
                 continue
-            fitting = [name for name in names if fnmatchcase(name, key)]
-            if not fitting:
+            matches = [name for name in names if fnmatchcase(name, key)]
+            if not matches:
                 raise self.unknown("", key, names, "a pattern that fits a name")
-            found |= dict.fromkeys(fitting, key)
-        return found | {key: key for key in self if not set(key) & set("*?[")}
+            keys |= dict.fromkeys(matches, key)
+        return keys | {key: key for key in self if not set(key) & set("*?[")}
 
     def list(self, key: str) -> list[Any]:
         """Return a list, empty if the key is missing."""

@@ -124,7 +124,7 @@ def read_robot(
 def _ratios(gears: Section, tree: MjcfTree, driven: Collection[str]) -> dict[str, float]:
     """Return the gear ratios that the caller gives, by the name of the body that the joint moves."""
     joints = [body for body in tree.moved_by.values() if body not in driven]
-    for joint, ratio in (ratios := gears.figures(joints)).items():
+    for joint, ratio in (ratios := gears.numbers_for(joints)).items():
         if joint not in joints:
             raise gears.unknown("", joint, joints, "the name of a joint that no rotor is given for")
         if ratio == 0.0:

@@ -1,4 +1,4 @@
-"""The `constraints` of the project's robot files: gears and differentials, closed loops, rods, users' functions."""
+"""The key `constraints` of YAML robot files: gears, differentials, closed loops, rods and users' functions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.urdf.elements import unit_axis
 from ce_gym.model.formats.urdf.tree import WORLD, Frame
-from ce_gym.model.frames import Placement
+from ce_gym.model.frames import ZERO, Placement
 
 
 def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Frame]) -> Iterator[Constraint]:
@@ -19,7 +19,7 @@ def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Fr
     Args:
         file: The whole file.
         bodies: All bodies.
-        frames: Body and pose of every frame that can be named, merged links included.
+        frames: Body and pose of every frame with a name, merged links included.
     """
     names = [body.name for body in bodies]
     for i, data in enumerate(file.list("constraints")):
@@ -57,18 +57,16 @@ def _loop(entry: Section, names: list[str], frames: dict[str, Frame]) -> LoopCon
     if joint == "ball" and "axis" in entry:
         raise entry.invalid("axis", entry.get("axis"), "no axis, because a ball joint has none")
     axis = unit_axis(entry.file, entry.key("axis"), entry.vector("axis", 3, (0.0, 0.0, 1.0)))
-    (first, first_placement), (second, second_placement) = (
-        _loop_end(entry, end, frames) for end in ("first", "second")
-    )
+    (first, frame_1), (second, frame_2) = (_loop_end(entry, end, frames) for end in ("first", "second"))
     name = entry.text("name")
-    return LoopConstraint(name, joint, first, second, first_placement, second_placement, axis)  # type: ignore[arg-type]
+    return LoopConstraint(name, joint, first, second, frame_1, frame_2, axis)  # type: ignore[arg-type]
 
 
 def _loop_end(entry: Section, end: str, frames: dict[str, Frame]) -> Frame:
     section = entry.section(end).allow("body", "xyz", "rpy")
     body, pose = frame_named(section, "body", frames)
-    rotation = rotation_from_rpy(*section.vector("rpy", 3, (0.0, 0.0, 0.0)))
-    return body, compose(pose, Placement(vec3(section.vector("xyz", 3, (0.0, 0.0, 0.0))), rotation))
+    rotation = rotation_from_rpy(*section.vector("rpy", 3, ZERO))
+    return body, compose(pose, Placement(vec3(section.vector("xyz", 3, ZERO)), rotation))
 
 
 def _rod(entry: Section, names: list[str], frames: dict[str, Frame]) -> RodConstraint:

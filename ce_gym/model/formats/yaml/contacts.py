@@ -1,11 +1,13 @@
-"""What touches, in a YAML file: `contacts:` with the ground -> spheres; `capsules:` and `self_collisions:` of links.
+"""The keys `contacts`, `capsules` and `self_collisions` of YAML robot files.
 
-Contacts are spheres themselves, primitives, and collisions of a URDF.
+A contact with the ground is a sphere, a primitive, or the <collision> elements of a link in the URDF file. Primitives
+become spheres.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,19 +18,19 @@ from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.yaml.constraints import frame_named
 from ce_gym.model.formats.yaml.links import Links
-from ce_gym.model.frames import Placement
+from ce_gym.model.frames import ZERO, Placement
 
 SIZES = {"box": 3, "cylinder": 2, "capsule": 2}
-"""How many lengths a primitive has: edges, or radius and length along z [m]."""
-AXIS = (0.0, 0.0, 1.0)
-"""Of contacts that do not roll, which have no use for one."""
+"""Number of lengths of a primitive: edges, or radius and length along z [m]."""
 MOST_ON_RIM = 64
 """Most spheres on one rim of a cylinder."""
 
 
-def read_contacts(section: Section, links: Links) -> Iterator[ContactSphere]:
-    """Iterate over the contact spheres; several that stand for one entry are numbered."""
-    for name, entry in section.sections():
+def read_contacts(file: Section, links: Links) -> Iterator[ContactSphere]:
+    """Iterate over the contact spheres; the spheres of a primitive are numbered."""
+    if "contacts" not in file:
+        yield from links.robot.contacts
+    for name, entry in file.section("contacts").sections():
         body, frame = frame_named(entry, "body", links.frames)
         if body is None:
             raise entry.invalid("body", entry.text("body"), "a body that moves")
@@ -45,26 +47,28 @@ def read_contacts(section: Section, links: Links) -> Iterator[ContactSphere]:
             pose = compose(frame, shape.placement)
             axis = vec3([row[2] for row in pose.rotation])
             for suffix, centre, radius in _spheres(entry, shape):
-                at, rim = transform_point(pose, vec3(centre)), shape.size[0] - radius if _rolls(entry, kind) else 0.0
-                yield ContactSphere(f"{stem}{suffix}", body, at, radius, group, rim, axis if rim else AXIS, shape=stem)
+                at = transform_point(pose, vec3(centre))
+                contact = ContactSphere(f"{stem}{suffix}", body, at, radius, group, shape=stem)
+                rim = shape.size[0] - radius if _rolls(entry, kind) else 0.0
+                yield replace(contact, rim=rim, axis=axis) if rim else contact
 
 
 def read_capsules(section: Section, links: Links) -> Iterator[Capsule]:
-    """Iterate over what links are to each other: a capsule, or several, under the name of each."""
+    """Iterate over the capsules under the name of each link."""
     for link in section:
         if links.frames.get(link, (None, None))[0] is None:
             raise section.unknown("", link, links.frames, "the name of a body that moves")
         body, frame = links.frames[link]
         entries = section.list(link) if isinstance(section.get(link), list) else [section.get(link)]
-        for i, entry in enumerate(entries):
-            one = Section(section.file, f"{section.key(link)}[{i}]", entry).allow("from", "to", "radius")
-            start = one.vector("from", 3)
-            ends = [transform_point(frame, vec3(end)) for end in (start, one.vector("to", 3, start))]
-            yield Capsule(str(body), ends[0], ends[1], one.number("radius"))
+        for i, data in enumerate(entries):
+            entry = Section(section.file, f"{section.key(link)}[{i}]", data).allow("from", "to", "radius")
+            start = entry.vector("from", 3)
+            ends = [transform_point(frame, vec3(end)) for end in (start, entry.vector("to", 3, start))]
+            yield Capsule(str(body), ends[0], ends[1], entry.number("radius"))
 
 
 def read_pairs(file: Section, links: Links) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of links that push each other apart, by the names of the bodies that they are part of."""
+    """Return the pairs of links that may collide, by the names of their bodies."""
     pairs: list[tuple[str, str]] = []
     for i, pair in enumerate(file.list("self_collisions")):
         key = f"{file.key('self_collisions')}[{i}]"
@@ -82,8 +86,9 @@ def _primitive(entry: Section, kind: str) -> Shape:
     size = entry.vector("size", SIZES[kind])
     if min(size) < 0.0 or (kind != "capsule" and min(size) == 0.0):
         raise entry.invalid("size", list(size), "lengths above 0 [m]")
-    turned = rotation_from_rpy(*entry.vector("rpy", 3, (0.0, 0.0, 0.0)))
-    return Shape(kind, size, Placement(vec3(entry.vector("position", 3, (0.0, 0.0, 0.0))), turned))  # type: ignore[arg-type]
+    rotation = rotation_from_rpy(*entry.vector("rpy", 3, ZERO))
+    placement = Placement(vec3(entry.vector("position", 3, ZERO)), rotation)
+    return Shape(kind, size, placement)  # type: ignore[arg-type]
 
 
 def _rolls(entry: Section, kind: str) -> bool:

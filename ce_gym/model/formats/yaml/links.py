@@ -1,4 +1,4 @@
-"""What a robot's YAML file stands on: a plain URDF (`urdf:`) or an MJCF file (`mjcf:`)."""
+"""The keys `urdf` and `mjcf` of YAML robot files: the file with the links."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from ce_gym.model.formats.urdf.drives import Drive
 from ce_gym.model.formats.urdf.tree import Base, Frame, read_urdf
 
 _TIES = ("rotors", "constraints", "independent")
-"""Keys under which links are named that move although the URDF alone gives them no mass."""
+"""Keys that name links which move although they have no mass in the URDF file."""
 
 
 @dataclass(frozen=True)
 class Links:
-    """The robot as its links alone say it, and what the YAML file can name in it.
+    """The robot of the URDF or MJCF file, and the frames in it that the YAML file can name.
 
     Attributes:
-        robot: Not checked yet.
-        frames: Body and pose of every frame that can be named, links merged into others included.
-        fixed: Links that no joint moves but that the YAML file calls rotors, by name; no body has their mass.
-        collisions: What a URDF says of how its links touch, in the frame of each; None for a mesh.
-        drives: Motors that a URDF describes.
-        driven: Joints that the YAML file has rotors for.
+        robot: The robot, not checked yet.
+        frames: Body and pose of every frame with a name, merged links included.
+        fixed: Links on fixed joints that the YAML file calls rotors, by name; no body includes their mass.
+        collisions: The <collision> elements of each link of a URDF, in the link's frame; None for a mesh.
+        drives: Motors in a URDF file.
+        driven: Joints with rotors in the YAML file.
     """
 
     robot: Robot
@@ -48,7 +48,7 @@ def read_links(path: Path, file: Section) -> Links:
         file: Its content.
 
     Raises:
-        RobotError: It names none, or both, or one that is wrong.
+        RobotError: The YAML file names neither or both, or the named file is wrong.
     """
     if ("urdf" in file) == ("mjcf" in file):
         value = None if "urdf" not in file else "both"
@@ -85,6 +85,6 @@ def names_in(section: Section, key: str) -> tuple[str, ...]:
 
 
 def _not_tied(bodies: tuple[Body, ...], constraints: tuple[LinearConstraint, ...]) -> tuple[str, ...]:
-    """Return the joints that no <mimic> solves for."""
+    """Return the joints without <mimic>."""
     solved = {constraint.bodies[0] for constraint in constraints}
     return tuple(body.name for body in bodies if body.joint.nv == 1 and body.name not in solved)

@@ -1,125 +1,91 @@
-"""The `rotors`, `motors` and `elastic` transmissions of the project's robot files.
+"""The keys `rotors` and `elastic` of YAML robot files.
 
-A rotor is given in full (parent, xyz, axis, mass, inertia), or is a link on a fixed joint of the URDF or MJCF file, of
-which only the axis is missing, or has one figure, the moment of inertia about its axis, perhaps from the motor library;
-then it is a thin disc that its carrier's published figures count (`rotor_links.py`).
+A rotor is given in one of three ways:
+
+- in full: parent, xyz, axis, mass and inertia;
+- as a link on a fixed joint of the URDF or MJCF file, with its axis;
+- by its moment of inertia about its axis, or a motor of the library that has one. The rotor is then a thin disc whose
+  inertia at rest the published inertia of its carrier includes (`rotor_links.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Inertial, Joint
-from ce_gym.model.drives import DriveFriction, Elasticity, Motor
+from ce_gym.model.drives import Elasticity
 from ce_gym.model.errors import invalid_value
-from ce_gym.model.formats.motors import MotorType, motor_type
+from ce_gym.model.formats.motor_library import MotorType
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, symmetric, vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink, disc, without_rotors
 from ce_gym.model.formats.urdf.elements import unit_axis
 from ce_gym.model.formats.yaml.constraints import coefficients, frame_named
 from ce_gym.model.formats.yaml.links import Links, names_in
-from ce_gym.model.formats.yaml.supply import read_cogging, read_heat
-from ce_gym.model.frames import Placement, Vec3
-
-_KEYS = ("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
-_ELASTIC_KEYS = ("stiffness", "damping", "backlash", "preload")
-_MOTOR_KEYS = ("torque", "velocity", "stall", "damping", "bandwidth", "motor_constant")
-_MOTOR_PARTS = ("use", "friction", "heat", "cogging")
-_FRICTION_KEYS = tuple(field.name for field in fields(DriveFriction) if field.name != "factor")
-_BOTH_KEYS = ("load", "stribeck_load")
-"""Stand for the share of the motor's torque and that of all else, equal."""
+from ce_gym.model.frames import ZERO, Placement, Vec3
 
 
-def read_motors(section: Section) -> tuple[dict[str, MotorType], tuple[Motor, ...]]:
-    """Return the library's entries that motors name, by rotor, and the motors."""
-    used: dict[str, MotorType] = {}
-    motors = []
-    for rotor, motor in section.sections():
-        motor.allow(*_MOTOR_PARTS, *_MOTOR_KEYS)
-        figures: dict[str, float] = {}
-        if "use" in motor:
-            used[rotor] = motor_type(motor.text("use"), motor.file, motor.key("use"))
-            figures = used[rotor].limits()
-        figures |= {key: motor.number(key) for key in motor if key in _MOTOR_KEYS}
-        more = _friction(motor) | read_heat(motor, used.get(rotor)) | read_cogging(motor)
-        motors.append(Motor(rotor, **figures, **more))
-    return used, tuple(motors)
-
-
-def _friction(motor: Section) -> dict[str, Any]:
-    """Return what a motor has of dry friction: a number, or a mapping with what depends on speed and load."""
-    if not isinstance(motor.get("friction", None), dict):
-        return {"friction": motor.number("friction", 0.0)}
-    section = motor.section("friction").allow("coulomb", *_BOTH_KEYS, *_FRICTION_KEYS)
-    figures = {key: section.number(key) for key in section if key in _FRICTION_KEYS}
-    for both in (key for key in _BOTH_KEYS if key in section):
-        for key in (f"{both}_motor", f"{both}_external"):
-            if key in section:
-                raise section.invalid(key, section.get(key), f"none beside {both!r}, which is both")
-            figures[key] = section.number(both)
-    more = {"drive_friction": DriveFriction(**figures)} if figures else {}
-    return {"friction": section.number("coulomb", 0.0)} | more
-
-
-def read_elastic(section: Section, bodies: Iterable[Body]) -> tuple[Elasticity, ...]:
-    """Return how transmissions give way, by rotor, in the order of bodies."""
-    rotors = [body.name for body in bodies if body.kind == "rotor"]
-    keys = section.keys_of(rotors)
-    found = []
+def read_elastic(file: Section, bodies: Iterable[Body]) -> tuple[Elasticity, ...]:
+    """Return the elastic transmissions, in the order of bodies."""
+    section, rotors = file.section("elastic"), [body.name for body in bodies if body.kind == "rotor"]
+    keys = section.keys_for(rotors)
+    transmissions = []
     for rotor in (*(name for name in rotors if name in keys), *(name for name in keys if name not in rotors)):
-        part = section.section(keys[rotor]).allow(*_ELASTIC_KEYS)
-        found.append(
-            Elasticity(rotor, part.number("stiffness"), **{k: part.number(k) for k in part if k != "stiffness"})
-        )
-    return tuple(found)
+        part = section.section(keys[rotor]).allow("stiffness", "damping", "backlash", "preload")
+        optional = {key: part.number(key) for key in part if key != "stiffness"}
+        transmissions.append(Elasticity(rotor, part.number("stiffness"), **optional))
+    return tuple(transmissions)
 
 
 def add_rotors(
     section: Section, links: Links, library: Mapping[str, MotorType]
 ) -> tuple[tuple[Body, ...], tuple[LinearConstraint, ...]]:
-    """Return the bodies with the rotors among them, and the gears; each rotor becomes a frame that others can name.
+    """Return the bodies with the rotors among them, and the gears; other keys can then name the rotors as frames.
 
     Args:
         section: The section `rotors`.
-        links: What the rotors are mounted on and drive; its frames gain the rotors.
+        links: The links that carry the rotors; its frames gain the rotors.
         library: Entries of the motor library, by rotor.
     """
-    bodies = list(links.robot.bodies)
-    rotors, counted = [], {}
+    rotors: list[Body] = []
+    discs: dict[str | None, list[Body]] = {}
     for name, rotor in section.sections():
-        rotor.allow(*_KEYS)
+        rotor.allow("parent", "xyz", "rpy", "axis", "mass", "com", "inertia", "ratios")
         if name in links.frames and name not in links.fixed:
-            raise invalid_value(rotor.file, section.key(name), name, "a name that no other body has")
-        body, is_counted = _rotor(rotor, name, links, library.get(name))
+            raise section.invalid(name, name, "a name that no other body has")
+        body, is_disc = _rotor(rotor, name, links, library.get(name))
         links.frames[name] = (name, Placement())
         rotors.append(body)
-        if is_counted and body.parent is not None:
-            counted.setdefault(body.parent, []).append(body)
-    for i, body in enumerate(bodies):
-        if body.name in counted:
-            rest = without_rotors(body.inertial, counted[body.name])
-            if rest is None:
-                names = ", ".join(rotor.name for rotor in counted[body.name])
-                expected = "less inertia at rest than the body that carries them has"
-                raise invalid_value(section.file, f"{section.path} on {body.name!r}", names, expected)
-            bodies[i] = replace(body, inertial=rest)
-    everything = _interleaved(tuple(bodies), tuple(rotors), section)
-    return everything, tuple(_gears(section, everything, library))
+        if is_disc:
+            discs.setdefault(body.parent, []).append(body)
+    bodies = tuple(_without_discs(section, body, discs.get(body.name, [])) for body in links.robot.bodies)
+    bodies = _interleaved(bodies, tuple(rotors), section)
+    return bodies, tuple(_gears(section, bodies, library))
+
+
+def _without_discs(section: Section, body: Body, discs: list[Body]) -> Body:
+    """Return a link without the inertia at rest of the thin discs that it carries."""
+    if not discs:
+        return body
+    inertial = without_rotors(body.inertial, discs)
+    if inertial is None:
+        names = ", ".join(rotor.name for rotor in discs)
+        expected = "less inertia at rest than the body that carries them has"
+        raise invalid_value(section.file, f"{section.path} on {body.name!r}", names, expected)
+    return replace(body, inertial=inertial)
 
 
 def _rotor(rotor: Section, name: str, links: Links, motor: MotorType | None) -> tuple[Body, bool]:
-    """Return a rotor, and whether its inertia at rest is counted in its carrier's."""
+    """Return a rotor, and whether its carrier's inertia includes the rotor at rest."""
     if name in links.fixed:
         return _fixed(rotor, name, links.fixed[name]), False
     carrier, pose, axis = _mount(rotor, links)
     inertia = rotor.get("inertia", None)
     if isinstance(inertia, list) or (inertia is None and motor is None):
-        centre = vec3(rotor.vector("com", 3, (0.0, 0.0, 0.0)))
-        inertial = Inertial(rotor.number("mass"), centre, symmetric(*rotor.vector("inertia", 6)))
+        com = vec3(rotor.vector("com", 3, ZERO))
+        inertial = Inertial(rotor.number("mass"), com, symmetric(*rotor.vector("inertia", 6)))
         return Body(name, "rotor", carrier, pose, Joint("revolute", axis), inertial), False
     for key in ("mass", "com"):
         if key in rotor:
@@ -131,7 +97,7 @@ def _rotor(rotor: Section, name: str, links: Links, motor: MotorType | None) -> 
 
 
 def _fixed(rotor: Section, name: str, link: FixedLink) -> Body:
-    """Return a link on a fixed joint as the rotor that it is."""
+    """Return a link on a fixed joint as a rotor."""
     for key in rotor:
         if key not in ("axis", "ratios"):
             expected = f"axis and ratios alone, because {name!r} is a link that has the rest"
@@ -141,7 +107,7 @@ def _fixed(rotor: Section, name: str, link: FixedLink) -> Body:
 
 
 def _mount(rotor: Section, links: Links) -> tuple[str | None, Placement, Vec3]:
-    """Return a rotor's carrier, pose and axis: at the joint it drives, if it says nothing and drives only one."""
+    """Return a rotor's carrier, pose and axis; without `parent`, a rotor of one joint is mounted at that joint."""
     driven = names_in(rotor, "ratios")
     if "parent" not in rotor and len(driven) == 1 and driven[0] in links.robot.joints:
         for key in ("xyz", "rpy", "axis"):
@@ -150,12 +116,12 @@ def _mount(rotor: Section, links: Links) -> tuple[str | None, Placement, Vec3]:
         body = links.robot.body(driven[0])
         return body.parent, body.placement, body.joint.axis
     carrier, mount = frame_named(rotor, "parent", links.frames)
-    pose = Placement(vec3(rotor.vector("xyz", 3)), rotation_from_rpy(*rotor.vector("rpy", 3, (0.0, 0.0, 0.0))))
+    pose = Placement(vec3(rotor.vector("xyz", 3)), rotation_from_rpy(*rotor.vector("rpy", 3, ZERO)))
     return carrier, compose(mount, pose), unit_axis(rotor.file, rotor.key("axis"), rotor.vector("axis", 3))
 
 
 def _interleaved(links: tuple[Body, ...], rotors: tuple[Body, ...], section: Section) -> tuple[Body, ...]:
-    """Put every rotor behind the last link it drives, or behind the body it is mounted on if that comes later."""
+    """Put every rotor behind the last link that it drives, or behind its carrier if that comes later."""
     rank: dict[str, tuple[int, ...]] = {link.name: (i,) for i, link in enumerate(links)}
     for rotor in rotors:
         driven = [rank[link] for link in names_in(section.section(rotor.name), "ratios") if link in rank]
@@ -165,21 +131,22 @@ def _interleaved(links: tuple[Body, ...], rotors: tuple[Body, ...], section: Sec
 
 
 def _gears(section: Section, bodies: Iterable[Body], library: Mapping[str, MotorType]) -> Iterator[LinearConstraint]:
-    """Iterate over the ties `rotor angle = sum(ratio * joint angle)`."""
+    """Iterate over the constraints `rotor angle = sum(ratio * joint angle)`."""
     names = [body.name for body in bodies]
-    for rotor, figures in section.sections():
-        ratios = _with_gearbox(figures, library.get(rotor)) if isinstance(figures.get("ratios", {}), list) else figures
-        ratios = ratios.section("ratios")
+    for name, rotor in section.sections():
+        if isinstance(rotor.get("ratios", {}), list):
+            rotor = _with_gearbox(rotor, library.get(name))
+        ratios = rotor.section("ratios")
         if not ratios.data:
-            raise figures.invalid("ratios", {}, "at least one link and its gear ratio")
-        if rotor in ratios:
-            raise invalid_value(figures.file, ratios.key(rotor), rotor, "a link other than the rotor itself")
+            raise rotor.invalid("ratios", {}, "at least one link and its gear ratio")
+        if name in ratios:
+            raise ratios.invalid(name, name, "a link other than the rotor itself")
         pairs = coefficients(ratios, names)
-        yield LinearConstraint(rotor, ((rotor, 1.0), *((link, -ratio) for link, ratio in pairs)))
+        yield LinearConstraint(name, ((name, 1.0), *((link, -ratio) for link, ratio in pairs)))
 
 
 def _with_gearbox(rotor: Section, motor: MotorType | None) -> Section:
-    """Return a rotor's section with the ratio of its motor's own gearbox for each of the joints that it lists."""
+    """Return a rotor's section with the gear ratio of the motor's gearbox for each listed joint."""
     joints = rotor.texts("ratios")
     if motor is None:
         expected = "a mapping from joints to gear ratios, or a motor of the library under `motors`, whose ratio it is"

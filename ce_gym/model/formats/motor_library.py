@@ -1,6 +1,6 @@
-"""The motor library: published figures of actuators, by name, for robot files to `use`.
+"""The motor library: published data of actuators, by name, for robot files to `use`.
 
-The file is `motors.yaml` beside the robots that come with the package; each entry names the source of its figures.
+The file is `motors.yaml` beside the robots of the package; each entry names its source.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ _OPTIONAL = ("velocity", "resistance", "motor_constant")
 
 @dataclass(frozen=True)
 class MotorType:
-    """An actuator that can be bought, its gearbox included.
+    """A commercial actuator with its gearbox; None for data that is not published.
 
     Attributes:
-        name: How robot files name it.
-        ratio: Of its own gearbox: turns of the rotor for one of the output.
-        inertia: Of all that spins, seen from the rotor [kg m^2]: reflected inertia over the ratio squared.
-        torque: Largest, at the rotor [N m].
-        velocity: No-load speed of the rotor [rad/s]; None if it is not published.
-        resistance: Of a phase [ohm]; None if it is not published.
-        motor_constant: Torque over the root of what the winding then loses, at 20 deg C [N m/sqrt(W)]; None likewise.
-        heat: How it grows warm; None likewise.
-        source: Where the figures are from, and which of them are estimates.
+        name: Name in robot files.
+        ratio: Gear ratio of the gearbox: turns of the rotor for one turn of the output.
+        inertia: Inertia of all rotating parts at the rotor [kg m^2]: reflected inertia over the ratio squared.
+        torque: Largest torque at the rotor [N m].
+        velocity: No-load speed of the rotor [rad/s].
+        resistance: Phase resistance [ohm].
+        motor_constant: Torque over the root of the copper loss, at 20 deg C [N m/sqrt(W)].
+        heat: Thermal parameters.
+        source: Source of the data, and which values are estimates.
     """
 
     name: str
@@ -46,19 +46,19 @@ class MotorType:
     source: str
 
     def limits(self) -> dict[str, float]:
-        """Return what a `Motor` has of it: torque [N m], velocity [rad/s] and motor constant of the rotor."""
-        more = {"velocity": self.velocity, "motor_constant": self.motor_constant}
-        return {"torque": self.torque} | {key: value for key, value in more.items() if value is not None}
+        """Return the arguments of a `Motor`: torque [N m], and velocity [rad/s] and motor constant if published."""
+        optional = {"velocity": self.velocity, "motor_constant": self.motor_constant}
+        return {"torque": self.torque} | {key: value for key, value in optional.items() if value is not None}
 
 
 def motor_types(folder: Path | None = None) -> dict[str, MotorType]:
     """Return the entries of the library by name.
 
     Args:
-        folder: Where `motors.yaml` is; by default the folder of robots that come with the package.
+        folder: Folder of `motors.yaml`; by default the folder of the package's robots.
 
     Raises:
-        RobotError: The file is wrong; one line that says where.
+        RobotError: The file is wrong; one line with the place.
 
     Examples:
         >>> motor_types()["unitree_7520_14"].ratio
@@ -71,9 +71,9 @@ def motor_type(name: str, file: str, key: str) -> MotorType:
     """Return an entry of the library.
 
     Args:
-        name: Its name.
-        file: The file that uses it, for messages.
-        key: Where in that file.
+        name: Name of the entry.
+        file: The file that uses the entry, for messages.
+        key: Key in that file, for messages.
 
     Raises:
         RobotError: There is no such entry.
@@ -91,11 +91,11 @@ def motor_table() -> str:
     return table_text(columns, rows)
 
 
-def heat_of(section: Section) -> Heat:
-    """Return the figures of how a motor grows warm."""
+def read_heat(section: Section) -> Heat:
+    """Return the thermal parameters of a motor."""
     section.allow(*(field.name for field in fields(Heat)))
-    asked = {field.name for field in fields(Heat) if field.default is MISSING} | set(section)
-    return Heat(**{name: section.number(name) for name in asked})
+    required = {field.name for field in fields(Heat) if field.default is MISSING}
+    return Heat(**{name: section.number(name) for name in required | set(section)})
 
 
 @cache
@@ -109,5 +109,5 @@ def _motor(name: str, section: Section) -> MotorType:
     for key, value in figures.items():
         if value is not None and not value > 0.0:
             raise section.invalid(key, value, "more than 0")
-    heat = heat_of(section.section("heat")) if "heat" in section else None
+    heat = read_heat(section.section("heat")) if "heat" in section else None
     return MotorType(name, **figures, heat=heat, source=section.text("source"))  # type: ignore[arg-type]
