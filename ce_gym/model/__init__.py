@@ -1,4 +1,4 @@
-"""What a robot is, where it is read from, and how its bodies cluster."""
+"""Descriptions of robots, their file formats and their clusters of bodies."""
 
 from ce_gym.model.assets import assets_folder, robots
 from ce_gym.model.checks.robot import check_robot

@@ -1,4 +1,4 @@
-"""The folder of robots that come with the package."""
+"""The folder of the package's robots."""
 
 from __future__ import annotations
 

@@ -1,22 +1,20 @@
-"""The cluster tree: which bodies must be treated together because constraints tie their joints.
+"""The cluster tree: groups of bodies that the recursions treat together because constraints couple their joints.
 
-Found by analysis of the graph, for any robot.
-
-A constraint over the *joints* of some bodies makes one cluster of those bodies and of everything between them: take
-the nearest common ancestor of their parents; every body on the way from there (exclusive) to each of them (inclusive)
-belongs to the cluster. A closed loop or rod ties the *bodies* themselves, so the nearest common ancestor of the bodies
-is taken instead, and may be one of them. Clusters that share a body are merged. So, in the terms of the paper's figure
-3:
+A constraint on the *joints* of some bodies groups these bodies and all bodies between them. Take the nearest common
+ancestor of their parents: each body on the paths from the ancestor (exclusive) to the constrained bodies (inclusive)
+belongs to the cluster. A closed loop or rod constrains the *bodies* themselves. Its paths start at the nearest common
+ancestor of the bodies, which may be an end of the loop. Clusters that share a body are merged. Examples, as in the
+paper's figure 3:
 
 - a link and its rotor on the same parent form one cluster;
 - a belt (knee, ankle on the knee, both rotors on the thigh) forms one cluster of four;
-- a tie between a body and its grandchild takes in the body between them;
+- a constraint between a body and its grandchild includes the body between;
 - a loop nested in another, or two loops through one body, form one cluster.
 
-All base bodies of a cluster hang on one output body, as the recursive algorithms need: that is so for one constraint
-by construction, and if two clusters share a body then both output bodies are ancestors of it, so one of the two lies
-on the path from the other and is a member of the other's cluster, whose output body the union keeps. Because output
-bodies lie strictly nearer to the root than their clusters, clusters form a tree.
+All base bodies of a cluster are attached to one output body, as the recursive algorithms need. For one constraint this
+holds by construction. If two clusters share a body, both output bodies are its ancestors, so one output body is a
+member of the other cluster, and the union keeps the output body of that cluster. Output bodies are strictly nearer to
+the root than their clusters, so clusters form a tree.
 """
 
 from __future__ import annotations
@@ -31,15 +29,16 @@ from ce_gym.model.errors import invalid_value
 
 @dataclass(frozen=True)
 class Cluster:
-    """Bodies whose joints are tied together, or one body that is free of ties.
+    """Bodies with coupled joints, or one body without constraints.
 
     Attributes:
         bodies: Names, parents before children.
-        constraints: The ties among them.
-        independent: Those of the bodies whose joint coordinates are independent, in the robot's order; empty for the
+        constraints: The constraints among the bodies.
+        independent: Bodies of the cluster with independent joint coordinates, in the robot's order; empty for the
             cluster of a floating base or of a ball joint.
-        parent: Index of the parent cluster; None is the world.
-        output_body: Body of the parent cluster that all base bodies of this cluster are attached to; None is the world.
+        parent: Index of the parent cluster; None for the world.
+        output_body: Body of the parent cluster to which all base bodies of this cluster are attached; None for the
+            world.
     """
 
     bodies: tuple[str, ...]
@@ -69,7 +68,7 @@ class ClusterTree:
         return reversed(range(len(self.clusters)))
 
     def cluster_of(self, body: str) -> int:
-        """Return the index of the cluster that holds `body`; KeyError if there is none."""
+        """Return the index of the cluster that contains `body`; KeyError without such a body."""
         for index, cluster in enumerate(self.clusters):
             if body in cluster.bodies:
                 return index
@@ -121,7 +120,7 @@ def _ancestors(body: str | None, parents: dict[str, str | None]) -> list[str | N
 
 
 def _constraint_span(constraint: Constraint, parents: dict[str, str | None], robot: Robot) -> list[str]:
-    """Return the bodies that one constraint makes a cluster of."""
+    """Return the bodies of the cluster of one constraint."""
     if not constraint.ends:
         return _between(constraint.bodies, [parents[body] for body in constraint.bodies], parents)
     span = _between(constraint.ends, constraint.ends, parents)
@@ -133,7 +132,7 @@ def _constraint_span(constraint: Constraint, parents: dict[str, str | None], rob
 
 
 def _between(tied: Sequence[str | None], below: Sequence[str | None], parents: dict[str, str | None]) -> list[str]:
-    """Return the bodies on the ways to `tied` from the nearest common ancestor of `below`, without the ancestor."""
+    """Return the bodies on the paths to `tied` from the nearest common ancestor of `below`, without the ancestor."""
     above = [_ancestors(body, parents) for body in below]
     common = next(a for a in above[0] if all(a in chain for chain in above))
     chains = [_ancestors(body, parents) for body in tied]

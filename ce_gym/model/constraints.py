@@ -16,11 +16,11 @@ from ce_gym.model.frames import ORIGIN, Placement, Vec3
 
 @dataclass(frozen=True)
 class Constraint:
-    """What all kinds of constraints have in common; each kind has checks, a residual and a reader beside its figures.
+    """Base class of constraints; each kind has data here, and checks, a residual and a reader in other files.
 
     Attributes:
-        name: For messages.
-        linear: Whether it is linear in joint coordinates.
+        name: Name for messages.
+        linear: Whether the constraint is linear in joint coordinates.
     """
 
     name: str
@@ -28,12 +28,12 @@ class Constraint:
 
     @property
     def ends(self) -> tuple[str | None, ...]:
-        """The bodies that it ties wherever their joints are, None for the world; empty if it ties joint coordinates."""
+        """The bodies of a loop or rod, None for the world; empty if the constraint is between joint coordinates."""
         return ()
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies, or of the bodies whose joint coordinates, it ties together, the world left out."""
+        """Names of the constrained bodies, or of the bodies with constrained joint coordinates; not the world."""
         return tuple(body for body in self.ends if body is not None)
 
 
@@ -164,7 +164,7 @@ def register_constraint(name: str, function: ConstraintFunction) -> None:
     Args:
         name: The name; registering it again with another function replaces it for models built later.
         function: Takes a sequence of joint coordinates (CasADi SX scalars) [rad or m] and returns a sequence of
-            expressions of them: residuals `phi` that vanish, or coordinates `gamma` of dependent joints.
+            expressions: residuals `phi` that vanish, or coordinates `gamma` of dependent joints.
     """
     _functions[name] = function
 
@@ -173,7 +173,7 @@ def constraint_function(name: str) -> ConstraintFunction:
     """Return the function registered under `name`.
 
     Raises:
-        RobotError: There is none.
+        RobotError: No function has this name.
     """
     if name not in _functions:
         known = ", ".join(sorted(_functions)) or "there are none"

@@ -1,9 +1,9 @@
-"""Where the coordinates of joints are in `q` and `v`: joints that turn freely have a quaternion, so `nq` is not `nv`.
+"""The coordinates of joints in `q` and `v`; `nq` is larger than `nv` because free and ball joints have a quaternion.
 
     q = [base position, base quaternion, quaternions of ball joints, joints with one coordinate]
     v = [base angular, base linear, angular velocities of ball joints, joints with one coordinate]
 
-Quaternions are (w, x, y, z), child to parent. Angular velocities are in the axes of the body that turns.
+Quaternions are (w, x, y, z), child to parent. Angular velocities are in the axes of the moving body.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 UNIT_TOLERANCE = 1e-3
-"""By how much the norm of a quaternion that comes in may differ from 1."""
+"""Largest difference from 1 of the norm of an input quaternion."""
 UNIT_ROUNDING = 16
-"""Up to so many roundings a quaternion counts as of unit length, and keeps its bits."""
+"""Quaternions within so many machine epsilons of unit length keep their bits."""
 SIZES: dict[str, tuple[int, int]] = {"free": (7, 6), "ball": (4, 3)}
-"""Number of positions and of velocities of types of joints; all others have one of each."""
+"""Number of positions and of velocities, by type of joint; other types have one of each."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Which rows of `q` and `v` are what.
+    """The rows of each kind of joint in `q` and `v`.
 
     Attributes:
         floating: Whether the base is free.
@@ -94,15 +94,15 @@ def placed(joints: Iterable[tuple[str, str]]) -> dict[str, tuple[range, range]]:
 
 
 def unit_quaternions(q: NDArray, first: Iterable[int], name: str = "q", dtype: DTypeLike = np.float64) -> NDArray:
-    """Return rows with quaternions of unit length, given rows in which they are nearly so.
+    """Return rows with quaternions scaled to unit length.
 
-    Quaternions that are of unit length but for rounding keep their bits, and so do those that are not a number.
+    Quaternions of unit length to rounding keep their bits, and so do quaternions that are not a number.
 
     Args:
-        q: Shape (..., n).
+        q: Rows with quaternions of nearly unit length, shape (..., n).
         first: Columns at which quaternions (w, x, y, z) begin.
-        name: Of the rows in error messages.
-        dtype: The precision that rounding is measured by.
+        name: Name of the rows in error messages.
+        dtype: Type whose machine epsilon is the unit of rounding.
 
     Raises:
         ValueError: The norm of a quaternion is not within `UNIT_TOLERANCE` of 1.

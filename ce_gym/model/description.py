@@ -1,11 +1,11 @@
-"""What a robot is: frozen data, nothing computed.
+"""`Robot`: the description of a robot as frozen data.
 
-Every loader ends in a `Robot`; every other part of the package starts from one. A robot is a spanning tree of
-bodies, each moved by one joint against its parent, plus the constraints that tie joint coordinates together
-(gears, belts, differentials, closed loops). A joint has the name of the body it moves, so one name space is
-enough: "the angle of FL_hip_link" is the coordinate of the joint between FL_hip_link and its parent.
+Every loader returns a `Robot`; every other part of the package starts from one. A robot is a spanning tree of
+bodies, each with one joint to its parent, plus the constraints among joint coordinates
+(gears, belts, differentials, closed loops). A joint has the name of the body it moves:
+"the angle of FL_hip_link" is the coordinate of the joint between FL_hip_link and its parent.
 
-Numbers are plain floats in tuples, so that two robots are equal if and only if their figures are, and a robot
+Numbers are plain floats in tuples. Two robots are equal if and only if their numbers are, and a robot
 can be hashed into a cache key. Units are SI and radians.
 """
 
@@ -24,7 +24,7 @@ from ce_gym.model.errors import listed_names
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
 
 UNKNOWN_RATIO = 1e6
-"""Gear ratio in place of one that is not known: the rotor's own inertia is then 1e-12 of the reflected one."""
+"""Gear ratio in place of an unknown one: the rotor's own inertia is then 1e-12 of the reflected inertia."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Inertial:
     """Mass properties of a body in its own frame.
 
     Attributes:
-        mass: [kg]; zero is allowed for rotors whose mass is already counted in the body that carries them.
+        mass: Mass [kg]; zero is allowed for rotors whose mass the carrier's mass includes.
         com: Centre of mass [m].
         inertia: Rotational inertia about the centre of mass, body axes [kg m^2].
     """
@@ -55,14 +55,14 @@ class Joint:
         type: "free" (six degrees of freedom, only against the world), "ball" (three, and no actuator), "revolute" or
             "prismatic".
         axis: Unit axis in the body frame; for "revolute" positive is right-handed. Ignored by "free" and "ball".
-        position: Lower and upper limit [rad or m]; infinite where there is none. The upper one of a ball joint is how
-            far it turns about whichever axis; it has no lower one.
+        position: Lower and upper limit [rad or m]; infinite without a limit. The upper limit of a ball joint is its
+            largest angle about any axis; a ball joint has no lower limit.
         torque: Largest actuator effort at the joint [N m or N].
         velocity: Largest speed the actuator reaches [rad/s or m/s].
         damping: Viscous friction at the joint [N m s/rad or N s/m].
         friction: Dry friction at the joint [N m or N].
-        stiffness: Of a spring at the joint [N m/rad or N/m].
-        springref: Where that spring is relaxed [rad or m]; that of a ball joint is where it is not turned.
+        stiffness: Stiffness of a spring at the joint [N m/rad or N/m].
+        springref: Coordinate of the relaxed spring [rad or m]; the spring of a ball joint is relaxed at no rotation.
     """
 
     type: Literal["free", "ball", "revolute", "prismatic"]
@@ -97,7 +97,7 @@ class Joint:
 
 
 SCREWS: dict[str, tuple[float, float]] = {"revolute": (1.0, 0.0), "prismatic": (0.0, 1.0)}
-"""Types of joints with one coordinate: how it turns [-] and slides [-]. All algorithms go by that."""
+"""Rotation and translation for a unit of the coordinate, by type of joint with one coordinate [-]."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,8 @@ class Shape:
 
     Attributes:
         type: "box", "cylinder", "capsule" or "sphere".
-        size: box: full edge lengths x, y, z; cylinder and capsule: radius, length along z (a capsule's length is
-            that of its cylindrical part); sphere: radius [m].
+        size: box: full edge lengths x, y, z; cylinder and capsule: radius, length along z (without a capsule's
+            half spheres); sphere: radius [m].
         placement: Pose of the shape's centre in the body frame.
         color: Red, green, blue, alpha in 0..1.
     """
@@ -125,9 +125,9 @@ class Body:
     Attributes:
         name: Unique among all bodies.
         kind: "link", or "rotor" for a body that spins inside a transmission. The transmission levels differ only in
-            what they keep of rotors. "stretch" is no body but the coordinate of an elastic transmission, see
-            `Elasticity`; only the elastic level has some.
-        parent: Name of the parent body; None is the world.
+            their treatment of rotors. "stretch" is the coordinate of an elastic transmission, see `Elasticity`; it
+            exists at the elastic level only.
+        parent: Name of the parent body; None for the world.
         placement: Pose of the body frame in the parent frame when the joint coordinate is zero.
     """
 
@@ -142,17 +142,17 @@ class Body:
 
 @dataclass(frozen=True)
 class ContactSphere:
-    """A sphere fixed to a body that may touch the ground, or one that moves around a rim to where it does.
+    """A sphere on a body that may touch the ground: fixed, or moving around a rim to the lowest point.
 
     Attributes:
         name: Unique among contacts.
-        body: Name of the body that carries it.
-        position: Centre in the body frame [m]; that of the rim for one that moves.
-        radius: [m]; zero is a point.
+        body: Name of the body with the sphere.
+        position: Centre of a fixed sphere, or of the rim, in the body frame [m].
+        radius: Radius [m]; zero for a point.
         group: Free label, such as "foot", "knee" or "torso", by which tasks choose contacts.
-        rim: Radius of the circle on which the sphere's centre moves [m]; 0 for a sphere that is fixed.
-        axis: Of that circle in the body frame, a unit vector.
-        shape: Name of the convex shape of which it is a corner; "" for a sphere or a point of its own.
+        rim: Radius of the circle on which the sphere's centre moves [m]; 0 for a fixed sphere.
+        axis: Unit axis of that circle in the body frame.
+        shape: Name of the convex shape with this corner; "" for a single sphere or point.
     """
 
     name: str
@@ -167,13 +167,13 @@ class ContactSphere:
 
 @dataclass(frozen=True)
 class Capsule:
-    """What a link is to other links of its robot: all that is within a radius of a segment.
+    """The shape of a link in collisions with other links of its robot: all points within a radius of a segment.
 
     Attributes:
         body: Name of the link.
-        start: Of the segment, in the body frame [m].
-        end: The same point for a sphere [m].
-        radius: [m].
+        start: Start of the segment in the body frame [m].
+        end: End of the segment in the body frame [m]; equal to the start for a sphere.
+        radius: Radius [m].
     """
 
     body: str
@@ -184,7 +184,7 @@ class Capsule:
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """Compliance and friction of a robot's contacts with the ground, figures of each contact sphere.
+    """Compliance and friction of each contact sphere.
 
     Attributes:
         stiffness: Normal stiffness [N/m].
@@ -209,8 +209,8 @@ class Pose:
 
     Attributes:
         height: Height of the base origin above flat ground [m]; ignored by a fixed base.
-        joints: Pairs (body, angle) for independent joints; those not named are zero [rad or m].
-        balls: Pairs (body, quaternion wxyz of norm 1 within 1e-3) for ball joints; those not named are not turned.
+        joints: Pairs (body, angle) for independent joints; other joints are at zero [rad or m].
+        balls: Pairs (body, quaternion wxyz of norm 1 within 1e-3) for ball joints; others have no rotation.
     """
 
     height: float = 0.0
@@ -238,24 +238,24 @@ class Robot:
     Attributes:
         name: Short name, such as "mini_cheetah".
         bodies: Parents before children. A floating base is a body with a "free" joint on the world, listed first.
-        constraints: What ties joint coordinates together.
+        constraints: Constraints among joint coordinates or bodies.
         independent: Bodies whose joint coordinates are the independent coordinates `y`, in the order of `y`.
         contacts: Spheres that may touch the ground.
         material: Compliance and friction of the contacts.
-        capsules: What links are to each other, of those whose shapes do not say it or say it wrongly.
-        self_collisions: Pairs of links that push each other apart, in a scene that asks for it.
-        motors: One for each driven rotor.
-        elastic: How transmissions give way at the elastic level; those that are not named are rigid there, too.
-        battery: What feeds the motors; None for a voltage that never sags.
+        capsules: Shapes of links in collisions with other links, where the drawn shapes do not fit.
+        self_collisions: Pairs of links that may collide, for scenes with self-collisions.
+        motors: Motors, one for each driven rotor.
+        elastic: Elastic transmissions of the elastic level; other transmissions are rigid.
+        battery: Battery of the motors; None for a constant voltage.
         pose: The standing pose.
         gains: PD gains for position control of the independent joints.
-        assembly: Pairs (body, angle) for dependent joints: where they are, roughly, in the standing pose. Chooses among
-            the ways in which closed loops can be assembled; those not named are near zero [rad or m].
+        assembly: Pairs (body, angle) for dependent joints: rough coordinates in the standing pose [rad or m], which
+            choose the branch on which closed loops are assembled. Other joints are near zero.
         gravity: Acceleration of free fall in the world frame [m/s^2].
-        tasks: For each task that wants something else on this robot, pairs (name of a figure of the task, value).
-        kept_inertia: Patterns of names of bodies whose published inertia no rigid body can have, and is kept knowingly.
-        source: The file it was read from, for messages.
-        notes: Facts a user should know, such as repaired figures.
+        tasks: For each task with other settings on this robot, pairs (name of a setting, value).
+        kept_inertia: Patterns of names of bodies whose published inertia violates the triangle inequality and is kept.
+        source: The robot's file, for messages.
+        notes: Facts a user should know, such as repaired values.
     """
 
     name: str
@@ -279,7 +279,7 @@ class Robot:
     notes: tuple[str, ...] = field(default=(), compare=False)
 
     def body(self, name: str) -> Body:
-        """Return the body called `name`; KeyError if there is none."""
+        """Return the body called `name`; KeyError without such a body."""
         for body in self.bodies:
             if body.name == name:
                 return body
@@ -291,7 +291,7 @@ class Robot:
 
     @property
     def unknown_ratios(self) -> tuple[str, ...]:
-        """The rotors whose gear ratio the robot's file does not say, such as armature in MJCF; see `UNKNOWN_RATIO`."""
+        """The rotors without gear ratio in the robot's file, such as armature in MJCF; see `UNKNOWN_RATIO`."""
         ties = [tie for tie in self.constraints if isinstance(tie, LinearConstraint)]
         steep = [tie for tie in ties if max(abs(x) for _, x in tie.coefficients) >= UNKNOWN_RATIO / 100]
         tied = {name for tie in steep for name in tie.bodies}
@@ -305,11 +305,11 @@ class Robot:
 
     @property
     def passive(self) -> tuple[str, ...]:
-        """The independent joints without an actuator, whose largest torque is 0 while that of another is not.
+        """The independent joints without an actuator: their torque limit is 0, and another joint's limit is not.
 
-        If it is 0 for all of them, the file does not say which joints are driven (CAD exports of URDF files have
-        `effort="0"` everywhere), and joints with a spring are passive. Passive joints have positions and speeds as the
-        others have, entries in targets that nothing follows, no gains and no actions.
+        CAD exports of URDF files have `effort="0"` everywhere. If the torque limit of all independent joints is 0,
+        joints with a spring are passive. Passive joints have positions and speeds, and entries in targets without
+        effect, but no gains and no actions.
         """
         joints = {body.name: body.joint for body in self.bodies}  # names are checked later
         idle = [name for name in self.commanded if name in joints and joints[name].torque == 0.0]
@@ -334,12 +334,12 @@ class Robot:
 
     @property
     def layout(self) -> Layout:
-        """Which rows of `q` and `v` are what."""
+        """The rows of each kind of joint in `q` and `v`."""
         return Layout(self.floating, len(self.balls), len(self.independent))
 
     @property
     def rows(self) -> dict[str, tuple[range, range]]:
-        """Rows in `q` and in `v` of each joint that has some, by the body it moves, in their order."""
+        """Rows in `q` and in `v` of the base, ball joints and independent joints, by body, in their order."""
         base = [self.bodies[0].name] if self.floating else []
         types = {body.name: body.joint.type for body in self.bodies}
         return placed([(name, types[name]) for name in (*base, *self.balls, *self.independent) if name in types])

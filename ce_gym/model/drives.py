@@ -1,40 +1,42 @@
-"""What drives joints: motors, what they lose, what feeds them, transmissions that give way; figures are the rotor's."""
+"""Drives: motors, their friction and heat, the battery, and elastic transmissions; all values are at the rotor."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 ELASTIC_FACTORS = "drive_stiffness", "drive_damping", "backlash"
-"""What each elastic transmission can have a factor on, and all of them together."""
+"""Parameters that scale one elastic transmission, or all elastic transmissions."""
 
 
 @dataclass(frozen=True)
 class DriveFriction:
-    """How much more dry friction a drive has at rest and under load. All figures are the rotor's.
+    """Dry friction of a drive that depends on speed and load, at the rotor.
 
-    With `tau_m` the torque of the motor, `tau_e` what all else does to the rotor, of opposite signs where it has to
-    carry something, and `s = exp(-|speed / stribeck_speed|^stribeck_exponent)`, its dry friction is at most
+    `tau_m` is the motor's torque and `tau_e` the external torque on the rotor; the signs are opposite if the motor
+    carries a load. With `s = exp(-|speed / stribeck_speed|^stribeck_exponent)`, dry friction is at most
     `friction + factor (|load_motor tau_m - load_external tau_e| + E + s (stribeck + S + Q))`, where
     `S = |stribeck_load_motor tau_m - stribeck_load_external tau_e|`.
 
-    If they are of opposite signs and the motor drives, `|tau_m| > |tau_e|`, it is `Q = stribeck_square_external
-    tau_e^2` and `E = (1 / efficiency - 1) |tau_e|`; if it is driven back, `Q = stribeck_square_motor tau_m^2` and `E =
-    (1 - backdriving_efficiency) |tau_e|`. Without E these are the models M2 to M6 of Duclusaud, Passault, Padois
-    and Ly, "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025 (arXiv:2410.08650).
+    `Q` and `E` act if the signs are opposite. If the motor drives the load, `|tau_m| > |tau_e|`, then
+    `Q = stribeck_square_external tau_e^2` and `E = (1 / efficiency - 1) |tau_e|`. If the load drives the motor back,
+    `Q = stribeck_square_motor tau_m^2` and `E = (1 - backdriving_efficiency) |tau_e|`.
+
+    Without E these are the models M2 to M6 of Duclusaud, Passault, Padois and Ly, "Extended Friction Models for the
+    Physics Simulation of Servo Actuators", ICRA 2025 (arXiv:2410.08650).
 
     Attributes:
-        stribeck: What is added at rest [N m].
-        stribeck_speed: Speed at which that has fallen to 37 % [rad/s].
-        stribeck_exponent: How abruptly it falls; 2 for a Gaussian.
-        load_motor: Share of the motor's torque [-].
-        load_external: Share of what all else does [-].
-        stribeck_load_motor: The same of what is added at rest [-].
-        stribeck_load_external: The same [-].
-        stribeck_square_motor: Share of the square in what is added at rest [1/(N m)].
-        stribeck_square_external: The same [1/(N m)].
-        efficiency: Share of the motor's torque that moves a load at a steady speed, without all the above [-].
-        backdriving_efficiency: Share of a load that reaches the motor as it is driven back; 0 for self-locking [-].
-        factor: On all of this [-].
+        stribeck: Additional friction at rest [N m].
+        stribeck_speed: Speed at which the additional friction has fallen to 37 % [rad/s].
+        stribeck_exponent: Exponent of the decay; 2 for a Gaussian.
+        load_motor: Friction per motor torque [-].
+        load_external: Friction per external torque [-].
+        stribeck_load_motor: Additional friction at rest per motor torque [-].
+        stribeck_load_external: Additional friction at rest per external torque [-].
+        stribeck_square_motor: Additional friction at rest per square of the motor torque [1/(N m)].
+        stribeck_square_external: Additional friction at rest per square of the external torque [1/(N m)].
+        efficiency: Share of the motor's torque that moves a load at a steady speed, without the terms above [-].
+        backdriving_efficiency: Share of a load that reaches the motor when driven back; 0 for self-locking [-].
+        factor: Factor on all terms [-].
     """
 
     stribeck: float = 0.0
@@ -52,31 +54,31 @@ class DriveFriction:
 
     @property
     def shares(self) -> tuple[float, ...]:
-        """What multiplies torques, or squares of them; none of it is negative."""
-        of_speed = self.stribeck_load_motor, self.stribeck_load_external
+        """Coefficients of torques and of squared torques, all 0 or more."""
+        at_rest = self.stribeck_load_motor, self.stribeck_load_external
         squares = self.stribeck_square_motor, self.stribeck_square_external
-        return self.load_motor, self.load_external, *of_speed, *squares
+        return self.load_motor, self.load_external, *at_rest, *squares
 
     @property
     def loaded(self) -> bool:
-        """Whether it depends on torques."""
+        """Whether friction depends on torques."""
         return any(self.shares) or self.efficiency < 1 or self.backdriving_efficiency < 1
 
 
 @dataclass(frozen=True)
 class Heat:
-    """How a motor grows warm: its losses heat the winding, the winding the housing, and the housing the air.
+    """Thermal model of a motor: losses heat the winding, the winding heats the housing, and the housing the air.
 
-    From `warm` on the largest torque falls with the winding's temperature, to none at `hot`, as drives protect motors.
+    The torque limit falls linearly from its full value at winding temperature `warm` to 0 at `hot`.
 
     Attributes:
         winding_capacity: Heat capacity of the winding [J/K].
-        housing_capacity: Of the housing [J/K].
-        winding_to_housing: Thermal resistance [K/W].
-        housing_to_ambient: The same [K/W].
-        warm: Temperature of the winding from which torque is held back [deg C].
-        hot: Where none is left [deg C].
-        ambient: Temperature of the air, and of a motor that has rested [deg C].
+        housing_capacity: Heat capacity of the housing [J/K].
+        winding_to_housing: Thermal resistance between winding and housing [K/W].
+        housing_to_ambient: Thermal resistance between housing and air [K/W].
+        warm: Winding temperature above which the torque limit falls [deg C].
+        hot: Winding temperature at which the torque limit is 0 [deg C].
+        ambient: Temperature of the air, and of a motor after a long rest [deg C].
     """
 
     winding_capacity: float
@@ -90,13 +92,13 @@ class Heat:
 
 @dataclass(frozen=True)
 class Battery:
-    """What feeds all motors: a voltage behind a resistance. What flows back charges it.
+    """The battery of all motors: a voltage behind a resistance. Braking motors charge it.
 
     Attributes:
-        voltage: Without load [V].
-        resistance: Of cells and wires [ohm].
-        nominal: At which the motors' torque-speed lines are what their figures say [V].
-        idle: What everything but the motors takes [W].
+        voltage: Voltage without load [V].
+        resistance: Resistance of cells and wires [ohm].
+        nominal: Voltage of the motors' torque-speed lines [V].
+        idle: Power of all consumers but the motors [W].
     """
 
     voltage: float
@@ -116,12 +118,12 @@ class Motor:
         stall: Torque at standstill, as the voltage allows, where the torque-speed line starts [N m]; `torque` if None.
         damping: Viscous friction of the rotor [N m s/rad].
         friction: Dry friction of the rotor [N m].
-        drive_friction: What depends on speed and load besides; None for nothing.
-        bandwidth: Of the loop that follows the torque it is asked for, a lag of first order [Hz].
-        motor_constant: Torque over the root of what the winding then loses, at 20 deg C [N m/sqrt(W)]; None if unknown.
-        heat: How it grows warm; None if it never does.
-        cogging: Harmonics of the torque of its magnets on its teeth, `-torque sin(order angle + phase)`: triples of
-            order in a turn of the rotor, torque [N m] and phase [rad].
+        drive_friction: Additional friction that depends on speed and load; None without.
+        bandwidth: Bandwidth of the torque loop, a first-order lag between commanded and actual torque [Hz].
+        motor_constant: Torque over the root of the copper loss, at 20 deg C [N m/sqrt(W)]; None if unknown.
+        heat: Thermal model; None for a constant temperature.
+        cogging: Harmonics of cogging torque, `-torque sin(order angle + phase)`: triples of periods in a turn of the
+            rotor, torque [N m] and phase [rad].
     """
 
     rotor: str
@@ -143,25 +145,25 @@ class Motor:
 
 
 def stretch_of(rotor: str) -> str:
-    """Return the name of the coordinate by which the transmission of a rotor stretches, if it is elastic."""
+    """Return the name of the stretch coordinate of a rotor's elastic transmission."""
     return f"{rotor}_stretch"
 
 
 @dataclass(frozen=True)
 class Elasticity:
-    """How the transmission of a rotor gives way: gear mesh, belt or series spring. All figures are the rotor's.
+    """An elastic transmission of a rotor: gear mesh, belt or series spring. All values are at the rotor.
 
-    The stretch is how far the rotor is ahead of where the joints that it drives would have it. What a data sheet says
-    of the output is divided by the square of the gear ratio if it is a stiffness, multiplied by the ratio if an angle.
+    The stretch is `rotor angle - sum(ratio * joint angle)`. To convert a data sheet's values at the output, divide a
+    stiffness by the squared gear ratio and multiply an angle by the ratio.
 
     Attributes:
         rotor: Name of the rotor body.
-        stiffness: [N m/rad].
-        damping: [N m s/rad].
-        backlash: Play: how far the rotor turns from one flank to the other, the joints held [rad].
-        preload: Of a belt: the torque at which one of its strands goes slack, beyond which it is half as stiff [N m];
-            infinite for what pulls and pushes alike.
-        play: Factor on the backlash [-]; with a backlash of 0 there are no flanks, whatever it is.
+        stiffness: Stiffness [N m/rad].
+        damping: Damping [N m s/rad].
+        backlash: Play: angle of the rotor from one flank to the other with fixed joints [rad].
+        preload: Torque at which one strand of a belt goes slack [N m]; beyond, the belt is half as stiff. Infinite for
+            transmissions that pull and push equally.
+        play: Factor on the backlash [-]; without effect if the backlash is 0.
     """
 
     rotor: str
@@ -173,10 +175,10 @@ class Elasticity:
 
     @property
     def stretch(self) -> str:
-        """Name of its coordinate."""
+        """Name of the stretch coordinate."""
         return stretch_of(self.rotor)
 
     @property
     def linear(self) -> bool:
-        """Whether its torque is proportional to the stretch."""
+        """Whether the elastic torque is proportional to the stretch."""
         return not self.backlash and self.preload == float("inf")

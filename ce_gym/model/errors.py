@@ -1,4 +1,4 @@
-"""What a user sees when a robot file is wrong: one line, no traceback of a dependency."""
+"""Errors and warnings of robot files: one line each, without the traceback of a dependency."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ class RobotError(ValueError):
 
 
 class InertiaWarning(UserWarning):
-    """An inertia that no rigid body can have; it is used as it is."""
+    """An inertia that no rigid body can have; it is used unchanged."""
 
 
 class LossyImportWarning(UserWarning):
-    """A file says things that a `Robot` cannot; the message is a short list, `Robot.notes` has all of them."""
+    """Parts of a file have no counterpart in `Robot`; the message is a short list, `Robot.notes` the full one."""
 
 
 def invalid_value(file: str, key: str, value: object, expected: str) -> RobotError:
-    """Return the error for one bad value: file, key, value, and what was expected.
+    """Return the error for an invalid value: file, key, value and allowed values.
 
     Args:
         file: Name of the file as the user gave it.
-        key: Where in the file, such as `rotors.FL_hip_rotor.mass`.
-        value: What was found there.
-        expected: What should be there instead.
+        key: Place in the file, such as `rotors.FL_hip_rotor.mass`.
+        value: The invalid value; None if it is missing.
+        expected: The allowed values.
     """
     return RobotError(f"{file}: {key} is {shown(value)}: expected {expected}")
 
 
 def unknown_name(file: str, key: str, value: object, known: Iterable[str], what: str) -> RobotError:
-    """Return the error for a name in a file that does not exist, with those that do."""
+    """Return the error for an unknown name in a file, with the known names."""
     return invalid_value(file, key, value, f"{what}: {listed_names(value, known)}")
 
 
@@ -55,18 +55,18 @@ def check_names(
     patterns: bool = False,
     listed: str | None = None,
 ) -> None:
-    """Check that each of the names that an argument lists exists and is listed once.
+    """Check that each name in a list exists and is listed once.
 
     Args:
-        argument: What lists them.
-        names: What a user listed.
+        argument: Name of the argument with the list.
+        names: The list.
         known: The names that exist.
-        what: What they are names of, such as "a joint".
+        what: Kind of the names, such as "a joint".
         patterns: Whether names can be patterns, such as "*_hip", each of which must match a name.
         listed: The names that exist, in words; all of `known` if None.
 
     Raises:
-        ValueError: One line with the first wrong name, the names that exist, and the closest of them.
+        ValueError: One line with the first wrong name, the names that exist and the most similar name.
     """
     if isinstance(names, str):
         raise ValueError(f"{argument}={names!r}; expected a list of names, such as [{names!r}]")
@@ -83,7 +83,7 @@ def check_names(
 
 
 def listed_names(value: object, known: Iterable[str], listed: str | None = None) -> str:
-    """Return the names that exist as text, with the closest to `value`: `hip, knee (did you mean 'hip'?)`."""
+    """Return the known names as text, with the most similar to `value`: `hip, knee (did you mean 'hip'?)`."""
     names = [str(name) for name in known]
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     listed = listed or f"{', '.join(names[:_MOST_NAMES])}{more}" or "none: there are none"
@@ -93,12 +93,12 @@ def listed_names(value: object, known: Iterable[str], listed: str | None = None)
 
 
 def printable(text: str) -> str:
-    """Return text with what could move a terminal's cursor, such as an escape sequence, spelled out."""
+    """Return text in which characters that could move a terminal's cursor are escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
 
 
 def shown(value: object) -> str:
-    """Return `value` as one short line of text; None is a value that is missing."""
+    """Return `value` as one short line of text, "missing" for None."""
     if value is None:
         return "missing"
     try:

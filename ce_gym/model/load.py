@@ -1,4 +1,4 @@
-"""Where robots are found: by name in the assets folder, or by path; and a table of those in the folder."""
+"""`load_robot`: robots by name, path or collection; and a table of the package's robots."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from ce_gym.model.formats.yaml.robot import robot_from_yaml
 from ce_gym.model.table import Cell, table_text
 
 COLUMNS = ("robot", "base", "bodies", "joints", "rotors", "clusters", "mass [kg]")
-"""Of `robot_table`."""
+"""Columns of `robot_table`."""
 
 
 def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = None) -> Robot:
     """Load a robot.
 
-    - `.yaml`: the project's own format. It names a plain URDF or an MJCF file and adds rotors, transmissions, motors,
-      contacts, a pose.
-    - `.urdf`: URDF+ if it has `<loop>`, `<coupling>` or `independent`; a plain URDF otherwise. A YAML file of the same
-      name beside a plain URDF is read with it if its key `urdf` names the URDF.
+    - `.yaml`: the package's own format. It names a plain URDF or an MJCF file and adds rotors, transmissions, motors,
+      contacts and a pose.
+    - `.urdf`: URDF+ if the file has `<loop>`, `<coupling>` or `independent`; a plain URDF otherwise. A YAML file of the
+      same name beside a plain URDF is loaded instead if its key `urdf` names the URDF.
     - `.xml`: MJCF, read through the package `mujoco`.
 
     Args:
         name_or_path: A name such as "mini_cheetah" (`robots()` lists them), the path of a file, or a robot that an
             installed package downloads: "menagerie:unitree_go2", "robot_descriptions:go2_description".
         floating: Whether the root link of a URDF or URDF+ moves freely or is fixed to the world. By default a root
-            link without mass, or called "world", is fixed. The other formats say it themselves.
+            link without mass, or called "world", is fixed. In other formats the file describes its base.
 
     Raises:
-        RobotError: There is no such robot, or its description is wrong; one line that says where and how.
+        RobotError: There is no such robot, or its description is wrong; one line with file, key and problem.
 
     Examples:
         >>> robot = ce_gym.load_robot("tello")

@@ -1,11 +1,11 @@
-"""From a robot description to the figures the dynamics needs, at one transmission level.
+"""`Mechanism`: a robot at one transmission level, ready for the recursions.
 
-The levels differ only in what they keep of a *spinning* rotor; its mass and its inertia at rest always stay with the
-body that carries it, so total mass and limits are the same at every level, and coordinates at all but the first:
+The levels differ only in the effects of a *spinning* rotor. A rotor's mass and inertia at rest always stay with its
+carrier, so total mass and limits are the same at every level, and so are coordinates at all levels but the first:
 
-| level      | what is kept of the spin                                                                     |
+| level      | effects of the spin                                                                          |
 |------------|----------------------------------------------------------------------------------------------|
-| `elastic`  | everything, and how far its transmission stretches: a coordinate more for each               |
+| `elastic`  | everything, and the stretch of its transmission: one more coordinate for each                |
 | `exact`    | everything: kinetic energy, coupling to the carrier, gyroscopic torque                       |
 | `coupled`  | the reflected inertia `G_r^T J G_r` of each cluster, with its off-diagonal terms             |
 | `armature` | the diagonal of that matrix                                                                  |
@@ -16,8 +16,8 @@ recursion: its mass, its axial and its mean transverse inertia are constant in i
 difference of its transverse moments if it is not symmetric, enter as an `EliminatedRotor`. Any other rotor stays a body
 of its cluster. `build_mechanism` decides rotor by rotor.
 
-A transmission that stretches is a rigid one with a term more, `rotor = sum(ratio * joint) + stretch`, of a joint that
-moves nothing: recursions and constraints need not know of it.
+An elastic transmission has the constraint `rotor = sum(ratio * joint) + stretch`. The stretch is the coordinate of a
+massless joint, so recursions and constraints need no special case.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ from ce_gym.model.clusters import Cluster, ClusterTree, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Inertial, Joint, Robot
 from ce_gym.model.errors import RobotError, invalid_value
+from ce_gym.model.frames import ZERO
 
 Level = Literal["exact", "coupled", "armature", "none"]
 LEVELS: tuple[Level, ...] = get_args(Level)
 """Transmission levels that share all coordinates, the exact one first."""
 ELASTIC = "elastic"
-"""The level above, with a coordinate more for each elastic transmission."""
+"""The exact level with one more coordinate for each elastic transmission."""
 Array = NDArray[np.float64]
 
 AXISYMMETRY_TOLERANCE = 1e-9
@@ -73,13 +74,13 @@ class MovingBody:
     """A body that takes part in the recursion.
 
     Attributes:
-        name: Its name.
-        parent: Its parent body; None is the world.
-        rotation: Columns are its axes in the parent frame at joint coordinate zero, shape (3, 3).
-        position: Its origin in the parent frame at joint coordinate zero [m], shape (3,).
-        joint: Its joint.
-        axis: Unit joint axis in its own frame, shape (3,).
-        inertia: Spatial inertia about its own origin, angular part first, shape (6, 6).
+        name: Name of the body.
+        parent: Parent body; None for the world.
+        rotation: Columns are the body's axes in the parent frame at joint coordinate zero, shape (3, 3).
+        position: The body's origin in the parent frame at joint coordinate zero [m], shape (3,).
+        joint: The body's joint.
+        axis: Unit joint axis in the body frame, shape (3,).
+        inertia: Spatial inertia about the body's origin, angular part first, shape (6, 6).
     """
 
     name: str
@@ -96,13 +97,13 @@ class Mechanism:
     """A robot at one transmission level, ready for the recursions.
 
     Attributes:
-        robot: The description it was made from.
+        robot: The description.
         level: Transmission level.
         tree: Clusters of the robot, including eliminated rotors.
         bodies: The bodies that take part in the recursion, by name, parents first.
         eliminated_rotors: For each cluster, its rotors that are no bodies of the recursion.
         gravity: Acceleration of free fall in the world [m/s^2], shape (3,).
-        ratio: Factor on the angles of all rotors, if their gears are not what the robot says.
+        ratio: Factor on all gear ratios; None for the robot's own ratios.
     """
 
     robot: Robot
@@ -115,7 +116,7 @@ class Mechanism:
 
     @property
     def exact(self) -> bool:
-        """Whether all of the spin is kept."""
+        """Whether the level keeps all effects of spinning rotors."""
         return self.level in (ELASTIC, "exact")
 
     def moving(self, cluster: Cluster) -> list[MovingBody]:
@@ -134,10 +135,10 @@ def build_mechanism(
         locked_rotors: Whether the mass and inertia at rest of an approximated rotor stay with its carrier. False
             deletes them, as in the "unconstrained" and "approximate" systems of the paper's figures.
         eliminate: Whether rotors that spin about a principal axis are eliminated at the exact level; False keeps every
-            rotor as a body, the general algorithm that the elimination is tested against.
+            rotor as a body, the general algorithm that tests compare with the elimination.
 
     Raises:
-        RobotError: If the level does not exist, or nothing of the robot is elastic at the elastic level.
+        RobotError: If the level does not exist, or the robot has no elastic transmission at the elastic level.
     """
     if level not in (ELASTIC, *LEVELS):
         known = ", ".join((ELASTIC, *LEVELS))
@@ -169,29 +170,29 @@ def build_mechanism(
 
 
 def with_stretches(robot: Robot) -> Robot:
-    """Return a robot whose elastic transmissions stretch: joints that move nothing, behind the independent ones.
+    """Return a robot with a massless joint for the stretch of each elastic transmission, after the independent joints.
 
     Raises:
-        RobotError: None is elastic.
+        RobotError: The robot has no elastic transmission.
     """
     if not robot.elastic:
         expected = f"the stiffness of at least one transmission, for transmission {ELASTIC!r}"
         raise invalid_value(robot.source or robot.name, "elastic", None, expected)
-    of = {elastic.rotor: elastic.stretch for elastic in robot.elastic}
-    still = (0.0, 0.0, 0.0)
-    bodies, massless = [], Inertial(0.0, still, (still, still, still))
+    stretches = {elastic.rotor: elastic.stretch for elastic in robot.elastic}
+    massless = Inertial(0.0, ZERO, (ZERO, ZERO, ZERO))
+    bodies = []
     for body in robot.bodies:
         bodies.append(body)
-        if body.name in of:
+        if body.name in stretches:
             joint = Joint("revolute", body.joint.axis)
-            bodies.append(Body(of[body.name], "stretch", body.parent, body.placement, joint, massless))
+            bodies.append(Body(stretches[body.name], "stretch", body.parent, body.placement, joint, massless))
     ties = []
     for tie in robot.constraints:
         if isinstance(tie, LinearConstraint):
-            more = tuple((of[name], -coefficient) for name, coefficient in tie.coefficients if name in of)
-            tie = replace(tie, coefficients=(*tie.coefficients, *more))
+            pairs = tuple((stretches[name], -x) for name, x in tie.coefficients if name in stretches)
+            tie = replace(tie, coefficients=(*tie.coefficients, *pairs))
         ties.append(tie)
-    independent = (*robot.independent, *of.values())
+    independent = (*robot.independent, *stretches.values())
     return replace(robot, bodies=tuple(bodies), constraints=tuple(ties), independent=independent)
 
 
@@ -235,10 +236,11 @@ def spin_inertia(rotor: Body) -> float:
 
 
 def smallest_spin_factor(rotor: Body) -> float:
-    """Return the smallest factor on the spin inertia of a rotor with which its tensor is one of a body [-].
+    """Return the smallest factor on the spin inertia of a rotor that a rigid body can have [-].
 
-    0 for a rotor about a principal axis. With products of inertia p between spin and transverse motion, or with the
-    centre of mass off the axis, `I + (factor - 1) J u u^T` is positive semidefinite from `1 - 1 / (J u^T I^-1 u)` on.
+    The factor is 0 for a rotor about a principal axis. With products of inertia between spin and transverse motion, or
+    with the centre of mass off the axis, `I + (factor - 1) J u u^T` is positive semidefinite for factors of at least
+    `1 - 1 / (J u^T I^-1 u)`.
     """
     if has_principal_axis(rotor):
         return 0.0
@@ -288,7 +290,7 @@ def _moving_body(body: Body, inertia: Array) -> MovingBody:
 
 
 def _averaged(rotor: Body) -> Body:
-    """Return a rotor with the mean of its inertia over all angles, which is that of two angles a right angle apart."""
+    """Return a rotor with the mean of its inertia over all angles: the mean of two angles a right angle apart."""
     if is_axisymmetric(rotor):
         return rotor
     u, inertia = np.array(rotor.joint.axis), np.array(rotor.inertial.inertia)

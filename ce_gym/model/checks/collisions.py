@@ -1,4 +1,4 @@
-"""Which capsules stand for the links of a robot, and which pairs of them may touch."""
+"""Capsules of links, and pairs of links that may touch."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ def colliding(robot: Robot, pairs: Sequence[tuple[str, str]]) -> tuple[tuple[Cap
 
 
 def capsules_of(robot: Robot, link: str) -> tuple[Capsule, ...]:
-    """Return the capsules of a link: those that the robot names, or the longest that is inside one of its shapes."""
+    """Return the robot's capsules of a link, or the longest capsule inside one of the link's shapes."""
     own = tuple(capsule for capsule in robot.capsules if capsule.body == link)
     inside = [_inside(link, shape) for shape in robot.body(link).shapes]
     return own or tuple(sorted(inside, key=_length)[-1:])
 
 
 def separate_links(robot: Robot) -> Iterator[tuple[str, str]]:
-    """Iterate over pairs of links that have capsules and of which none carries the other."""
+    """Iterate over pairs of links with capsules of which neither carries the other."""
     links = [body for body in robot.bodies if body.kind == "link" and capsules_of(robot, body.name)]
     for one, other in combinations(links, 2):
         if not adjacent(one, other):
@@ -47,8 +47,8 @@ def _inside(link: str, shape: Shape) -> Capsule:
     elif shape.type == "box":
         axis, radius = int(np.argmax(shape.size)), min(shape.size) / 2
         half = max(shape.size) / 2 - radius
-    way = half * np.array(shape.placement.rotation)[:, axis]
-    start, end = (_tuple(np.array(shape.placement.position) + side * way) for side in (-1.0, 1.0))
+    reach = half * np.array(shape.placement.rotation)[:, axis]
+    start, end = (_tuple(np.array(shape.placement.position) + side * reach) for side in (-1.0, 1.0))
     return Capsule(link, start, end, radius)
 
 

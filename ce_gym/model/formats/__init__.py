@@ -1,1 +1,1 @@
-"""Readers of robot files, one package for each format, and what they share."""
+"""Readers of robot files, one package for each format, and their common functions."""

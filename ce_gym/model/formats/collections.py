@@ -1,7 +1,7 @@
 """Robot files from packages that download them: `menagerie:unitree_go2`, `robot_descriptions:go2_description`.
 
-`mujoco-menagerie` has MuJoCo's models, `robot_descriptions` URDF and MJCF files of many makers. Neither is needed for
-anything else; each keeps what it has downloaded.
+`mujoco-menagerie` has MuJoCo's models, `robot_descriptions` URDF and MJCF files of many makers. Both packages are
+optional, and cache their downloads.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from ce_gym.model.formats.text_file import one_line
 
 
 def is_in_collection(name: str) -> bool:
-    """Whether a name starts with that of a collection and a colon."""
+    """Whether a name starts with the name of a collection and a colon."""
     return name.partition(":")[0] in COLLECTIONS and ":" in name
 
 
 def downloaded(name: str) -> Path:
-    """Return the file of a robot in a collection, downloaded if it is not there.
+    """Return the file of a robot in a collection, and download the file on first use.
 
     Args:
         name: Collection and robot, such as "menagerie:unitree_go2".
 
     Raises:
-        RobotError: The package is not installed, has no such robot, or cannot download it.
+        RobotError: The package is not installed, has no such robot, or fails to download the file.
     """
     collection, _, robot = name.partition(":")
     package, find = COLLECTIONS[collection]
@@ -64,4 +64,4 @@ COLLECTIONS: dict[str, tuple[str, Callable[[ModuleType, str, str], Path]]] = {
     "menagerie": ("mujoco-menagerie", _of_menagerie),
     "robot_descriptions": ("robot_descriptions", _of_descriptions),
 }
-"""The package, and the function that asks it for a file, by the name of the collection."""
+"""For each collection, its package and the function that returns a robot's file."""

@@ -1,15 +1,15 @@
-"""Primitives that may touch the ground -> the contact spheres that stand for them.
+"""Primitives that may touch the ground -> contact spheres.
 
-| primitive  | spheres                                                | on a plane                                |
-|------------|--------------------------------------------------------|-------------------------------------------|
-| sphere     | itself                                                 | exact                                     |
-| capsule    | the two at its ends                                    | exact                                     |
-| box        | at its eight corners                                   | exact                                     |
-| cylinder   | on both rims, evenly, the first towards x              | up to `1 - cos(pi / n)` radii short of it |
-| that rolls | one on each rim, which moves around it to the ground   | exact but where it stands on a face       |
+| primitive        | spheres                                              | error on a plane                   |
+|------------------|------------------------------------------------------|------------------------------------|
+| sphere           | the sphere itself                                    | 0                                  |
+| capsule          | one at each end                                      | 0                                  |
+| box              | one at each of the eight corners                     | 0                                  |
+| cylinder         | evenly on both rims, the first towards x             | up to `1 - cos(pi / n)` radii      |
+| rolling cylinder | one on each rim, moving around the rim to the ground | 0, unless it stands on a face      |
 
-With a radius, boxes and cylinders are rounded inwards by it, and stay as large as they are. None of these spheres
-sticks out of its primitive; what a field of heights raises between two of them passes unnoticed.
+A radius rounds the edges of boxes and cylinders without changing their size. Every sphere lies inside its primitive.
+Ground that rises between two spheres of a height field has no effect.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Sphere = tuple[str, NDArray[np.float64], float]
-"""Suffix of its name, centre in the frame of the primitive [m], and radius [m]."""
+"""Suffix of the name, centre in the frame of the primitive [m], and radius [m]."""
 
 DIAGONALS = np.array(list(product((1.0, -1.0), repeat=3)))
 FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
-"""Sides of a primitive of which the spheres alone can be kept."""
+"""Sides of a primitive to which contacts can be restricted."""
 
 
 def spheres_of(kind: str, size: tuple[float, ...], radius: float = 0.0, rim: int = 8) -> Iterator[Sphere]:
@@ -33,9 +33,9 @@ def spheres_of(kind: str, size: tuple[float, ...], radius: float = 0.0, rim: int
 
     Args:
         kind: "sphere", "capsule", "box" or "cylinder".
-        size: As that of a `Shape`: full edge lengths; radius and length; radius [m].
-        radius: Of what rounds boxes and cylinders [m].
-        rim: How many spheres there are on each rim of a cylinder.
+        size: Size as in `Shape`: full edge lengths; radius and length; radius [m].
+        radius: Radius of the edges of boxes and cylinders [m].
+        rim: Number of spheres on each rim of a cylinder.
     """
     if kind == "sphere":
         yield "", np.zeros(3), size[0]
@@ -55,13 +55,13 @@ def spheres_of(kind: str, size: tuple[float, ...], radius: float = 0.0, rim: int
 
 
 def rims_of(size: tuple[float, ...], radius: float = 0.0) -> list[Sphere]:
-    """Return the rims of a cylinder that rolls, as spheres at their centres; arguments as for `spheres_of`."""
+    """Return the rims of a rolling cylinder, as spheres at the centres of the rims; arguments as for `spheres_of`."""
     half = size[1] / 2 - radius
     return [*_numbered("_rim", np.array([[0.0, 0.0, half], [0.0, 0.0, -half]]), radius)]
 
 
 def on_face(spheres: list[Sphere], face: str) -> list[Sphere]:
-    """Return the spheres that are furthest out on one side, such as "-z" for a sole; all for ""."""
+    """Return the outermost spheres on one side, such as "-z" for a sole; all for ""."""
     if not face:
         return spheres
     axis, sign = "xyz".index(face[1]), -1.0 if face[0] == "-" else 1.0
@@ -70,7 +70,7 @@ def on_face(spheres: list[Sphere], face: str) -> list[Sphere]:
 
 
 def points(name: str, places: NDArray[np.float64]) -> Iterator[Sphere]:
-    """Iterate over points as spheres of no radius, numbered."""
+    """Iterate over points as numbered spheres of radius 0."""
     return _numbered(name, places, 0.0)
 
 

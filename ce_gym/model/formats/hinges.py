@@ -1,8 +1,8 @@
-"""A ball joint as three revolute joints through one point, which is what it is inside closed loops.
+"""A ball joint inside a closed loop as three revolute joints through one point.
 
-The last one is the spin about an axis of the body. A rod with ball joints at both ends spins about the line through
-them as it likes: along that axis the spin is one independent joint, and the loop determines the two others. They are
-singular where the body has swung by a right angle, as cardan joints are; at zero they are furthest from it.
+The last joint is the spin about an axis of the body. A rod with ball joints at both ends can spin freely about the line
+through the joints: the spin about that axis is one independent joint, and the loop determines the other two joints.
+Like a cardan joint, the three joints are singular when the body has swung by a right angle.
 """
 
 from __future__ import annotations
@@ -22,16 +22,15 @@ _MASSLESS = Inertial(0.0, ZERO, (ZERO, ZERO, ZERO))
 def coincident_hinges(body: Body, along: Vec3) -> tuple[Body, Body, Body]:
     """Return three bodies on revolute joints in place of one on a ball joint.
 
-    The body keeps its name, which is that of its spin; the massless ones before it are `NAME_swing_1` and
-    `NAME_swing_2`. Each joint has the damping of the ball joint, which is right near zero; there are no limits,
-    springs or dry friction.
+    The body keeps its name for the spin; the massless bodies before it are `NAME_swing_1` and `NAME_swing_2`. Each
+    joint has the damping of the ball joint, which is correct near zero. Limits, springs and dry friction are left out.
 
     Args:
-        body: On a ball joint.
+        body: A body on a ball joint.
         along: Axis of the spin in the frame of the body, of any length but 0.
 
     Raises:
-        RobotError: The joint is no ball joint, or the axis has no length.
+        RobotError: The joint is not a ball joint, or the axis has length 0.
     """
     if body.joint.type != "ball":
         raise invalid_value(body.name, "joint type", body.joint.type, "ball")

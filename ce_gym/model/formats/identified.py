@@ -1,6 +1,6 @@
-"""Figures that were identified from logs, laid over another robot file: `robot:` and `identified:`.
+"""The keys `robot` and `identified` of YAML robot files: parameters identified from logs, applied to another robot.
 
-Each is what the parameter of the simulator of the same name is: factors on inertia, friction in its unit.
+Each kind equals the simulator's parameter of the same name: a factor on inertia, or friction in its unit.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from ce_gym.model.formats.placement import mat3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.mechanism import spin_inertia
 
-RUBBING = "motor_damping", "motor_friction", "joint_damping", "joint_friction"
-KINDS = "link_inertia", "added_mass", "rotor_inertia", *RUBBING, *ELASTIC_FACTORS
-"""In the order in which they are laid over: a link's factor is one on what the file has."""
-MAY_VANISH = *RUBBING, "drive_damping", "backlash"
-"""What may be 0."""
+FRICTION = "motor_damping", "motor_friction", "joint_damping", "joint_friction"
+KINDS = "link_inertia", "added_mass", "rotor_inertia", *FRICTION, *ELASTIC_FACTORS
+"""Kinds of parameters in the order in which they are applied: factors on links act on the inertia in the file."""
+MAY_VANISH = *FRICTION, "drive_damping", "backlash"
+"""Kinds that may be 0."""
 
 
 def with_identified(robot: Robot, section: Section) -> Robot:
-    """Return a robot with figures of a section, by kind and by rotor, joint or link.
+    """Return a robot with the parameters of a section, by kind and by rotor, joint or link.
 
     Raises:
-        RobotError: There is no such kind, or the robot has none of that name.
+        RobotError: A kind or name does not exist, or a value is negative.
     """
     section.allow(*KINDS)
     for kind, part in sorted(section.sections(), key=lambda named: KINDS.index(named[0])):
@@ -75,14 +75,14 @@ def _with(robot: Robot, kind: str, name: str, value: float) -> Robot:
 
 
 def _with_spin(robot: Robot, rotor: Body, factor: float) -> Robot:
-    """Scale a rotor's moment about its axis; as a load of the body that carries it, it stays what it is."""
+    """Scale a rotor's moment of inertia about its axis; the sum of rotor and carrier at rest does not change."""
     axis, inertia = np.array(rotor.joint.axis), np.array(rotor.inertial.inertia)
-    more = (factor - 1) * spin_inertia(rotor) * np.outer(axis, axis)
-    robot = _with_body(robot, replace(rotor, inertial=replace(rotor.inertial, inertia=mat3(inertia + more))))
+    added = (factor - 1) * spin_inertia(rotor) * np.outer(axis, axis)
+    robot = _with_body(robot, replace(rotor, inertial=replace(rotor.inertial, inertia=mat3(inertia + added))))
     if rotor.parent is None:
         return robot
     carrier, turn = robot.body(rotor.parent), np.array(rotor.placement.rotation)
-    rest = mat3(np.array(carrier.inertial.inertia) - turn @ more @ turn.T)
+    rest = mat3(np.array(carrier.inertial.inertia) - turn @ added @ turn.T)
     return _with_body(robot, replace(carrier, inertial=replace(carrier.inertial, inertia=rest)))
 
 

@@ -1,7 +1,4 @@
-"""Poses and mass properties, seen from another frame: what loaders need to merge bodies that do not move.
-
-Plain numbers in, plain numbers out.
-"""
+"""Changes of frame of poses and mass properties, for loaders that merge rigidly joined bodies."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from ce_gym.model.description import Inertial
 from ce_gym.model.frames import IDENTITY, Mat3, Placement, Vec3, added
 
 # Entries this close to 0 or 1 come from a rounded right angle. They are made exact because the compiler of the
-# dynamics drops multiplications by 0 and 1: sin(pi) = 1.2e-16 would keep them all.
+# dynamics drops multiplications by 0 and 1, but not by sin(pi) = 1.2e-16.
 _RIGHT_ANGLE_TOLERANCE = 1e-12
 
 
@@ -41,7 +38,7 @@ def exact_right_angles(rotation: Sequence[Sequence[float]] | np.ndarray) -> Mat3
 
 
 def compose(outer: Placement, inner: Placement) -> Placement:
-    """Return the pose in the frame that `outer` is given in of a frame whose pose in `outer` is `inner`."""
+    """Return the pose of `inner`, given in the frame `outer`, in the parent of `outer`."""
     rotation = np.array(outer.rotation) @ np.array(inner.rotation)
     return Placement(transform_point(outer, inner.position), exact_right_angles(rotation))
 

@@ -1,9 +1,8 @@
-"""Rotors in files that have no word for them.
+"""Rotors in file formats without rotors.
 
-Vendors write a rotor as a link on a fixed joint; or they give its moment about the axis alone (or the reflected one).
-A published inertia of a link includes the motor in it. A rotor of which only the moment is known therefore is a thin
-disc without mass, whose inertia at rest is taken out of the body that carries it: mass and inertia stay those of the
-file.
+Vendors write a rotor as a link on a fixed joint, or publish only its moment of inertia about the axis (or the reflected
+inertia). A published inertia of a link includes its motor. A rotor with a known moment only therefore becomes a thin
+disc without mass, and its inertia at rest is subtracted from its carrier: total mass and inertia do not change.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from ce_gym.model.frames import ZERO, Placement, Vec3
 
 @dataclass(frozen=True)
 class FixedLink:
-    """A link that no joint moves, kept apart from the body that carries it.
+    """A link on a fixed joint that is not merged into its carrier.
 
     Attributes:
-        carrier: The body that carries it; None is the world.
+        carrier: The body that carries the link; None for the world.
         placement: Pose in that body.
-        inertial: Its own mass properties, own frame.
-        shapes: What is drawn of it, own frame.
+        inertial: Mass properties in the link's frame.
+        shapes: Shapes to draw, in the link's frame.
     """
 
     carrier: str | None
@@ -47,7 +46,7 @@ def disc(moment: float, axis: Vec3) -> Inertial:
 
 
 def without_rotors(carrier: Inertial, rotors: Iterable[Body]) -> Inertial | None:
-    """Return a carrier's mass properties without the inertia at rest of rotors; None if it has not that much."""
+    """Return a carrier's mass properties without the inertia of rotors at rest; None if the rest is not positive."""
     rest = np.array(carrier.inertia)
     for rotor in rotors:
         axes = np.array(rotor.placement.rotation)

@@ -1,7 +1,7 @@
-"""Which bodies of a file that has no word for it are rotors? One rule for URDF+ and MJCF.
+"""One rule for URDF+ and MJCF that tells rotors from links.
 
-Both formats write a rotor as a link like any other. It matters which is which: transmission levels differ in what they
-keep of *rotors*. At the exact level the answer changes nothing.
+Both formats write a rotor like any other link. The transmission levels treat *rotors* differently; at the exact level
+the distinction has no effect.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ _NAMES = ("rotor", "motor")
 def with_rotors(
     bodies: Iterable[Body], constraints: Iterable[Constraint], dependent: Iterable[str]
 ) -> tuple[Body, ...]:
-    """Return the bodies with those that are rotors marked as such.
+    """Return the bodies with `kind="rotor"` for rotors.
 
     A rotor is a body
 
-    - that turns, and whose angle is one of the `dependent` ones;
-    - that a linear constraint ties to bodies on other branches, never to its own carrier, and that no other kind of
-      constraint holds;
-    - that carries nothing;
-    - that is symmetric about its axis, or whose name says "rotor" or "motor". (The finger of a gripper is tied to its
-      twin by a coupling too, but is lopsided.)
+    - on a revolute joint with a `dependent` angle;
+    - in linear constraints with bodies on other branches, never with its own carrier, and in no other kind of
+      constraint;
+    - that carries no other body;
+    - symmetric about its axis, or with "rotor" or "motor" in its name. (The finger of a gripper is also coupled to
+      its twin, but is not symmetric.)
 
     Args:
         bodies: Parents before children.
-        constraints: What ties their joints together.
+        constraints: The constraints among the bodies.
         dependent: Names of the bodies whose joint coordinates are not independent.
     """
     bodies, constraints, dependent = tuple(bodies), tuple(constraints), set(dependent)
@@ -48,7 +48,7 @@ def with_rotors(
 
 
 def _tied_across_branches(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> set[str]:
-    """Names in linear constraints that do not name the body's carrier, less those that are part of a loop."""
+    """Return bodies in linear constraints that do not name the body's carrier, without bodies of loops."""
     parents = {body.name: body.parent for body in bodies}
     linear = [c for c in constraints if isinstance(c, LinearConstraint)]
     loops = {name for c in constraints if not c.linear for name in c.bodies}

@@ -10,7 +10,7 @@ Pairs = tuple[tuple[str, float], ...]
 
 
 def with_limits(pose: Pairs, bodies: Iterable[Body], independent: Sequence[str]) -> Pairs:
-    """Return a pose in which joints that it does not name are as near to zero as their limits let them be.
+    """Return a pose with joints that it does not name as near to zero as their limits allow.
 
     Args:
         pose: Pairs (body, angle) [rad or m].

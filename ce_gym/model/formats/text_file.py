@@ -1,4 +1,4 @@
-"""The text of a robot file: from regular files only, of limited size, so that no path keeps a reader waiting."""
+"""The text of a robot file: only regular files of limited size, so that reading always ends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from ce_gym.model.errors import RobotError
 
 LARGEST_FILE = 4 * 2**20
-"""Largest robot file [bytes]; the largest that comes with the package has 50 kB."""
+"""Largest robot file [bytes]; the largest of the package has 50 kB."""
 
 
 def read_text(path: Path, kind: str, largest: int = LARGEST_FILE) -> str:
@@ -17,11 +17,11 @@ def read_text(path: Path, kind: str, largest: int = LARGEST_FILE) -> str:
 
     Args:
         path: The file.
-        kind: What it should be, for messages, such as "a YAML file".
-        largest: Most bytes it may have.
+        kind: Kind of the file for messages, such as "a YAML file".
+        largest: Largest number of bytes.
 
     Raises:
-        RobotError: It is missing, not a regular file (a folder, a device, a pipe), too large, or not UTF-8.
+        RobotError: The file is missing, not a regular file (a folder, a device, a pipe), too large, or not UTF-8.
     """
     data = read_bytes(path, kind, largest)
     try:
@@ -34,7 +34,7 @@ def read_bytes(path: Path, kind: str, largest: int = LARGEST_FILE) -> bytes:
     """Return the content of a file; see `read_text`.
 
     Raises:
-        RobotError: It is missing, not a regular file, or too large.
+        RobotError: The file is missing, not a regular file, or too large.
     """
     try:
         return _read(path, kind, largest)
@@ -49,7 +49,7 @@ def _unreadable(path: Path, kind: str, error: Exception) -> RobotError:
 
 
 def _read(path: Path, kind: str, largest: int) -> bytes:
-    """Read a file without waiting for whoever may write into it, should it be a pipe."""
+    """Read a file without waiting for the writer of a pipe."""
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
     descriptor = os.open(path, flags)
     try:
@@ -67,7 +67,7 @@ def check_regular(name: str, status: os.stat_result, kind: str, largest: int) ->
     """Check that a file is a regular one and not too large.
 
     Raises:
-        RobotError: It is not.
+        RobotError: The file is not regular or too large.
     """
     if not stat.S_ISREG(status.st_mode):
         raise RobotError(f"{name}: not a regular file: expected {kind}")

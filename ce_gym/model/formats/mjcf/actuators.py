@@ -1,10 +1,10 @@
 """The actuators of a compiled MJCF file -> torque limits and gains of joints.
 
-An actuator on a joint gives `gear * (gain * control + bias)`. With an affine bias it is a position controller, whose
-gains are the robot's `kp` and `kd`; without one it is a motor. Several on one joint add up. An actuator on a joint or a
-fixed tendon whose coordinate is `ratio` times that of one independent joint, by linear equalities, acts on that joint:
-its torque is `ratio` times as large, its gains `ratio^2` times. Where a file has actuators, an independent joint that
-none of them moves is passive: its torque limit is 0, and it has no gains.
+The effort of an actuator on a joint is `gear * (gain * control + bias)`. An actuator with an affine bias is a position
+controller with the robot's gains `kp` and `kd`; an actuator without bias is a motor. Several actuators on one joint add
+up. By linear equalities, the coordinate of a joint or fixed tendon may be `ratio` times the coordinate of one
+independent joint. Its actuator then acts on the independent joint, with `ratio` times the torque and `ratio^2` times
+the gains. In a file with actuators, independent joints without actuator are passive: torque limit 0 and no gains.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from ce_gym.model.formats.mjcf.bodies import MjcfTree
 from ce_gym.model.formats.mjcf.equalities import actuated_joints
 from ce_gym.model.formats.mjcf.source import MjcfSource
 
-Ratios = dict[str, tuple[str, float]]  # for a body, the independent joint that moves it, and how far for a unit of that
+Ratios = dict[str, tuple[str, float]]
+"""For a body, the independent joint that moves it, and the body's coordinate per unit of that joint."""
 
 
 def read_actuators(
@@ -30,14 +31,14 @@ def read_actuators(
     constraints: Iterable[Constraint],
     driven: Collection[str] = (),
 ) -> Gains:
-    """Set the torque limits of the tree's joints and return the gains; what else there is is left out.
+    """Set the torque limits of the tree's joints and return the gains; note other parts of actuators.
 
     Args:
         source: The compiled file.
-        tree: Its bodies.
-        independent: Those of them whose joint coordinates are independent.
-        constraints: What ties the joints together.
-        driven: Bodies whose rotors the caller knows; they are not passive.
+        tree: The bodies of the file.
+        independent: Bodies with independent joint coordinates.
+        constraints: Constraints among the joints.
+        driven: Bodies with rotors in the YAML file; they are not passive.
     """
     model, ratios = source.model, _ratios(independent, constraints)
     kp, kd = dict.fromkeys(independent, 0.0), dict.fromkeys(independent, 0.0)
@@ -68,7 +69,7 @@ def read_actuators(
 
 
 def _ratios(independent: tuple[str, ...], constraints: Iterable[Constraint]) -> Ratios:
-    """Return how far each independent joint moves itself, and what follows it alone by linear ties of two joints."""
+    """Return the ratios of independent joints, and of joints that linear constraints couple to one."""
     ratios: Ratios = {name: (name, 1.0) for name in independent}
     ties = [dict(tie.coefficients) for tie in constraints if isinstance(tie, LinearConstraint)]
     pairs = [tie for tie in ties if len(tie) == 2]
@@ -82,7 +83,7 @@ def _ratios(independent: tuple[str, ...], constraints: Iterable[Constraint]) -> 
 
 
 def _gains(source: MjcfSource, kp: dict[str, float], kd: dict[str, float]) -> Gains:
-    """Return gains for all joints if there is a position controller at all."""
+    """Return gains for all joints if the file has a position controller."""
     if not any(kp.values()):
         if any(kd.values()):
             source.leave_out("velocity actuators (there is no position actuator)")

@@ -1,4 +1,4 @@
-"""The ball joints of a compiled MJCF file that are inside closed loops: there each becomes three hinges."""
+"""Ball joints of a compiled MJCF file inside closed loops, which become three hinges each."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from ce_gym.model.formats.placement import vec3
 from ce_gym.model.frames import Vec3
 
 Point = tuple[int, NDArray[np.float64]]
-"""A body of MuJoCo's and a point in it [m]."""
+"""One of MuJoCo's bodies and a point in its frame [m]."""
 
 
 def balls_in_loops(source: MjcfSource) -> dict[int, Vec3]:
-    """Return the axis of the spin in its body, by joint index, of each ball joint that an equality reaches across.
+    """Return the axis of spin of each ball joint inside a loop, in the frame of its body, by joint index.
 
-    It leads to the point at which the equality holds the body; z if it holds another one further out.
+    The axis leads to the point at which the equality holds the body; it is z if the equality holds a body further out.
     """
     model, axes = source.model, dict[int, Vec3]()
     for i in range(model.neq):
@@ -39,7 +39,7 @@ def balls_in_loops(source: MjcfSource) -> dict[int, Vec3]:
 
 
 def _to_world(source: MjcfSource, body: int) -> list[int]:
-    """Return a body and all that carry it, the world, 0, last."""
+    """Return a body and its ancestors, the world, 0, last."""
     chain = [body]
     while chain[-1]:
         chain.append(int(source.model.body_parentid[chain[-1]]))
@@ -47,7 +47,7 @@ def _to_world(source: MjcfSource, body: int) -> list[int]:
 
 
 def _ends(source: MjcfSource, i: int) -> list[Point]:
-    """Return the bodies that equality `i` ties together, with the points at which it holds them, if it does."""
+    """Return the bodies of equality `i`, with the points at which it holds them."""
     model, kinds, objects = source.model, source.mujoco.mjtEq, source.mujoco.mjtObj
     kind, ids = model.eq_type[i], [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
     if kind == kinds.mjEQ_CONNECT or kind == kinds.mjEQ_WELD:

@@ -1,8 +1,8 @@
 """The bodies of a compiled MJCF file -> a tree of bodies with one joint each.
 
-MuJoCo's body may have no joint (then it is welded to its parent) or several (then all but the last move massless links
-in between), a joint may turn about a point other than the body's origin, and `ref` gives a name to the angle at which
-the file was drawn. Here, a body turns about its own origin and its coordinate is MuJoCo's `qpos`.
+MuJoCo's body without joint is welded to its parent. If it has several joints, all but the last move massless links. A
+joint may turn about a point other than the body's origin, and `ref` is the coordinate of the pose in the file. Here, a
+body turns about its own origin and its coordinate is MuJoCo's `qpos`.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ _UNLIMITED = (-float("inf"), float("inf"))
 
 @dataclass
 class MjcfTree:
-    """Bodies, and where everything of the file is.
+    """The bodies of a file, and the places of MuJoCo's bodies and joints among them.
 
     Attributes:
         bodies: Parents before children, a free base first.
         frames: For each of MuJoCo's bodies, the body (None: the world) that carries its frame, and the pose in it.
-        moved_by: The body that each of MuJoCo's joints moves, by joint index; joints that are locked have none, nor
-            ball joints that have become hinges.
-        hinged: The bodies of the three hinges that such a ball joint has become, by joint index.
-        fixed: Bodies without a joint that were asked for to be kept apart, by name.
+        moved_by: The body that each of MuJoCo's joints moves, by joint index, without locked joints and ball joints
+            that became hinges.
+        hinged: The bodies of the three hinges of each ball joint that became hinges, by joint index.
+        fixed: Separate bodies without a joint, by name.
         ties: Names of constraints.
     """
 
@@ -47,11 +47,11 @@ class MjcfTree:
     ties: set[str] = field(default_factory=set)
 
     def fresh(self, name: str) -> str:
-        """Return `name`, or `name_2` and so on if a body or a constraint has it already."""
+        """Return `name`, or `name_2` and so on if a body or a constraint has this name already."""
         return _fresh(name, {body.name for body in self.bodies} | self.ties)
 
     def fresh_tie(self, name: str) -> str:
-        """Return a name that no other constraint has, and keep it."""
+        """Return a new name for a constraint, and reserve it."""
         self.ties.add(new := _fresh(name, self.ties))
         return new
 
@@ -75,9 +75,9 @@ def read_bodies(
 
     Args:
         source: The compiled file.
-        locked: Coordinates [rad or m] of joints that an equality holds still, by joint index: they become welds.
+        locked: Coordinates [rad or m] of joints that an equality fixes, by joint index; they become welds.
         hinged: Axes of spin of ball joints that become hinges, by joint index.
-        apart: Names of bodies to keep apart if they have no joint; others mean nothing.
+        apart: Names of bodies without joint to keep separate; other names have no effect.
 
     Raises:
         RobotError: Nothing moves, or several bodies move freely.
@@ -182,7 +182,7 @@ def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, fram
 
 
 def _at_reference(source: MjcfSource, j: int, body: Body) -> Body:
-    """Return the body of a ball joint that is to become hinges, turned as it is in the reference pose, their zero."""
+    """Return the body of a ball joint that becomes hinges, in its reference orientation, the zero of the hinges."""
     model = source.model
     if model.jnt_limited[j]:
         source.leave_out("limit of ball joint {}, which is part of a loop", source.name("joint", j))
@@ -224,7 +224,7 @@ def _motion(source: MjcfSource, j: int, coordinate: float) -> Placement:
 
 
 def _report_forces(source: MjcfSource) -> None:
-    """Note passive forces of joints and bodies that a robot cannot have."""
+    """Note passive forces of joints and bodies without counterpart in a robot."""
     model, kinds = source.model, source.mujoco.mjtJoint
     bent = np.atleast_1d(getattr(model, "dof_dampingpoly", np.zeros(model.nv)))
     for j in range(model.njnt):

@@ -2,18 +2,18 @@
 
 | geom      | spheres                                                                                  |
 |-----------|------------------------------------------------------------------------------------------|
-| sphere    | itself                                                                                   |
-| capsule   | the two at its ends                                                                      |
-| box       | points at its eight corners                                                              |
-| cylinder  | points on both rims, four each: up to 0.3 radii short of the rim between them            |
-| ellipsoid | points at the ends of its axes                                                           |
-| mesh      | its vertices that reach furthest along the eight diagonals of its axes                   |
+| sphere    | the sphere itself                                                                        |
+| capsule   | one at each end                                                                          |
+| box       | points at the eight corners                                                              |
+| cylinder  | four points on each rim: up to 0.3 radii short of the rim between them                   |
+| ellipsoid | points at the ends of the axes                                                           |
+| mesh      | the outermost vertices along the eight diagonals of the axes                             |
 
-None of them sticks out of its geom. A geom can touch the ground if MuJoCo would let it touch one of the geoms that do
-not move, or, in a file without any, anything at all. The ground is the plane z = 0.
+Every sphere lies inside its geom. A geom can touch the ground if MuJoCo lets it touch a fixed geom, or, in a file
+without fixed geoms, any geom. The ground is the plane z = 0.
 
-Groups follow from the reference pose: "foot" is what is lowest, the base apart; "torso" is on the base and on bodies
-beyond it that several limbs hang on; "limb" is the rest, which no task simulates unless it is told to.
+Groups follow from the reference pose. "foot" is the group of the lowest spheres, not on the base. "torso" is the group
+on the base and on bodies that carry several limbs. "limb" is the rest, which tasks simulate only on request.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from ce_gym.model.formats.mjcf.touching import can_touch, is_ground, solid, touc
 from ce_gym.model.formats.placement import transform_point, vec3
 
 FOOT_BAND = 0.02
-"""Spheres whose undersides are this close [m] to the lowest one are feet."""
+"""Largest height of the underside of a foot above the lowest underside [m]."""
 
 RIM = 4
 """Points on each rim of a cylinder."""
 
 
 def read_contacts(source: MjcfSource, tree: MjcfTree) -> tuple[tuple[ContactSphere, ...], ContactMaterial, float]:
-    """Return the contact spheres, their material, and how high their lowest underside is [m] (0 without any)."""
+    """Return the contact spheres, their material, and the height of the lowest underside [m] (0 without spheres)."""
     geoms = [g for g in range(source.model.ngeom) if _carrier(source, tree, g) is not None]
     ground = [g for g in range(source.model.ngeom) if _carrier(source, tree, g) is None]
     _report_ground(source, ground)
@@ -60,7 +60,7 @@ def read_contacts(source: MjcfSource, tree: MjcfTree) -> tuple[tuple[ContactSphe
 
 
 def _frictions(source: MjcfSource, geoms: list[int], ground: list[int]) -> Iterator[tuple[int, float]]:
-    """Iterate over the geoms that can touch the ground and their friction with it; note what else contacts have."""
+    """Iterate over the geoms that can touch the ground, each with its friction; note other contact properties."""
     anything, unlike = any(solid(source, g) for g in ground), dict[str, None]()
     for geom in geoms:
         under = touched(source, geom, ground)
@@ -134,7 +134,7 @@ def _trunk(spheres: list[ContactSphere], tree: MjcfTree, base: str | None) -> se
 
 
 def _material(source: MjcfSource, contacts: tuple[ContactSphere, ...], frictions: list[float]) -> ContactMaterial:
-    """Return the friction that most feet have, of all contacts if there are no feet.
+    """Return the most frequent friction of feet, or of all contacts if there are no feet.
 
     MuJoCo's compliance of contacts has no counterpart in N/m.
     """
@@ -160,7 +160,7 @@ def _report_ground(source: MjcfSource, ground: list[int]) -> None:
 
 
 def _report_between(source: MjcfSource, tree: MjcfTree, geoms: list[int]) -> None:
-    """Note that bodies of the robot pass through each other, if in MuJoCo they would not."""
+    """Note that bodies of the robot can pass through each other, unlike in MuJoCo."""
     parents = {body.name: body.parent for body in tree.bodies}
     for i, a in enumerate(geoms):
         for b in geoms[:i]:

@@ -12,7 +12,7 @@
 | weld with `torquescale` 0                  | a ball joint                                                           |
 | fixed tendon with a narrow `range`         | a linear constraint at the middle of the range                         |
 
-MuJoCo holds them softly; here they are exact. What an equality repeats of others is found in `independent.py`.
+Equalities are soft in MuJoCo and exact here. `independent.py` finds redundant equalities.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from ce_gym.model.frames import Placement, Vec3, added
 WELD_AXES: tuple[Vec3, Vec3] = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 
 NARROW = 0.01
-"""Width of the range of a tendon that couples its joints, as a share of what their own ranges let it travel."""
+"""Width of the range of a tendon that couples its joints, as a share of its travel over the ranges of the joints."""
 UNLIMITED_TRAVEL = 2 * np.pi
-"""Travel of a joint without limits, where such a share is taken [rad or m]."""
+"""Assumed travel of a joint without limits [rad or m]."""
 
 Form = tuple[dict[int, float], float]  # coefficients of joint coordinates by joint index, and a constant [rad or m]
 
 
 def locked_joints(source: MjcfSource) -> dict[int, float]:
-    """Return the coordinates [rad or m] of joints that equalities hold still, by joint index.
+    """Return the coordinates [rad or m] of joints that equalities fix, by joint index.
 
-    An equality of joints or fixed tendons does so if it is with a constant, or if its other joints are held already.
+    An equality of joints or fixed tendons fixes its last joint if all other joints are fixed.
     """
     locked: dict[int, float] = {}
     active = [i for i in range(source.model.neq) if source.model.eq_active0[i]]
@@ -54,10 +54,10 @@ def locked_joints(source: MjcfSource) -> dict[int, float]:
 
 
 def read_constraints(source: MjcfSource, tree: MjcfTree, locked: Mapping[int, float]) -> dict[int, list[Constraint]]:
-    """Return the constraints that each equality becomes, by its index; what cannot be one is left out.
+    """Return the constraints of each equality, by its index; equalities without counterpart are left out.
 
-    An equality that has been left out is switched off in `source.data`, so that its Jacobian is that of the rest. The
-    couplings by tendons come last, with indices from the number of equalities on.
+    Ignored equalities are switched off in `source.data`, which removes their rows from its Jacobian. Couplings by
+    tendons come last, with indices from the number of equalities on.
     """
     found: dict[int, list[Constraint]] = {}
     given = [source.given_name("equality", i) for i in range(source.model.neq)]
@@ -87,7 +87,7 @@ def read_constraints(source: MjcfSource, tree: MjcfTree, locked: Mapping[int, fl
 
 
 def coupling_tendons(source: MjcfSource) -> list[int]:
-    """Return the fixed tendons whose limits leave their joints so little play that they couple them."""
+    """Return the fixed tendons with ranges so narrow that they couple their joints."""
     model = source.model
     return [t for t in range(model.ntendon) if model.tendon_limited[t] and _is_narrow(source, t)]
 
@@ -102,7 +102,7 @@ def _is_narrow(source: MjcfSource, tendon: int) -> bool:
 
 
 def actuated_joints(source: MjcfSource, actuator: int) -> dict[int, float]:
-    """Return how far an actuator moves for a unit of each joint, by joint index; nothing if it is on anything else."""
+    """Return the travel of an actuator per unit of each joint, by joint index; empty for other transmissions."""
     model, kinds = source.model, source.mujoco.mjtTrn
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator][0])
     if kind in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
@@ -113,7 +113,7 @@ def actuated_joints(source: MjcfSource, actuator: int) -> dict[int, float]:
 
 
 def _name_by_ends(source: MjcfSource, tree: MjcfTree, i: int) -> str:
-    """Return a name for an equality without one: those of the bodies or tendons that it ties."""
+    """Return a name for an equality without name: the names of its bodies or tendons."""
     model, kinds, objects = source.model, source.mujoco.mjtEq, source.mujoco.mjtObj
     ids, kind = (int(model.eq_obj1id[i]), int(model.eq_obj2id[i])), model.eq_type[i]
     if kind == kinds.mjEQ_JOINT:
@@ -134,7 +134,7 @@ def _holds_bodies(source: MjcfSource, i: int) -> bool:
 
 
 def _reason(source: MjcfSource, i: int) -> str:
-    """Say what an equality that is left out is, `{}` standing for its name."""
+    """Return the note on an ignored equality; `{}` stands for its name."""
     if _holds_bodies(source, i):
         return "equality {} (both of its ends move together)"
     if _forms(source, i) is not None:
@@ -143,14 +143,14 @@ def _reason(source: MjcfSource, i: int) -> str:
 
 
 def _constraint(source: MjcfSource, tree: MjcfTree, i: int, name: str, line: Form | None) -> Iterator[Constraint]:
-    """Iterate over the constraints that equality `i` becomes: none if it cannot be represented.
+    """Iterate over the constraints of equality `i`: none if it has no counterpart.
 
     Args:
         source: The compiled file.
-        tree: Its bodies.
-        i: The equality.
-        name: Its name.
-        line: What it is as a linear equation of joints, if it is one.
+        tree: The bodies of the file.
+        i: Index of the equality.
+        name: Name of the equality.
+        line: The equality as a linear equation of joints; None if it is not linear.
     """
     model, kinds = source.model, source.mujoco.mjtEq
     kind = model.eq_type[i]
@@ -189,7 +189,7 @@ def tendon_coefficients(source: MjcfSource, tendon: int) -> dict[int, float] | N
 def _forms(source: MjcfSource, i: int) -> tuple[Form, Form] | None:
     """Return the two sides of an equality of joints or fixed tendons, each less its value at `ref`; None for others.
 
-    That is what MuJoCo's polynomial is about.
+    MuJoCo's polynomial is a function of these differences.
     """
     model, kinds = source.model, source.mujoco.mjtEq
     ids = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
@@ -234,7 +234,7 @@ def _polynomial(source: MjcfSource, tree: MjcfTree, i: int, name: str) -> Polyno
 
 
 def _unlocked(coefficients: dict[int, float], offset: float, locked: Mapping[int, float]) -> Form:
-    """Return a linear form without joints that are locked or do not matter, and its right-hand side."""
+    """Return a linear form without locked joints and zero coefficients, and its right-hand side."""
     offset -= added(value * locked[joint] for joint, value in coefficients.items() if joint in locked)
     return {joint: x for joint, x in coefficients.items() if joint not in locked and x != 0.0}, offset
 
@@ -252,7 +252,7 @@ def _rod(source: MjcfSource, tree: MjcfTree, i: int, name: str) -> Iterator[RodC
 
 
 def _ends(source: MjcfSource, tree: MjcfTree, i: int) -> list[tuple[str | None, Placement]]:
-    """Return the bodies that a connect or weld holds together, and the frame in each that it makes coincide."""
+    """Return the two bodies of a connect or weld, each with the frame that coincides with the other."""
     model = source.model
     ids = (int(model.eq_obj1id[i]), int(model.eq_obj2id[i]))
     if model.eq_objtype[i] == source.mujoco.mjtObj.mjOBJ_SITE:

@@ -1,7 +1,7 @@
-"""Which joints of a compiled MJCF file are independent, and which equalities repeat others.
+"""Independent joints and redundant equalities of a compiled MJCF file.
 
-Both follow from the rank of the Jacobian of the equalities, in numbers, at the reference pose and at poses around it
-in which the loops are closed: a mechanism may be singular at one pose.
+Both follow from the numerical rank of the Jacobian of the equalities, at the reference pose and at nearby poses with
+closed loops: a mechanism may be singular at one pose.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Array = NDArray[np.float64]
 RANK_TOLERANCE = 1e-5
 """Relative size of rows, columns and singular values of a constraint Jacobian that count as zero: files are rounded."""
 VANISHING = 1e-9
-"""Size of a row that counts as zero where all rows of its kind are as small."""
+"""Size of a row that counts as zero if all rows of its equality are as small."""
 CLOSING_STEPS, LARGEST_STEP = 8, 0.1
-"""How often a pose is moved to close its loops, and how far joints may be from there [rad or m]."""
+"""Number of steps to close the loops of a pose, and the largest step of a joint [rad or m]."""
 POSES, SPREAD = 4, 0.05
-"""How many poses are tried around the reference pose, and how far from it [rad or m]."""
+"""Number of poses around the reference pose, and their largest distance from it [rad or m]."""
 OPEN = 1e-4
-"""Residual beyond which a pose does not count as closed [m or rad]."""
+"""Largest residual of a closed pose [m or rad]."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class EqualityRows:
     """The Jacobian of the equalities at one pose.
 
     Attributes:
-        columns: By the scalar joints, rows of length 1 or 0, shape (n, n_joints).
-        owner: Index of the equality that each row belongs to, as in `read_constraints`, shape (n,).
-        gap: Largest residual that could not be closed [m or rad].
+        columns: Jacobian by the scalar joints, rows of length 1 or 0, shape (n, n_joints).
+        owner: Index of each row's equality, as in `read_constraints`, shape (n,).
+        gap: Largest residual that remains [m or rad].
     """
 
     columns: Array
@@ -51,9 +51,9 @@ class EqualityRows:
 
 
 def equality_rows(source: MjcfSource, tree: MjcfTree) -> list[EqualityRows]:
-    """Return the Jacobian at the reference pose, then at those around it that could be closed.
+    """Return the Jacobian at the reference pose, then at nearby poses whose loops close.
 
-    Rounded poses are closed first: a gap makes joints that equalities do not move look as if they did.
+    Rounded poses are closed first: with a gap, equalities seem to move joints that they do not move.
     """
     model, rng = source.model, np.random.default_rng(0)
     start, fixed = source.data.qpos.copy(), model.jnt_type[model.dof_jntid] == source.mujoco.mjtJoint.mjJNT_FREE
@@ -107,9 +107,9 @@ def _raw_rows(source: MjcfSource) -> tuple[Array, Array, NDArray[np.int64]]:
 
 
 def _scalar_joints(source: MjcfSource, tree: MjcfTree) -> list[tuple[int, str, tuple[slice, Array]]]:
-    """Return joint index and body of each joint with one coordinate, and how MuJoCo's velocities follow from its own.
+    """Return joint index, body and column of MuJoCo's velocities of each joint with one coordinate.
 
-    The last is the rows of its joint and the entries there, at the reference pose.
+    The column is a slice of rows and the entries in these rows, at the reference pose.
     """
     model, kinds, found = source.model, source.mujoco.mjtJoint, []
     for j in sorted({*tree.moved_by, *tree.hinged}):
@@ -124,10 +124,9 @@ def _scalar_joints(source: MjcfSource, tree: MjcfTree) -> list[tuple[int, str, t
 def without_repeats(
     source: MjcfSource, constraints: Mapping[int, Sequence[Constraint]], poses: Sequence[EqualityRows]
 ) -> tuple[Constraint, ...]:
-    """Return the constraints without those that follow from others, linear ones before others.
+    """Return the constraints without redundant ones; linear constraints are kept first.
 
-    Of an equality that repeats others in part the rest is kept, and closed loops leave out rows when they are
-    assembled. Both are noted.
+    Partly redundant equalities are kept, with a note: the assembly of closed loops drops redundant rows.
     """
     order = sorted(constraints, key=lambda i: not all(tie.linear for tie in constraints[i]))
     repeated: list[int] = []
@@ -158,7 +157,7 @@ def _rank(rows: Array) -> int:
 
 
 def _rank_and_rest(rows: Array) -> tuple[int, float]:
-    """Return the rank of rows, and the largest singular value that counts as zero over the largest of all."""
+    """Return the rank of rows, and the largest singular value that counts as zero relative to the largest."""
     values = np.linalg.svd(rows, compute_uv=False) if rows.size else np.zeros(0)
     relative = values / values.max(initial=VANISHING)
     rank = int((relative > RANK_TOLERANCE).sum())
@@ -170,16 +169,16 @@ def choose_independent(
 ) -> tuple[str, ...]:
     """Return the bodies whose joints are independent, in MuJoCo's order.
 
-    The dependent joints are found by elimination in the Jacobian of all equalities, at the pose where it has the
-    largest rank, and as many as that: joints that no actuator moves before those that only a tendon's actuator moves,
-    then others; of each those of `rotors` first, then what a joint equality names first (MuJoCo's own dependent joint),
-    then hinges that were a ball joint, then joints without a spring.
+    Elimination in the Jacobian of all equalities, at the pose with the largest rank, finds the dependent joints. It
+    prefers, in this order: joints without actuator, joints moved only by a tendon's actuator, other joints. Within
+    each group it prefers `rotors`, then the first joint of a joint equality (MuJoCo's own dependent joint), then hinges
+    that were a ball joint, then joints without a spring.
 
     Args:
         source: The compiled file.
-        tree: Its bodies.
-        rotors: Bodies that would best be dependent.
-        poses: From `equality_rows`.
+        tree: The bodies of the file.
+        rotors: Bodies that should be dependent if possible.
+        poses: Jacobians from `equality_rows`.
     """
     model, kinds = source.model, source.mujoco.mjtEq
     moved = [actuated_joints(source, a) for a in range(model.nu)]
@@ -196,7 +195,7 @@ def choose_independent(
 
 
 def _dependent(columns: Array, order: Sequence[tuple[object, ...]]) -> set[int]:
-    """Return the columns that elimination chooses, those of lower order first."""
+    """Return the columns that elimination chooses, in ascending order of preference keys."""
     dependent: set[int] = set()
     for group in sorted(set(order)):  # type: ignore[type-var]
         while (pivot := _largest(columns, [i for i, key in enumerate(order) if key == group])) is not None:
@@ -208,6 +207,6 @@ def _dependent(columns: Array, order: Sequence[tuple[object, ...]]) -> set[int]:
 
 
 def _largest(columns: Array, among: list[int]) -> int | None:
-    """Return the index of the longest of some columns; None if all of them are zero."""
+    """Return the index of the longest column in `among`; None if all are zero."""
     lengths = np.linalg.norm(columns[:, among], axis=0)
     return among[int(np.argmax(lengths))] if lengths.size and lengths.max() > RANK_TOLERANCE else None

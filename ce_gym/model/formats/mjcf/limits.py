@@ -1,7 +1,7 @@
-"""What an MJCF file may ask for, checked before MuJoCo's compiler, which would try anything, sees the file.
+"""Limits on the size of an MJCF file, checked before MuJoCo's compiler reads the file.
 
-Counted with the copies that `replicate`, `composite` and `flexcomp` make and with included files. Every file that an
-asset names must be a regular one.
+Elements are counted with the copies of `replicate`, `composite` and `flexcomp` and with included files. Every file of
+an asset must be a regular file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MOST_ELEMENTS = 10_000
 MOST_FILES = 50
 """Most files that include each other."""
 LARGEST_SIZE = 10_000
-"""Largest number of copies, rows or pixels that an element may ask for."""
+"""Largest number of copies, rows or pixels of an element."""
 LARGEST_PICTURE = 2**24
 """Most pixels of a texture, or points of a height field."""
 LARGEST_ASSET = 2**27
@@ -38,10 +38,10 @@ _UNITS = {unit: 1024**power for power, unit in enumerate("KMGTPE", start=1)}
 
 
 def check_file(path: Path) -> None:
-    """Check an MJCF file and what it includes.
+    """Check an MJCF file and the files that it includes.
 
     Raises:
-        RobotError: It is not MJCF, asks for too much, or has NaN or a range the wrong way round.
+        RobotError: The file is not MJCF, is too large, or has NaN or a range with its ends swapped.
     """
     pages: dict[Path, Element] = {}
     _read_pages(path, path.parent, pages)
@@ -64,7 +64,7 @@ def check_file(path: Path) -> None:
 
 
 def _read_pages(path: Path, main: Path, pages: dict[Path, Element]) -> None:
-    """Read a file and what it includes or attaches; MuJoCo looks for those beside the main file."""
+    """Read a file and the files that it includes or attaches; MuJoCo looks for them beside the main file."""
     pages[path] = root = _parsed(path)
     for element in root.iter():
         file = element.get("file")
@@ -72,7 +72,7 @@ def _read_pages(path: Path, main: Path, pages: dict[Path, Element]) -> None:
             for other in {main / file, path.parent / file}:
                 if len(pages) >= MOST_FILES:
                     raise invalid_value(str(path), f"<{element.tag} file>", file, f"at most {MOST_FILES} files")
-                if other not in pages and os.path.lexists(other):  # of others, MuJoCo says what is wrong
+                if other not in pages and os.path.lexists(other):  # MuJoCo reports the others
                     _read_pages(other, main, pages)
 
 
@@ -143,17 +143,17 @@ def _check_figures(file: str, element: Element) -> None:
 
 
 def _check_range(file: str, key: str, value: str) -> None:
-    """A range the wrong way round would be read as none."""
+    """Check that a range is not empty: MuJoCo would ignore it."""
     try:
         low, high = (float(word) for word in value.split())
     except ValueError:
-        return  # MuJoCo says what is wrong
+        return  # MuJoCo reports the error
     if low > high:
         raise invalid_value(file, key, value, "a lower limit that is not above the upper")
 
 
 def _check_assets(file: str, element: Element, folders: set[Path]) -> None:
-    """Every file that might be meant must be a regular one."""
+    """Check that every file that MuJoCo may read for an asset is a regular file."""
     for key, value in element.items():
         if not key.startswith("file") or element.tag in ("include", "model"):
             continue
@@ -161,5 +161,5 @@ def _check_assets(file: str, element: Element, folders: set[Path]) -> None:
             try:
                 status = path.stat()
             except (OSError, ValueError):
-                continue  # MuJoCo says what is missing
+                continue  # MuJoCo reports missing files
             check_regular(f"{file}: <{element.tag} {key}>: {path}", status, "a regular file", LARGEST_ASSET)

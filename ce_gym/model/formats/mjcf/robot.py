@@ -10,8 +10,8 @@
 | actuators                        | torque limits and gains (`actuators.py`)                                       |
 | the first keyframe               | the standing pose, and the branch in which loops are assembled                 |
 
-What else acts on the robot in MuJoCo is in its notes, and summed up in one `LossyImportWarning`. Cameras, lights,
-sensors and textures act on nothing and are passed over.
+Other parts of the file that act on the robot are listed in its notes and in one `LossyImportWarning`. Cameras, lights,
+sensors and textures are ignored.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from ce_gym.model.frames import Placement
 Angles = tuple[tuple[str, float], ...]  # pairs (body, joint coordinate [rad or m])
 
 UPRIGHT = 1e-3
-"""A base that is inclined by less than this in the reference pose is upright [rad]: keyframes are rounded."""
+"""Largest inclination in the reference pose of a base that counts as upright [rad]: keyframes are rounded."""
 DEEPEST = 0.01
-"""A reference pose in which contacts are further below ground than this is raised [m]."""
+"""Largest depth of contacts below ground without raising the reference pose [m]."""
 
 
 def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) -> Robot:
@@ -55,14 +55,14 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
 
     Args:
         path: The file.
-        gear_ratios: For joints with armature whose gear ratio is not the `gear` of their actuator: the ratio, by the
-            name of the body that the joint moves, or a pattern. Only the exact level depends on it, see `rotors.py`.
+        gear_ratios: Gear ratios of joints with armature where they differ from the `gear` of the actuator, by the name
+            of the body that the joint moves, or a pattern. They matter at the exact level only, see `rotors.py`.
 
     Raises:
-        RobotError: `mujoco` is missing or refuses the file, or the file describes something that cannot be.
+        RobotError: `mujoco` is missing or refuses the file, or the file describes an impossible robot.
 
     Warns:
-        LossyImportWarning: Something in the file has no counterpart; `Robot.notes` has all of it.
+        LossyImportWarning: Parts of the file have no counterpart; `Robot.notes` has the full list.
     """
     robot = read_robot(path, Section(str(path), "gears", dict(gear_ratios or {})))[0]
     check_robot(robot)
@@ -77,11 +77,11 @@ def read_robot(
     Args:
         path: The file.
         gears: Gear ratios for `robot_from_mjcf`.
-        driven: Bodies whose joints' rotors come from elsewhere, so that the file's armature there is passed over.
-        apart: Names of bodies to keep apart if no joint moves them, because they are rotors.
+        driven: Bodies with rotors in the YAML file; the armature of their joints is ignored.
+        apart: Names of bodies without joint to keep separate, because they are rotors.
 
     Returns:
-        The robot; the body that carries each of the file's bodies, and the pose in it; the bodies kept apart.
+        The robot; for each of the file's bodies, the body that carries it and its pose in that body; separate bodies.
     """
     source = read_mjcf(path)
     locked = locked_joints(source)

@@ -1,14 +1,14 @@
 """The armature of a compiled MJCF file -> rotors behind gears.
 
-Armature is the reflected inertia `ratio^2 J` of a rotor. MuJoCo adds it to the diagonal of the mass matrix and knows
-nothing of the rest that a spinning rotor does: it couples to the body that carries it (terms `ratio J`) and has
-gyroscopic torque. Here every armature becomes a rotor, a thin disc about the joint axis at the joint, tied by a gear:
+Armature is the reflected inertia `ratio^2 J` of a rotor. MuJoCo adds armature to the diagonal of the mass matrix, and
+neglects the coupling of a spinning rotor to its carrier (terms `ratio J`) and the gyroscopic torque. Here every
+armature becomes a rotor, a thin disc about the joint axis at the joint, behind a gear:
 
 - `coupled` reproduces MuJoCo's mass matrix, and `armature` too unless tendon armature or an equality ties several
   joints together; `none` lacks the armature;
-- `exact` adds what MuJoCo leaves out, as far as the file knows the ratio: the `gear` of the joint's actuator, if it is
-  not 1, or what the caller says. Where the ratio is not known it is taken as 1e6, the limit in which armature is all
-  there is, and `exact` equals MuJoCo too. That is said in the one warning.
+- `exact` adds the neglected terms if the ratio is known: the `gear` of the joint's actuator, if it is not 1, or the
+  caller's ratio. An unknown ratio is taken as 1e6, a limit in which only armature remains and `exact` equals MuJoCo
+  too. The warning lists unknown ratios.
 
 The rotors are thin discs without mass, see `rotor_links.py`.
 """
@@ -31,13 +31,13 @@ from ce_gym.model.frames import Placement
 
 @dataclass(frozen=True)
 class _Armature:
-    """Reflected inertia of what turns with `sum(coefficient * joint coordinate)`.
+    """Reflected inertia of a rotor that turns with `sum(coefficient * joint coordinate)`.
 
     Attributes:
         name: Name of the joint's body, of the tendon or of the actuator.
         joints: Coefficients of joint coordinates, by joint index.
-        reflected: `ratio^2 J` [kg m^2 or kg].
-        ratio: Speed of the rotor over that of the sum; None if it is not known.
+        reflected: Reflected inertia `ratio^2 J` [kg m^2 or kg].
+        ratio: Speed of the rotor over the speed of the sum; None if unknown.
     """
 
     name: str
@@ -53,9 +53,9 @@ def add_rotors(
 
     Args:
         source: The compiled file.
-        tree: Its bodies; gains the rotors.
-        gear_ratios: Ratios that the file does not know, by the name of the body that the joint moves.
-        driven: Bodies whose rotors the caller knows: the armature of their joints is passed over.
+        tree: The bodies of the file; gains the rotors.
+        gear_ratios: Ratios that are not in the file, by the name of the body that the joint moves.
+        driven: Bodies with rotors in the YAML file; the armature of their joints is ignored.
     """
     ratios = _known_ratios(source, tree) | {j: gear_ratios[b] for j, b in tree.moved_by.items() if b in gear_ratios}
     found = [*_joint_armatures(source, tree, ratios), *_tendon_armatures(source), *_motor_armatures(source)]
@@ -76,7 +76,7 @@ def add_rotors(
 def _mount(
     source: MjcfSource, tree: MjcfTree, carrier: str | None, armatures: list[_Armature]
 ) -> Iterator[LinearConstraint]:
-    """Mount rotors on one body, take their inertia at rest out of it, and iterate over their gears."""
+    """Mount rotors on a body, subtract their inertia at rest from the body, and iterate over their gears."""
     known = [armature for armature in armatures if armature.ratio is not None]
     if known and not _take_out(tree, carrier, [_rotor(tree, carrier, armature) for armature in known]):
         names = ", ".join(armature.name for armature in known)
@@ -91,7 +91,7 @@ def _mount(
 
 
 def _take_out(tree: MjcfTree, carrier: str | None, rotors: list[Body]) -> bool:
-    """Take the rotors' inertia at rest out of their carrier and return True; False if it has not that much."""
+    """Subtract the rotors' inertia at rest from their carrier; return whether the carrier has enough inertia."""
     if carrier is None:
         return True
     at = next(i for i, body in enumerate(tree.bodies) if body.name == carrier)
@@ -103,7 +103,7 @@ def _take_out(tree: MjcfTree, carrier: str | None, rotors: list[Body]) -> bool:
 
 
 def _carrier(tree: MjcfTree, armature: _Armature) -> str | None:
-    """Return the body that all joints of an armature lie beyond: their nearest common ancestor."""
+    """Return the nearest common ancestor of all joints of an armature."""
     parents = {body.name: body.parent for body in tree.bodies}
     chains: list[list[str | None]] = []
     for j in armature.joints:
@@ -128,7 +128,7 @@ def _ratio(armature: _Armature) -> float:
 
 
 def _known_ratios(source: MjcfSource, tree: MjcfTree) -> dict[int, float]:
-    """Return gear ratios by joint index: those of single actuators with a gear that is not 1."""
+    """Return gear ratios by joint index: the gear of a joint's only actuator, if it is not 1."""
     model = source.model
     gears: dict[int, list[float]] = {}
     for a in range(model.nu):
@@ -167,7 +167,7 @@ def _tendon_armatures(source: MjcfSource) -> list[_Armature]:
 
 
 def _motor_armatures(source: MjcfSource) -> list[_Armature]:
-    """Armature that stands at an actuator, before its gear; MuJoCo has it since 4.0."""
+    """Return armatures of actuators, at the motor side of the gear; in MuJoCo since 4.0."""
     model = source.model
     found = []
     for a in range(model.nu):

@@ -1,4 +1,4 @@
-"""Hints for MJCF that is spread over several files: a scene without its robot, a robot that needs its scene."""
+"""Hints for MJCF in several files: a scene without its robot, a robot that needs its scene."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from ce_gym.model.errors import RobotError
 from ce_gym.model.formats.text_file import read_text
 
 MOST_SEARCHED, MOST_NAMED = 50, 3
-"""How many files beside one are searched for what it lacks, and how many of them a message names."""
+"""Number of neighbouring files to search, and to name in a message."""
 
 
 def scene_hint(path: Path, is_readable: Callable[[Path], bool]) -> str:
-    """Return which files beside an MJCF file include it, as the end of a message that it cannot stand alone.
+    """Return a hint with the neighbouring files that include an MJCF file, as the end of an error message.
 
     Args:
         path: The file.
@@ -26,7 +26,7 @@ def scene_hint(path: Path, is_readable: Callable[[Path], bool]) -> str:
 
 
 def robot_hint(path: Path) -> str:
-    """Return which files beside a scene have robots, as the end of a message that the scene has none."""
+    """Return a hint with the neighbouring files that have robots, as the end of an error message."""
     own = read_text(path, "an MJCF file")
     names = [
         other.name

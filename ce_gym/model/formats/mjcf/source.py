@@ -1,7 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
-"""A compiled MJCF file: the one object that the parts of the MJCF reader share.
+"""A compiled MJCF file, shared by the parts of the MJCF reader.
 
-`mujoco` is imported only when a file is read; its compiled modules carry no types, hence the line above.
+`mujoco` is imported only when a file is read. Its compiled modules have no types, which explains the line above.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ce_gym.model.formats.text_file import one_line
 from ce_gym.model.frames import Placement, rotation_matrix
 
 MOST_KINDS, MOST_NAMES = 8, 3
-"""How many kinds of things, and names of each, a summary of what was left out has."""
+"""Number of kinds, and of names of each kind, in a summary of ignored parts."""
 
 _FIGURES = (
     *("body_pos", "body_quat", "body_ipos", "body_iquat", "body_inertia", "body_mass"),
@@ -39,16 +39,16 @@ _LIMITS = ("jnt_range", "actuator_forcerange")
 
 @dataclass
 class MjcfSource:
-    """A compiled file, and what has been found in it that cannot be represented.
+    """A compiled file, and its parts that have no counterpart in a robot.
 
     Attributes:
         file: Name of the file, for messages.
         mujoco: The package.
         model: `MjModel`.
         data: `MjData` at the reference pose: the first keyframe, or all joints at their `ref`.
-        left_out: What the robot will lack: a text that completes "... is left out", and the name to put in it.
-        notes: What else a user should know.
-        moved: Whether joints were moved to within their limits, so that the height of the base means nothing.
+        left_out: Ignored parts of the file: a text to complete "left out: ...", and the name to put in it.
+        notes: Other notes for users.
+        moved: Whether joints were moved to within their limits, which invalidates the height of the base.
     """
 
     file: str
@@ -60,15 +60,15 @@ class MjcfSource:
     moved: bool = False
 
     def name(self, kind: str, index: int) -> str:
-        """Return the name of element `index` of a kind, such as "body"; one like "body3" if it has none."""
+        """Return the name of element `index` of a kind, such as "body"; a name like "body3" without a name."""
         return self.given_name(kind, index) or self._unused(kind, f"{kind}{index}")
 
     def given_name(self, kind: str, index: int) -> str:
-        """Return the name that the file gives to an element; "" if it gives none."""
+        """Return the name of an element in the file; "" without a name."""
         return printable(getattr(self.model, kind)(int(index)).name)
 
     def _unused(self, kind: str, name: str) -> str:
-        """Return a name, with as many underscores as it takes that no element of a kind has it."""
+        """Return a name that no element of a kind has, with underscores added if necessary."""
         try:
             getattr(self.model, kind)(name)
         except KeyError:
@@ -76,7 +76,7 @@ class MjcfSource:
         return self._unused(kind, f"{name}_")
 
     def leave_out(self, what: str, name: str = "") -> None:
-        """Note what the robot will lack, `{}` in it standing for the name of an element."""
+        """Note an ignored part of the file; `{}` in the text stands for the name of an element."""
         self.left_out.append((what, name))
 
     def enabled(self, feature: str) -> bool:
@@ -84,7 +84,7 @@ class MjcfSource:
         return not self.model.opt.disableflags & int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{feature}"))
 
     def forward(self) -> None:
-        """Compute everything that follows from the reference pose, contacts apart, of which there could be many."""
+        """Compute the kinematics and constraints of the reference pose, without contacts."""
         options = self.model.opt
         flags = options.disableflags
         options.disableflags = flags | int(self.mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -94,7 +94,7 @@ class MjcfSource:
 
 
 def summary(left_out: list[tuple[str, str]]) -> str:
-    """Return what was left out in one line: each kind of thing once, with the names of a few."""
+    """Return the ignored parts in one line: each kind once, with a few names."""
     kinds: dict[str, list[str]] = {}
     for what, name in left_out:
         kinds.setdefault(what, []).append(name)
@@ -111,7 +111,7 @@ def read_mjcf(path: Path) -> MjcfSource:
     """Compile a file with MuJoCo.
 
     Raises:
-        RobotError: `mujoco` is not installed, or it refuses the file.
+        RobotError: `mujoco` is not installed, or refuses the file.
     """
     check_file(path)
     try:
@@ -150,7 +150,7 @@ def _is_readable(mujoco: Any, path: Path) -> bool:
 
 
 def _switch_off(mujoco: Any, model: Any) -> None:
-    """Set to zero what the <flag> of a file disables; gravity, contacts and actuators apart, see `enabled`."""
+    """Set parameters to zero that a <flag> of the file disables; not gravity, contacts or actuators, see `enabled`."""
     for features, figures in (
         (("CONSTRAINT", "FRICTIONLOSS"), ("dof_frictionloss", "tendon_frictionloss")),
         (("CONSTRAINT", "LIMIT"), ("jnt_limited", "tendon_limited")),
@@ -190,7 +190,7 @@ def _without_log(mujoco: Any) -> Iterator[None]:
 
 
 def _check_figures(file: str, model: Any) -> None:
-    """Refuse figures that MuJoCo lets pass, and robots of too many bodies."""
+    """Refuse numbers that MuJoCo accepts but no robot can have, and robots of too many bodies."""
     for name in _FIGURES:
         values = np.asarray(getattr(model, name))
         usable = np.isfinite(values) & ((np.abs(values) <= LARGEST_FIGURE) | (name in _LIMITS))

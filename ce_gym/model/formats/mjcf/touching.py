@@ -23,11 +23,11 @@ _DEFAULT_SOLVER = (0.02, 1.0, 0.9, 0.95, 0.001, 0.5, 2.0)  # MuJoCo's solref and
 
 @dataclass(frozen=True)
 class Touch:
-    """What MuJoCo's contact of two geoms has.
+    """MuJoCo's contact of two geoms.
 
     Attributes:
         friction: Sliding friction [-], the larger one of a `<pair>` with two; 0 if the contact is frictionless.
-        other: What else the contact has that a `ContactMaterial` has no figures for.
+        other: Properties of the contact without a counterpart in `ContactMaterial`.
     """
 
     friction: float
@@ -52,7 +52,7 @@ def can_touch(source: MjcfSource, a: int, b: int) -> bool:
 
 
 def touched(source: MjcfSource, geom: int, ground: list[int]) -> list[int]:
-    """Return those of the geoms that do not move that a geom can touch; the planes z = 0 alone if there are any."""
+    """Return the fixed geoms that a geom can touch; only planes z = 0 if there are any."""
     found = [g for g in ground if can_touch(source, geom, g)]
     return [g for g in found if is_ground(source, g)] or found
 
@@ -65,7 +65,7 @@ def is_ground(source: MjcfSource, geom: int) -> bool:
 
 
 def touch_of(source: MjcfSource, a: int, b: int | None) -> Touch:
-    """Return what MuJoCo's contact of two geoms has; of one alone, in a file without ground, its own figures."""
+    """Return MuJoCo's contact of two geoms; with the geom's own parameters alone in a file without ground."""
     model, pair = source.model, None if b is None else _pair(source, a, b)
     slip_solver: tuple[float, ...] = ()
     if pair is not None:

@@ -1,7 +1,6 @@
-"""What a compiled MJCF file says of joints, actuators, geoms and the world that a `Robot` has no figures for: notes.
+"""Notes on attributes of a compiled MJCF file that no part of the reader reads.
 
-The parts of the reader note what concerns them; here is what none of them reads. Each note names the attribute where
-its name in MJCF is not the word itself.
+Each note names the attribute if its name in MJCF differs from the usual word.
 Source: https://mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
 
@@ -16,7 +15,7 @@ from ce_gym.model.formats.mjcf.touching import is_default_solver, solid
 
 
 def report_unmodelled(source: MjcfSource) -> None:
-    """Note everything of a file that acts on the robot and that no part of the reader reads."""
+    """Note all attributes that act on the robot in MuJoCo and that no part of the reader reads."""
     _report_world(source)
     _report_joints(source)
     _report_actuators(source)
@@ -28,7 +27,7 @@ def report_unmodelled(source: MjcfSource) -> None:
 
 
 def _new(source: MjcfSource, attribute: str, count: int) -> NDArray[np.float64]:
-    """Return figures that only later versions of MuJoCo have, zeros before, shape (count, ...)."""
+    """Return an attribute of later versions of MuJoCo, zeros in earlier versions, shape (count, ...)."""
     return np.asarray(getattr(source.model, attribute, np.zeros(count)))
 
 

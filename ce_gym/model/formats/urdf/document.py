@@ -16,7 +16,7 @@ from ce_gym.model.errors import RobotError, invalid_value
 from ce_gym.model.formats.text_file import one_line, read_bytes
 
 XACRO_DEFINITIONS = ("xacro:property", "xacro:arg")
-"""Elements of xacro that add nothing to a robot by themselves."""
+"""Elements of xacro that add no links or joints."""
 BYTE_ORDER_MARKS = (
     *((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32")),
     *((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")),
@@ -76,7 +76,7 @@ def _decoded(path: Path, data: bytes) -> str:
 
 
 def _refuse_xacro(file: str, root: Element) -> None:
-    """Refuse a file whose macros were not expanded: links and numbers are missing in it."""
+    """Refuse a file with macros that were not expanded: links and numbers are missing."""
     for element in root.iter():
         wants = element.tag.startswith("xacro:") and element.tag not in XACRO_DEFINITIONS
         texts = (*element.attrib.values(), element.text or "")

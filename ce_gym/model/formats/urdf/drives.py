@@ -2,7 +2,7 @@
 
 - <transmission> of one joint with <mechanicalReduction> and <motorInertia>, in the transmission, its joint or each
   actuator (ROS control), or with <drake:gear_ratio value> and <drake:rotor_inertia value> (Drake).
-- <dynamics rotor_inertia> (RaiSim): an inertia that is added at the joint, so a rotor whose ratio is not known.
+- <dynamics rotor_inertia> (RaiSim): a reflected inertia at the joint, so a rotor of unknown gear ratio.
 
 Each becomes a thin disc without mass about the joint's axis, mounted where the joint is; see `rotor_links.py`.
 """
@@ -26,7 +26,7 @@ WORDS = {
     "inertia": ("motorInertia", "drake:rotor_inertia", "rotor_inertia"),
 }
 UNMODELLED = ("type", "joint", "actuator", "hardwareInterface", "role", "offset")
-"""Other elements of a <transmission>, which say nothing of inertia."""
+"""Other elements of a <transmission>, without inertia."""
 _READ = {*UNMODELLED, *(tag for words in WORDS.values() for tag in words)}
 MOST_NAMES = 3
 """Most transmissions that a note names."""
@@ -37,10 +37,10 @@ class Drive:
     """A motor at a joint.
 
     Attributes:
-        where: Its element, for messages.
-        link: The link that its joint moves.
-        inertia: Of its rotor about the axis [kg m^2].
-        ratio: Turns of the rotor for one of the joint.
+        where: Element of the motor, for messages.
+        link: The link that the joint moves.
+        inertia: Inertia of the rotor about its axis [kg m^2].
+        ratio: Turns of the rotor for one turn of the joint.
     """
 
     where: str
@@ -50,10 +50,10 @@ class Drive:
 
 
 def drives_of(graph: UrdfGraph, notes: list[str]) -> tuple[Drive, ...]:
-    """Return the motors that a file describes in full, and add a note for each that it does not.
+    """Return the motors with inertia and ratio, and add a note for each incomplete motor.
 
     Raises:
-        RobotError: A number is none, or negative.
+        RobotError: A number is malformed or negative.
     """
     return (*_transmissions(graph, notes), *_added_inertias(graph))
 
@@ -66,8 +66,8 @@ def add_rotors(
     Args:
         bodies: Links, parents before children.
         drives: The motors.
-        known: Links whose rotors are described elsewhere, which goes before the URDF.
-        notes: Gains a note for each drive that adds no rotor.
+        known: Links with rotors in the YAML file, which goes before the URDF.
+        notes: Gains a note for each drive without rotor.
     """
     moved, rotors, gears = {body.name: body for body in bodies}, list[Body](), list[LinearConstraint]()
     for drive in drives:
@@ -93,7 +93,7 @@ def _with_rest(
 ) -> Iterator[Body]:
     """Iterate over the links without the inertia at rest of the rotors that they carry.
 
-    A carrier with less inertia than its rotors keeps its own, and the ratio of its rotors counts as not known.
+    A carrier with less inertia than its rotors keeps its inertia, and the ratios of these rotors become unknown.
     """
     unknown = {gear.name for gear in gears if abs(gear.coefficients[1][1]) == UNKNOWN_RATIO}
     for body in bodies:
@@ -108,7 +108,7 @@ def _with_rest(
 
 
 def _forget_ratio(rotor: Body, rotors: list[Body], gears: list[LinearConstraint]) -> None:
-    """Keep the reflected inertia of a rotor only: a far lighter rotor behind a far higher ratio."""
+    """Keep only the reflected inertia of a rotor: a much lighter rotor behind a much higher ratio."""
     i = next(i for i, gear in enumerate(gears) if gear.name == rotor.name)
     (own, (link, ratio)), at = gears[i].coefficients, rotors.index(rotor)
     gears[i] = replace(gears[i], coefficients=(own, (link, math.copysign(UNKNOWN_RATIO, ratio))))
@@ -144,9 +144,9 @@ def _transmissions(graph: UrdfGraph, notes: list[str]) -> Iterator[Drive]:
 
 
 def _motors(file: str, where: str, transmission: Element) -> Iterator[tuple[float, list[float]]]:
-    """Iterate over the inertia of each motor and its ratio; several ratios if it is not clear which one is meant.
+    """Iterate over the inertia of each motor and its ratio; several ratios if the ratio is ambiguous.
 
-    A figure belongs to the <actuator> that it stands in, otherwise to all. A ratio of 1 beside another says nothing.
+    A number belongs to its <actuator>, a number outside to all actuators. A ratio of 1 beside another ratio is ignored.
     """
     actuators = transmission.findall("actuator")
     inside = {part for actuator in actuators for part in actuator.iter()}
@@ -161,7 +161,7 @@ def _motors(file: str, where: str, transmission: Element) -> Iterator[tuple[floa
 
 
 def _figures(file: str, where: str, parts: Iterable[Element], key: str) -> list[float]:
-    """Return the numbers in elements that say a ratio or an inertia, as text or as `value`."""
+    """Return the numbers in elements of a ratio or an inertia, as text or as `value`."""
     found = []
     for element in (part for part in parts if part.tag in WORDS[key]):
         text = element.get("value", element.text or "")

@@ -1,4 +1,4 @@
-"""Single URDF elements -> numbers, placements, inertials, joints and shapes, each checked as it is read.
+"""Single URDF elements -> checked numbers, placements, inertials, joints and shapes.
 
 Source: wiki.ros.org/urdf/XML.
 """
@@ -68,12 +68,12 @@ def name_of(file: str, element: Element, attribute: str = "name", where: str = "
 
 
 def placement(file: str, where: str, parent: Element) -> Placement:
-    """Return the pose in the <origin> of `parent`; the identity if there is none."""
+    """Return the pose in the <origin> of `parent`; the identity without <origin>."""
     return pose_of(file, where, parent.find("origin"))
 
 
 def pose_of(file: str, where: str, origin: Element | None) -> Placement:
-    """Return the pose that the attributes `xyz` and `rpy` of an element say; the identity without one."""
+    """Return the pose of the attributes `xyz` and `rpy` of an element; the identity without element."""
     if origin is None:
         return Placement()
     xyz = numbers(file, where, origin, "xyz", 3) if origin.get("xyz") else (0.0, 0.0, 0.0)
@@ -124,7 +124,7 @@ def unit_axis(file: str, key: str, axis: tuple[float, ...]) -> Vec3:
 
 
 def axis(file: str, where: str, parent: Element) -> Vec3:
-    """Return the unit vector in the <axis> of `parent`; x if there is none."""
+    """Return the unit vector in the <axis> of `parent`; x without <axis>."""
     element = parent.find("axis")
     if element is None:
         return (1.0, 0.0, 0.0)  # the format's default

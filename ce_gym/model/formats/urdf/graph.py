@@ -12,7 +12,7 @@ from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.document import parse_urdf
 
 MOST_LINKS = 1000
-"""Most links of a file, those included that fixed joints weld to others."""
+"""Most links of a file, links on fixed joints included."""
 MIMIC_DEFAULTS = (("multiplier", 1.0), ("offset", 0.0))
 MOVING = ("revolute", "continuous", "prismatic", "floating")
 
@@ -24,9 +24,9 @@ class UrdfJoint:
     Attributes:
         name: Its name.
         type: "revolute", "continuous", "prismatic", "floating" or "fixed".
-        parent, child: The links that it joins.
-        element: Its element.
-        offset: Coordinate at which it is fixed [rad or m], because it mimics a joint that does not move.
+        parent, child: The two links.
+        element: The element.
+        offset: Coordinate of a fixed joint [rad or m], other than 0 if the joint mimics a joint that does not move.
     """
 
     name: str
@@ -52,7 +52,7 @@ class UrdfGraph:
         joints: The joint that moves a link, by the name of that link.
         order: Names of the links, parents before children, otherwise in the order of the file.
         root: The only link that is no joint's child.
-        notes: What reading the joints left out.
+        notes: Joints that became fixed.
     """
 
     def __init__(self, path: Path):
@@ -66,14 +66,14 @@ class UrdfGraph:
 
     @property
     def is_plus(self) -> bool:
-        """Whether the file uses what URDF+ adds: <loop>, <coupling>, or `independent` on a joint; or a <loop_joint>."""
+        """Whether the file has <loop>, <coupling> or `independent` of URDF+, or a <loop_joint>."""
         added = [self.robot.find(tag) for tag in ("loop", "coupling", "loop_joint")]
         return any(element is not None for element in added) or any(
             joint.element.get("independent") is not None for joint in self.joints.values()
         )
 
     def welded_to(self, link: str) -> Iterator[str]:
-        """Iterate over `link` and the links beyond it that fixed joints tie to it, parents before children."""
+        """Iterate over `link` and the links rigidly joined to it by fixed joints beyond it, parents before children."""
         welded = {link}
         for other in self.order:
             joint = self.joints.get(other)
@@ -82,7 +82,7 @@ class UrdfGraph:
         return (other for other in self.order if other in welded)
 
     def hold(self, link: str) -> None:
-        """Fix the joint of a link at 0, and those that mimic it at their offsets."""
+        """Fix the joint of a link at 0, and joints that mimic it at their offsets."""
         self.joints[link] = replace(self.joints[link], type="fixed")
         self.joints = {joint.child: joint for joint in self._without_idle_mimics(list(self.joints.values()))}
 
@@ -116,9 +116,9 @@ class UrdfGraph:
         return list(joints.values())
 
     def _without_idle_mimics(self, joints: list[UrdfJoint]) -> list[UrdfJoint]:
-        """Return the joints; those that mimic a joint that does not move, or 0 times one that does, are fixed.
+        """Return the joints; a joint that mimics a fixed joint, or 0 times a moving joint, becomes fixed.
 
-        A <mimic> on a fixed joint means nothing: the joint does not move.
+        A <mimic> on a fixed joint has no effect.
         """
         by_name = {joint.name: joint for joint in joints}
         changed = True

@@ -1,6 +1,6 @@
 """URDF and URDF+ -> `Robot`.
 
-URDF+ is the format in which the paper's authors publish robots with loops and transmissions: a URDF with additions.
+URDF+ is the format of the paper's authors for robots with loops and transmissions: a URDF with additions.
 
 - `independent="true|false"` on a joint; true is the default. The independent joints are the coordinates.
 - `<coupling name>` with `<predecessor link>`, `<successor link>` and `<ratio value>`: the sum of the joint coordinates
@@ -46,10 +46,10 @@ def robot_from_graph(graph: UrdfGraph, base: Base | None = None) -> Robot:
 
     Args:
         graph: The parsed file.
-        base: "floating" or "fixed"; by default what the file implies.
+        base: "floating" or "fixed"; by default as the file implies.
 
     Raises:
-        RobotError: The file is malformed or describes something that cannot be.
+        RobotError: The file is malformed or describes an impossible robot.
 
     Warns:
         LossyImportWarning: Joints are fixed because they move no mass.

@@ -1,9 +1,9 @@
 """A plain URDF file -> bodies in a tree.
 
-Links joined by fixed joints become one body that has the name of the link nearest to the root; the names of the
-others stay known as frames. A body has the name of its link, and its joint has the name of its body.
+Links joined by fixed joints become one body with the name of the link nearest to the root; the other links stay
+frames with names. A body has the name of its link, and its joint has the name of its body.
 
-Vendors write rotors as links on fixed joints. Whoever knows that they are rotors names them, and they stay apart.
+Vendors write rotors as links on fixed joints. Such links stay separate if the caller names them in `apart`.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ Frame = tuple[str | None, Placement]  # the body (None: the world) that carries 
 
 WORLD = "world"
 ROUNDING = 1e-12
-"""Of the largest moment of inertia in a file."""
+"""Relative size, to the largest moment of inertia in a file, of rounding errors."""
 
 
 @dataclass(frozen=True)
 class UrdfTree:
-    """What a URDF file says.
+    """The content of a URDF file.
 
     Attributes:
         name: Name of the robot.
         bodies: Parents before children, otherwise in the order of the links in the file.
-        frames: Where every link of the file is, also those that were merged into another.
+        frames: Body and pose of every link of the file, merged links included.
         constraints: The file's <mimic> joints.
-        notes: What was left out.
-        fixed: Links that were asked for to be kept apart, by name.
-        collisions: The <collision> elements of every link that has some, in the link's frame; None for a mesh.
-        drives: Motors that the file describes.
+        notes: Ignored parts of the file.
+        fixed: Links of `apart` on fixed joints, by name.
+        collisions: The <collision> elements of every link with some, in the link's frame; None for a mesh.
+        drives: Motors in the file.
         held: A line for each joint that is fixed because it moves no mass.
     """
 
@@ -71,14 +71,14 @@ def read_urdf(
 
     Args:
         path: The file.
-        base: Whether the root link is a body that moves freely or is fixed to the world. By default the root is fixed
-            if it is called "world" or has no mass.
-        apart: Names of links to keep apart if they hang on a fixed joint; others mean nothing.
-        tied: Names of links that may move without mass, because more is tied to them than the file says.
+        base: Whether the root link moves freely or is fixed to the world. By default the root is fixed if it is called
+            "world" or has no mass.
+        apart: Names of links on fixed joints to keep separate; other names have no effect.
+        tied: Names of links that may move without mass because constraints elsewhere name them.
 
     Raises:
-        RobotError: The file is missing, malformed, or describes something that is not a tree of rigid bodies; or it is
-            URDF+, whose loops and couplings must not be lost.
+        RobotError: The file is missing, malformed, or not a tree of rigid bodies; or it is URDF+, whose loops and
+            couplings must not be lost.
 
     Warns:
         LossyImportWarning: Joints are fixed because they move no mass.
@@ -105,14 +105,14 @@ def warn_of_held_joints(file: str, tree: UrdfTree) -> None:
 def read_tree(
     graph: UrdfGraph, base: Base | None = None, apart: Collection[str] = (), tied: Collection[str] = ()
 ) -> UrdfTree:
-    """Read the tree of a file that has been parsed; as `read_urdf`, but the figures of bodies are not checked."""
+    """Read the tree of a parsed file; like `read_urdf`, but without checks of bodies."""
     return _Reader(graph, base, apart, tied).tree()
 
 
 def _without_rounding(inertials: dict[str, Inertial | None]) -> dict[str, Inertial | None]:
-    """Return mass properties in which principal moments that are negative by rounding are zero.
+    """Return mass properties with zero in place of principal moments that rounding made negative.
 
-    Rounding is 1e-12 of the largest moment in the file: CAD programs write -5e-20 for the inertia of a small part.
+    CAD programs write -5e-20 for the inertia of a small part.
     """
     given = {name: part for name, part in inertials.items() if part is not None}
     largest = max((np.abs(part.inertia).max() for part in given.values()), default=0.0)
@@ -124,7 +124,7 @@ def _without_rounding(inertials: dict[str, Inertial | None]) -> dict[str, Inerti
 
 
 class _Reader:
-    """One pass over one file; holds the look-up tables the pass needs."""
+    """One pass over one file, with its look-up tables."""
 
     def __init__(self, graph: UrdfGraph, base: Base | None, apart: Collection[str], tied: Collection[str]):
         self.graph, self.file = graph, graph.file
@@ -175,7 +175,7 @@ class _Reader:
         return tuple(f"{joint.where} moves no mass: it is fixed at 0; {expected}" for joint in idle)
 
     def _gazebo_springs(self) -> dict[str, dict[str, float]]:
-        """Return the figures of springs that <gazebo> elements give joints, by the name of the joint."""
+        """Return the spring parameters in <gazebo> elements, by the name of the joint."""
         found: dict[str, dict[str, float]] = {}
         for element in self.graph.robot.findall("gazebo"):
             for part in (part for part in element if part.tag in SPRINGS):
@@ -222,7 +222,7 @@ class _Reader:
         return link in self.joints and self.joints[link].type == "fixed"
 
     def _fixed(self, link: str) -> FixedLink:
-        """Return a link that is kept apart, which must carry nothing."""
+        """Return a separate link, which must carry no other link."""
         carried = next((joint.child for joint in self.joints.values() if joint.parent == link), None)
         inertial = self.inertials[link]
         if carried is not None or inertial is None:
@@ -251,7 +251,7 @@ class _Reader:
         return Body(link, "link", parent, pose, motion, merge_inertials(inertials), shapes)
 
     def _shapes(self, link: str, frame: Placement) -> Iterator[Shape]:
-        """Iterate over what is drawn of a link: primitives; where all that can be seen is meshes, those that touch."""
+        """Iterate over primitives to draw: of <visual> elements, or of <collision> if all visuals are meshes."""
         shapes = {tag: self._shapes_of(link, tag) for tag in ("visual", "collision")}
         drawn = [shape for shape in shapes["visual"] if shape] or [shape for shape in shapes["collision"] if shape]
         return (replace(shape, placement=compose(frame, shape.placement)) for shape in drawn)

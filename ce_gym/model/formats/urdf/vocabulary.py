@@ -1,6 +1,6 @@
-"""Words of a URDF file that nothing reads, so that none is left out silently.
+"""Elements and attributes of a URDF file that are not read; each becomes a note.
 
-Source: wiki.ros.org/urdf/XML. Everything under <visual> and <material> is for the eye and may say what it likes.
+Source: wiki.ros.org/urdf/XML. <visual> and <material> are for display only and are not checked.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ CHILDREN = {
     "geometry": {"box", "sphere", "cylinder", "capsule", "mesh"},
     "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic"},
 }
-"""Elements that are read, by the element that they stand in; the others have none."""
+"""Elements that are read, by their parent element."""
 ATTRIBUTES = {
     "robot": {"name", "version"},
     "link": {"name"},
@@ -43,15 +43,15 @@ EXTENSIONS = {
     "gazebo": {"material", "sensor", "visual"},
     "mujoco": {"meshdir", "assetdir", "strippath", "discardvisual"},
 }
-"""Elements for other programs, and words in them that are for the eye, for sensors or for files."""
+"""Elements for other programs, and words in them for display, sensors or files."""
 SPRINGS = {"springStiffness": "stiffness", "springReference": "springref"}
-"""Words of <gazebo reference="JOINT"> that are read, and the figure of the joint that each is."""
+"""Words of <gazebo reference="JOINT"> that are read, and the field of `Joint` for each."""
 READ_ELSEWHERE = ("visual", "material", "transmission", "loop", "coupling", "loop_joint")
-"""Elements whose content is not looked at here."""
+"""Elements whose content is checked elsewhere or not at all."""
 
 
 def unread_words(robot: Element) -> tuple[str, ...]:
-    """Return a note for each kind of element or attribute that nothing reads, with how often it occurs."""
+    """Return a note for each kind of element or attribute that is not read, with its number of occurrences."""
     counts = Counter(_unread("", robot))
     words = [f"<{tag}>: {', '.join(_counted(of))}" for tag in EXTENSIONS if (of := Counter(_extended(robot, tag)))]
     return tuple(f"left out: {word}" for word in (*_counted(counts), *words))
@@ -62,7 +62,7 @@ def _counted(words: Counter[str]) -> list[str]:
 
 
 def _extended(robot: Element, tag: str) -> Iterator[str]:
-    """Iterate over the words for another program that nothing reads, with their attributes where these say it all."""
+    """Iterate over the words for another program that are not read, each with its attributes if it has some."""
     joints = {joint.get("name") for joint in robot.findall("joint") if joint.get("type") != "fixed"}
     for element in robot.findall(tag):
         springs = SPRINGS if element.get("reference") in joints else ()
@@ -74,7 +74,7 @@ def _extended(robot: Element, tag: str) -> Iterator[str]:
 
 
 def _unread(parent: str, element: Element) -> Iterator[str]:
-    """Iterate over the words under an element that nothing reads, as `<joint><calibration>` or `<limit jerk>`."""
+    """Iterate over the words under an element that are not read, as `<joint><calibration>` or `<limit jerk>`."""
     tag = element.tag
     if tag in EXTENSIONS and parent == "robot":
         return
