@@ -1,7 +1,7 @@
 """The quantities of a mechanism as traced CasADi functions, by name.
 
-Each entry of `FUNCTIONS` takes a mechanism and returns an SX function of dense columns with common sub-expressions
-shared.
+Each entry of `FUNCTIONS` takes a mechanism and returns an SX function of dense columns with shared common
+sub-expressions.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _function(name: str, guess: SX, inputs: dict[str, SX], outputs: dict[str, SX
 
 
 def _base(x: SX, count: int) -> list[SX]:
-    """Return the first `count` rows, if any, to be stacked; of a scalar, `x[:0]` would be one row in CasADi."""
+    """Return the first `count` rows as a list to stack; CasADi's `x[:0]` of a scalar would be one row."""
     return [x[:count]] if count else []
 
 
@@ -168,7 +168,7 @@ def _body_poses(mechanism: Mechanism) -> ca.Function:
     for body in mechanism.robot.bodies:
         if body.name in kinematics.bodies:
             p, R = kinematics.bodies[body.name].p, kinematics.bodies[body.name].R
-        else:  # a rotor that is no body of the recursion still has a place to be drawn at
+        else:  # an eliminated rotor still has a pose
             parent = kinematics.bodies[body.parent] if body.parent is not None else None
             R_parent, p_parent = (parent.R, parent.p) if parent is not None else (SX.eye(3), SX(3, 1))
             p = p_parent + R_parent @ constant(np.array(body.placement.position))
@@ -200,7 +200,7 @@ def _body_velocities(mechanism: Mechanism) -> ca.Function:
         if body.name in kinematics.bodies:
             state = kinematics.bodies[body.name]
             w, origin = state.R @ state.v[:3], state.R @ state.v[3:]
-        else:  # a rotor that is no body of the recursion turns about an axis of its carrier
+        else:  # an eliminated rotor turns about an axis of its carrier
             axis = constant(np.array(body.placement.rotation) @ np.array(body.joint.axis)) * rates[body.name]
             w, origin = axis, SX(3, 1)
             if body.parent is not None:

@@ -1,19 +1,19 @@
-"""Convex shapes whose corners are contacts: points between the corners, where uneven ground may rise into the shape.
+"""Convex shapes whose corners are contacts: contacts between the corners, for uneven ground.
 
-A convex shape on a plane touches it with corners only, so corners are all that flat ground needs. On a height field the
+A convex shape touches a plane with corners only, so flat ground needs no other contacts. On a height field the
 ground between corners can be higher than the plane through them: a ridge under a sole, the edge of a stair. A `Hull`
 has points on the edges and faces of such a shape, in regions around up to eight of its corners. Each region has one
-further contact. With the depth `d_i` of its points in the ground, that contact pushes at their weighted mean
+further contact. With the depths `d_i` of the region's points in the ground, the contact acts at their weighted mean
 
     p = sum(w_i p_i) / sum(w_i),    w_i = (d_i / D)^3 / sqrt(n),    D = (sum(d_i^4) / sqrt(n))^(1/4),
 
-with the depth `D |sum(w_i n_i)|`. `k D^2 / 2` is a potential of all points, whose force is `k D sum(w_i n_i)`: the
-force does not jump when another point becomes the deepest, and a cycle of touching and leaving gains no energy but for
-what the ground turns under a point. A region that is in the ground in one point is `n^(-1/4)` times as stiff as a
-corner, one that is with all its n points `n^(1/4)` times.
+with the depth `D |sum(w_i n_i)|`. The force `k D sum(w_i n_i)` has the potential `k D^2 / 2` of all points. It
+therefore does not jump when another point becomes the deepest, and repeated touching gains no energy, except where the
+ground's slope changes under a point. A region with one point in the ground is `n^(-1/4)` times as stiff as a corner; a
+region with all its n points in the ground is `n^(1/4)` times as stiff.
 
-A point counts only where the ground under it is higher than the corners' ground says (by `RISE` and more), so that a
-shape that stands flat rests on its corners, with their stiffness.
+A point counts only if the ground under the point is more than `RISE` above the ground interpolated between the corners.
+A shape that stands flat thus rests on its corners, with their stiffness.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from ce_gym.model.frames import Vec3
 Array = NDArray[np.float64]
 
 MOST_POINTS = 256
-"""Points on one hull."""
+"""Most points on one hull."""
 MOST_CORNERS = 32
-"""Corners of one hull; of more those that lie furthest apart stand for it."""
+"""Most corners of one hull; of more corners, the ones furthest apart are chosen."""
 RISE = 1e-3
-"""What the ground may rise between corners and still counts as a plane [m]."""
+"""Rise between corners up to which the ground counts as a plane [m]."""
 LATTICE = np.array([0.7548776662466927, 0.5698402909980532])
 """Steps of the R2 sequence (Roberts 2018): powers of the inverse of the plastic number."""
 LEAST_DEPTH = 2e-4
-"""Depth from which on the points of a region share its force by their depths alone [m]."""
+"""Depth above which the shares of a region's points in its force depend on their depths only [m]."""
 STEEPNESS = 25.0
-"""A point is no deeper than this many times what the ground rises above `RISE`."""
+"""Largest depth of a point over the ground's rise above `RISE` [-]."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class Hull:
 
     Attributes:
         body: Name of the body.
-        radius: Of the spheres at its corners, which rounds the shape [m].
-        points: Between the corners, in the body frame [m].
-        weights: For each point pairs (contact, weight) of the corners around it; contacts by their place in the scene.
-        regions: For each region the corner to which its force counts, and its points.
+        radius: Radius of the spheres at the corners [m].
+        points: Points between the corners, in the body frame [m].
+        weights: For each point, pairs (contact, weight) of the corners around it; contacts by index in the scene.
+        regions: For each region, the corner to which its force is added, and its points.
         spacing: Largest distance of points along edges [m].
     """
 
@@ -68,12 +68,12 @@ class Hull:
 
 
 def poles_of(hulls: Sequence[Hull]) -> tuple[int, ...]:
-    """Return the corner to which the force of each region of hulls counts, by its place in the scene."""
+    """Return the corner to which the force of each region of hulls is added, by index in the scene."""
     return tuple(corner for hull in hulls for corner, _ in hull.regions)
 
 
 def with_hulls(of_contacts: SX, hulls: Sequence[Hull]) -> SX:
-    """Add what belongs to the regions of hulls, last, to their corners; rows or columns are contacts."""
+    """Add the last rows or columns, of regions of hulls, to the rows or columns of their corners."""
     poles = poles_of(hulls)
     if not poles:
         return of_contacts
@@ -89,10 +89,10 @@ def hull_of(body: str, radius: float, corners: dict[int, Vec3], spacing: float) 
     """Return the convex hull of contacts.
 
     Args:
-        body: Name of the body that carries them.
-        radius: Of the contacts [m].
-        corners: Their centres in the body frame [m], by their place in the scene.
-        spacing: Largest distance of points [m]; it grows until there are no more than `MOST_POINTS`.
+        body: Name of the body with the contacts.
+        radius: Radius of the contacts [m].
+        corners: Centres of the contacts in the body frame [m], by index in the scene.
+        spacing: Largest distance of points [m]; increased until the hull has at most `MOST_POINTS` points.
     """
     names, at = list(corners), np.array(list(corners.values()))
     scale = float(np.ptp(at, axis=0).max())
@@ -148,7 +148,7 @@ def _faces(points: Array, rank: int, scale: float) -> list[list[int]]:
 
 
 def _around(points: Array, members: list[int], normal: Array, tolerance: float) -> list[int]:
-    """Return the points in a plane that are corners of their hull, in order."""
+    """Return the corners of the hull of points in a plane, in order around the hull."""
     u = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     axes = np.stack([u / np.linalg.norm(u), np.cross(normal, u) / np.linalg.norm(u)])
     flat = {i: axes @ points[i] for i in members}
@@ -188,10 +188,10 @@ def _between(points: Array, faces: list[list[int]], spacing: float, tolerance: f
 
 
 def _grid(n: int, m: int) -> Array:
-    """Return places (u, v) on a square: evenly on its sides, and inside as many as a grid of n by m cells has.
+    """Return places (u, v) on a square: evenly on its sides, and inside as many as the inner corners of n by m cells.
 
-    Those inside are a lattice in one quarter, mirrored to the others, in which no two points have the same `u` or the
-    same `v`. So the edge of a ridge or of a stair is found more exactly than the points are apart.
+    The places inside are a lattice in one quarter, mirrored to the others. No two have the same `u` or the same `v`,
+    which locates the edge of a ridge or a stair more exactly than the spacing of the points.
     """
     along, across = np.arange(n + 1) / n, np.arange(m + 1) / m
     sides = [(u, v) for u in along for v in (0.0, 1.0)] + [(u, v) for u in (0.0, 1.0) for v in across]
@@ -204,13 +204,13 @@ def _grid(n: int, m: int) -> Array:
 def pressed(hull: Hull, up: SX, z: SX, under: SX, corners: SX) -> list[tuple[SX, SX, SX]]:
     """Return where each region of a hull touches the ground: point (3,) in the body frame [m], depth [m], normal (3,).
 
-    Of a rounded hull it is what is straight below its points that touches: on ground that leans by an angle `b` against
-    the line between them, that is `radius (1 / cos b - 1)` short of where a sphere would.
+    A rounded hull touches straight below its points. On ground inclined by an angle `b` against the line between the
+    points, the depth is `radius (1 / cos b - 1)` less than the depth of a sphere.
 
     Args:
         hull: The hull.
         up: The world's upward direction in the body frame, shape (3,).
-        z: Heights of its points [m], shape (n,).
+        z: Heights of the points [m], shape (n,).
         under: Height [m] and slopes of the ground under each point, shape (3, n).
         corners: Height of the ground under the contacts of the scene [m], shape (n_contacts,).
     """

@@ -462,7 +462,7 @@ class Model:
         return unit_quaternions(q, [i for i, _ in self.robot.layout.turns]) if fits else q
 
     def loop_report(self) -> str:
-        """Return one line for each cluster with closed loops: how it is solved and how well it is conditioned."""
+        """Return one line for each cluster with closed loops: its solution method and condition number."""
         return loop_report(self.mechanism)
 
     def describe(self) -> str:

@@ -1,4 +1,4 @@
-"""Declared parameters that cannot change anything: the robot has no such thing, or its level or scene leaves it out."""
+"""Checks of declared parameters without effect on a robot, at a transmission level or in a scene."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ OF_BATTERY = "battery_voltage", "battery_resistance"
 
 
 def check_effects(mechanism: Mechanism, options: StepOptions) -> None:
-    """Check that every declared parameter acts on something.
+    """Check that every declared parameter has an effect.
 
     Raises:
-        ValueError: One does not; one line.
+        ValueError: A parameter has no effect; one line.
     """
     for name in options.parameters:
         if expected := _missing(mechanism, options, *name.partition(":")[::2]):
@@ -25,7 +25,7 @@ def check_effects(mechanism: Mechanism, options: StepOptions) -> None:
 
 
 def _missing(mechanism: Mechanism, options: StepOptions, kind: str, owner: str) -> str:
-    """Return what a parameter needs and does not have; nothing if it acts."""
+    """Return the missing requirement of a parameter; "" if the parameter has an effect."""
     robot, limited = mechanism.robot, MOTORS[options.motors].at_motors
     if kind in OF_CONTACTS and not (options.contacts or options.self_collisions):
         return "contacts"

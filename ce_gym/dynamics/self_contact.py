@@ -1,4 +1,4 @@
-"""Which links of a robot may touch each other: those that are apart where it stands, in numbers."""
+"""Pairs of links that may collide: pairs that do not overlap in the standing pose."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ce_gym.model.mechanism import Mechanism
 
 
 def apart_when_standing(mechanism: Mechanism) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of links that are not adjacent and no capsules of which meet in the standing pose."""
+    """Return the pairs of links that are not adjacent and whose capsules do not overlap in the standing pose."""
     standing, robot = standing_pose(mechanism), mechanism.robot
     return tuple(
         (one, other)
@@ -24,7 +24,7 @@ def apart_when_standing(mechanism: Mechanism) -> tuple[tuple[str, str], ...]:
 
 
 def distance(standing: Standing, a: Capsule, b: Capsule) -> float:
-    """Return how far two capsules are apart [m], negative if they meet."""
+    """Return the distance of two capsules [m], negative if they overlap."""
     ends = [
         standing.p[one.body] + standing.R[one.body] @ np.array(end) for one in (a, b) for end in (one.start, one.end)
     ]

@@ -1,7 +1,7 @@
-"""A mechanism in its standing pose, in numbers: what must hold there before anything is traced.
+"""Numerical checks of a mechanism in its standing pose, before its functions are traced.
 
-The mass matrix is the sum `J^T I J` over bodies, with each body's Jacobian `J` from its parent's, plus what rotors that
-are no bodies of their own add (see recursion/rotors.py). An independent way to the figure that `Model` traces.
+The mass matrix is the sum `J^T I J` over bodies, each body's Jacobian `J` computed from its parent's, plus the inertia
+of eliminated rotors (see recursion/rotors.py). It is independent of the mass matrix that `Model` traces.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody, skew
 Array = NDArray[np.float64]
 
 SMALLEST_EIGENVALUE = 1e-12
-"""Of the mass matrix scaled to ones on its diagonal: with less, accelerations have no correct digits [-]."""
+"""Smallest allowed eigenvalue of the mass matrix scaled to ones on its diagonal; below, accelerations are noise [-]."""
 DEEPEST_CONTACT = 0.1
-"""How far contacts may be below ground in the standing pose [m]."""
+"""Largest allowed depth of contacts below ground in the standing pose [m]."""
 FURTHEST_BEYOND = 0.01
-"""How far dependent joints may be beyond their limits, where loops are assembled from rounded figures [rad or m]."""
+"""Tolerance of limits of dependent joints, because loops are assembled from rounded numbers [rad or m]."""
 
 
 @dataclass
@@ -33,8 +33,8 @@ class Standing:
     """A mechanism in its standing pose.
 
     Attributes:
-        q: Joint coordinates by body [rad or m], a floating base's and ball joints' left out.
-        G: Rows of the constraint Jacobian by body, shape (nv,) each; not of those joints.
+        q: Joint coordinates by body [rad or m], without floating base and ball joints.
+        G: Rows of the constraint Jacobian by body, shape (nv,) each, without floating base and ball joints.
         R: Rotations, body to world, by body.
         p: Origins in the world [m], by body.
         J: Spatial velocities in body axes for unit independent velocities, shape (6, nv), by body.
@@ -48,10 +48,10 @@ class Standing:
 
 
 def check_standing(mechanism: Mechanism) -> None:
-    """Check that a mechanism can stand, and move, in its standing pose.
+    """Check that the standing pose is possible and that every motion from it moves some mass.
 
     Raises:
-        RobotError: Its mass matrix is not positive definite, a dependent joint is beyond its limits, or contacts are
+        RobotError: The mass matrix is not positive definite, a dependent joint is beyond its limits, or contacts are
             far below ground.
     """
     standing = standing_pose(mechanism)
@@ -62,7 +62,7 @@ def check_standing(mechanism: Mechanism) -> None:
             expected = f"a standing pose that keeps every joint within its limits, here {lower:g} to {upper:g}"
             raise invalid_value(file, f"joint {body.name!r} in the standing pose", angle, expected)
     _check_mass_matrix(mechanism, mass_matrix(mechanism, standing), file)
-    placed = mechanism.robot.floating and mechanism.robot.pose.height != 0.0  # a height of 0 is one that nobody gave
+    placed = mechanism.robot.floating and mechanism.robot.pose.height != 0.0  # 0 is the default height
     for contact in mechanism.robot.contacts if placed else ():
         centre = standing.p[contact.body] + standing.R[contact.body] @ np.array(contact.position)
         lean = float(np.hypot(*(standing.R[contact.body] @ np.array(contact.axis))[:2]))
@@ -124,7 +124,7 @@ def _coordinates(mechanism: Mechanism, cluster: Cluster, closure: Closure | None
 
 
 def _place(standing: Standing, mechanism: Mechanism, name: str) -> None:
-    """Place one body, its parent being placed."""
+    """Place one body on its parent."""
     body, q = mechanism.bodies[name], standing.q[name]
     axis, turn, slide = body.axis, body.joint.turn, body.joint.slide
     _attach(standing, body, axis * (slide * q), turned(axis, turn * q))
@@ -139,7 +139,7 @@ def _place_ball(standing: Standing, mechanism: Mechanism, name: str, rows: Array
 
 
 def _attach(standing: Standing, body: MovingBody, shift: Array, turn: Array) -> None:
-    """Place a body whose joint has moved it by a shift and turned it, and let it move with its parent."""
+    """Place a body whose joint has the given translation and rotation; its Jacobian is the parent's motion."""
     position, rotation, parent = body.position + body.rotation @ shift, body.rotation @ turn, body.parent
     standing.R[body.name] = standing.R[parent] @ rotation
     standing.p[body.name] = standing.p[parent] + standing.R[parent] @ position
@@ -164,7 +164,7 @@ def mass_matrix(mechanism: Mechanism, standing: Standing) -> Array:
 
 
 def _reflected(mechanism: Mechanism, rotors: tuple[EliminatedRotor, ...], standing: Standing) -> Array:
-    """Return what the rotors of a cluster add that are no bodies of the recursion, at the level of the mechanism."""
+    """Return the mass matrix of a cluster's eliminated rotors at the level of the mechanism, shape (nv, nv)."""
     nv = len(standing.J[None][0])
     if mechanism.level == "none" or not rotors:
         return np.zeros((nv, nv))

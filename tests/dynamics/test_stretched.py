@@ -23,7 +23,7 @@ def test_elimination_solves_for_accelerations_and_what_is_felt(d: int):
     U, u, D = biased[:, :6].T, biased[:, 6] + tau, inertia + slope
     np.testing.assert_allclose(np.array(ca.evalf(one.acceleration(ca.SX(a))))[:, 0], np.linalg.solve(D, u - U.T @ a))
     felt = felt + felt.T
-    less, more = one.felt(ca.SX(felt), ca.SX(force))
+    less, more = one.articulated(ca.SX(felt), ca.SX(force))
     np.testing.assert_allclose(np.array(ca.evalf(less)), felt - U @ np.linalg.solve(D, U.T))
     np.testing.assert_allclose(np.array(ca.evalf(more))[:, 0], force + U @ np.linalg.solve(D, u))
 

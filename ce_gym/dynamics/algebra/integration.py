@@ -1,8 +1,8 @@
 """Semi-implicit update of positions and velocities from accelerations.
 
 Velocities first, then positions with the new velocities. The base's linear momentum is integrated in the world frame,
-so that free flight is a straight line whatever the spin. Orientations, its own and those of ball joints, move by the
-exponential map, and quaternions are scaled back to unit length.
+so that free flight is a straight line at any spin. Orientations of the base and of ball joints move by the exponential
+map, and quaternions are scaled back to unit length.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Spatial vector algebra on CasADi SX, angular part first (Featherstone 2008, chapter 2).
 
 Motion and force vectors are (6, 1) columns [angular; linear] in body coordinates. A `Transform` takes motion vectors
-from a parent frame to a child frame and, transposed, forces and inertias back. Everything is written on 3x3 blocks
-and on upper triangles, because structural zeros and shared nodes are what keeps traced code short: a symmetric
-matrix holds the *same* node in both halves.
+from a parent frame to a child frame and, transposed, forces and inertias back. All operations work on 3x3 blocks and
+upper triangles, because structural zeros and shared nodes keep traced code short: a symmetric matrix holds the *same*
+node in both halves.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def skew(x: SX) -> SX:
 
 
 def mirrored(m: SX) -> SX:
-    """Return the symmetric matrix with the upper triangle of `m`; the lower half then costs nothing."""
+    """Return the symmetric matrix with the upper triangle of `m`; its lower half shares the nodes."""
     return ca.triu2symm(ca.triu(m))
 
 

@@ -1,8 +1,8 @@
-"""How a cluster with closed loops goes together at its reference pose: found once, in numbers, when a model is built.
+"""Assembly of a cluster with closed loops at its reference pose, computed once in numbers when a model is built.
 
 The reference pose is the robot's standing pose for the independent joints and its `assembly` for the others, completed
-so that every constraint is met. It decides which rows of the constraints are redundant, which linear rows are
-eliminated, and on which branch the loops are.
+so that every constraint holds. The reference pose determines the redundant rows of the constraints, the linear rows to
+eliminate, and the branch of the loops.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from ce_gym.model.errors import RobotError
 Array = NDArray[np.float64]
 
 CLOSED = 1e-10
-"""Largest residual of a constraint that is met at the reference pose."""
+"""Largest residual of a constraint that holds at the reference pose."""
 SINGULAR = 1e-7
 """Smallest singular value, relative to the largest, of loops that are not singular."""
 REDUNDANT = 1e-5
-"""Smallest singular value of scaled rows that do not repeat each other.
+"""Smallest singular value of scaled rows that are not redundant.
 
-Files with six digits turn the axes of a planar loop against each other by up to 3e-6.
+Files with six digits misalign the axes of a planar loop by up to 3e-6.
 """
 DISTINCT = 0.05
-"""The same of rows that are taken first: of two that repeat each other, the better one."""
+"""Smallest singular value of rows that are chosen first: of two nearly equal rows, the better one."""
 VANISHING = 1e-9
-"""Scale of rows that vanish."""
+"""Largest scale of rows that count as zero."""
 NEARLY_CLOSED = 1e-5
-"""Largest residual of rounded rows in configurations that meet all others."""
+"""Largest residual of rounded redundant rows in configurations that satisfy the other rows."""
 SAMPLES, SPREADS = 6, (0.3, 0.1, 0.03)
-"""Configurations around the reference pose that are tried, and how far from it, in units of the coordinates."""
+"""Number of configurations to try around the reference pose, and their distances from it in units of coordinates."""
 ENOUGH = 3
-"""How many of them must be closed before nearer ones are tried."""
+"""Number of closed configurations after which nearer ones are not tried."""
 FARTHEST = 0.5
-"""How far a configuration may move when it is closed: beyond, it is on another branch, which may be singular."""
+"""Largest move to close a configuration; beyond, it is on another branch, which may be singular."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class Assembly:
     """A cluster at its reference pose; `q = B [y; z] + q0` solves the linear constraints.
 
     Attributes:
-        q: Spanning coordinates that meet all constraints [rad or m], shape (n,).
+        q: Spanning coordinates that satisfy all constraints [rad or m], shape (n,).
         B: Shape (n, d + m).
         q0: Shape (n,).
-        unknown: Rows of `q` that are the unknowns `z`, which other than linear constraints determine, shape (m,).
-        rows: Rows of those constraints that are kept, shape (m,); the others are redundant.
+        unknown: Rows of `q` that are the unknowns `z`, which the nonlinear constraints determine, shape (m,).
+        rows: Rows of the nonlinear constraints that are kept, shape (m,); the others are redundant.
         dropped: Number of redundant rows.
         condition: Condition number of the constraint Jacobian of the dependent coordinates, rows scaled.
     """
@@ -71,12 +71,12 @@ class Assembly:
 
 
 def nonlinear_rows(robot: Robot, cluster: Cluster, q: SX) -> SX:
-    """Return the rows of a cluster's constraints that are not linear, at spanning coordinates `q` (n,)."""
+    """Return the rows of a cluster's nonlinear constraints at spanning coordinates `q` (n,)."""
     return ca.vertcat(*[rows for _, rows in _rows_by_tie(robot, cluster, q)])
 
 
 def _rows_by_tie(robot: Robot, cluster: Cluster, q: SX) -> list[tuple[Constraint, SX]]:
-    """Return the constraints of a cluster that are not linear, each with its rows at `q` (n,)."""
+    """Return the nonlinear constraints of a cluster, each with its rows at `q` (n,)."""
     angles = {body: q[i] for i, body in enumerate(cluster.bodies)}
     return [(tie, residual(robot, tie, angles)) for tie in cluster.constraints if not tie.linear]
 
@@ -86,7 +86,7 @@ class Assembler:
 
     Args:
         robot: The robot.
-        cluster: One of its clusters, with a constraint that is not linear.
+        cluster: A cluster of the robot with a nonlinear constraint.
     """
 
     def __init__(self, robot: Robot, cluster: Cluster) -> None:
@@ -135,10 +135,10 @@ class Assembler:
         return Assembly(q, linear.B, linear.q0, linear.unknown, rows, self.n_rows - len(rows), condition)
 
     def _close_rounded(self, q: Array, rows: tuple[int, ...], gap: float) -> Array:
-        """Return coordinates that meet the rows that are kept; the others, which repeat them, may be rounded."""
+        """Return coordinates that satisfy the kept rows; redundant rows may be rounded."""
         kept = [*range(len(self.A)), *(len(self.A) + row for row in rows)]
-        q, left = self._close(q, self.dependent, kept=kept)
-        if left >= CLOSED or np.abs(self._all(q)[0]).max() > NEARLY_CLOSED:
+        q, residual = self._close(q, self.dependent, kept=kept)
+        if residual >= CLOSED or np.abs(self._all(q)[0]).max() > NEARLY_CLOSED:
             raise self._error(
                 f"does not close at the standing pose, gap {gap:.2g}: expected `pose` and `assembly` near"
             )
@@ -150,9 +150,9 @@ class Assembler:
         return RobotError(f"{self.robot.source or self.robot.name}: the loop of {bodies}, tied by {names}, {problem}")
 
     def _units(self) -> Array:
-        """Units of the coordinates [rad or m], shape (n,): in theirs, rotors move about as fast as what they drive.
+        """Return units of the coordinates [rad or m], shape (n,), in which rotors move about as fast as their joints.
 
-        That makes steps and condition numbers those of the loops, whatever the gear ratios are.
+        Steps and condition numbers then do not depend on gear ratios.
         """
         unit = np.ones(self.n)
         for i in set(range(self.n)) - self.appears:
@@ -161,7 +161,7 @@ class Assembler:
         return unit
 
     def _all(self, q: Array) -> tuple[Array, Array]:
-        """Residual of all rows, linear ones first, and their Jacobian by the coordinates in their units."""
+        """Return the residuals of all rows, linear rows first, and their Jacobian by the coordinates in their units."""
         phi, K = (np.array(out.full()) for out in self.evaluate.call([ca.DM(q)]))
         scale = np.abs(self.A).max(axis=1, initial=0.0)
         linear = (self.A @ q - self.b) / scale
@@ -170,10 +170,10 @@ class Assembler:
     def _close(
         self, q: Array, free: list[int], smallest: float = 1e-10, kept: list[int] | slice = slice(None)
     ) -> tuple[Array, float]:
-        """Move the coordinates `free` until the rows `kept` are met, by a damped Gauss-Newton iteration.
+        """Move the coordinates `free` until the rows `kept` are zero, by a damped Gauss-Newton iteration.
 
-        Directions whose singular value is below `smallest`, relative to the largest, are left alone: along them the
-        iteration would wander far for the sake of a rounding error.
+        The iteration does not move along directions whose singular value is below `smallest`, relative to the largest:
+        a rounding error would cause a large move.
         """
         q = q.copy()
         for _ in range(200):
@@ -187,11 +187,11 @@ class Assembler:
         return q, float(np.abs(self._all(q)[0][kept]).max())
 
     def _start(self) -> Array:
-        given = dict(self.robot.pose.joints) | dict(self.robot.assembly)
-        return np.array([given.get(body, 0.0) for body in self.cluster.bodies])
+        pose = dict(self.robot.pose.joints) | dict(self.robot.assembly)
+        return np.array([pose.get(body, 0.0) for body in self.cluster.bodies])
 
     def _independent_rows(self, q: Array) -> tuple[int, ...]:
-        """Find rows that are not implied by others, in configurations around the reference pose that meet them all."""
+        """Return rows that the other rows do not imply, from closed configurations around the reference pose."""
         Ks: list[Array] = []
         gap = np.abs(self._all(q)[0]).max()
         limits = (max(CLOSED, 10 * gap), NEARLY_CLOSED) if gap < NEARLY_CLOSED else ()
@@ -211,21 +211,21 @@ class Assembler:
         """Return the Jacobian of all rows in configurations near `q` with gaps below `limit`, on the same branch."""
         directions = np.eye(self.n)
         only_nearly_closed = np.abs(self._all(q)[0]).max() >= CLOSED
-        if only_nearly_closed:  # a rounded loop must not be led to where it closes exactly
+        if only_nearly_closed:  # do not move a rounded loop to the configuration in which it closes exactly
             values, directions = np.linalg.svd(self._scaled(self._all(q)[1]))[1:]
             directions = directions[(values > REDUNDANT).sum() :]
         samples = np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, len(directions))) @ directions
         found = []
         for start in q + self.unit * samples:
-            closed, left = self._close(start, list(range(self.n)), REDUNDANT)
-            if left < limit and np.abs((closed - start) / self.unit).max() < FARTHEST:
+            closed, residual = self._close(start, list(range(self.n)), REDUNDANT)
+            if residual < limit and np.abs((closed - start) / self.unit).max() < FARTHEST:
                 found.append(self._all(closed)[1])
         return found
 
     def _scaled(self, K: Array) -> Array:
-        """Scale rows to a largest entry of 1: the three of a loop's origin together, those of its axis not at all.
+        """Scale rows to a largest entry of 1: the three rows of a loop's origin together, the rows of its axis not.
 
-        In a planar loop the rows across its plane vanish but for rounding, and must not be scaled up.
+        In a planar loop the rows across its plane are zero up to rounding, and must not be scaled up.
         """
         scale = np.abs(K).max(axis=1)
         row = len(self.A)
@@ -237,7 +237,7 @@ class Assembler:
         return np.divide(K, scale[:, None], out=np.zeros_like(K), where=scale[:, None] > VANISHING)
 
     def _condition(self, q: Array, rows: tuple[int, ...]) -> float:
-        """Condition number of the dependent columns, each row scaled to its largest entry."""
+        """Return the condition number of the dependent columns, each row scaled to its largest entry."""
         K = self._all(q)[1][[*range(len(self.A)), *(len(self.A) + row for row in rows)]]
         K = K / np.abs(K).max(axis=1, keepdims=True).clip(1e-300)
         values = np.linalg.svd(K[:, self.dependent], compute_uv=False)
@@ -253,5 +253,5 @@ class Assembler:
 
 
 def _smallest(K: Array) -> float:
-    """Smallest singular value of rows; 0 if there are more rows than columns."""
+    """Return the smallest singular value of rows; 0 if there are more rows than columns."""
     return 0.0 if K.shape[0] > K.shape[1] else float(np.linalg.svd(K, compute_uv=False)[-1])

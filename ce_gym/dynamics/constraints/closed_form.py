@@ -1,4 +1,4 @@
-"""Constraints that can be solved by a formula, found by looking at the expressions.
+"""Solutions of constraints by formulas, for expressions of a known shape.
 
 | shape                                     | example                         | solution                              |
 |-------------------------------------------|---------------------------------|---------------------------------------|
@@ -7,7 +7,7 @@
 | one row, `P sin wz + Q cos wz + R`        | a rod that ends on a crank      | one `atan2`, on the reference branch  |
 | two rows, two revolute unknowns, in plane | a pin that closes a four-bar    | the same, then a second `atan2`       |
 
-Whether a row has a shape is tried on random numbers; the coefficients are derivatives at zero.
+Random numbers test whether a row has a shape; the coefficients are derivatives at zero.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 _POINTS = 12
 _SAME = 1e-8
 _FAR = 1.0
-"""Angles whose reference is farther from zero [rad] are counted from it, lest they jump half a turn from zero."""
+"""Angles with a reference farther from zero [rad] are measured from the reference, because `atan2` jumps at pi."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Sample:
 
     Attributes:
         symbols: `[y; z]`, shape (d + m,).
-        reference: Their values at the reference pose, shape (d + m,).
+        reference: Values of the symbols at the reference pose, shape (d + m,).
     """
 
     symbols: SX
@@ -70,8 +70,8 @@ def solve_single(row: SX, z: SX, sample: Sample) -> SX | None:
 def solve_pair(rows: tuple[SX, SX], unknowns: tuple[SX, SX], sample: Sample) -> tuple[SX, SX] | None:
     """Return both unknowns of a planar loop, as expressions of the other symbols; None if there is no formula.
 
-    With `rows = e + C cos z2 + S sin z2`, `C` and `S` of equal length and at right angles, `z2` only turns a vector:
-    `e.e = C.C` has lost it, and is a row for `z1` alone.
+    With `rows = e + C cos z2 + S sin z2`, `C` and `S` of equal length and at right angles, `z2` only rotates a vector:
+    `e.e = C.C` does not contain `z2`, and is a row for `z1` alone.
     """
     pair = ca.vertcat(*rows)
     for z1, z2 in permutations(unknowns):
@@ -108,7 +108,7 @@ def _turned_vector(pair: SX, z: SX) -> tuple[SX, SX, SX]:
 
 
 def _frequency(d1: np.ndarray, d3: np.ndarray) -> float | None:
-    """Return `w` if `d3 = -w^2 d1` everywhere; rounded to the inverse of a round number where it is one."""
+    """Return `w` if `d3 = -w^2 d1` everywhere, rounded if it is nearly the inverse of a round number."""
     if not d3.any():
         return None
     squared = -float(d1 @ d3) / float(d1 @ d1)
@@ -120,7 +120,7 @@ def _frequency(d1: np.ndarray, d3: np.ndarray) -> float | None:
 
 
 def sine_coefficients(row: SX, z: SX, sample: Sample) -> tuple[SX, SX, SX, float] | None:
-    """Return `P`, `Q`, `R`, `w` of a row `P sin wz + Q cos wz + R`; None if it is none."""
+    """Return `P`, `Q`, `R`, `w` of a row `P sin wz + Q cos wz + R`; None if the row has another shape."""
     first, second, third = _derivatives(row, z, 3)
     w = _frequency(*sample.at_random(first, third))
     if w is None:
@@ -132,8 +132,8 @@ def sine_coefficients(row: SX, z: SX, sample: Sample) -> tuple[SX, SX, SX, float
 def _solve_quadratic(row: SX, z: SX, sample: Sample) -> SX:
     """Solve `A z^2 + B z + C = 0` on the side of the reference pose.
 
-    The derivative of the row is `+-sqrt(B^2 - 4 A C)` at its two roots, so that its sign tells them apart. The root
-    vanishes at a singularity and is not a number beyond.
+    The derivative of the row at the two solutions is `+-sqrt(B^2 - 4 A C)`, so its sign distinguishes them. The square
+    root is zero at a singularity and not a number beyond.
     """
     first, second = _derivatives(row, z, 2)
     A, B, C = (ca.substitute(x, z, SX(0)) for x in (second / 2, first, row))
@@ -144,8 +144,8 @@ def _solve_quadratic(row: SX, z: SX, sample: Sample) -> SX:
 def _solve_sine(row: SX, z: SX, sample: Sample) -> SX | None:
     """Solve `P sin wz + Q cos wz + R = 0` on the side of the reference pose.
 
-    With `d = sqrt(P^2 + Q^2 - R^2)` the two solutions are `wz = atan2(-R P -+ d Q, -R Q +- d P)`; the derivative of the
-    row is `+-w d` there, so that its sign tells them apart. `d` vanishes at a singularity and is not a number beyond.
+    With `d = sqrt(P^2 + Q^2 - R^2)` the two solutions are `wz = atan2(-R P -+ d Q, -R Q +- d P)`. The derivative of the
+    row is `+-w d` there, so its sign distinguishes them. `d` is zero at a singularity and not a number beyond.
     """
     coefficients = sine_coefficients(row, z, sample)
     if coefficients is None:
@@ -157,7 +157,7 @@ def _solve_sine(row: SX, z: SX, sample: Sample) -> SX | None:
 
 
 def sine_derivatives(coefficients: tuple[SX, SX, SX, float], z: SX, zd: SX, others: SX, rates: SX) -> tuple[SX, SX, SX]:
-    """Differentiate a row `P sin wz + Q cos wz + R` where it vanishes, so that `P sin wz + Q cos wz = -R`.
+    """Differentiate a row `P sin wz + Q cos wz + R` where it is zero, so that `P sin wz + Q cos wz = -R`.
 
     Returns:
         Slope against `others` (1, n), slope against `z`, and second derivative along `rates` (n,) and `zd`.
@@ -180,10 +180,10 @@ def _near(S: SX, C: SX, reference: float) -> SX:
 
 
 def solve_block(A: SX, b: SX) -> tuple[SX, SX]:
-    """Solve a small `A x = b` by formulas that no fixed order of pivots can spoil.
+    """Solve a small `A x = b` by formulas without pivots.
 
-    A mechanism that moves far brings zeros onto any pivot that was good at the reference pose. So: Cramer's rule up to
-    2 x 2, orthogonal rows (modified Gram-Schmidt) beyond.
+    A pivot chosen at the reference pose can become zero at another pose. Therefore: Cramer's rule up to 2 x 2,
+    orthogonal rows (modified Gram-Schmidt) beyond.
 
     Args:
         A: Shape (m, m).
@@ -203,7 +203,7 @@ def solve_block(A: SX, b: SX) -> tuple[SX, SX]:
 
 
 def _orthogonal_solve(rows: Sequence[SX], right: Sequence[SX]) -> tuple[SX, SX]:
-    """Make rows orthonormal, treating the right-hand sides alike; then `x = sum(row^T right)`."""
+    """Make rows orthonormal, with the same operations on the right-hand sides; then `x = sum(row^T right)`."""
     rows, right, determinant = list(rows), list(right), SX(1)
     for i in range(len(rows)):
         length = ca.sqrt(ca.sumsqr(rows[i]))

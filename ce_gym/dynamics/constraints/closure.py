@@ -1,12 +1,10 @@
 """The dependent coordinates of a cluster with closed loops, as functions of the independent ones.
 
-`q = B [y; z] + q0`: linear constraints are eliminated first. The unknowns `z` left over are found block by block, each
-block by a formula (closed_form.py) where there is one, otherwise by a fixed number of Newton iterations from a guess,
-which a simulation carries along. Velocities follow by differentiating the rows that determined `z`,
+`q = B [y; z] + q0`: linear constraints are eliminated first. The remaining unknowns `z` are solved block by block: by a
+formula (closed_form.py) if one exists, otherwise by a fixed number of Newton iterations from a guess that is part of a
+simulation's state. Velocities follow by differentiating the rows that determine `z`, again block by block:
 
     Phi_z zd = -Phi_y yd,    Phi_z zdd = -Phi_y ydd - (second derivative of phi along [yd; zd])
-
-block by block again, whichever way `z` was found.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ from ce_gym.model.description import Robot
 from ce_gym.model.mechanism import Mechanism
 
 NEWTON_ITERATIONS = 3
-"""Enough to reach rounding error from a guess that a step has carried along, velocities included."""
+"""Newton iterations that reach rounding error from the guess of the last step, for velocities too."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +39,9 @@ class Block:
     """Unknowns of a cluster that are solved together.
 
     Attributes:
-        rows: Which rows of `phi` determine them.
-        unknowns: Which entries of `z` they are.
-        formula: The unknowns as expressions of the cluster's symbols; None if they are found by Newton's method.
+        rows: Rows of `phi` that determine the unknowns.
+        unknowns: Entries of `z`.
+        formula: The unknowns as expressions of the cluster's symbols; None for Newton's method.
     """
 
     rows: tuple[int, ...]
@@ -52,16 +50,16 @@ class Block:
 
 
 class Closure:
-    """How one cluster closes.
+    """The solution of one cluster's closed loops.
 
     Args:
         robot: The robot.
-        cluster: One of its clusters, with a constraint that is not linear.
+        cluster: A cluster of the robot with a nonlinear constraint.
 
     Attributes:
         assembly: The cluster at its reference pose.
-        blocks: In the order in which they are solved.
-        guessed: Which entries of `z` need a guess.
+        blocks: Blocks in the order of their solution.
+        guessed: Entries of `z` that need a guess.
         locate: Function (y, guess) -> z, residual of the Newton blocks (largest absolute value).
         rates: Function (y, z, yd) -> G, g, nearness (see `ClusterCoordinates`).
         rows: Function (y, z) -> phi.
@@ -107,7 +105,7 @@ class Closure:
         return rows[list(self.assembly.rows)]
 
     def _blocks(self) -> list[Block]:
-        """Find the smallest groups of rows that can be solved, one after the other."""
+        """Return the smallest groups of rows that can be solved one after the other."""
         pattern = np.array(ca.DM(ca.sparsify(ca.jacobian(self.phi, self.z)).sparsity(), 1).full()) != 0
         rows, known, blocks = list(range(len(pattern))), np.zeros(len(pattern), dtype=bool), []
         while rows:
@@ -168,7 +166,7 @@ class Closure:
     def _derivatives(self, at: SX, speed: SX) -> tuple[SX, SX]:
         """Return the slope of the rows (m, d + m) and their second derivative along a speed (m,), in the shorter form.
 
-        Rows that a sine solved can also be differentiated as such: that shares more with the solution, or less.
+        A row solved by a sine can also be differentiated as a sine; the form that needs fewer instructions is used.
         """
         d, slope = self.y.numel(), ca.jacobian(self.phi, at)
         bias = ca.jtimes(slope @ speed, at, speed)
@@ -191,7 +189,7 @@ class Closure:
 
 
 def _cost(expressions: list[SX]) -> int:
-    """Number of instructions of expressions evaluated together."""
+    """Return the number of instructions of expressions evaluated together."""
     shared = ca.cse([ca.densify(expression) for expression in expressions])
     return ca.Function("cost", [ca.vertcat(*ca.symvar(ca.vertcat(*map(ca.vec, shared))))], shared).n_instructions()
 
@@ -228,7 +226,7 @@ def reference_guess(mechanism: Mechanism) -> np.ndarray:
 
 
 def loop_report(mechanism: Mechanism) -> str:
-    """Return one line for each cluster with closed loops: how it is solved and how well it is conditioned."""
+    """Return one line for each cluster with closed loops: its solution method and condition number."""
     lines = []
     for cluster, closure in zip(mechanism.tree.clusters, closures(mechanism), strict=True):
         if closure is not None:

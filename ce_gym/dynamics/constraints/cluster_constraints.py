@@ -1,12 +1,12 @@
-"""What a cluster's constraints say about its coordinates: `q = gamma(y)` and its derivatives `G` and `g`.
+"""The explicit constraints `q = gamma(y)` of a cluster and their derivatives `G` and `g`.
 
-Each cluster has spanning coordinates `q` (one per body, eliminated rotors included) and independent coordinates `y`,
-a subset of them. All that the recursions need is
+Each cluster has spanning coordinates `q` (one per body, eliminated rotors included), and independent coordinates `y`
+among them. The recursions need
 
     q = gamma(y),   qd = G yd,   qdd = G ydd + g        (constraint-embedding paper, eq. explicit_constraints)
 
-`G` and `g` are derived by automatic differentiation, never by hand. Here for clusters whose constraints are all
-linear; closure.py does the others.
+`G` and `g` are derived by automatic differentiation. This file treats clusters with linear constraints only, closure.py
+the others.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ SX = ca.SX
 
 @dataclass(frozen=True)
 class LoopState:
-    """How a cluster's loops are closed at one state.
+    """The accuracy of a cluster's closed loops at one state.
 
     Attributes:
-        guessed: Rows of the dependent coordinates that were found from a guess.
+        guessed: Rows of the dependent coordinates that were computed from a guess.
         gap: Largest residual of the rows that were solved by iteration; 0 if all were solved by formulas.
         nearness: 1 at the reference pose, 0 at a singularity, negative beyond: the smallest determinant of the blocks
             of the constraint Jacobian, relative to the reference pose.
@@ -52,7 +52,7 @@ class ClusterCoordinates:
         qd: Spanning velocities, shape (n,).
         G: Constraint Jacobian, shape (n, d).
         g: Velocity-product acceleration of the constraint, shape (n,).
-        loop: What closed loops add; None if all constraints are linear.
+        loop: State of the closed loops; None if all constraints are linear.
         second_derivative: Function of a row -> second derivative of that coordinate by y, shape (d, d); None if all
             constraints are linear.
     """
@@ -89,7 +89,7 @@ def cluster_coordinates(cluster: Cluster, y: SX, yd: SX) -> ClusterCoordinates:
 
 
 def loop_coordinates(cluster: Cluster, closure: Closure, y: SX, yd: SX, guess: SX) -> ClusterCoordinates:
-    """Evaluate a cluster with closed loops at `y` (d,), `yd` (d,) and a guess of what needs one, (n_guess,)."""
+    """Evaluate a cluster with closed loops at `y` (d,), `yd` (d,) and a guess of dependent coordinates (n_guess,)."""
     z, gap = closure.locate(y, guess)
     G, g, nearness = closure.rates(y, z, yd)
     G, g = ca.sparsify(G), ca.sparsify(g)
@@ -101,7 +101,7 @@ def loop_coordinates(cluster: Cluster, closure: Closure, y: SX, yd: SX, guess: S
 
 
 def geared(coordinates: ClusterCoordinates, rotors: dict[str, str], ratio: SX | float) -> ClusterCoordinates:
-    """Return coordinates whose rotors turn `ratio` times as far but for stretches; nothing else follows from them."""
+    """Return coordinates with rotor angles, less stretches, scaled by `ratio`; no other body depends on rotors."""
     scale = SX.eye(coordinates.q.numel())
     for rotor, stretch in rotors.items():
         row = coordinates.index[rotor]

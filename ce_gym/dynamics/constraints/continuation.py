@@ -1,4 +1,4 @@
-"""Dependent coordinates that no formula gives, followed from where they are known."""
+"""Dependent coordinates without formula, by continuation from a known pose."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def follow(loops: ca.Function, start: Array, guess: Array, q: Array) -> tuple[Ar
         q: Configurations, shape (n, nq).
 
     Returns:
-        The dependent coordinates at `q`, shape (n, n_guess); the largest gap there; the smallest nearness on the way,
-        at which it stops if it is not positive.
+        The dependent coordinates at `q`, shape (n, n_guess); the largest gap there; the smallest nearness on the way.
+        The continuation stops where the nearness is not positive.
     """
     batched, found, worst, least = loops.map(len(q)), np.tile(guess, (len(q), 1)).T, np.inf, np.inf
     for share in (*np.linspace(0.0, 1.0, STEPS + 1)[1:], 1.0):  # twice at the end, to the last digit

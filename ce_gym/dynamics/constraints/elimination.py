@@ -1,4 +1,4 @@
-"""The linear constraints of a cluster solved: its coordinates as linear functions of a few of them."""
+"""Elimination of the linear constraints of a cluster: coordinates as linear functions of the other coordinates."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Elimination:
         B: Shape (n, d + m).
         q0: [rad or m], shape (n,).
         unknown: Rows of `q` that are `z`: dependent coordinates that linear constraints do not determine, shape (m,).
-        left: Number of constraints that are not needed for that.
+        left: Number of redundant linear constraints.
     """
 
     B: Array

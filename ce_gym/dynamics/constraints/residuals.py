@@ -1,7 +1,7 @@
-"""What each kind of constraint says must vanish: `phi(q)` over a robot's joint coordinates.
+"""The residual `phi(q)` of each kind of constraint, as a function of joint coordinates.
 
-Closed loops and rods are written in the frame where their expressions are shortest, because the same expressions are
-differentiated and solved later.
+Closed loops and rods are expressed in the frame with the shortest expressions, because the expressions are later
+differentiated and solved.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ def residual(robot: Robot, constraint: Constraint, angles: Angles) -> SX:
         angles: Joint coordinates by the name of the body they move.
 
     Returns:
-        `phi`, zero where the constraint is met, shape (rows,): half the excess of squared length for rods [m^2], [m]
-        for origins and [-] for axes of loops, the user's unit for functions.
+        `phi`, zero where the constraint holds, shape (rows,): half the excess of squared length for rods [m^2], [m] for
+        origins and [-] for axes of loops, the user's unit for functions.
     """
     return KINDS[type(constraint)].rows(robot, constraint, angles)
 
 
 def gap(robot: Robot, constraint: Constraint, angles: Angles) -> SX:
-    """Return the rows of one constraint scaled so that those of rods are lengths too [m], shape (rows,)."""
+    """Return the rows of one constraint, shape (rows,), with the rows of rods scaled to lengths [m]."""
     return residual(robot, constraint, angles) / KINDS[type(constraint)].scale(constraint)
 
 
@@ -58,7 +58,7 @@ def _linear(robot: Robot, constraint: LinearConstraint, angles: Angles) -> SX:
 
 
 def _polynomial(robot: Robot, constraint: PolynomialConstraint, angles: Angles) -> SX:
-    """The dependent coordinate less the polynomial, by Horner's rule."""
+    """Return the dependent coordinate less the polynomial, by Horner's rule."""
     value, argument = SX(0), angles[constraint.argument]
     for coefficient in reversed(constraint.coefficients):
         value = value * argument + coefficient
@@ -86,7 +86,7 @@ def _first_joint(robot: Robot, body: str | None, ancestor: str | None) -> Body:
 def _reach(
     robot: Robot, body: str | None, ancestor: str | None, point: Vec3, origin: Vec3, angles: Angles
 ) -> tuple[SX, SX, float]:
-    """Return a point of a body as `origin` in the ancestor's frame sees it, and half its squared distance from there.
+    """Return a point of a body relative to `origin` in the ancestor's frame, and half its squared distance from there.
 
     The square is summed joint by joint, `|o + R x|^2 = |o|^2 + |x|^2 + 2 o.(R x)`, in a varying and a constant part.
     """
@@ -112,13 +112,13 @@ def _reach(
 
 
 def _square(vector: Sequence[float] | np.ndarray) -> float:
-    """Return the squared length of a vector of three, added up in order; BLAS rounds as suits the CPU."""
+    """Return the squared length of a 3-vector, summed in order; the rounding of BLAS depends on the CPU."""
     x, y, z = map(float, vector)
     return x * x + y * y + z * z
 
 
 def _loop(robot: Robot, loop: LoopConstraint, angles: Angles) -> SX:
-    """Difference of the origins, along and across the axis of `second` at zero angles; then of the axes."""
+    """Return the difference of the origins, along and across the axis of `second` at zero angles, then of the axes."""
     common = common_ancestor(robot, loop.first, loop.second)
     R1, p1 = within(frame_in(robot, loop.first, common, angles), loop.first_placement)
     R2, p2 = within(frame_in(robot, loop.second, common, angles), loop.second_placement)
@@ -153,7 +153,7 @@ def _function(robot: Robot, constraint: FunctionConstraint, angles: Angles) -> S
 
 
 def common_ancestor(robot: Robot, first: str | None, second: str | None) -> str | None:
-    """Return the nearest body that carries both, which may be one of them; None is the world."""
+    """Return the nearest body that is, or carries, each of two bodies; None for the world."""
     above = lineage(robot, first)
     return next(body for body in lineage(robot, second) if body in above)
 
@@ -167,7 +167,7 @@ def lineage(robot: Robot, body: str | None) -> list[str | None]:
 
 
 def frame_in(robot: Robot, body: str | None, ancestor: str | None, angles: Angles) -> Frame:
-    """Return the frame of a body as its ancestor sees it."""
+    """Return the frame of a body in the frame of its ancestor."""
     frame: Frame = (SX.eye(3), SX(3, 1))
     chain = lineage(robot, body)
     for name in reversed(chain[: chain.index(ancestor)]):
@@ -181,7 +181,7 @@ def frame_in(robot: Robot, body: str | None, ancestor: str | None, angles: Angle
 
 
 def within(frame: Frame, placement: Placement) -> Frame:
-    """Return a frame that is placed in another."""
+    """Return the frame at a placement in another frame."""
     R, p = frame
     return R @ constant(snapped(np.array(placement.rotation))), p + R @ constant(placement.position)
 
@@ -194,17 +194,17 @@ def across_axis(axis: np.ndarray) -> list[np.ndarray]:
 
 
 def constant(x: object) -> SX:
-    """Return figures as a sparse SX, so that their zeros are structural."""
+    """Return numbers as a sparse SX, so that zeros are structural."""
     return SX(ca.sparsify(ca.DM(np.asarray(x, dtype=float))))
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What the dynamics knows of a kind of constraint.
+    """The equations of a kind of constraint.
 
     Attributes:
-        rows: Function (robot, constraint, angles) -> rows that vanish, see `residual`.
-        scale: Function constraint -> what the rows are divided by to be lengths or angles.
+        rows: Function (robot, constraint, angles) -> residual rows, see `residual`.
+        scale: Function constraint -> divisor that scales the rows to lengths or angles.
     """
 
     rows: Callable[[Robot, Any, Angles], SX]

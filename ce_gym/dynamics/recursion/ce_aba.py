@@ -46,7 +46,7 @@ from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody, snapp
 
 @dataclass
 class JointTerms:
-    """What acts on the independent coordinates, linearised over one time step: `tau - slope * ydd`.
+    """Forces on the independent coordinates, linearised over one time step: `tau - slope * ydd`.
 
     Attributes:
         tau: Generalised forces, base wrench [moment; force] first, shape (nv,).
@@ -59,7 +59,7 @@ class JointTerms:
 
 @dataclass
 class BodyTerms:
-    """What acts on a body, linearised over one time step: `force - inertia * a`, with `a` free of gravity.
+    """Forces on a body, linearised over one time step: `force - inertia * a`, with `a` free of gravity.
 
     Attributes:
         inertia: Added to the articulated inertia, shape (6, 6).
@@ -72,16 +72,16 @@ class BodyTerms:
 
 @dataclass
 class Articulation:
-    """What the inward pass leaves for the outward pass, for each cluster.
+    """Results of the inward pass for the outward pass, for each cluster.
 
     Attributes:
         U: Force at the handle for a unit independent acceleration, shape (6, d).
         D: Inertia of the cluster's own motion, shape (d, d).
-        inertia: The same without what acts on its coordinates and without damping, shape (d, d).
-        u: Generalised force left after all biases, shape (d,).
+        inertia: `D` without the slope of joint forces and without damping, shape (d, d).
+        u: Generalised force after all biases, shape (d,).
         handle_body: The body whose frame is the handle; None if the handle is the output body's frame.
         base: Articulated inertia of a floating base and the force left on it; None for a fixed base.
-        stretched: How clusters whose transmissions stretch are eliminated, with that `u`; if it is another, nothing.
+        stretched: Elimination of clusters with elastic transmissions, for the same `u`.
     """
 
     U: dict[int, SX] = field(default_factory=dict)
@@ -134,15 +134,15 @@ def inward_inertia_pass(
             more, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
             D, u = mirrored(D + more), u + drag
         if stretches(mechanism, cluster):
-            felt, biased = mirrored(condensed.D + more), ca.horzcat(U.T, drag - condensed.bias - transverse_bias)
-            D = mirrored(felt + joints.slope[rows, rows])
-            articulation.stretched[k] = Stretched.of(felt, joints.slope[rows, rows], biased, joints.tau[rows])
+            own, biased = mirrored(condensed.D + more), ca.horzcat(U.T, drag - condensed.bias - transverse_bias)
+            D = mirrored(own + joints.slope[rows, rows])
+            articulation.stretched[k] = Stretched.of(own, joints.slope[rows, rows], biased, joints.tau[rows])
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
         articulation.inertia[k], articulation.handle_body[k] = condensed.D, handle.name if handle else None
         if cluster.output_body is None:
             continue
         if k in articulation.stretched:
-            Ia, pa = articulation.stretched[k].felt(condensed.inertia, condensed.force)
+            Ia, pa = articulation.stretched[k].articulated(condensed.inertia, condensed.force)
         else:
             solved = solve_positive_definite(D, ca.horzcat(U.T, u))  # D^-1 [U^T, u]
             Ia = mirrored(condensed.inertia - U @ solved[:, :6])
@@ -179,7 +179,7 @@ def outward_acceleration_pass(
         mechanism: The mechanism.
         kinematics: From the outward velocity pass.
         articulation: From the inward pass.
-        momentum: Of a floating base, see `turning_momentum`, if there is a step.
+        momentum: Momentum of a floating base, see `turning_momentum`, if there is a step.
 
     Returns:
         vdot, shape (nv,), in the coordinates of `v`; and the acceleration of every body *minus gravity*, body
@@ -228,8 +228,8 @@ def _parent_acceleration(body: MovingBody, a: dict[str, SX], gravity: SX) -> SX:
 def _handle_body(mechanism: Mechanism, cluster: Cluster, rotors: tuple[EliminatedRotor, ...]) -> MovingBody | None:
     """Return the body whose frame can serve as the cluster's handle, if there is one.
 
-    That is its only base body, provided that every rotor on the output body spins parallel to that body's joint, so
-    that its momentum is constant in both frames. Condensing there keeps `S`, and so `U`, sparse.
+    The handle is the only base body, if every rotor on the output body spins parallel to the base body's joint, so that
+    its momentum is constant in both frames. Condensing there keeps `S`, and so `U`, sparse.
     """
     moving = mechanism.moving(cluster)
     roots = [body for body in moving if body.parent == cluster.output_body]
@@ -243,7 +243,7 @@ def _handle_body(mechanism: Mechanism, cluster: Cluster, rotors: tuple[Eliminate
 
 @dataclass
 class _Condensed:
-    """A cluster condensed to its handle: `D`, `U`, bias force, and inertia and bias force felt at the handle."""
+    """A cluster condensed to its handle: `D`, `U`, bias force, and inertia and bias force at the handle."""
 
     D: SX
     U: SX
@@ -264,7 +264,7 @@ class _Condenser:
         self.n = self.coordinates.qd.numel()
 
     def condense(self, IA: dict[str, SX], pA: dict[str, SX]) -> _Condensed:
-        """Return the cluster as its output body feels it, given articulated inertias and bias forces of its bodies."""
+        """Return the condensed cluster, given articulated inertias and bias forces of its bodies."""
         G, index = self.coordinates.G, self.coordinates.index
         zeta = self._bias_accelerations()
         composite = {body.name: IA[body.name] for body in self.moving}
@@ -292,7 +292,7 @@ class _Condenser:
         return Transform.identity() if body is self.handle else self.states[body.name].X
 
     def _bias_accelerations(self) -> dict[str, SX]:
-        """Accelerations of the bodies for a still handle and `ydd = 0`."""
+        """Return accelerations of the bodies for a handle without acceleration and `ydd = 0`."""
         zeta: dict[str, SX] = {}
         for body in self.moving:
             state, i = self.states[body.name], self.coordinates.index[body.name]
@@ -302,7 +302,7 @@ class _Condenser:
         return zeta
 
     def _to_handle(self, body: MovingBody, force: SX) -> tuple[SX, SX]:
-        """Carry forces (6, m) on a body inwards to the handle; also return what each joint on the way feels, (n, m)."""
+        """Return forces (6, m) on a body transformed to the handle, and torques (n, m) of the joints on the way."""
         torques = SX(self.n, force.shape[1])
         while True:
             torques[self.coordinates.index[body.name], :] = self.states[body.name].S.T @ force
@@ -312,7 +312,7 @@ class _Condenser:
             body = self.inside[body.parent]
 
     def _add_rotor(self, condensed: _Condensed, rotor: EliminatedRotor, zeta: dict[str, SX]) -> None:
-        """Add a rotor's spin in place, at the transmission level of the mechanism."""
+        """Add a rotor in place, at the transmission level of the mechanism."""
         G, row, J = self.coordinates.G, self.coordinates.index[rotor.name], rotor.inertia
         G_r, g_r, thd = G[row, :], self.coordinates.g[row], self.coordinates.qd[row]
         level = self.mechanism.level
@@ -342,7 +342,7 @@ class _Condenser:
         condensed.force += f
 
     def _rotor_frame(self, rotor: EliminatedRotor) -> tuple[SX, SX]:
-        """Spin axis and angular velocity of the carrier; of an output body, in the frame of the handle."""
+        """Return spin axis and angular velocity of the carrier; of an output body, in the frame of the handle."""
         if rotor.carrier in self.inside:
             return constant(rotor.axis), self.states[rotor.carrier].v[:3]
         if self.handle is not None:  # the axis is parallel to the handle's joint: constant, and so is cross(w, axis)
@@ -352,5 +352,5 @@ class _Condenser:
 
 
 def _lower_to_upper(m: SX) -> SX:
-    """Keep of each pair (i, j), (j, i) the entry that is there, in the upper triangle."""
+    """Return the upper triangle with the structurally nonzero entry of each pair (i, j), (j, i)."""
     return ca.triu(m) + ca.triu(m.T, False)

@@ -1,9 +1,9 @@
 """Inverse dynamics by the constraint-embedding recursive Newton-Euler algorithm (CE-RNEA), paper section V.
 
 Bodies are visited one by one: accelerations base to tip, forces tip to base, and the cluster's constraint Jacobian
-projects the spanning torques, `tau_y = G^T tau_span`. A rotor's spin adds the couple `h thdd + v_c x* h thd` to its
-carrier and `G_r^T (J thdd + h^T a_c)` to the torques, see ce_aba.py for the symbols; for that of rotors that are not
-symmetric see rotors.py.
+projects the spanning torques, `tau_y = G^T tau_span`. An eliminated rotor adds the couple `h thdd + v_c x* h thd` to
+its carrier and `G_r^T (J thdd + h^T a_c)` to the torques, see ce_aba.py for the symbols; rotors.py has the additional
+terms of rotors that are not symmetric.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def outward_acceleration(mechanism: Mechanism, kinematics: Kinematics, vdot: SX)
 
 
 def net_forces(mechanism: Mechanism, kinematics: Kinematics, a: dict[str, SX]) -> dict[str, SX]:
-    """Return the force that moves each body, [moment; force], shape (6,), given accelerations minus gravity."""
+    """Return the net force on each body, [moment; force], shape (6,), given accelerations minus gravity."""
     f = {}
     for name, body in mechanism.bodies.items():
         inertia, w = constant(body.inertia), kinematics.bodies[name].v[:3]
@@ -101,7 +101,7 @@ def inward_force_pass(
 
 
 def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qdd: SX) -> SX:
-    """Torque of the reflected inertia: the whole block, or its diagonal at the armature level, shape (d,).
+    """Return the torque of the reflected inertia: of the whole block, or its diagonal at the armature level, (d,).
 
     With closed loops `G_r` varies, which adds velocity terms, see reflected.py.
     """
@@ -120,7 +120,7 @@ def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qd
 
 
 def _to_parents(mechanism: Mechanism, kinematics: Kinematics, k: int, f: dict[str, SX], spanning: SX) -> None:
-    """Carry forces on the bodies of a cluster to their parents, and what the joints on the way feel to `spanning`."""
+    """Add forces on the bodies of a cluster to their parents, and write the torques of their joints to `spanning`."""
     coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
     for body in reversed(mechanism.moving(mechanism.tree.clusters[k])):
         state = kinematics.bodies[body.name]

@@ -47,7 +47,7 @@ def loop_state(kinematics: Kinematics) -> tuple[SX, SX]:
 
 
 def guessed_coordinates(kinematics: Kinematics, vdot: SX, dt: float) -> SX:
-    """Return the dependent coordinates that were found from a guess, a time `dt` [s] later, shape (n_guess,)."""
+    """Return the dependent coordinates that are computed from a guess, a time `dt` [s] later, shape (n_guess,)."""
     later = [SX(0, 1)]
     for coordinates, rows in zip(kinematics.coordinates, kinematics.rows, strict=True):
         if coordinates is not None and coordinates.loop is not None and coordinates.loop.guessed:
@@ -74,7 +74,7 @@ def external_wrenches(mechanism: Mechanism, kinematics: Kinematics, wrenches: SX
             about_origin = moment - cross(state.p, force)
             old = on_bodies.get(carrier, SX(6, 1))
             on_bodies[carrier] = old + ca.vertcat(state.R.T @ about_origin, state.R.T @ force)
-        if carrier != body.name:  # a rotor that is no body of the recursion still turns
+        if carrier != body.name:  # an eliminated rotor still turns
             k = mechanism.tree.cluster_of(body.name)
             coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
             R, p = (state.R, state.p) if carrier is not None else (SX.eye(3), SX(3, 1))

@@ -1,22 +1,21 @@
-"""Gyroscopic terms to which explicit integration adds energy, stabilised: of a turning base, and of joints on one.
+"""Stabilised gyroscopic terms of a rotating base, of ball joints, and of joints on rotating bodies.
 
-*The base.* A body that turns freely feels `-w x L`, by which an explicit step adds energy, `dt^2 |w x L|^2 / (2 I)`
-each time: one that tumbles at 20 rad/s is lost within 15 s at 5 ms. Here a part is taken one step ahead, `(J w) x w+`,
-with J the inertia of the robot in its standing pose about its centre of mass, frozen into one rigid body. That adds the
-*antisymmetric* matrix `-dt skew(J w)` to the inertia of the base. For one rigid body the step then reads
-`w+^T J w+ = w+^T J w`: its energy never grows, whatever the step length. A robot in another pose keeps the difference
-explicit; J needs to be right only within a factor of two, as in any method that takes a part of its derivative.
+*The base.* On a freely rotating body, an explicit step with the gyroscopic moment `-w x L` adds the energy
+`dt^2 |w x L|^2 / (2 I)`: a body that tumbles at 20 rad/s diverges within 15 s at 5 ms. Here a part is implicit,
+`(J w) x w+`, with J the inertia about the centre of mass of the robot frozen in its standing pose. This adds the
+*antisymmetric* matrix `-dt skew(J w)` to the inertia of the base. For one rigid body the step then satisfies
+`w+^T J w+ = w+^T J w`: the energy never grows, at any step length. In another pose the difference stays explicit; J
+needs to be correct within a factor of two only, as in any linearly implicit method.
 
-*Ball joints.* The same happens to a body on a ball joint. Its articulated inertia must stay symmetric, so the implicit
-part is found beforehand, for the body and what it carries frozen into one rigid body, with J its inertia about the
-joint: `(J - dt skew(J w)) dw = dt (J w) x w` gives `dw`, and `J dw / dt` takes the place of `(J w) x w`.
+*Ball joints.* The same instability exists on a ball joint. Its articulated inertia must stay symmetric, so the implicit
+part is computed beforehand for the body and its descendants frozen into one rigid body, with inertia J about the joint:
+`(J - dt skew(J w)) dw = dt (J w) x w` gives `dw`, and `J dw / dt` replaces `(J w) x w`.
 
-*The joints.* Their Coriolis forces stay explicit; what those make of a turn by `a = dt w` within a step grows with a^2.
-Joints carried by a body that turns so are damped at a rate `4 a^4 / dt`, implicitly: at 10 rad/s and 5 ms 0.005/s,
-which is less than any joint's own friction and far below the error of the step; where a step turns the body by half a
-radian and resolves nothing any more, 50/s.
+*The joints.* Their Coriolis forces stay explicit, with an error that grows with a^2 if a step rotates the carrier by
+`a = dt w`. Such joints are damped implicitly at a rate `4 a^4 / dt`. At 10 rad/s and 5 ms the rate is 0.005/s, less
+than any joint's own friction and far below the error of the step. At half a radian per step the rate is 50/s.
 
-Both vanish with the step and leave its order as it is.
+All terms vanish with the step length and do not change the order of the method.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free, 
 from ce_gym.model.mechanism import Mechanism
 
 TURNING_DAMPING = 4.0
-"""Factor on the fourth power of the angle turned in a step, see above."""
+"""Factor on the fourth power of the rotation angle in a step, see above."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +38,14 @@ class TurningDamping:
 
     Attributes:
         v: Velocities, shape (nv,).
-        dt: [s].
+        dt: Step length [s].
     """
 
     v: SX
     dt: float
 
     def on(self, D: SX, rows: list[int], w: SX) -> tuple[SX, SX]:
-        """Return the addition to a cluster's inertia `D`, and the force, given the turning of its carrier [rad/s]."""
+        """Return the addition to a cluster's `D`, and the force, at an angular velocity `w` of its carrier [rad/s]."""
         rate = TURNING_DAMPING * self.dt**3 * ca.sumsqr(w) ** 2
         return rate * self.dt * D, -rate * (D @ self.v[rows])
 
@@ -58,7 +57,7 @@ def frozen_inertia(mechanism: Mechanism) -> SX:
 
 
 def frozen_inertias(mechanism: Mechanism) -> dict[str, SX]:
-    """Return the inertia of each body and what it carries in the standing pose, about its origin, body axes, (6, 6)."""
+    """Return the inertia of each body and its descendants in the standing pose, about its origin, body axes, (6, 6)."""
     robot = mechanism.robot
     kinematics = outward_velocity_pass(mechanism, SX(ca.DM(robot.standing_q)), SX(robot.layout.nv, 1))
     total = {name: constant(body.inertia) for name, body in mechanism.bodies.items()}

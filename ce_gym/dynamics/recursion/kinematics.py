@@ -1,11 +1,11 @@
-"""Where the bodies of a mechanism are and how they move: the outward velocity pass.
+"""Positions and velocities of the bodies of a mechanism: the outward velocity pass.
 
-Coordinates are those of `ce_gym.model.coordinates`. A ball joint is a cluster of its own, whose position is a
-quaternion and whose velocity is that of its body against the parent, in the body's axes.
+`ce_gym.model.coordinates` defines the coordinates. A ball joint is a cluster of its own: its position is a quaternion,
+and its velocity is the angular velocity of the body relative to the parent, in the body's axes.
 
-Accelerations of bodies are classical everywhere in this room: [angular; that of the material point at the origin], not
-Featherstone's spatial ones, from which they differ by `[0; w x v_origin]` (2008, section 2.11). Both transform by `X`,
-so the recursions are the same; but these need no linear velocities, which saves 5 to 10 % of all instructions.
+Accelerations of bodies are classical in this folder: [angular; acceleration of the material point at the origin]. They
+differ from Featherstone's spatial accelerations by `[0; w x v_origin]` (2008, section 2.11). Both transform by `X`, so
+the recursions are the same; classical ones need no linear velocities, which saves 5 to 10 % of all instructions.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ class BodyState:
 
     Attributes:
         X: Motion transform from its parent body.
-        S: Motion subspace of its own joint, shape (6, 1); (6, 3) for a ball joint, (6, 6) for a free base.
+        S: Motion subspace of the body's joint, shape (6, 1); (6, 3) for a ball joint, (6, 6) for a free base.
         v: Spatial velocity in body coordinates, shape (6,).
-        c: Velocity-product acceleration, centripetal and Coriolis, of the step from its parent, `a = X a_parent + S qdd
+        c: Velocity-product acceleration, centripetal and Coriolis, relative to the parent, `a = X a_parent + S qdd
             + c`, shape (6,). Constraint terms `S g` not included.
-        drift: Acceleration with all of `vdot` zero, the base's linear velocity kept in the world, shape (6,).
-        R: Rotation, body to world, shape (3, 3). Rows nobody asks for cost nothing.
+        drift: Acceleration for `vdot = 0`, at constant linear velocity of the base in the world, shape (6,).
+        R: Rotation, body to world, shape (3, 3). Unused entries cost no instructions.
         p: Origin in the world [m], shape (3,).
     """
 
@@ -83,7 +83,7 @@ class Kinematics:
 
 
 def independent_rows(mechanism: Mechanism) -> list[list[int]]:
-    """Return, for each cluster, the rows of `v` (and of tau) that are its own."""
+    """Return the rows of each cluster in `v` and tau."""
     rows = mechanism.robot.rows
     return [[row for name in moved_by(cluster) for row in rows[name][1]] for cluster in mechanism.tree.clusters]
 
@@ -105,8 +105,8 @@ def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None =
         mechanism: The mechanism.
         q: Positions, shape (nq,).
         v: Velocities, shape (nv,).
-        guess: Guess of the dependent coordinates that are found by iteration, shape (n_guess,); those of the reference
-            pose if None.
+        guess: Guess of the dependent coordinates that are found by iteration, shape (n_guess,); at the reference pose
+            if None.
     """
     guess = SX(reference_guess(mechanism)) if guess is None else guess
     used = 0
@@ -170,5 +170,5 @@ def joint_transform(body: MovingBody, q: SX) -> tuple[Transform, SX]:
 
 
 def constant(x: np.ndarray | SX) -> SX:
-    """Return an array of figures as SX; of numbers as a sparse one, so that its zeros are structural."""
+    """Return an array as SX; an array of numbers becomes sparse, so that its zeros are structural."""
     return x if isinstance(x, SX) else SX(ca.sparsify(ca.DM(x)))

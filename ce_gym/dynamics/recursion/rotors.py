@@ -1,4 +1,4 @@
-"""The inertia of an eliminated rotor that is not symmetric about its spin axis, as its carrier feels it.
+"""The effect on its carrier of an eliminated rotor that is not symmetric about its spin axis.
 
 A rotor that spins by theta about a principal axis u of its inertia, centre of mass on that axis, has the kinetic energy
 
@@ -8,8 +8,8 @@ because I(theta) u = J u at every angle. Its two transverse principal moments, m
 
     I(theta) = I_mean + dI,   dI = transverse (cos(2 theta) (e e^T - n n^T) + sin(2 theta) (e n^T + n e^T)),   n = u x e
 
-with the axis e of the larger one at theta = 0. I_mean is constant and merged into the carrier; the terms with J are
-those of a symmetric rotor, see ce_aba.py. Since (d dI/dtheta) w = 2 u x (dI w), Lagrange's equations leave
+with the axis e of the larger moment at theta = 0. I_mean is constant and merged into the carrier. ce_aba.py has the
+terms with J, as for a symmetric rotor. Since (d dI/dtheta) w = 2 u x (dI w), Lagrange's equations leave
 
     couple on the carrier   dI wd + (w + 2 thd u) x (dI w)
     torque about the axis   -w^T (d dI/dtheta) w / 2 = u^T (w x (dI w))
@@ -31,12 +31,12 @@ from ce_gym.model.mechanism import EliminatedRotor
 
 @dataclass
 class TransverseInertia:
-    """What the transverse difference of a rotor's moments adds at one state; nothing for a symmetric rotor.
+    """Additional terms of a rotor's transverse inertia at one state; zero for a symmetric rotor.
 
     Attributes:
         inertia: dI, added to the angular inertia of the carrier [kg m^2], carrier's frame, shape (3, 3).
-        couple: Velocity-product couple that moves the carrier [N m], carrier's frame, shape (3,).
-        torque: Velocity-product torque that turns the rotor about its axis [N m].
+        couple: Velocity-product couple of the carrier's motion [N m], carrier's frame, shape (3,).
+        torque: Velocity-product torque of the rotor's motion about its axis [N m].
     """
 
     inertia: SX
@@ -45,12 +45,12 @@ class TransverseInertia:
 
 
 def transverse_inertia(rotor: EliminatedRotor, angle: SX, rate: SX, w: SX) -> TransverseInertia:
-    """Evaluate a rotor that has a carrier.
+    """Return the transverse inertia of a rotor on a carrier.
 
     Args:
         rotor: The rotor.
-        angle: Its joint coordinate [rad].
-        rate: Its speed [rad/s].
+        angle: Joint coordinate of the rotor [rad].
+        rate: Speed of the rotor [rad/s].
         w: Angular velocity of the carrier [rad/s], carrier's frame, shape (3,).
     """
     e, n = rotor.heavy_axis, np.cross(rotor.axis, rotor.heavy_axis)

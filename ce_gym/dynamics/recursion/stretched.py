@@ -1,15 +1,15 @@
-"""Clusters whose transmissions stretch: their stretches are eliminated before their joints.
+"""Clusters with elastic transmissions: stretches are eliminated before joints.
 
-A rotor behind a transmission that stretches is a coordinate of its own, of which little is felt: its column of `U` is
-a momentum along one axis. With `D = L diag(pivots) L^T` from the last coordinate to the first, stretches behind joints,
+A stretch is a coordinate with a sparse column of `U`: the momentum of a rotor along one axis. Stretches are the last
+coordinates. With `D = L diag(pivots) L^T` from the last coordinate to the first,
 
     L left = [U^T, u],   U D^-1 U^T = left^T diag(pivots)^-1 left,   L^T ydd = diag(pivots)^-1 (left_u - left_U a),
 
-a stretch leaves one number at one place of a joint's column, while a joint's column would fill that of the stretch. The
-outward pass needs no more of a joint than where nothing stretches.
+a stretch adds one entry to a joint's column, while eliminating a joint first would fill the column of the stretch. The
+outward pass needs as many instructions as without stretches.
 
-What acts on coordinates is added to what elimination leaves of it, and both to the articulated inertia last. It is
-known before the bodies beyond are; summed first it is one number to be kept until then, instead of one for each term.
+Forces on coordinates are known before the outer bodies. They are summed with the terms of the elimination first, and
+added to the articulated inertia last, so that one number is stored instead of one for each term.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from ce_gym.model.mechanism import Mechanism
 
 @dataclass
 class Stretched:
-    """A cluster whose stretches are eliminated first. Rows are in that order, the last coordinate first.
+    """A cluster after elimination; rows are in reverse order, the last coordinate first.
 
     Attributes:
         L: Lower triangle with ones, shape (d, d).
-        left: What is left of `[U^T, u]`, shape (d, 7).
-        scaled: The same over the pivots, shape (d, 7).
+        left: `L^-1 [U^T, u]`, shape (d, 7).
+        scaled: `diag(pivots)^-1 left`, shape (d, 7).
     """
 
     L: SX
@@ -42,12 +42,12 @@ class Stretched:
         """Eliminate the coordinates of a cluster.
 
         Args:
-            inertia: Articulated, shape (d, d).
-            slope: What is added to it by what acts on coordinates, shape (d, d).
-            biased: `[U^T, u]` without what acts on coordinates, shape (d, 7).
-            tau: That, shape (d,).
+            inertia: `D` without `slope`, shape (d, d).
+            slope: Slope of forces on coordinates, added to `inertia`, shape (d, d).
+            biased: `[U^T, u]` without forces on coordinates, shape (d, 7).
+            tau: Forces on coordinates, shape (d,).
         """
-        n, given = tau.numel(), ca.horzcat(SX(tau.numel(), 6), tau)[::-1, :]
+        n, forces = tau.numel(), ca.horzcat(SX(tau.numel(), 6), tau)[::-1, :]
         inertia, slope, biased = inertia[::-1, ::-1], slope[::-1, ::-1], biased[::-1, :]
         L, pivoted, inverse_pivot, left = SX.eye(n), SX(n, n), [], []  # pivoted = L diag(pivots)
         for j in range(n):
@@ -56,11 +56,11 @@ class Stretched:
             inverse_pivot.append(1 / pivoted[j, j])
             for i in range(j + 1, n):
                 L[i, j] = pivoted[i, j] * inverse_pivot[j]
-            left.append(biased[j, :] + (given[j, :] - sum(L[j, k] * left[k] for k in range(j))))
+            left.append(biased[j, :] + (forces[j, :] - sum(L[j, k] * left[k] for k in range(j))))
         scaled = [row * inverse for row, inverse in zip(left, inverse_pivot, strict=True)]
         return Stretched(L, ca.vertcat(*left), ca.vertcat(*scaled))
 
-    def felt(self, inertia: SX, force: SX) -> tuple[SX, SX]:
+    def articulated(self, inertia: SX, force: SX) -> tuple[SX, SX]:
         """Return `inertia - U D^-1 U^T`, its upper triangle mirrored, and `force + U D^-1 u`, (6, 6) and (6,)."""
         for j in range(self.L.shape[0]):
             U, scaled = self.left[j, :6].T, self.scaled[j, :]
@@ -76,5 +76,5 @@ class Stretched:
 
 
 def stretches(mechanism: Mechanism, cluster: Cluster) -> bool:
-    """Whether a transmission of a cluster stretches; stretches are the last of its coordinates."""
+    """Whether a cluster has an elastic transmission."""
     return any(mechanism.robot.body(name).kind == "stretch" for name in cluster.independent)
