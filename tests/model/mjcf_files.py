@@ -82,3 +82,11 @@ GEOMS = """<worldbody><geom name="floor" type="plane" size="0 0 1" friction="0.6
  conaffinity="0" group="2"/><body name="leg" pos="0.1 0 0"><joint name="hip" axis="0 1 0" range="-1 2" damping="0.3"/>
 <geom name="shin" type="capsule" size="0.02" fromto="0 0 0 0 0 -0.4" friction="0.6"/></body></body></worldbody>"""
 ROUGH = 'size="0.2 0.1 0.05" friction="0.6"'
+
+
+def body(name: str = "b", inside: str = '<joint name="j"/>', geom: str = '<geom size=".1"/>', more: str = "") -> str:
+    return f'<body name="{name}">{inside}{geom}{more}</body>'
+
+
+def plain_mjcf(world: str = body(), rest: str = "") -> str:
+    return f"<mujoco><worldbody>{world}</worldbody>{rest}</mujoco>"
