@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 
 from ce_gym.model.errors import RobotError
 from ce_gym.model.frames import ORIGIN, Placement, Vec3
+from ce_gym.model.ranges import Finite, Positive
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class LinearConstraint(Constraint):
     """
 
     coefficients: tuple[tuple[str, float], ...]
-    offset: float = 0.0
+    offset: Finite = 0.0
     linear: ClassVar[bool] = True
 
     @property
@@ -122,7 +123,7 @@ class RodConstraint(Constraint):
     second: str | None
     first_point: Vec3
     second_point: Vec3
-    length: float
+    length: Positive
 
     @property
     def ends(self) -> tuple[str | None, ...]:

@@ -22,6 +22,7 @@ from ce_gym.model.coordinates import Layout, placed, sizes, unit_quaternions
 from ce_gym.model.drives import Battery, Elasticity, Motor
 from ce_gym.model.errors import listed_names
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
+from ce_gym.model.ranges import Finite, NotNegative, NotNegativeOrInfinite, Positive
 
 UNKNOWN_RATIO = 1e6
 """Gear ratio in place of an unknown one: the rotor's own inertia is then 1e-12 of the reflected inertia."""
@@ -68,12 +69,12 @@ class Joint:
     type: Literal["free", "ball", "revolute", "prismatic"]
     axis: Vec3 = (0.0, 0.0, 1.0)
     position: tuple[float, float] = (-float("inf"), float("inf"))
-    torque: float = float("inf")
-    velocity: float = float("inf")
-    damping: float = 0.0
-    friction: float = 0.0
-    stiffness: float = 0.0
-    springref: float = 0.0
+    torque: NotNegativeOrInfinite = float("inf")
+    velocity: NotNegativeOrInfinite = float("inf")
+    damping: NotNegative = 0.0
+    friction: NotNegative = 0.0
+    stiffness: NotNegative = 0.0
+    springref: Finite = 0.0
 
     @property
     def nq(self) -> int:
@@ -158,9 +159,9 @@ class ContactSphere:
     name: str
     body: str
     position: Vec3
-    radius: float
+    radius: NotNegative
     group: str = "foot"
-    rim: float = 0.0
+    rim: NotNegative = 0.0
     axis: Vec3 = (0.0, 0.0, 1.0)
     shape: str = ""
 
@@ -179,7 +180,7 @@ class Capsule:
     body: str
     start: Vec3
     end: Vec3
-    radius: float
+    radius: Positive
 
 
 @dataclass(frozen=True)
@@ -195,12 +196,12 @@ class ContactMaterial:
         dissipation: Normal dissipation of Hunt and Crossley's law [s/m], which then takes the place of damping.
     """
 
-    stiffness: float = 5e4
-    damping: float = 500.0
-    friction: float = 0.8
-    slip_speed: float = 1e-3
-    bristle: float = 5e4
-    dissipation: float | None = None
+    stiffness: NotNegative = 5e4
+    damping: NotNegative = 500.0
+    friction: NotNegative = 0.8
+    slip_speed: Positive = 1e-3
+    bristle: NotNegative = 5e4
+    dissipation: NotNegative | None = None
 
 
 @dataclass(frozen=True)
@@ -213,7 +214,7 @@ class Pose:
         balls: Pairs (body, quaternion wxyz of norm 1 within 1e-3) for ball joints; others have no rotation.
     """
 
-    height: float = 0.0
+    height: Finite = 0.0
     joints: tuple[tuple[str, float], ...] = ()
     balls: tuple[tuple[str, tuple[float, float, float, float]], ...] = ()
 

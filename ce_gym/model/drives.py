@@ -4,6 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ce_gym.model.ranges import (
+    NotNegative,
+    NotNegativeOrInfinite,
+    Positive,
+    PositiveOrInfinite,
+    PositiveShare,
+    Share,
+    Temperature,
+)
+
 ELASTIC_FACTORS = "drive_stiffness", "drive_damping", "backlash"
 """Parameters that scale one elastic transmission, or all elastic transmissions."""
 
@@ -39,18 +49,18 @@ class DriveFriction:
         factor: Factor on all terms [-].
     """
 
-    stribeck: float = 0.0
-    stribeck_speed: float = float("inf")
-    stribeck_exponent: float = 2.0
-    load_motor: float = 0.0
-    load_external: float = 0.0
-    stribeck_load_motor: float = 0.0
-    stribeck_load_external: float = 0.0
-    stribeck_square_motor: float = 0.0
-    stribeck_square_external: float = 0.0
-    efficiency: float = 1.0
-    backdriving_efficiency: float = 1.0
-    factor: float = 1.0
+    stribeck: NotNegative = 0.0
+    stribeck_speed: PositiveOrInfinite = float("inf")
+    stribeck_exponent: PositiveOrInfinite = 2.0
+    load_motor: NotNegative = 0.0
+    load_external: NotNegative = 0.0
+    stribeck_load_motor: NotNegative = 0.0
+    stribeck_load_external: NotNegative = 0.0
+    stribeck_square_motor: NotNegative = 0.0
+    stribeck_square_external: NotNegative = 0.0
+    efficiency: PositiveShare = 1.0
+    backdriving_efficiency: Share = 1.0
+    factor: NotNegative = 1.0
 
     @property
     def shares(self) -> tuple[float, ...]:
@@ -81,13 +91,13 @@ class Heat:
         ambient: Temperature of the air, and of a motor after a long rest [deg C].
     """
 
-    winding_capacity: float
-    housing_capacity: float
-    winding_to_housing: float
-    housing_to_ambient: float
-    warm: float = 100.0
-    hot: float = 125.0
-    ambient: float = 25.0
+    winding_capacity: PositiveOrInfinite
+    housing_capacity: PositiveOrInfinite
+    winding_to_housing: PositiveOrInfinite
+    housing_to_ambient: PositiveOrInfinite
+    warm: Temperature = 100.0
+    hot: Temperature = 125.0
+    ambient: Temperature = 25.0
 
 
 @dataclass(frozen=True)
@@ -101,10 +111,10 @@ class Battery:
         idle: Power of all consumers but the motors [W].
     """
 
-    voltage: float
-    resistance: float
-    nominal: float
-    idle: float = 0.0
+    voltage: PositiveOrInfinite
+    resistance: NotNegative
+    nominal: PositiveOrInfinite
+    idle: NotNegative = 0.0
 
 
 @dataclass(frozen=True)
@@ -127,14 +137,14 @@ class Motor:
     """
 
     rotor: str
-    torque: float = float("inf")
-    velocity: float = float("inf")
-    stall: float | None = None
-    damping: float = 0.0
-    friction: float = 0.0
+    torque: NotNegativeOrInfinite = float("inf")
+    velocity: PositiveOrInfinite = float("inf")
+    stall: NotNegativeOrInfinite | None = None
+    damping: NotNegative = 0.0
+    friction: NotNegative = 0.0
     drive_friction: DriveFriction | None = None
-    bandwidth: float = float("inf")
-    motor_constant: float | None = None
+    bandwidth: PositiveOrInfinite = float("inf")
+    motor_constant: PositiveOrInfinite | None = None
     heat: Heat | None = None
     cogging: tuple[tuple[int, float, float], ...] = ()
 
@@ -167,10 +177,10 @@ class Elasticity:
     """
 
     rotor: str
-    stiffness: float
-    damping: float = 0.0
-    backlash: float = 0.0
-    preload: float = float("inf")
+    stiffness: Positive
+    damping: NotNegative = 0.0
+    backlash: NotNegative = 0.0
+    preload: PositiveOrInfinite = float("inf")
     play: float = 1.0
 
     @property

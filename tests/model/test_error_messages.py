@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import URDF, YAML
+from leg_files import URDF, YAML
 from mjcf_files import body, plain_mjcf
 
 import ce_gym

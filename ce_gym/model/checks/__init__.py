@@ -1,1 +1,1 @@
-"""Is this robot possible? Checks of bodies, of constraints and of whole robots."""
+"""Checks of bodies, constraints, drives, collisions and whole robots."""

@@ -1,28 +1,24 @@
-"""Is this body possible? Checks of mass properties, placement and joint of one body.
-
-Each check raises a `RobotError` of one line.
-"""
+"""Checks of mass properties, placement and joint of one body; each raises a `RobotError` of one line."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from ce_gym.model.coordinates import SIZES
 from ce_gym.model.description import SCREWS, Body, Joint
 from ce_gym.model.errors import invalid_value
+from ce_gym.model.ranges import LARGEST_FIGURE, check_fields
 
 RELATIVE_TOLERANCE = 1e-9
-LARGEST_FIGURE = 1e12
-"""Largest length, mass, inertia, ratio, gain and so on [SI units]; its cube is within the range of single precision."""
 
 
 def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
-    """Check the figures of one body.
+    """Check one body.
 
-    A rotor needs no mass of its own; a link may be massless, with an inertia of zero too, if it `may_be_massless`.
+    A rotor may have mass 0. A link that `may_be_massless` may have mass 0 if its inertia is 0 too.
     """
     where = f"{body.kind} {body.name!r}"
     mass = body.inertial.mass
@@ -48,30 +44,32 @@ def _check_joint(file: str, where: str, joint: Joint) -> None:
         raise invalid_value(file, f"{where} joint friction", joint.friction, expected)
     if joint.type == "ball" and not (joint.position[0] == -math.inf and joint.position[1] > 0.0):
         raise invalid_value(file, f"{where} joint limits", joint.position, "no lower one, and an angle above 0 [rad]")
-    if len(joint.axis) != 3 or not math.isclose(math.hypot(*joint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
-        raise invalid_value(file, f"{where} joint axis", joint.axis, "a unit axis")
+    check_axis(file, f"{where} joint axis", joint.axis)
     lower, upper = joint.position
     if not lower <= upper:
         raise invalid_value(file, f"{where} joint limits", joint.position, "a lower limit that is not above the upper")
-    for name, value in (("torque", joint.torque), ("velocity", joint.velocity)):
-        if not value >= 0.0:
-            raise invalid_value(file, f"{where} joint {name}", value, "0 or more")
-    check_not_negative(file, f"{where} joint damping", joint.damping)
-    check_not_negative(file, f"{where} joint friction", joint.friction)
-    check_not_negative(file, f"{where} joint stiffness", joint.stiffness)
-    check_finite(file, f"{where} joint springref", (joint.springref,))
+    check_fields(joint, file, f"{where} joint ")
 
 
 def check_finite(file: str, key: str, values: Iterable[float]) -> None:
-    """Check that all values are finite numbers of a usable size."""
+    """Check that all values are finite and not larger than `LARGEST_FIGURE`."""
     if not all(abs(value) <= LARGEST_FIGURE for value in values):
         raise invalid_value(file, key, tuple(values), f"finite numbers, up to {LARGEST_FIGURE:g} in size")
 
 
-def check_not_negative(file: str, key: str, value: float, unit: str = "") -> None:
-    """Check that a value is 0 or more, and of a usable size."""
-    if not 0.0 <= value <= LARGEST_FIGURE:
-        raise invalid_value(file, key, value, f"0 or more{unit}, up to {LARGEST_FIGURE:g}")
+def check_unique(file: str, key: str, names: Iterable[str]) -> None:
+    """Check that no name occurs twice."""
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise invalid_value(file, key, name, "a name that is used once")
+        seen.add(name)
+
+
+def check_axis(file: str, key: str, axis: Sequence[float]) -> None:
+    """Check that an axis has three numbers and unit length."""
+    if len(axis) != 3 or not math.isclose(math.hypot(*axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
+        raise invalid_value(file, key, axis, "a unit axis")
 
 
 def _check_inertia(file: str, key: str, inertia: np.ndarray) -> None:
@@ -86,13 +84,13 @@ def _check_inertia(file: str, key: str, inertia: np.ndarray) -> None:
 
 
 def violates_triangle_inequality(body: Body) -> bool:
-    """Whether one principal moment exceeds the sum of the others, which no distribution of mass can do."""
+    """Whether one principal moment exceeds the sum of the others, which no rigid body can have."""
     small, middle, large = np.linalg.eigvalsh(np.array(body.inertial.inertia))
     return bool(large > (small + middle) * (1.0 + RELATIVE_TOLERANCE))
 
 
 def moves_inertia(body: Body) -> bool:
-    """Whether every motion of its own joint moves some inertia of a body."""
+    """Whether every motion of a body's joint moves some of its inertia."""
     inertia, axis = np.array(body.inertial.inertia), np.array(body.joint.axis)
     if body.joint.type == "free":
         return bool(body.inertial.mass > 0.0 and np.linalg.matrix_rank(inertia) == 3)

@@ -1,16 +1,14 @@
-"""Is this constraint possible? Checks of one constraint of each kind against the bodies it names.
+"""Checks of one constraint against the bodies it names; each raises a `RobotError` of one line.
 
-Each check raises a `RobotError` of one line. Whether the constraints of a robot can
-be met together is a matter of solving them, which the dynamics does.
+Whether all constraints of a robot can hold together is checked when the dynamics solves them.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ce_gym.model.checks.body import LARGEST_FIGURE, RELATIVE_TOLERANCE, check_finite
+from ce_gym.model.checks.body import check_axis, check_finite
 from ce_gym.model.constraints import (
     Constraint,
     FunctionConstraint,
@@ -22,10 +20,11 @@ from ce_gym.model.constraints import (
 )
 from ce_gym.model.description import Body, Robot
 from ce_gym.model.errors import RobotError, invalid_value, unknown_name
+from ce_gym.model.ranges import LARGEST_FIGURE, check_fields
 
 
 def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
-    """Check the figures of one constraint and the names in it."""
+    """Check the names and numbers of one constraint."""
     key = f"constraint {constraint.name!r}"
     names = {body.name: body for body in robot.bodies}
     for body in constraint.bodies:
@@ -35,11 +34,12 @@ def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
         raise invalid_value(file, key, constraint.ends, "two different bodies")
     if not constraint.ends:
         _check_joints(constraint, names, key, file)
+    check_fields(constraint, file, f"{key} ")
     CHECKS[type(constraint)](constraint, key, file)
 
 
 def _check_joints(constraint: Constraint, names: Mapping[str, Body], key: str, file: str) -> None:
-    """Check the bodies of a constraint that ties joint coordinates."""
+    """Check the bodies of a constraint between joint coordinates."""
     for body in constraint.bodies:
         if names[body].joint.nv > 1:
             raise invalid_value(file, key, body, "a body whose joint has one degree of freedom")
@@ -52,7 +52,6 @@ def _check_linear(constraint: LinearConstraint, key: str, file: str) -> None:
         if not 0.0 < abs(coefficient) <= LARGEST_FIGURE:
             expected = f"a finite number other than 0, up to {LARGEST_FIGURE:g} in size"
             raise invalid_value(file, f"{key} coefficient of {body!r}", coefficient, expected)
-    check_finite(file, f"{key} offset", (constraint.offset,))
 
 
 def _check_polynomial(constraint: PolynomialConstraint, key: str, file: str) -> None:
@@ -65,16 +64,13 @@ def _check_polynomial(constraint: PolynomialConstraint, key: str, file: str) -> 
 def _check_loop(constraint: LoopConstraint, key: str, file: str) -> None:
     if constraint.joint not in ("revolute", "ball"):
         raise invalid_value(file, f"{key} joint", constraint.joint, "revolute or ball")
-    if not math.isclose(math.hypot(*constraint.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
-        raise invalid_value(file, f"{key} axis", constraint.axis, "a unit axis")
+    check_axis(file, f"{key} axis", constraint.axis)
     for placement in (constraint.first_placement, constraint.second_placement):
         check_finite(file, f"{key} placement", (*placement.position, *[x for row in placement.rotation for x in row]))
 
 
 def _check_rod(constraint: RodConstraint, key: str, file: str) -> None:
     check_finite(file, f"{key} points", (*constraint.first_point, *constraint.second_point))
-    if not 0.0 < constraint.length <= LARGEST_FIGURE:
-        raise invalid_value(file, f"{key} length", constraint.length, f"a length above 0 [m], up to {LARGEST_FIGURE:g}")
 
 
 def _check_function(constraint: FunctionConstraint, key: str, file: str) -> None:
@@ -93,4 +89,4 @@ CHECKS: dict[type[Constraint], Callable[[Any, str, str], None]] = {
     RodConstraint: _check_rod,
     FunctionConstraint: _check_function,
 }
-"""Functions (constraint, key, file) that check the figures of a kind of constraint."""
+"""Functions (constraint, key, file) that check a kind of constraint."""

@@ -1,41 +1,39 @@
 """Checks of complete robot descriptions, from files or from code.
 
-Each check raises a `RobotError` of one line for the first thing that is wrong.
+Each check raises a `RobotError` of one line for the first mistake.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable
-from dataclasses import fields
 from fnmatch import fnmatchcase
 from functools import cache
 
 import numpy as np
 
 from ce_gym.model.checks.body import (
-    RELATIVE_TOLERANCE,
+    check_axis,
     check_body,
     check_finite,
-    check_not_negative,
+    check_unique,
     moves_inertia,
     violates_triangle_inequality,
 )
 from ce_gym.model.checks.collisions import adjacent, capsules_of
 from ce_gym.model.checks.constraint import check_constraint
-from ce_gym.model.checks.supply import check_supply
+from ce_gym.model.checks.drives import check_elastic, check_motors
 from ce_gym.model.clusters import Cluster, cluster_tree
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.coordinates import UNIT_TOLERANCE
 from ce_gym.model.description import Robot
-from ce_gym.model.drives import DriveFriction
 from ce_gym.model.errors import InertiaWarning, invalid_value, listed_names, unknown_name
+from ce_gym.model.ranges import check_fields
 
 MOST_BODIES = 500
-"""Most bodies of a robot: what is done with them takes more than in proportion, and none has as many."""
+"""Most bodies of a robot; costs grow faster than the number of bodies."""
 LIMIT_TOLERANCE = 1e-6
-"""How far a standing pose may be over a joint's limit, where both were rounded [rad or m]."""
+"""Tolerance of joint limits in the standing pose, for rounded numbers [rad or m]."""
 LONGEST_NAME = 200
 """Most characters of a name."""
 
@@ -44,11 +42,11 @@ def check_robot(robot: Robot) -> None:
     """Check a whole robot.
 
     Raises:
-        RobotError: Something cannot be.
+        RobotError: The robot is impossible.
 
     Warns:
-        InertiaWarning: An inertia violates the triangle inequality, and the robot does not say that it is kept
-            knowingly; said once per process and robot.
+        InertiaWarning: An inertia violates the triangle inequality and is not listed in `kept_inertia`; once per
+            process and robot.
     """
     file = robot.source or robot.name
     _check_names(robot, file)
@@ -60,15 +58,14 @@ def check_robot(robot: Robot) -> None:
     _check_independent(robot, file)
     _check_something_moves(robot, file)
     _check_contacts(robot, file)
-    _check_motors(robot, file)
-    check_supply(robot, file)
-    _check_elastic(robot, file)
+    check_motors(robot, file)
+    check_elastic(robot, file)
     _check_pose_and_gains(robot, file)
     _check_inertia(robot, file)
 
 
 def _check_names(robot: Robot, file: str) -> None:
-    """Names can be printed, on one line: an escape sequence in a file moves nobody's cursor."""
+    """Check that names can be printed on one line, without escape sequences."""
     if len(robot.bodies) > MOST_BODIES:
         raise invalid_value(file, "number of bodies", len(robot.bodies), f"at most {MOST_BODIES}")
     names = {"name": [robot.name], "task": [name for name, _ in robot.tasks]}
@@ -76,33 +73,33 @@ def _check_names(robot: Robot, file: str) -> None:
     names["constraint name"] = [constraint.name for constraint in robot.constraints]
     names["contact name"] = [contact.name for contact in robot.contacts]
     names["contact group"] = [contact.group for contact in robot.contacts]
-    for key, given in names.items():
-        for name in given:
+    for key, listed in names.items():
+        for name in listed:
             if not name or not name.isprintable() or len(name) > LONGEST_NAME:
                 raise invalid_value(file, key, name, f"1 to {LONGEST_NAME} characters that can be printed")
 
 
 def _check_inertia(robot: Robot, file: str) -> None:
-    """Warn of figures that no rigid body can have, unless they are kept knowingly."""
+    """Warn of inertias that no rigid body can have, unless `kept_inertia` lists them."""
     impossible = [body.name for body in robot.bodies if violates_triangle_inequality(body)]
-    _check_unique(file, "kept_inertia", robot.kept_inertia)
+    check_unique(file, "kept_inertia", robot.kept_inertia)
     for pattern in robot.kept_inertia:
         if not any(fnmatchcase(name, pattern) for name in impossible):
             expected = f"one of {listed_names(pattern, impossible)}" if impossible else "none: no inertia is impossible"
             raise invalid_value(file, "kept_inertia", pattern, expected)
-    unknowing = [name for name in impossible if not any(fnmatchcase(name, pattern) for pattern in robot.kept_inertia)]
-    if unknowing:
-        _warn_of_inertia(robot.name, tuple(unknowing))
+    unlisted = [name for name in impossible if not any(fnmatchcase(name, pattern) for pattern in robot.kept_inertia)]
+    if unlisted:
+        _warn_of_inertia(robot.name, tuple(unlisted))
 
 
 def _dependent(robot: Robot) -> set[str]:
-    """Bodies that others move: such a body, or one that carries another, can be so light that its mass is left out."""
+    """Return the bodies with dependent joints; such bodies, and bodies that carry others, may be massless."""
     tied = {name for constraint in robot.constraints for name in constraint.bodies}
     return tied - set(robot.independent)
 
 
 def _check_tree(robot: Robot, file: str) -> None:
-    """Names are unique, parents come first, and only the first body may be free."""
+    """Check that names are unique, parents come first, and only the first body is free."""
     if not robot.bodies:
         expected = "at least one body that moves: a moving joint, or a root link with mass"
         raise invalid_value(file, "bodies", (), expected)
@@ -123,7 +120,7 @@ def _check_tree(robot: Robot, file: str) -> None:
 
 
 def _check_constraints(robot: Robot, file: str) -> None:
-    _check_unique(file, "constraint name", [constraint.name for constraint in robot.constraints])
+    check_unique(file, "constraint name", [constraint.name for constraint in robot.constraints])
     for constraint in robot.constraints:
         check_constraint(constraint, robot, file)
 
@@ -134,14 +131,14 @@ def _check_independent(robot: Robot, file: str) -> None:
         if joint not in names:
             expected = "the name of a body whose joint has one degree of freedom"
             raise unknown_name(file, "independent", joint, names, expected)
-    _check_unique(file, "independent", robot.independent)
+    check_unique(file, "independent", robot.independent)
     for cluster in cluster_tree(robot).clusters:
         if cluster.linear and robot.body(cluster.bodies[0]).joint.nv == 1:
             _check_determined(cluster, file)  # others are solved to be checked: a Model does
 
 
 def _check_determined(cluster: Cluster, file: str) -> None:
-    """The constraints of a cluster must determine its dependent coordinates from the independent ones."""
+    """Check that the constraints of a cluster determine its dependent coordinates from the independent ones."""
     rows = [dict(tie.coefficients) for tie in cluster.constraints if isinstance(tie, LinearConstraint)]
     count = len(cluster.bodies) - len(rows)
     key = f"independent joints among {', '.join(cluster.bodies)}"
@@ -161,7 +158,7 @@ def _check_determined(cluster: Cluster, file: str) -> None:
 
 
 def _check_something_moves(robot: Robot, file: str) -> None:
-    """The joint of a body that carries nothing and is tied to nothing must move some inertia."""
+    """Check that the joint of each body without children and constraints moves some inertia."""
     tied = {name for constraint in robot.constraints for name in constraint.bodies}
     for body in robot.bodies:
         if body.name not in tied | {other.parent for other in robot.bodies} and not moves_inertia(body):
@@ -170,7 +167,7 @@ def _check_something_moves(robot: Robot, file: str) -> None:
 
 
 def _check_contacts(robot: Robot, file: str) -> None:
-    _check_unique(file, "contact name", [contact.name for contact in robot.contacts])
+    check_unique(file, "contact name", [contact.name for contact in robot.contacts])
     names = [body.name for body in robot.bodies]
     for contact in robot.contacts:
         key = f"contacts.{contact.name}"
@@ -179,17 +176,10 @@ def _check_contacts(robot: Robot, file: str) -> None:
         if robot.body(contact.body).kind == "rotor":
             raise invalid_value(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
         check_finite(file, f"{key}.position", contact.position)
-        check_not_negative(file, f"{key}.radius", contact.radius, " [m]")
-        check_not_negative(file, f"{key}.rim", contact.rim, " [m]")
-        if len(contact.axis) != 3 or not math.isclose(math.hypot(*contact.axis), 1.0, rel_tol=RELATIVE_TOLERANCE):
-            raise invalid_value(file, f"{key}.axis", contact.axis, "a unit axis")
+        check_fields(contact, file, f"{key}.")
+        check_axis(file, f"{key}.axis", contact.axis)
     _check_capsules(robot, file)
-    for name in ("stiffness", "damping", "friction", "bristle", "dissipation"):
-        value = getattr(robot.material, name)
-        if value is not None:
-            check_not_negative(file, f"material.{name}", value)
-    if not 0.0 < robot.material.slip_speed < math.inf:
-        raise invalid_value(file, "material.slip_speed", robot.material.slip_speed, "more than 0 [m/s]")
+    check_fields(robot.material, file, "material.")
 
 
 def _check_capsules(robot: Robot, file: str) -> None:
@@ -199,9 +189,8 @@ def _check_capsules(robot: Robot, file: str) -> None:
         if capsule.body not in links:
             raise unknown_name(file, key, capsule.body, links, "the name of a link")
         check_finite(file, key, (*capsule.start, *capsule.end))
-        if not 0.0 < capsule.radius < math.inf:
-            raise invalid_value(file, f"{key} radius", capsule.radius, "more than 0 [m]")
-    _check_unique(file, "self_collisions", [" and ".join(sorted(pair)) for pair in robot.self_collisions])
+        check_fields(capsule, file, f"{key} ")
+    check_unique(file, "self_collisions", [" and ".join(sorted(pair)) for pair in robot.self_collisions])
     for pair in robot.self_collisions:
         for name in pair:
             if name not in links:
@@ -214,73 +203,11 @@ def _check_capsules(robot: Robot, file: str) -> None:
             raise invalid_value(file, "self_collisions", pair, "two links of which none carries the other")
 
 
-def _check_motors(robot: Robot, file: str) -> None:
-    rotors = [body.name for body in robot.rotors()]
-    _check_unique(file, "motors", [motor.rotor for motor in robot.motors])
-    for motor in robot.motors:
-        if motor.rotor not in rotors:
-            raise unknown_name(file, "motors", motor.rotor, rotors, "the name of a rotor")
-        for name in ("torque", "velocity", "stall", "damping", "friction"):
-            value = getattr(motor, name)
-            if name in ("damping", "friction"):
-                check_not_negative(file, f"motors.{motor.rotor}.{name}", value)
-            elif value is not None and not value >= 0.0:
-                raise invalid_value(file, f"motors.{motor.rotor}.{name}", value, "0 or more")
-        if motor.velocity == 0.0:
-            raise invalid_value(file, f"motors.{motor.rotor}.velocity", 0.0, "more than 0 [rad/s]")
-        if not motor.bandwidth > 0.0:
-            raise invalid_value(file, f"motors.{motor.rotor}.bandwidth", motor.bandwidth, "more than 0 [Hz]")
-        if motor.drive_friction is not None:
-            _check_drive_friction(motor.drive_friction, file, f"motors.{motor.rotor}.friction")
-
-
-def _check_drive_friction(friction: DriveFriction, file: str, key: str) -> None:
-    for field in fields(friction):
-        value, name = getattr(friction, field.name), f"{key}.{field.name}"
-        if field.name.endswith("efficiency"):
-            if not 0.0 <= value <= 1.0 or (field.name == "efficiency" and value == 0.0):
-                raise invalid_value(file, name, value, "a share of at most 1")
-        elif field.name in ("stribeck_speed", "stribeck_exponent"):
-            if not value > 0.0:
-                raise invalid_value(file, name, value, "more than 0")
-        else:
-            check_not_negative(file, name, value)
-    at_rest = [f.name for f in fields(friction) if f.name.startswith("stribeck") and f.default == 0.0]
-    if math.isinf(friction.stribeck_speed) and any(getattr(friction, name) for name in at_rest):
-        expected = "the speed at which what is added at rest falls [rad/s]"
-        raise invalid_value(file, f"{key}.stribeck_speed", None, expected)
-
-
-def _check_elastic(robot: Robot, file: str) -> None:
-    """An elastic transmission is one linear tie, in which the rotor follows from joints and nothing from the rotor."""
-    rotors = [body.name for body in robot.rotors()]
-    _check_unique(file, "elastic", [elastic.rotor for elastic in robot.elastic])
-    for elastic in robot.elastic:
-        key = f"elastic.{elastic.rotor}"
-        if elastic.rotor not in rotors:
-            raise unknown_name(file, "elastic", elastic.rotor, rotors, "the name of a rotor")
-        ties = [tie for tie in robot.constraints if elastic.rotor in tie.bodies]
-        if len(ties) != 1 or not ties[0].linear or elastic.rotor in robot.independent:
-            raise invalid_value(
-                file, key, elastic.rotor, "a rotor that follows from joints by one linear tie, and nothing from it"
-            )
-        if elastic.stretch in (body.name for body in robot.bodies):
-            raise invalid_value(file, "body name", elastic.stretch, f"another one: {elastic.rotor!r} is elastic")
-        if not 0.0 < elastic.stiffness < math.inf:
-            raise invalid_value(file, f"{key}.stiffness", elastic.stiffness, "more than 0 [N m/rad]")
-        check_not_negative(file, f"{key}.damping", elastic.damping, " [N m s/rad]")
-        check_not_negative(file, f"{key}.backlash", elastic.backlash, " [rad]")
-        if not elastic.preload > 0.0:
-            raise invalid_value(file, f"{key}.preload", elastic.preload, "more than 0 [N m]")
-        if elastic.backlash and math.isfinite(elastic.preload):
-            raise invalid_value(file, f"{key}.preload", elastic.preload, "none where there is backlash")
-
-
 def _check_pose_and_gains(robot: Robot, file: str) -> None:
-    check_finite(file, "pose.height", (robot.pose.height,))
+    check_fields(robot.pose, file, "pose.")
     check_finite(file, "gravity", robot.gravity)
     _check_joint_values(robot, file, "pose.joints", robot.pose.joints)
-    _check_unique(file, "pose.balls", [name for name, _ in robot.pose.balls])
+    check_unique(file, "pose.balls", [name for name, _ in robot.pose.balls])
     for name, quaternion in robot.pose.balls:
         if name not in robot.balls:
             raise unknown_name(file, "pose.balls", name, robot.balls, "the name of a body on a ball joint")
@@ -292,7 +219,8 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
     for key, pairs in (("gains.kp", robot.gains.kp), ("gains.kd", robot.gains.kd)):
         _check_joint_values(robot, file, key, pairs)
         for joint, gain in pairs:
-            check_not_negative(file, f"{key}.{joint}", gain)
+            if not gain >= 0.0:
+                raise invalid_value(file, f"{key}.{joint}", gain, "0 or more")
             if joint in robot.passive:
                 raise invalid_value(file, f"{key}.{joint}", gain, "none for a passive joint, whose largest torque is 0")
         for joint in robot.driven:
@@ -311,7 +239,7 @@ def _check_within_limits(robot: Robot, file: str) -> None:
 
 def _check_assembly(robot: Robot, file: str) -> None:
     dependent = [b.name for b in robot.bodies if b.joint.nv == 1 and b.name not in robot.independent]
-    _check_unique(file, "assembly", [joint for joint, _ in robot.assembly])
+    check_unique(file, "assembly", [joint for joint, _ in robot.assembly])
     for joint, value in robot.assembly:
         if joint not in dependent:
             raise unknown_name(file, "assembly", joint, dependent, "the name of a dependent joint")
@@ -319,19 +247,11 @@ def _check_assembly(robot: Robot, file: str) -> None:
 
 
 def _check_joint_values(robot: Robot, file: str, key: str, pairs: tuple[tuple[str, float], ...]) -> None:
-    _check_unique(file, key, [joint for joint, _ in pairs])
+    check_unique(file, key, [joint for joint, _ in pairs])
     for joint, value in pairs:
         if joint not in robot.independent:
             raise unknown_name(file, key, joint, robot.independent, "the name of an independent joint")
         check_finite(file, f"{key}.{joint}", (value,))
-
-
-def _check_unique(file: str, key: str, names: Iterable[str]) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise invalid_value(file, key, name, "a name that is used once")
-        seen.add(name)
 
 
 @cache

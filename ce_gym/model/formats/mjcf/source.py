@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.checks.body import LARGEST_FIGURE
 from ce_gym.model.checks.robot import MOST_BODIES
 from ce_gym.model.errors import RobotError, invalid_value, printable
 from ce_gym.model.formats.mjcf.limits import check_file
@@ -23,6 +22,7 @@ from ce_gym.model.formats.mjcf.scenes import scene_hint
 from ce_gym.model.formats.placement import exact_right_angles, vec3
 from ce_gym.model.formats.text_file import one_line
 from ce_gym.model.frames import Placement, rotation_matrix
+from ce_gym.model.ranges import LARGEST_FIGURE
 
 MOST_KINDS, MOST_NAMES = 8, 3
 """Number of kinds, and of names of each kind, in a summary of ignored parts."""
