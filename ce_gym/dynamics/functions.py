@@ -142,9 +142,9 @@ def _implicit_constraint(mechanism: Mechanism) -> ca.Function:
             phi = ca.vertcat(phi, nonlinear_rows(mechanism.robot, cluster, at)[list(closure.assembly.rows)])
         K = ca.jacobian(phi, at)
         rows = ca.Function("rows", [at, speed], [K, -ca.jtimes(K @ speed, at, speed)])
-        here, bias = rows(coordinates.q, coordinates.qd)
-        spread = SX(here.shape[0], count)
-        spread[:, [column for name in cluster.bodies for column in columns[name]]] = here
+        K_here, bias = rows(coordinates.q, coordinates.qd)
+        spread = SX(K_here.shape[0], count)
+        spread[:, [column for name in cluster.bodies for column in columns[name]]] = K_here
         jacobians.append(spread)
         biases.append(bias)
     outputs = {"K": ca.vertcat(*jacobians), "k": ca.vertcat(*biases)}

@@ -99,11 +99,11 @@ def hull_of(body: str, radius: float, corners: dict[int, Vec3], spacing: float) 
     chosen = _spread(at, MOST_CORNERS)
     rank = int((np.linalg.svd(at - at.mean(0), compute_uv=False) > 1e-6 * scale).sum())
     faces = [[chosen[i] for i in face] for face in _faces(at[chosen], rank, scale)]
-    while len(found := _between(at, faces, spacing, 1e-6 * scale)) > MOST_POINTS:
+    while len(all_weights := _between(at, faces, spacing, 1e-6 * scale)) > MOST_POINTS:
         spacing *= 1.1
     outer = sorted({i for face in faces for i in face})
     poles = [outer[i] for i in _spread(at[outer], 2**rank)]
-    points = np.array([weights @ at for weights in found]).reshape(-1, 3)
+    points = np.array([weights @ at for weights in all_weights]).reshape(-1, 3)
     far = np.linalg.norm(points[:, None] - at[poles], axis=2)
     near = far <= far.min(axis=1, keepdims=True) + 1e-6 * scale
     regions = [(names[pole], tuple(np.flatnonzero(near[:, k]).tolist())) for k, pole in enumerate(poles)]
@@ -111,7 +111,7 @@ def hull_of(body: str, radius: float, corners: dict[int, Vec3], spacing: float) 
         body,
         radius,
         tuple((float(x), float(y), float(z)) for x, y, z in points),
-        tuple(tuple((names[i], float(weights[i])) for i in np.flatnonzero(weights)) for weights in found),
+        tuple(tuple((names[i], float(weights[i])) for i in np.flatnonzero(weights)) for weights in all_weights),
         tuple(region for region in regions if region[1]),
         spacing,
     )
@@ -168,7 +168,7 @@ def _around(points: Array, members: list[int], normal: Array, tolerance: float) 
 
 def _between(points: Array, faces: list[list[int]], spacing: float, tolerance: float) -> list[Array]:
     """Return the weights of the corners in points all over the faces, without the corners themselves."""
-    found: dict[tuple[int, ...], Array] = {}
+    weights_at: dict[tuple[int, ...], Array] = {}
     for face in faces:
         for k in range(1, max(len(face) - 1, 2), 2):  # a fan of quadrangles, the last perhaps a triangle
             a, b, c, d = face[0], face[k], face[min(k + 1, len(face) - 1)], face[min(k + 2, len(face) - 1)]
@@ -183,8 +183,8 @@ def _between(points: Array, faces: list[list[int]], spacing: float, tolerance: f
                 for i, weight in ((a, (1 - u) * (1 - v)), (b, u * (1 - v)), (c, u * v), (d, (1 - u) * v)):
                     weights[i] += weight
                 if weights.max() < 1 - 1e-9:
-                    found.setdefault(tuple(np.rint(weights @ points / tolerance).astype(int).tolist()), weights)
-    return list(found.values())
+                    weights_at.setdefault(tuple(np.rint(weights @ points / tolerance).astype(int).tolist()), weights)
+    return list(weights_at.values())
 
 
 def _grid(n: int, m: int) -> Array:
@@ -220,7 +220,7 @@ def pressed(hull: Hull, up: SX, z: SX, under: SX, corners: SX) -> list[tuple[SX,
         rise = under[0, i] - sum((weight * corners[corner] for corner, weight in weights), SX(0))
         depths.append(ca.fmin(cosine * (hull.radius - z[i] + under[0, i]), STEEPNESS * (rise - RISE)))
         normals.append(cosine * ca.vertcat(-under[1:, i], 1))
-    found = []
+    contacts = []
     for _, members in hull.regions:
         deepest = depths[members[0]]
         for i in members[1:]:
@@ -235,8 +235,8 @@ def pressed(hull: Hull, up: SX, z: SX, under: SX, corners: SX) -> list[tuple[SX,
         push = weighted([normals[i] for i in members], cubes)
         length = ca.norm_2(push)
         depth = unit * length / (scale * scale * root)
-        found.append((point - hull.radius * up, depth + ca.fmin(deepest - LEAST_DEPTH, 0), push / length))
-    return found
+        contacts.append((point - hull.radius * up, depth + ca.fmin(deepest - LEAST_DEPTH, 0), push / length))
+    return contacts
 
 
 def weighted(values: Sequence[SX], weights: Sequence[SX]) -> SX:

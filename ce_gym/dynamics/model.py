@@ -219,8 +219,8 @@ class Model:
         if wrenches is None:
             return self.evaluate("forward_dynamics", q, v, tau)[0][..., 0]
         check_names("wrenches", wrenches, self.body_names, f"the name of a body of {self.robot.name}:")
-        each = [np.asarray(wrenches.get(name, np.zeros(6)), dtype=float) for name in self.body_names]
-        stacked = np.concatenate(np.broadcast_arrays(*each), axis=-1)
+        rows = [np.asarray(wrenches.get(name, np.zeros(6)), dtype=float) for name in self.body_names]
+        stacked = np.concatenate(np.broadcast_arrays(*rows), axis=-1)
         return self.evaluate("forward_dynamics_with_wrenches", q, v, tau, stacked)[0][..., 0]
 
     def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:

@@ -85,8 +85,8 @@ def check_names(
 def listed_names(value: object, known: Iterable[str], listed: str | None = None) -> str:
     """Return the known names as text, with the most similar to `value`: `hip, knee (did you mean 'hip'?)`."""
     names = [str(name) for name in known]
-    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    listed = listed or f"{', '.join(names[:_MOST_NAMES])}{more}" or "none: there are none"
+    rest = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    listed = listed or f"{', '.join(names[:_MOST_NAMES])}{rest}" or "none: there are none"
     by_lower = {name.lower(): name for name in names}
     close = difflib.get_close_matches(str(value).strip("*?").lower(), by_lower, n=1)
     return listed + (f" (did you mean {by_lower[close[0]]!r}?)" if close else "")

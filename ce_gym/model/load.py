@@ -65,9 +65,10 @@ def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = 
 def _from_urdf(path: Path, floating: bool | None) -> Robot:
     base: Base | None = None if floating is None else "floating" if floating else "fixed"
     graph = UrdfGraph(path)
-    beside = path.with_suffix(".yaml")
-    if base is None and not graph.is_plus and beside.is_file() and read_yaml(beside).data.get("urdf") == path.name:
-        return robot_from_yaml(beside)
+    yaml_file = path.with_suffix(".yaml")
+    is_plain = base is None and not graph.is_plus
+    if is_plain and yaml_file.is_file() and read_yaml(yaml_file).data.get("urdf") == path.name:
+        return robot_from_yaml(yaml_file)
     return robot_from_graph(graph, base)
 
 

@@ -215,12 +215,12 @@ class Assembler:
             values, directions = np.linalg.svd(self._scaled(self._all(q)[1]))[1:]
             directions = directions[(values > REDUNDANT).sum() :]
         samples = np.random.default_rng(0).uniform(-spread, spread, (SAMPLES, len(directions))) @ directions
-        found = []
+        jacobians = []
         for start in q + self.unit * samples:
             closed, residual = self._close(start, list(range(self.n)), REDUNDANT)
             if residual < limit and np.abs((closed - start) / self.unit).max() < FARTHEST:
-                found.append(self._all(closed)[1])
-        return found
+                jacobians.append(self._all(closed)[1])
+        return jacobians
 
     def _scaled(self, K: Array) -> Array:
         """Scale rows to a largest entry of 1: the three rows of a loop's origin together, the rows of its axis not.

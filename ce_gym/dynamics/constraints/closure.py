@@ -82,8 +82,8 @@ class Closure:
         self.rows = ca.Function("rows", [self.y, self.z], [self.phi])
         self.locate = self._locate()
         self.rates = self._rates()
-        found, _ = self.locate(self.reference[:d], self.guess)
-        if not np.isfinite(found.full()).all():  # at a dead centre rounding decides whether there is a solution
+        solution, _ = self.locate(self.reference[:d], self.guess)
+        if not np.isfinite(solution.full()).all():  # at a dead centre rounding decides whether there is a solution
             raise assembler.singular()
 
     @property
@@ -230,9 +230,9 @@ def loop_report(mechanism: Mechanism) -> str:
     lines = []
     for cluster, closure in zip(mechanism.tree.clusters, closures(mechanism), strict=True):
         if closure is not None:
-            found = sum(len(block.unknowns) for block in closure.blocks if block.formula is not None)
+            by_formula = sum(len(block.unknowns) for block in closure.blocks if block.formula is not None)
             lines.append(
-                f"loops of {', '.join(tie.name for tie in cluster.constraints)}: {found} joints by formula, "
+                f"loops of {', '.join(tie.name for tie in cluster.constraints)}: {by_formula} joints by formula, "
                 f"{len(closure.guessed)} by iteration, {closure.assembly.dropped} redundant rows dropped, "
                 f"condition number {closure.assembly.condition:.3g} for {', '.join(cluster.independent)}"
             )

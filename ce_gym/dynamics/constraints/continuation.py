@@ -25,11 +25,11 @@ def follow(loops: ca.Function, start: Array, guess: Array, q: Array) -> tuple[Ar
         The dependent coordinates at `q`, shape (n, n_guess); the largest gap there; the smallest nearness on the way.
         The continuation stops where the nearness is not positive.
     """
-    batched, found, worst, least = loops.map(len(q)), np.tile(guess, (len(q), 1)).T, np.inf, np.inf
+    batched, dependent, worst, least = loops.map(len(q)), np.tile(guess, (len(q), 1)).T, np.inf, np.inf
     for share in (*np.linspace(0.0, 1.0, STEPS + 1)[1:], 1.0):  # twice at the end, to the last digit
-        here = q + (1.0 - share) * (start - q)
-        found, gap, nearness = (np.array(out.full()) for out in batched.call([here.T, found]))
+        point = q + (1.0 - share) * (start - q)
+        dependent, gap, nearness = (np.array(out.full()) for out in batched.call([point.T, dependent]))
         worst, least = float(gap.max()), min(least, float(nearness.min()))
         if not nearness.min() > 0.0:
-            return found.T, worst, float(nearness.min())
-    return found.T, worst, least
+            return dependent.T, worst, float(nearness.min())
+    return dependent.T, worst, least

@@ -54,8 +54,8 @@ def eliminate(cluster: Cluster, last: Collection[int] = ()) -> Elimination:
     independent = [cluster.bodies.index(name) for name in cluster.independent]
     dependent = [i for i in range(n) if i not in independent]
     rows, pivots = list(range(len(A))), {}
-    for late in (False, True):
-        columns = [i for i in dependent if (i in last) == late]
+    for is_last in (False, True):
+        columns = [i for i in dependent if (i in last) == is_last]
         while rows and columns and np.abs(M[np.ix_(rows, columns)]).max() > SMALLEST_PIVOT:
             r, c = divmod(int(np.abs(M[np.ix_(rows, columns)]).argmax()), len(columns))
             row, column = rows.pop(r), columns.pop(c)

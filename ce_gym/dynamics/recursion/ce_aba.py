@@ -129,14 +129,14 @@ def inward_inertia_pass(
         condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
         D = mirrored(condensed.D + joints.slope[rows, rows])
         U, u = condensed.U, joints.tau[rows] - condensed.bias - transverse_bias
-        more, drag = SX(*D.shape), SX(len(rows), 1)
+        damping, drag = SX(*D.shape), SX(len(rows), 1)
         if turning is not None and cluster.output_body is not None:
-            more, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
-            D, u = mirrored(D + more), u + drag
+            damping, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
+            D, u = mirrored(D + damping), u + drag
         if stretches(mechanism, cluster):
-            own, biased = mirrored(condensed.D + more), ca.horzcat(U.T, drag - condensed.bias - transverse_bias)
-            D = mirrored(own + joints.slope[rows, rows])
-            articulation.stretched[k] = Stretched.of(own, joints.slope[rows, rows], biased, joints.tau[rows])
+            D_joints, biased = mirrored(condensed.D + damping), ca.horzcat(U.T, drag - condensed.bias - transverse_bias)
+            D = mirrored(D_joints + joints.slope[rows, rows])
+            articulation.stretched[k] = Stretched.of(D_joints, joints.slope[rows, rows], biased, joints.tau[rows])
         articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
         articulation.inertia[k], articulation.handle_body[k] = condensed.D, handle.name if handle else None
         if cluster.output_body is None:

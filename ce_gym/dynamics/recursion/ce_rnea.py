@@ -106,14 +106,14 @@ def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qd
     With closed loops `G_r` varies, which adds velocity terms, see reflected.py.
     """
     G, index, cluster = coordinates.G, coordinates.index, mechanism.tree.clusters[k]
-    own = [index[name] for name in cluster.independent]
+    independent = [index[name] for name in cluster.independent]
     torque = SX(G.shape[1], 1)
     for rotor in mechanism.eliminated_rotors[k]:
         row = index[rotor.name]
         G_r = G[row, :]
         if mechanism.level == "armature":
-            torque += rotor.inertia * (ca.vec(G_r) ** 2 * qdd[own])
-            torque += diagonal_bias(coordinates, coordinates.qd[own], row, rotor.inertia)
+            torque += rotor.inertia * (ca.vec(G_r) ** 2 * qdd[independent])
+            torque += diagonal_bias(coordinates, coordinates.qd[independent], row, rotor.inertia)
         else:
             torque += rotor.inertia * (G_r.T * qdd[row])
     return torque

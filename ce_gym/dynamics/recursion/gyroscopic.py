@@ -74,8 +74,8 @@ def steadying_couples(mechanism: Mechanism, kinematics: Kinematics, dt: float) -
     for name in mechanism.robot.balls:
         J, w = total[name][:3, :3], kinematics.bodies[name].v[:3]
         momentum = J @ w
-        left = cross(momentum, w)
-        couples[name] = J @ _solve_three(J - dt * skew(momentum), left) - left
+        explicit = cross(momentum, w)
+        couples[name] = J @ _solve_three(J - dt * skew(momentum), explicit) - explicit
     return couples
 
 
@@ -95,9 +95,9 @@ def solve_turning(inertia: SX, turning: SX, force: SX) -> SX:
     """
     across = inertia[:3, 3:]
     linear = solve_positive_definite(inertia[3:, 3:], ca.horzcat(across.T, force[3:, :]))
-    left = inertia[:3, :3] - across @ linear[:, :3] - skew(turning)
+    schur = inertia[:3, :3] - across @ linear[:, :3] - skew(turning)
     moment = force[:3, :] - across @ linear[:, 3:]
-    angular = ca.horzcat(*[_solve_three(left, moment[:, i]) for i in range(moment.shape[1])])
+    angular = ca.horzcat(*[_solve_three(schur, moment[:, i]) for i in range(moment.shape[1])])
     return ca.vertcat(angular, linear[:, 3:] - linear[:, :3] @ angular)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -13,27 +13,28 @@ from ce_gym.model.frames import Vec3
 
 def colliding(robot: Robot, pairs: Sequence[tuple[str, str]]) -> tuple[tuple[Capsule, Capsule], ...]:
     """Return the pairs of capsules of pairs of links, in their order."""
-    return tuple((a, b) for one, other in pairs for a in capsules_of(robot, one) for b in capsules_of(robot, other))
+    capsules = ((capsules_of(robot, first), capsules_of(robot, second)) for first, second in pairs)
+    return tuple(pair for first, second in capsules for pair in product(first, second))
 
 
 def capsules_of(robot: Robot, link: str) -> tuple[Capsule, ...]:
     """Return the robot's capsules of a link, or the longest capsule inside one of the link's shapes."""
-    own = tuple(capsule for capsule in robot.capsules if capsule.body == link)
+    named = tuple(capsule for capsule in robot.capsules if capsule.body == link)
     inside = [_inside(link, shape) for shape in robot.body(link).shapes]
-    return own or tuple(sorted(inside, key=_length)[-1:])
+    return named or tuple(sorted(inside, key=_length)[-1:])
 
 
 def separate_links(robot: Robot) -> Iterator[tuple[str, str]]:
     """Iterate over pairs of links with capsules of which neither carries the other."""
     links = [body for body in robot.bodies if body.kind == "link" and capsules_of(robot, body.name)]
-    for one, other in combinations(links, 2):
-        if not adjacent(one, other):
-            yield one.name, other.name
+    for first, second in combinations(links, 2):
+        if not adjacent(first, second):
+            yield first.name, second.name
 
 
-def adjacent(one: Body, other: Body) -> bool:
+def adjacent(first: Body, second: Body) -> bool:
     """Whether two links are the same or one carries the other."""
-    return one.name in (other.name, other.parent) or other.name == one.parent
+    return first.name in (second.name, second.parent) or second.name == first.parent
 
 
 def _inside(link: str, shape: Shape) -> Capsule:

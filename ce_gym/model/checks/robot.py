@@ -198,8 +198,8 @@ def _check_capsules(robot: Robot, file: str) -> None:
             if not capsules_of(robot, name):
                 expected = "a link with a box, cylinder, sphere, or one of `capsules`"
                 raise invalid_value(file, "self_collisions", name, expected)
-        one, other = robot.body(pair[0]), robot.body(pair[1])
-        if adjacent(one, other):
+        first, second = robot.body(pair[0]), robot.body(pair[1])
+        if adjacent(first, second):
             raise invalid_value(file, "self_collisions", pair, "two links of which none carries the other")
 
 

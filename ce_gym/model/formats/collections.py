@@ -48,8 +48,8 @@ def downloaded(name: str) -> Path:
 def _of_menagerie(module: ModuleType, name: str, robot: str) -> Path:
     if robot not in module.names():
         raise unknown_name(name, "robot", robot, module.names(), "the name of a robot of Menagerie")
-    found = module.get(robot)
-    return Path(found.xml(found.default_model))
+    entry = module.get(robot)
+    return Path(entry.xml(entry.default_model))
 
 
 def _of_descriptions(module: ModuleType, name: str, robot: str) -> Path:

@@ -90,5 +90,5 @@ def _with_body(robot: Robot, body: Body) -> Robot:
     return replace(robot, bodies=tuple(body if old.name == body.name else old for old in robot.bodies))
 
 
-def _changed(things: tuple[Any, ...], key: str, name: str, fields: Mapping[str, float]) -> tuple[Any, ...]:
-    return tuple(replace(thing, **fields) if getattr(thing, key) == name else thing for thing in things)
+def _changed(items: tuple[Any, ...], key: str, name: str, fields: Mapping[str, float]) -> tuple[Any, ...]:
+    return tuple(replace(item, **fields) if getattr(item, key) == name else item for item in items)

@@ -37,14 +37,14 @@ class _Loader(yaml.SafeLoader):
         self._sizes: dict[int, int] = {}  # values in each finished node
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        event, before = self.peek_event(), self._total
+        event, total_before = self.peek_event(), self._total
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_SCALAR:
             raise _refused(event, f"a value of {len(event.value)} characters: expected at most {LONGEST_SCALAR}")
         node = super().compose_node(parent, index)
         if isinstance(event, yaml.AliasEvent) and id(node) not in self._sizes:
             raise _refused(event, f"alias {event.anchor!r} stands inside what it names: expected no self-reference")
         self._total += self._sizes[id(node)] if isinstance(event, yaml.AliasEvent) else 1
-        self._sizes.setdefault(id(node), self._total - before)
+        self._sizes.setdefault(id(node), self._total - total_before)
         if self._total > LARGEST_TREE:
             raise _refused(event, f"more than {LARGEST_TREE} values, aliases counted: expected fewer")
         return node

@@ -18,5 +18,5 @@ def with_limits(pose: Pairs, bodies: Iterable[Body], independent: Sequence[str])
         independent: Bodies whose joint coordinates are independent.
     """
     named, limits = dict(pose), {body.name: body.joint.position for body in bodies}
-    beside = [(joint, min(max(0.0, limits[joint][0]), limits[joint][1])) for joint in independent if joint in limits]
-    return (*pose, *((joint, angle) for joint, angle in beside if joint not in named and angle != 0.0))
+    nearest = [(joint, min(max(0.0, limits[joint][0]), limits[joint][1])) for joint in independent if joint in limits]
+    return (*pose, *((joint, angle) for joint, angle in nearest if joint not in named and angle != 0.0))

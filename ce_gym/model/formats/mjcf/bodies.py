@@ -144,12 +144,12 @@ def _inertial(source: MjcfSource, index: int) -> Inertial:
     return Inertial(float(model.body_mass[index]), vec3(model.body_ipos[index]), mat3((inertia + inertia.T) / 2))
 
 
-def _join(source: MjcfSource, tree: MjcfTree, carrier: str, index: int, own: bool) -> None:
+def _join(source: MjcfSource, tree: MjcfTree, carrier: str, index: int, has_joint: bool) -> None:
     """Give a body's mass and shapes to the link that carries it."""
     part = transform_inertial(tree.frames[index][1], _inertial(source, index))
     at = next(i for i, body in enumerate(tree.bodies) if body.name == carrier)
     body = tree.bodies[at]
-    tree.bodies[at] = replace(body, inertial=part if own else merge_inertials([body.inertial, part]))
+    tree.bodies[at] = replace(body, inertial=part if has_joint else merge_inertials([body.inertial, part]))
 
 
 def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, frame: Placement) -> Body:
@@ -219,8 +219,8 @@ def _motion(source: MjcfSource, j: int, coordinate: float) -> Placement:
         return Placement(vec3(travel * axis))
     turn = placement(np.zeros(3), np.array([np.cos(travel / 2), *(np.sin(travel / 2) * axis)]))
     pivot = _pivot(source, j)
-    there = compose(Placement(pivot), turn)
-    return compose(there, _after(source, j))
+    moved_pivot = compose(Placement(pivot), turn)
+    return compose(moved_pivot, _after(source, j))
 
 
 def _report_forces(source: MjcfSource) -> None:

@@ -59,19 +59,19 @@ def read_constraints(source: MjcfSource, tree: MjcfTree, locked: Mapping[int, fl
     Ignored equalities are switched off in `source.data`, which removes their rows from its Jacobian. Couplings by
     tendons come last, with indices from the number of equalities on.
     """
-    found: dict[int, list[Constraint]] = {}
-    given = [source.given_name("equality", i) for i in range(source.model.neq)]
-    tree.ties.update(name for name in given if name)
+    constraints_of: dict[int, list[Constraint]] = {}
+    names = [source.given_name("equality", i) for i in range(source.model.neq)]
+    tree.ties.update(name for name in names if name)
     for i in range(source.model.neq):
         if not source.model.eq_active0[i]:
-            source.leave_out("equality {}, which is not active", given[i] or f"number {i + 1}")
+            source.leave_out("equality {}, which is not active", names[i] or f"number {i + 1}")
             continue
         line = _linear(source, i, locked)
         if line is not None and not line[0]:
             continue  # its joints are welds in the tree
-        name = given[i] or tree.fresh_tie(_name_by_ends(source, tree, i))
+        name = names[i] or tree.fresh_tie(_name_by_ends(source, tree, i))
         if constraints := list(_constraint(source, tree, i, name, line)):
-            found[i] = constraints
+            constraints_of[i] = constraints
         else:
             source.leave_out(_reason(source, i), name)
             source.data.eq_active[i] = 0
@@ -81,9 +81,9 @@ def read_constraints(source: MjcfSource, tree: MjcfTree, locked: Mapping[int, fl
         coefficients, offset = _unlocked(tendon_coefficients(source, tendon) or {}, (low + high) / 2, locked)
         if len(coefficients) > 1:
             pairs = tuple((tree.moved_by[j], x) for j, x in coefficients.items())
-            found[source.model.neq + tendon] = [LinearConstraint(name, pairs, offset)]
+            constraints_of[source.model.neq + tendon] = [LinearConstraint(name, pairs, offset)]
             source.leave_out("the play of tendon {}", f"{name} (range {low:g} to {high:g}, held at its middle)")
-    return found
+    return constraints_of
 
 
 def coupling_tendons(source: MjcfSource) -> list[int]:

@@ -57,15 +57,15 @@ def equality_rows(source: MjcfSource, tree: MjcfTree) -> list[EqualityRows]:
     """
     model, rng = source.model, np.random.default_rng(0)
     start, fixed = source.data.qpos.copy(), model.jnt_type[model.dof_jntid] == source.mujoco.mjtJoint.mjJNT_FREE
-    found = [_closed_rows(source, tree, LARGEST_STEP)]
-    for spread in rng.uniform(-SPREAD, SPREAD, (POSES if len(found[0].owner) else 0, model.nv)):
+    poses = [_closed_rows(source, tree, LARGEST_STEP)]
+    for spread in rng.uniform(-SPREAD, SPREAD, (POSES if len(poses[0].owner) else 0, model.nv)):
         source.data.qpos[:] = start
         source.mujoco.mj_integratePos(model, source.data.qpos, np.where(fixed, 0.0, spread), 1.0)
         rows = _closed_rows(source, tree, LARGEST_STEP + 2 * SPREAD)
-        found += [rows] if rows.gap < OPEN else []
+        poses += [rows] if rows.gap < OPEN else []
     source.data.qpos[:] = start
     source.forward()
-    return found
+    return poses
 
 
 def _closed_rows(source: MjcfSource, tree: MjcfTree, largest_step: float) -> EqualityRows:
@@ -111,14 +111,14 @@ def _scalar_joints(source: MjcfSource, tree: MjcfTree) -> list[tuple[int, str, t
 
     The column is a slice of rows and the entries in these rows, at the reference pose.
     """
-    model, kinds, found = source.model, source.mujoco.mjtJoint, []
+    model, kinds, joints = source.model, source.mujoco.mjtJoint, []
     for j in sorted({*tree.moved_by, *tree.hinged}):
         first = int(model.jnt_dofadr[j])
         if j in tree.hinged:
-            found += [(j, b.name, (slice(first, first + 3), np.array(b.joint.axis))) for b in tree.hinged[j]]
+            joints += [(j, b.name, (slice(first, first + 3), np.array(b.joint.axis))) for b in tree.hinged[j]]
         elif model.jnt_type[j] != kinds.mjJNT_FREE and model.jnt_type[j] != kinds.mjJNT_BALL:
-            found.append((j, tree.moved_by[j], (slice(first, first + 1), np.ones(1))))
-    return found
+            joints.append((j, tree.moved_by[j], (slice(first, first + 1), np.ones(1))))
+    return joints
 
 
 def without_repeats(
@@ -131,9 +131,9 @@ def without_repeats(
     order = sorted(constraints, key=lambda i: not all(tie.linear for tie in constraints[i]))
     repeated: list[int] = []
     for place, i in enumerate(order):
-        before = [other for other in order[:place] if other not in repeated]
-        ranks = [(_rank(p.of({i})), _rank(p.of(before)), *_rank_and_rest(p.of({*before, i}))) for p in poses]
-        alone, new = max(one for one, *_ in ranks), max(total - known for _, known, total, _ in ranks)
+        kept = [other for other in order[:place] if other not in repeated]
+        ranks = [(_rank(p.of({i})), _rank(p.of(kept)), *_rank_and_rest(p.of({*kept, i}))) for p in poses]
+        alone, new = max(rank for rank, *_ in ranks), max(total - known for _, known, total, _ in ranks)
         if new >= alone:
             continue
         names = " and ".join(body or "the world" for body in _ends(constraints[i]))

@@ -46,8 +46,8 @@ def check_file(path: Path) -> None:
     pages: dict[Path, Element] = {}
     _read_pages(path, path.parent, pages)
     folders = {page.parent for page in pages}
-    given = {root.get(key) for root in _all(pages, "compiler") for key in ("assetdir", "meshdir", "texturedir")}
-    folders |= {folder / name for folder in list(folders) for name in given if name}
+    subfolders = {root.get(key) for root in _all(pages, "compiler") for key in ("assetdir", "meshdir", "texturedir")}
+    folders |= {folder / name for folder in list(folders) for name in subfolders if name}
     largest = max(sum(1 for _ in root.iter()) for root in pages.values())
     total = 0
     for page, root in pages.items():

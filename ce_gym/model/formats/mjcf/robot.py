@@ -163,8 +163,8 @@ def _pose(source: MjcfSource, tree: MjcfTree, independent: tuple[str, ...], lowe
             up = rotation(qpos[address + 3 : address + 7])[:, 2]  # the base's z axis in the world, whatever the yaw
             inclination = float(np.arctan2(np.hypot(up[0], up[1]), up[2]))
             if inclination > UPRIGHT:
-                told = f"{np.degrees(inclination):.3g} degrees"
-                source.leave_out("the inclination of the base in the reference pose ({})", told)
+                angle = f"{np.degrees(inclination):.3g} degrees"
+                source.leave_out("the inclination of the base in the reference pose ({})", angle)
             if source.moved:
                 height -= lowest  # feet just touch
             elif lowest < -DEEPEST:

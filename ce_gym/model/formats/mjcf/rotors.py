@@ -58,8 +58,8 @@ def add_rotors(
         driven: Bodies with rotors in the YAML file; the armature of their joints is ignored.
     """
     ratios = _known_ratios(source, tree) | {j: gear_ratios[b] for j, b in tree.moved_by.items() if b in gear_ratios}
-    found = [*_joint_armatures(source, tree, ratios), *_tendon_armatures(source), *_motor_armatures(source)]
-    moving = [replace(a, joints={j: x for j, x in a.joints.items() if j in tree.moved_by}) for a in found]
+    armatures = [*_joint_armatures(source, tree, ratios), *_tendon_armatures(source), *_motor_armatures(source)]
+    moving = [replace(a, joints={j: x for j, x in a.joints.items() if j in tree.moved_by}) for a in armatures]
     moving = [a for a in moving if not {tree.moved_by[j] for j in a.joints} & set(driven)]
     for armature in moving:
         if armature.joints and armature.ratio is None:
@@ -140,36 +140,36 @@ def _known_ratios(source: MjcfSource, tree: MjcfTree) -> dict[int, float]:
 
 def _joint_armatures(source: MjcfSource, tree: MjcfTree, ratios: Mapping[int, float]) -> list[_Armature]:
     model = source.model
-    found = []
-    kinds, several = source.mujoco.mjtJoint, tree.moved_by | dict.fromkeys(tree.hinged, "")
-    for j, body in several.items():
+    armatures = []
+    kinds, joints = source.mujoco.mjtJoint, tree.moved_by | dict.fromkeys(tree.hinged, "")
+    for j, body in joints.items():
         reflected = float(model.dof_armature[model.jnt_dofadr[j]])
-        what = {int(kinds.mjJNT_FREE): "free", int(kinds.mjJNT_BALL): "ball"}.get(int(model.jnt_type[j]))
-        if what is not None:
+        kind = {int(kinds.mjJNT_FREE): "free", int(kinds.mjJNT_BALL): "ball"}.get(int(model.jnt_type[j]))
+        if kind is not None:
             if reflected:
-                source.leave_out(f"armature of the {what} joint {{}}", source.name("joint", j))
+                source.leave_out(f"armature of the {kind} joint {{}}", source.name("joint", j))
         elif reflected:
-            found.append(_Armature(body, {j: 1.0}, reflected, ratios.get(j)))
-    return found
+            armatures.append(_Armature(body, {j: 1.0}, reflected, ratios.get(j)))
+    return armatures
 
 
 def _tendon_armatures(source: MjcfSource) -> list[_Armature]:
     model = source.model
-    found = []
+    armatures = []
     for t in range(model.ntendon):
         name, reflected = source.name("tendon", t), float(getattr(model, "tendon_armature", np.zeros(model.ntendon))[t])
         coefficients = tendon_coefficients(source, t)
         if reflected and coefficients is None:
             source.leave_out("armature of the spatial tendon {}", name)
         elif reflected:
-            found.append(_Armature(name, coefficients or {}, reflected, None))
-    return found
+            armatures.append(_Armature(name, coefficients or {}, reflected, None))
+    return armatures
 
 
 def _motor_armatures(source: MjcfSource) -> list[_Armature]:
     """Return armatures of actuators, at the motor side of the gear; in MuJoCo since 4.0."""
     model = source.model
-    found = []
+    armatures = []
     for a in range(model.nu):
         inertia = float(getattr(model, "actuator_armature", np.zeros(model.nu))[a])
         gear, name = float(model.actuator_gear[a][0]), source.name("actuator", a)
@@ -177,5 +177,5 @@ def _motor_armatures(source: MjcfSource) -> list[_Armature]:
         if inertia and not joints:
             source.leave_out("armature of actuator {}", name)
         elif inertia:
-            found.append(_Armature(name, joints, inertia * gear**2, None if abs(gear) in (0.0, 1.0) else gear))
-    return found
+            armatures.append(_Armature(name, joints, inertia * gear**2, None if abs(gear) in (0.0, 1.0) else gear))
+    return armatures

@@ -27,11 +27,11 @@ def scene_hint(path: Path, is_readable: Callable[[Path], bool]) -> str:
 
 def robot_hint(path: Path) -> str:
     """Return a hint with the neighbouring files that have robots, as the end of an error message."""
-    own = read_text(path, "an MJCF file")
+    scene = read_text(path, "an MJCF file")
     names = [
         other.name
         for other, text in _beside(path)
-        if re.search(r"<(freejoint|joint)\b", text.partition("<worldbody")[2]) and not _includes(own, other)
+        if re.search(r"<(freejoint|joint)\b", text.partition("<worldbody")[2]) and not _includes(scene, other)
     ]
     listed = ", ".join(names[:MOST_NAMED])
     return f"; this may be a scene for the robot in {listed}: read that, or <include> it here" if names else ""

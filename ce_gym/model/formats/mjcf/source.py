@@ -100,8 +100,8 @@ def summary(left_out: list[tuple[str, str]]) -> str:
         kinds.setdefault(what, []).append(name)
     parts = []
     for what, names in list(kinds.items())[:MOST_KINDS]:
-        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-        parts.append(what.format(", ".join(names[:MOST_NAMES]) + more))
+        rest = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+        parts.append(what.format(", ".join(names[:MOST_NAMES]) + rest))
     if len(kinds) > MOST_KINDS:
         parts.append(f"{len(kinds) - MOST_KINDS} other kinds of things")
     return "; ".join(parts) + (" (Robot.notes has all)" if len(left_out) > len(parts) else "")
@@ -122,8 +122,8 @@ def read_mjcf(path: Path) -> MjcfSource:
         model = _compiled(mujoco, path)
         source = MjcfSource(str(path), mujoco, model, mujoco.MjData(model))
     except Exception as error:  # MuJoCo raises ValueError, FatalError, MemoryError and others
-        told = f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})"
-        raise RobotError(told + scene_hint(path, lambda other: _is_readable(mujoco, other))) from None
+        message = f"{path}: MuJoCo refuses the file: expected valid MJCF ({one_line(error)})"
+        raise RobotError(message + scene_hint(path, lambda other: _is_readable(mujoco, other))) from None
     _check_figures(str(path), model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, source.data, 0)

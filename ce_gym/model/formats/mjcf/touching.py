@@ -53,8 +53,8 @@ def can_touch(source: MjcfSource, a: int, b: int) -> bool:
 
 def touched(source: MjcfSource, geom: int, ground: list[int]) -> list[int]:
     """Return the fixed geoms that a geom can touch; only planes z = 0 if there are any."""
-    found = [g for g in ground if can_touch(source, geom, g)]
-    return [g for g in found if is_ground(source, g)] or found
+    touchable = [g for g in ground if can_touch(source, geom, g)]
+    return [g for g in touchable if is_ground(source, g)] or touchable
 
 
 def is_ground(source: MjcfSource, geom: int) -> bool:
@@ -75,14 +75,14 @@ def touch_of(source: MjcfSource, a: int, b: int | None) -> Touch:
         slip_solver = tuple(model.pair_solreffriction[pair])
         margins = [float(model.pair_margin[pair]), float(model.pair_gap[pair])]
     else:
-        both = [a] if b is None else [a, b]
-        highest = max(int(model.geom_priority[g]) for g in both)
-        deciding = [g for g in both if model.geom_priority[g] == highest]
+        geoms = [a] if b is None else [a, b]
+        highest = max(int(model.geom_priority[g]) for g in geoms)
+        deciding = [g for g in geoms if model.geom_priority[g] == highest]
         dimension = max([DEFAULT_DIMENSION] * (b is None) + [int(model.geom_condim[g]) for g in deciding])
         friction = [max(float(model.geom_friction[g][0]) for g in deciding)] * 2
         solvers = [(*model.geom_solref[g], *model.geom_solimp[g]) for g in deciding]
-        solver = next((one for one in solvers if not is_default_solver(one)), _DEFAULT_SOLVER)
-        margins = [float(x) for g in both for x in (model.geom_margin[g], model.geom_gap[g])]
+        solver = next((solver_pair for solver_pair in solvers if not is_default_solver(solver_pair)), _DEFAULT_SOLVER)
+        margins = [float(x) for g in geoms for x in (model.geom_margin[g], model.geom_gap[g])]
     if model.opt.enableflags & int(source.mujoco.mjtEnableBit.mjENBL_OVERRIDE):
         friction = [float(x) for x in model.opt.o_friction]
         solver, margins = (*model.opt.o_solref, *model.opt.o_solimp), [float(model.opt.o_margin)]

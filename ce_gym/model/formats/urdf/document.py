@@ -82,5 +82,5 @@ def _refuse_xacro(file: str, root: Element) -> None:
         texts = (*element.attrib.values(), element.text or "")
         value = next((text for text in texts if "${" in text or "$(" in text), None)
         if wants or (value is not None and not element.tag.startswith("xacro:")):
-            found = f"<{element.tag}>" if wants else value
-            raise invalid_value(file, "xacro", found, "a plain URDF; expand it first: xacro FILE > robot.urdf")
+            value = f"<{element.tag}>" if wants else value
+            raise invalid_value(file, "xacro", value, "a plain URDF; expand it first: xacro FILE > robot.urdf")

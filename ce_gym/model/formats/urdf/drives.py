@@ -162,7 +162,7 @@ def _motors(file: str, where: str, transmission: Element) -> Iterator[tuple[floa
 
 def _figures(file: str, where: str, parts: Iterable[Element], key: str) -> list[float]:
     """Return the numbers in elements of a ratio or an inertia, as text or as `value`."""
-    found = []
+    numbers = []
     for element in (part for part in parts if part.tag in WORDS[key]):
         text = element.get("value", element.text or "")
         try:
@@ -173,13 +173,13 @@ def _figures(file: str, where: str, parts: Iterable[Element], key: str) -> list[
         if not math.isfinite(value) or negative:
             expected = "a finite number" + (" that is not negative" * negative)
             raise invalid_value(file, f"{where} <{element.tag}>", text, expected)
-        found.append(value)
-    return found
+        numbers.append(value)
+    return numbers
 
 
 def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-    return ", ".join(map(repr, names[:MOST_NAMES])) + more
+    rest = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(map(repr, names[:MOST_NAMES])) + rest
 
 
 def _added_inertias(graph: UrdfGraph) -> Iterator[Drive]:

@@ -107,10 +107,9 @@ class UrdfGraph:
             if joint.name in joints:
                 raise invalid_value(self.file, "joint name", joint.name, "a name that no other joint has")
             if joint.child in moved_by:
-                both = f"{moved_by[joint.child]!r} and {joint.name!r}"
-                raise invalid_value(
-                    self.file, f"link {joint.child!r} parents", both, "one joint; close a loop by a constraint instead"
-                )
+                names = f"{moved_by[joint.child]!r} and {joint.name!r}"
+                expected = "one joint; close a loop by a constraint instead"
+                raise invalid_value(self.file, f"link {joint.child!r} parents", names, expected)
             joints[joint.name] = joint
             moved_by[joint.child] = joint.name
         return list(joints.values())

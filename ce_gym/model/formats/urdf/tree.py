@@ -98,8 +98,8 @@ def warn_of_held_joints(file: str, tree: UrdfTree) -> None:
     """Warn in one line of joints that are fixed because they move no mass."""
     if tree.held:
         first, *others = tree.held
-        more = f" (and {len(others)} more, see Robot.notes)" if others else ""
-        warnings.warn(f"{file}: {first}{more}", LossyImportWarning, stacklevel=5)
+        rest = f" (and {len(others)} more, see Robot.notes)" if others else ""
+        warnings.warn(f"{file}: {first}{rest}", LossyImportWarning, stacklevel=5)
 
 
 def read_tree(
@@ -114,9 +114,9 @@ def _without_rounding(inertials: dict[str, Inertial | None]) -> dict[str, Inerti
 
     CAD programs write -5e-20 for the inertia of a small part.
     """
-    given = {name: part for name, part in inertials.items() if part is not None}
-    largest = max((np.abs(part.inertia).max() for part in given.values()), default=0.0)
-    for name, part in given.items():
+    known = {name: part for name, part in inertials.items() if part is not None}
+    largest = max((np.abs(part.inertia).max() for part in known.values()), default=0.0)
+    for name, part in known.items():
         moments, axes = np.linalg.eigh(np.array(part.inertia))
         if -ROUNDING * largest <= moments[0] < 0.0:
             inertials[name] = replace(part, inertia=mat3(axes * np.fmax(moments, 0.0) @ axes.T))
@@ -176,14 +176,14 @@ class _Reader:
 
     def _gazebo_springs(self) -> dict[str, dict[str, float]]:
         """Return the spring parameters in <gazebo> elements, by the name of the joint."""
-        found: dict[str, dict[str, float]] = {}
+        springs: dict[str, dict[str, float]] = {}
         for element in self.graph.robot.findall("gazebo"):
             for part in (part for part in element if part.tag in SPRINGS):
                 joint, text = element.get("reference", ""), part.get("value", part.text or "")
                 where = f"gazebo {joint!r}"
                 value = read.numbers(self.file, where, Element(part.tag, value=text), "value", 1)[0]
-                found.setdefault(joint, {})[SPRINGS[part.tag]] = value
-        return found
+                springs.setdefault(joint, {})[SPRINGS[part.tag]] = value
+        return springs
 
     def _root_is_world(self, base: Base | None) -> bool:
         floating = [joint for joint in self.joints.values() if joint.type == "floating"]

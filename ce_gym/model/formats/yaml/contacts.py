@@ -109,9 +109,9 @@ def _collisions(entry: Section, links: Links) -> Iterator[Shape]:
     link = entry.text("body")
     shapes = links.collisions.get(link, ())
     if not shapes or None in shapes:
-        told, expected = ("a mesh", "primitives") if shapes else (None, "some in its URDF file")
+        value, expected = ("a mesh", "primitives") if shapes else (None, "some in its URDF file")
         expected = f"{expected}: box, cylinder or sphere"
-        raise invalid_value(entry.file, f"{entry.path} <collision> of {link!r}", told, expected)
+        raise invalid_value(entry.file, f"{entry.path} <collision> of {link!r}", value, expected)
     return (shape for shape in shapes if shape)
 
 
