@@ -201,7 +201,7 @@ def _grid(n: int, m: int) -> Array:
     return np.concatenate([sides, *inside])
 
 
-def pressed(hull: Hull, up: SX, z: SX, under: SX, corners: SX) -> list[tuple[SX, SX, SX]]:
+def hull_contacts(hull: Hull, up: SX, z: SX, under: SX, corners: SX) -> list[tuple[SX, SX, SX]]:
     """Return where each region of a hull touches the ground: point (3,) in the body frame [m], depth [m], normal (3,).
 
     A rounded hull touches straight below its points. On ground inclined by an angle `b` against the line between the

@@ -16,7 +16,7 @@ from ce_gym.model.coordinates import Layout
 def advance(q: SX, v: SX, vdot: SX, dt: float, layout: Layout) -> tuple[SX, SX]:
     """Return positions (nq,) and velocities (nv,) after a step of length `dt` [s] with constant acceleration."""
     v_next = v + dt * vdot
-    turned = [turned_by(q[i : i + 4], v_next[j : j + 3] * dt) for i, j in layout.turns]
+    turned = [rotate_quaternion(q[i : i + 4], v_next[j : j + 3] * dt) for i, j in layout.turns]
     y_next = q[layout.joints_q :] + dt * v_next[layout.joints_v :]
     if not layout.floating:
         return ca.vertcat(*turned, y_next), v_next
@@ -26,7 +26,7 @@ def advance(q: SX, v: SX, vdot: SX, dt: float, layout: Layout) -> tuple[SX, SX]:
     return ca.vertcat(q[:3] + dt * u_world, *turned, y_next), v_next
 
 
-def turned_by(quaternion: SX, rotation: SX) -> SX:
+def rotate_quaternion(quaternion: SX, rotation: SX) -> SX:
     """Return a unit quaternion turned by a rotation vector [rad] in body axes, by the exponential map."""
     angle = ca.sqrt(ca.sumsqr(rotation) + 1e-24)  # never zero, so that sin(angle / 2) / angle stays finite
     half_turn = ca.vertcat(ca.cos(angle / 2), ca.sin(angle / 2) / angle * rotation)
@@ -34,7 +34,7 @@ def turned_by(quaternion: SX, rotation: SX) -> SX:
     return product / ca.sqrt(ca.sumsqr(product))
 
 
-def between(a: SX, b: SX) -> SX:
+def rotation_between(a: SX, b: SX) -> SX:
     """Return the small rotation vector [rad], body axes, that takes unit quaternion `a` to `b`; shape (3,).
 
     The vector part of the relative quaternion is half of its sine; the arcsine is expanded to third order, which is far

@@ -100,18 +100,18 @@ def loop_coordinates(cluster: Cluster, closure: Closure, y: SX, yd: SX, guess: S
     return ClusterCoordinates(index, q, qd, G, g, loop, lambda row: closure.second_derivative(y, z, row))
 
 
-def geared(coordinates: ClusterCoordinates, rotors: dict[str, str], ratio: SX | float) -> ClusterCoordinates:
-    """Return coordinates with rotor angles, less stretches, scaled by `ratio`; no other body depends on rotors."""
+def with_gear_factor(coordinates: ClusterCoordinates, rotors: dict[str, str], factor: SX | float) -> ClusterCoordinates:
+    """Return coordinates with rotor angles, less stretches, scaled by `factor`; no other body depends on rotors."""
     scale = SX.eye(coordinates.q.numel())
     for rotor, stretch in rotors.items():
         row = coordinates.index[rotor]
-        scale[row, row] = ratio
+        scale[row, row] = factor
         if stretch in coordinates.index:
-            scale[row, coordinates.index[stretch]] = 1 - ratio
+            scale[row, coordinates.index[stretch]] = 1 - factor
     q, qd, g = scale @ coordinates.q, scale @ coordinates.qd, scale @ coordinates.g
-    geared = replace(coordinates, q=q, qd=qd, G=ca.sparsify(scale @ coordinates.G), g=g)
+    scaled = replace(coordinates, q=q, qd=qd, G=ca.sparsify(scale @ coordinates.G), g=g)
     second = coordinates.second_derivative
-    return geared if second is None else replace(geared, second_derivative=lambda row: scale[row, row] * second(row))
+    return scaled if second is None else replace(scaled, second_derivative=lambda row: scale[row, row] * second(row))
 
 
 def explicit_constraint(cluster: Cluster, y: SX) -> SX:

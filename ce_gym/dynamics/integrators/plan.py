@@ -12,7 +12,7 @@ from typing import Literal
 
 import casadi as ca
 
-from ce_gym.dynamics.algebra.integration import between, turned_by
+from ce_gym.dynamics.algebra.integration import rotate_quaternion, rotation_between
 from ce_gym.dynamics.algebra.spatial import SX, quaternion_to_rotation
 from ce_gym.dynamics.state import State
 from ce_gym.model.coordinates import Layout
@@ -135,8 +135,8 @@ def combined(plan: Plan, ends: Mapping[str, State], layout: Layout) -> State:
     v = sum((weight * ends[name].v for name, weight in weights.items()), SX(0))
     for i, _ in layout.turns:
         others = [(weight, ends[name].q[i : i + 4]) for name, weight in weights.items() if ends[name] is not last]
-        turned = sum((-weight * between(other, last.q[i : i + 4]) for weight, other in others), SX(0))
-        q[i : i + 4] = turned_by(last.q[i : i + 4], turned)
+        turned = sum((-weight * rotation_between(other, last.q[i : i + 4]) for weight, other in others), SX(0))
+        q[i : i + 4] = rotate_quaternion(last.q[i : i + 4], turned)
     if layout.floating:
         world = [w * (quaternion_to_rotation(ends[s].q[3:7]) @ ends[s].v[3:6]) for s, w in weights.items()]
         v[3:6] = quaternion_to_rotation(q[3:7]).T @ sum(world, SX(0))
@@ -170,7 +170,7 @@ def step_errors(plan: Plan, before: State, ends: Mapping[str, State], layout: La
     assert isinstance(plan.end, Ends)
     one, other = (ends[name] for name in plan.end.error)
     turns = {i for i, _ in layout.turns}
-    turned = [between(one.q[i : i + 4], other.q[i : i + 4]) for i in sorted(turns)]
+    turned = [rotation_between(one.q[i : i + 4], other.q[i : i + 4]) for i in sorted(turns)]
     others = [i for i in range(one.q.numel()) if not any(start <= i < start + 4 for start in turns)]
     touches = [[state[name] > 0 for name in TOUCHES] for state in (before, *ends.values())]
     first, *others_touch = [ca.vertcat(SX(0), *each) for each in touches]

@@ -27,8 +27,8 @@ from ce_gym.dynamics.constraints.cluster_constraints import (
     ClusterCoordinates,
     ball_coordinates,
     cluster_coordinates,
-    geared,
     loop_coordinates,
+    with_gear_factor,
 )
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.drives import stretch_of
@@ -129,7 +129,7 @@ def outward_velocity_pass(mechanism: Mechanism, q: SX, v: SX, guess: SX | None =
             coordinates = loop_coordinates(cluster, closure, y, yd, guess[first:used])
         if mechanism.ratio is not None and cluster.independent:
             rotors = {name: stretch_of(name) for name in cluster.bodies if mechanism.robot.body(name).kind == "rotor"}
-            coordinates = geared(coordinates, rotors, mechanism.ratio)
+            coordinates = with_gear_factor(coordinates, rotors, mechanism.ratio)
         kinematics.coordinates.append(coordinates)
         for body in mechanism.moving(cluster):
             i = coordinates.index[body.name]

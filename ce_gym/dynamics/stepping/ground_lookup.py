@@ -18,7 +18,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.ground import above_deepest
 from ce_gym.dynamics.forces.scene import StepOptions, contact_spheres
-from ce_gym.dynamics.hulls import pressed
+from ce_gym.dynamics.hulls import hull_contacts
 from ce_gym.dynamics.laws.scene_laws import symbolic_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
 from ce_gym.model.mechanism import Mechanism
@@ -107,7 +107,7 @@ def hulls_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
         own = slice(first, first + len(hull.points))
         first = own.stop
         body = kinematics.bodies[hull.body]
-        for spot, depth, normal in pressed(hull, body.R[2, :].T, points[2, own], under[:, own], ground[0, :]):
+        for spot, depth, normal in hull_contacts(hull, body.R[2, :].T, points[2, own], under[:, own], ground[0, :]):
             place = body.point_position(spot)
             region_points.append(spot)
             places.append(place[:2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from ce_gym.dynamics.algebra.integration import turned_by
+from ce_gym.dynamics.algebra.integration import rotate_quaternion
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.task.sampling import Sampler
@@ -28,9 +28,9 @@ def starting_pose(model: Model, task: Task, sampler: Sampler) -> SX:
         height, lean = (task.start.get(name, (0.0, 0.0)) for name in ("height", "lean"))
         standing[2] += sampler.uniform(*height)
         direction, angle = sampler.uniform(-np.pi, np.pi), sampler.uniform(*lean)
-        quaternion = turned_by(quaternion, angle * ca.vertcat(ca.cos(direction), ca.sin(direction), 0))
+        quaternion = rotate_quaternion(quaternion, angle * ca.vertcat(ca.cos(direction), ca.sin(direction), 0))
     rows = [row for row, _ in layout.ball_turns]
-    balls = [turned_by(standing[row : row + 4], noise[3 * i : 3 * i + 3]) for i, row in enumerate(rows)]
+    balls = [rotate_quaternion(standing[row : row + 4], noise[3 * i : 3 * i + 3]) for i, row in enumerate(rows)]
     joints = standing[layout.joints_q :] + noise[3 * layout.balls :]
     return ca.densify(ca.vertcat(standing[:3], quaternion, *balls, joints))
 

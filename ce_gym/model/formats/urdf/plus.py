@@ -25,8 +25,8 @@ from ce_gym.model.constraints import LinearConstraint, LoopConstraint
 from ce_gym.model.description import Body, Pose, Robot
 from ce_gym.model.errors import invalid_value, unknown_name
 from ce_gym.model.formats.placement import compose
+from ce_gym.model.formats.pose import complete_pose
 from ce_gym.model.formats.rotor_rule import with_rotors
-from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.drives import add_rotors
 from ce_gym.model.formats.urdf.graph import UrdfGraph
@@ -63,7 +63,7 @@ def robot_from_graph(graph: UrdfGraph, base: Base | None = None) -> Robot:
     notes = list(tree.notes)
     bodies, gears = add_rotors(bodies, tree.drives, (), notes)
     constraints = (*constraints, *gears)
-    pose = Pose(joints=with_limits((), bodies, independent))
+    pose = Pose(joints=complete_pose((), bodies, independent))
     robot = Robot(tree.name, bodies, constraints, independent, pose=pose, source=graph.file, notes=tuple(notes))
     check_robot(robot)
     return robot

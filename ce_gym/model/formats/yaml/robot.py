@@ -17,8 +17,8 @@ from ce_gym.model.constraints import Constraint
 from ce_gym.model.description import Body, ContactMaterial, Gains, Pose, Robot
 from ce_gym.model.formats.identified import with_identified
 from ce_gym.model.formats.placement import vec3
+from ce_gym.model.formats.pose import complete_pose
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
-from ce_gym.model.formats.standing import with_limits
 from ce_gym.model.formats.urdf import drives
 from ce_gym.model.formats.yaml.constraints import read_constraints
 from ce_gym.model.formats.yaml.contacts import read_capsules, read_contacts, read_pairs
@@ -143,7 +143,7 @@ def _pose(section: Section, default: Pose, bodies: tuple[Body, ...], independent
     section.allow("height", "joints")
     named = section.section("joints").numbers_for(independent)
     rest = ((joint, value) for joint, value in default.joints if joint in independent and joint not in named)
-    joints = with_limits((*named.items(), *rest), bodies, independent)
+    joints = complete_pose((*named.items(), *rest), bodies, independent)
     return Pose(section.number("height", default.height), joints)
 
 

@@ -9,8 +9,8 @@ from ce_gym.model.description import Body
 Pairs = tuple[tuple[str, float], ...]
 
 
-def with_limits(pose: Pairs, bodies: Iterable[Body], independent: Sequence[str]) -> Pairs:
-    """Return a pose with joints that it does not name as near to zero as their limits allow.
+def complete_pose(pose: Pairs, bodies: Iterable[Body], independent: Sequence[str]) -> Pairs:
+    """Return a pose of all independent joints; joints without angle are as near to zero as their limits allow.
 
     Args:
         pose: Pairs (body, angle) [rad or m].
