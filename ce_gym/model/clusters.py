@@ -165,7 +165,7 @@ def _cluster(
         names = ", ".join(constraint.name for constraint in ties)
         expected = f"a tie that does not reach across the {free[0].joint.type} joint of {free[0].name}"
         if free[0].joint.type == "ball":
-            expected += ", which in a loop is three revolute joints (ce_gym.model.coincident_hinges)"
+            expected += ", which must be three revolute joints in a loop (ce_gym.model.coincident_hinges)"
         raise invalid_value(robot.source or robot.name, f"constraint {names}", tuple(group), expected)
     output = parents[group[0]]
     return Cluster(

@@ -54,7 +54,7 @@ def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = 
     if kind == ".urdf":
         return _from_urdf(path, floating)
     if floating is not None:
-        raise invalid_value(str(path), "floating", floating, "None, because the file itself says what its base is")
+        raise invalid_value(str(path), "floating", floating, "None: the file describes its base")
     if kind in (".yaml", ".yml"):
         return robot_from_yaml(path)
     if kind == ".xml":

@@ -72,7 +72,7 @@ def robot_with(tmp_path, text: str):
 
 def test_capsules_and_pairs_of_links_by_any_name_of_theirs(tmp_path):
     ball = "capsules: {sole: {from: [0, 0, 0], radius: 0.03}, trunk: [{from: [0, 0, 0], to: [1, 0, 0], radius: 0.1}]}"
-    with pytest.raises(RobotError, match="none carries the other"):
+    with pytest.raises(RobotError, match="not parent and child"):
         robot_with(tmp_path, f"{ball}\nself_collisions: [[trunk, sole]]")
     sole, trunk = robot_with(tmp_path, ball).capsules
     assert (sole.body, sole.start, sole.end, sole.radius) == ("leg", (0.0, 0.0, -0.3), (0.0, 0.0, -0.3), 0.03)

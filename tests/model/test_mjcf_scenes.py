@@ -60,7 +60,7 @@ def test_a_scene_without_its_robot_says_where_it_may_be(tmp_path):
     with pytest.raises(RobotError, match=r"bodies that move is \(\): .* a scene for the robot in robot.xml"):
         load_robot(tmp_path / "scene.xml")
     (tmp_path / "robot.xml").write_text("<mujoco><default><joint/></default></mujoco>")
-    with pytest.raises(RobotError, match=r"has a body with a joint$"):
+    with pytest.raises(RobotError, match=r"expected at least one body with a joint$"):
         load_robot(tmp_path / "scene.xml")
 
 

@@ -62,7 +62,7 @@ def test_gains_are_of_joints_that_are_driven(write_robot):
     """One number is for all but a spring, which a pattern does not fit; a spring that has one is refused."""
     robot = load_robot(write_robot(*SPRUNG, ("kd: {thigh: 1, shank: 2}", 'kd: {"*": 1}')))
     assert (robot.passive, robot.gains.kp, robot.gains.kd) == (("shank",), (("thigh", 20.0),), (("thigh", 1.0),))
-    with pytest.raises(RobotError, match=r"gains\.kd\.shank is 2\.0: expected none for a passive joint") as caught:
+    with pytest.raises(RobotError, match=r"gains\.kd\.shank is 2\.0: expected no gain for a passive joint") as caught:
         load_robot(write_robot(*SPRUNG))
     assert "\n" not in str(caught.value)
 

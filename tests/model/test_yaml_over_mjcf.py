@@ -86,8 +86,8 @@ def test_a_body_without_joint_that_is_a_rotor(over):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("urdf: x.urdf\n", "urdf or mjcf is 'both': expected one of them"),
-        ("base: floating\n", "base is 'floating': expected none"),
+        ("urdf: x.urdf\n", "urdf or mjcf is 'both': expected exactly one of them"),
+        ("base: floating\n", "base is 'floating': expected no `base`"),
         ("gears: {lag: 8}\n", "gears is 'lag': expected the name of a joint .*did you mean 'leg'"),
         ('gears: {"x*": 8}\n', r"gears is 'x\*': expected a pattern that fits a name"),
         ("gears: {leg: 0}\n", "gears.leg is 0.0: expected a number other than 0"),

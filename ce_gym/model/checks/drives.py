@@ -75,10 +75,10 @@ def check_elastic(robot: Robot, file: str) -> None:
             raise unknown_name(file, "elastic", elastic.rotor, rotors, "the name of a rotor")
         ties = [tie for tie in robot.constraints if elastic.rotor in tie.bodies]
         if len(ties) != 1 or not ties[0].linear or elastic.rotor in robot.independent:
-            expected = "a rotor that follows from joints by one linear tie, and nothing from it"
+            expected = "a rotor in exactly one constraint, a linear one, and not independent"
             raise invalid_value(file, key, elastic.rotor, expected)
         if elastic.stretch in names:
             raise invalid_value(file, "body name", elastic.stretch, f"another one: {elastic.rotor!r} is elastic")
         check_fields(elastic, file, f"{key}.")
         if elastic.backlash and math.isfinite(elastic.preload):
-            raise invalid_value(file, f"{key}.preload", elastic.preload, "none where there is backlash")
+            raise invalid_value(file, f"{key}.preload", elastic.preload, "no preload beside backlash")

@@ -85,7 +85,7 @@ def _check_inertia(robot: Robot, file: str) -> None:
     check_unique(file, "kept_inertia", robot.kept_inertia)
     for pattern in robot.kept_inertia:
         if not any(fnmatchcase(name, pattern) for name in impossible):
-            expected = f"one of {listed_names(pattern, impossible)}" if impossible else "none: no inertia is impossible"
+            expected = f"one of {listed_names(pattern, impossible)}" if impossible else "no pattern: all are possible"
             raise invalid_value(file, "kept_inertia", pattern, expected)
     unlisted = [name for name in impossible if not any(fnmatchcase(name, pattern) for pattern in robot.kept_inertia)]
     if unlisted:
@@ -200,7 +200,7 @@ def _check_capsules(robot: Robot, file: str) -> None:
                 raise invalid_value(file, "self_collisions", name, expected)
         first, second = robot.body(pair[0]), robot.body(pair[1])
         if adjacent(first, second):
-            raise invalid_value(file, "self_collisions", pair, "two links of which none carries the other")
+            raise invalid_value(file, "self_collisions", pair, "two links that are not parent and child")
 
 
 def _check_pose_and_gains(robot: Robot, file: str) -> None:
@@ -222,7 +222,7 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
             if not gain >= 0.0:
                 raise invalid_value(file, f"{key}.{joint}", gain, "0 or more")
             if joint in robot.passive:
-                raise invalid_value(file, f"{key}.{joint}", gain, "none for a passive joint, whose largest torque is 0")
+                raise invalid_value(file, f"{key}.{joint}", gain, "no gain for a passive joint (torque limit 0)")
         for joint in robot.driven:
             if pairs and joint not in dict(pairs):
                 raise invalid_value(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")
@@ -258,5 +258,5 @@ def _check_joint_values(robot: Robot, file: str, key: str, pairs: tuple[tuple[st
 def _warn_of_inertia(robot: str, bodies: tuple[str, ...]) -> None:
     """Warn once: the cache keeps the second call with the same arguments from running."""
     names = ", ".join(bodies)
-    message = f"{robot}: the inertia of {names} violates the triangle inequality; it is kept as it is"
+    message = f"{robot}: the inertia of {names} violates the triangle inequality; it is used unchanged"
     warnings.warn(message, InertiaWarning, stacklevel=2)

@@ -35,7 +35,7 @@ def with_identified(robot: Robot, section: Section) -> Robot:
     for kind, part in sorted(section.sections(), key=lambda named: KINDS.index(named[0])):
         for name, value in part.numbers():
             if name not in (known := _owners(robot, kind)):
-                raise unknown_name(section.file, part.path, name, known, "what has such a figure")
+                raise unknown_name(section.file, part.path, name, known, "a rotor, joint or link with this parameter")
             if kind != "added_mass" and not (value > 0 or (value == 0 and kind in MAY_VANISH)):
                 expected = "more than 0, or 0 for friction, damping and backlash"
                 raise invalid_value(section.file, part.key(name), value, expected)

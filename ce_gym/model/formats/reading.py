@@ -42,7 +42,7 @@ class _Loader(yaml.SafeLoader):
             raise _refused(event, f"a value of {len(event.value)} characters: expected at most {LONGEST_SCALAR}")
         node = super().compose_node(parent, index)
         if isinstance(event, yaml.AliasEvent) and id(node) not in self._sizes:
-            raise _refused(event, f"alias {event.anchor!r} stands inside what it names: expected no self-reference")
+            raise _refused(event, f"alias {event.anchor!r} stands inside its own anchor: expected no self-reference")
         self._total += self._sizes[id(node)] if isinstance(event, yaml.AliasEvent) else 1
         self._sizes.setdefault(id(node), self._total - total_before)
         if self._total > LARGEST_TREE:

@@ -87,7 +87,7 @@ def read_bodies(
         _add_body(source, tree, index, locked, hinged, apart)
     if not tree.bodies:
         hint = robot_hint(Path(source.file))
-        raise invalid_value(source.file, "bodies that move", (), f"a robot, which has a body with a joint{hint}")
+        raise invalid_value(source.file, "bodies that move", (), f"at least one body with a joint{hint}")
     _report_forces(source)
     tree.bodies.sort(key=lambda body: body.joint.type != "free")
     free = [body.name for body in tree.bodies if body.joint.type == "free"]

@@ -193,7 +193,7 @@ class _Reader:
                 raise invalid_value(self.file, f"{joint.where} type", "floating", expected)
         mass = added(part.mass for link in self.graph.welded_to(self.graph.root) if (part := self.inertials[link]))
         if floating and mass:
-            expected = "none, because a floating joint hangs on it"
+            expected = "0, because the root of a floating joint is the world"
             raise invalid_value(self.file, f"link {self.graph.root!r} mass", mass, expected)
         if base is not None:
             return bool(floating) or base == "fixed"
@@ -226,8 +226,8 @@ class _Reader:
         carried = next((joint.child for joint in self.joints.values() if joint.parent == link), None)
         inertial = self.inertials[link]
         if carried is not None or inertial is None:
-            value, expected = (carried, "nothing: a rotor carries no link") if carried else (None, "mass and inertia")
-            raise invalid_value(self.file, f"what rotor {link!r} {'carries' if carried else 'has'}", value, expected)
+            key, expected = ("child", "no child link") if carried else ("<inertial>", "mass and inertia")
+            raise invalid_value(self.file, f"{key} of rotor {link!r}", carried, expected)
         return FixedLink(*self.frames[link], inertial, tuple(self._shapes(link, Placement())))
 
     def _body(self, link: str) -> Body:

@@ -97,7 +97,7 @@ def _rolls(entry: Section, kind: str) -> bool:
     if not isinstance(rolls, bool):
         raise entry.invalid("rolls", rolls, "true or false")
     if rolls and kind != "cylinder":
-        raise entry.invalid("rolls", rolls, f"`shape: cylinder` with it, and not {kind}")
+        raise entry.invalid("rolls", rolls, f"`shape: cylinder` and not {kind}")
     if rolls and "rim" in entry:
         raise entry.invalid("rim", entry.get("rim"), "none: with `rolls`, each rim is one contact")
     return rolls
@@ -120,13 +120,13 @@ def _spheres(entry: Section, shape: Shape) -> list[tuple[str, np.ndarray, float]
     radius, rim = entry.number("radius", 0.0), entry.number("rim", 8.0)
     most = {"box": min(shape.size) / 2, "cylinder": min(shape.size[0], shape.size[-1] / 2)}.get(shape.type, 0.0)
     if not 0.0 <= radius <= most and "radius" in entry:
-        expected = f"from 0 to {most:g} [m], by which edges are rounded" if most else "none: its size has it"
+        expected = f"from 0 to {most:g} [m], by which edges are rounded" if most else "no radius beside `size`"
         raise entry.invalid("radius", radius, expected)
     if rim not in range(3, MOST_ON_RIM + 1):
         raise entry.invalid("rim", rim, f"a whole number from 3 to {MOST_ON_RIM}, of spheres on a rim")
     face = entry.text("face", "", FACES)
     if _rolls(entry, shape.type):
         if face not in ("", "+z", "-z"):
-            raise entry.invalid("face", face, "+z or -z: one of the two rims of what rolls")
+            raise entry.invalid("face", face, "+z or -z, one of the two rims")
         return on_face(rims_of(shape.size, radius), face)
     return on_face(list(spheres_of(shape.type, shape.size, radius, int(rim))), face)

@@ -52,7 +52,7 @@ def read_links(path: Path, file: Section) -> Links:
     """
     if ("urdf" in file) == ("mjcf" in file):
         value = None if "urdf" not in file else "both"
-        raise invalid_value(file.file, "urdf or mjcf", value, "one of them, the file that says what the links are")
+        raise invalid_value(file.file, "urdf or mjcf", value, "exactly one of them, the file with the links")
     rotors = file.section("rotors")
     driven = {joint for _, rotor in rotors.sections() for joint in names_in(rotor, "ratios")}
     if "urdf" in file:
@@ -65,7 +65,7 @@ def read_links(path: Path, file: Section) -> Links:
         robot = Robot(tree.name, tree.bodies, tree.constraints, independent, notes=tree.notes)
         return Links(robot, dict(tree.frames), tree.fixed, tree.collisions, tree.drives, driven)
     if "base" in file:
-        raise file.invalid("base", file.get("base"), "none, because an MJCF file says itself what its base is")
+        raise file.invalid("base", file.get("base"), "no `base` beside `mjcf`: the MJCF file describes the base")
     robot, frames, fixed = read_robot(path.parent / file.text("mjcf"), file.section("gears"), driven, rotors.data)
     return Links(robot, frames, fixed, {})
 

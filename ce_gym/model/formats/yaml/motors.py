@@ -50,7 +50,7 @@ def _friction(motor: Section) -> dict[str, Any]:
     for both in (key for key in _BOTH_KEYS if key in section):
         for key in (f"{both}_motor", f"{both}_external"):
             if key in section:
-                raise section.invalid(key, section.get(key), f"none beside {both!r}, which is both")
+                raise section.invalid(key, section.get(key), f"none beside {both!r}, which sets both")
             numbers[key] = section.number(both)
     drive = {"drive_friction": DriveFriction(**numbers)} if numbers else {}
     return {"friction": section.number("coulomb", 0.0)} | drive

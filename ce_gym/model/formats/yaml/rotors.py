@@ -89,7 +89,7 @@ def _rotor(rotor: Section, name: str, links: Links, motor: MotorType | None) -> 
         return Body(name, "rotor", carrier, pose, Joint("revolute", axis), inertial), False
     for key in ("mass", "com"):
         if key in rotor:
-            raise rotor.invalid(key, rotor.get(key), "none: with one moment of inertia the carrier has it")
+            raise rotor.invalid(key, rotor.get(key), "none: the carrier's values include the rotor")
     moment = motor.inertia if inertia is None and motor is not None else rotor.number("inertia")
     if not moment > 0.0:
         raise rotor.invalid("inertia", moment, "more than 0 [kg m^2]")
@@ -100,7 +100,7 @@ def _fixed(rotor: Section, name: str, link: FixedLink) -> Body:
     """Return a link on a fixed joint as a rotor."""
     for key in rotor:
         if key not in ("axis", "ratios"):
-            expected = f"axis and ratios alone, because {name!r} is a link that has the rest"
+            expected = f"axis and ratios only: the link {name!r} has the other values"
             raise rotor.invalid(key, rotor.get(key), expected)
     axis = unit_axis(rotor.file, rotor.key("axis"), rotor.vector("axis", 3))
     return Body(name, "rotor", link.carrier, link.placement, Joint("revolute", axis), link.inertial, link.shapes)
@@ -149,6 +149,6 @@ def _with_gearbox(rotor: Section, motor: MotorType | None) -> Section:
     """Return a rotor's section with the gear ratio of the motor's gearbox for each listed joint."""
     joints = rotor.texts("ratios")
     if motor is None:
-        expected = "a mapping from joints to gear ratios, or a motor of the library under `motors`, whose ratio it is"
+        expected = "a mapping from joints to gear ratios, or a motor of the library under `motors`"
         raise rotor.invalid("ratios", list(joints), expected)
     return Section(rotor.file, rotor.path, {**rotor.data, "ratios": dict.fromkeys(joints, motor.ratio)})
