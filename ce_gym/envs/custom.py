@@ -58,7 +58,8 @@ def missing(robot: Robot) -> list[RobotError]:
     if not robot.floating:
         problems.append(invalid_value(file, "base", "fixed", "a floating base, because tasks are about walking"))
     if not any(contact.group == "foot" for contact in robot.contacts):
-        problems.append(invalid_value(file, "contacts of group 'foot'", None, "at least one contact sphere in this group"))
+        expected = "at least one contact sphere in this group"
+        problems.append(invalid_value(file, "contacts of group 'foot'", None, expected))
     if not robot.independent:
         problems.append(invalid_value(file, "independent", (), "at least one joint"))
     for joint, gain in robot.gains.kp:  # a robot without gains needs torques as actions
