@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ce_gym.console import examples, has_display
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy
-from ce_gym.viewer.console import examples, has_display
 
 if TYPE_CHECKING:
     from ce_gym.viewer.rollouts.rollout import Rollout
@@ -22,8 +22,8 @@ def add_view_command(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "view",
         help="show recorded rollouts and policies in a browser",
-        description="Show recorded rollouts, or what policies do: write one self-contained HTML file (default) or a "
-        "video, or\nserve the page on this machine until Ctrl-C.",
+        description="Show recorded rollouts or policies: write one self-contained HTML file (default) or a video, or "
+        "serve\nthe page on this machine until Ctrl-C.",
         epilog=examples(
             "view walk.npz", "view exact.npz armature.npz --overlay", "view walk.npz --plot 'torque of FL_knee' reward"
         ),
@@ -41,9 +41,9 @@ def add_play_command(subparsers: Any) -> None:
     """Add `play` to the subcommands of an argument parser."""
     parser = subparsers.add_parser(
         "play",
-        help="let a trained policy act, record it and show it in a browser",
-        description="Let a trained policy drive robots through a list of commands, and show them: several transmission "
-        "levels\nas ghosts of the first, from the same seed, or many robots in a square.",
+        help="simulate a trained policy, record it and show it in a browser",
+        description="Simulate a trained policy with a list of commands, and show it: several transmission levels as "
+        "ghosts\nof the first, from the same seed, or many robots in a square.",
         epilog=examples(
             "play mini_cheetah_velocity",
             "play mit_humanoid_velocity --transmission exact none",
@@ -61,7 +61,7 @@ def add_play_command(subparsers: Any) -> None:
         help=f"{', '.join(LEVELS)} or {ELASTIC} (default: as trained); all but the first become ghosts",
     )
     parser.add_argument(
-        "--robots", type=_at_least_one, default=1, metavar="N", help="robots, each with a seed of its own"
+        "--robots", type=_at_least_one, default=1, metavar="N", help="number of robots; each has its own seed"
     )
     parser.add_argument(
         "--command",
@@ -69,11 +69,11 @@ def add_play_command(subparsers: Any) -> None:
         type=float,
         action="append",
         metavar=("SECONDS", "FORWARD", "LEFT", "TURN"),
-        help="what to command [m/s, m/s, rad/s], and for how long; may be repeated (default: a short show)",
+        help="command [m/s, m/s, rad/s] and its duration; may be repeated (default: a short show)",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first robot (default 0)")
     add_env_arguments(parser)
-    parser.add_argument("--save", type=Path, metavar="FOLDER", help="also keep the rollouts as .npz files there")
+    parser.add_argument("--save", type=Path, metavar="FOLDER", help="also write the rollouts as .npz files there")
     _add_page_arguments(parser, "here, named after the policy's folder")
     parser.set_defaults(run=play)
 
@@ -85,7 +85,7 @@ def _at_least_one(text: str) -> int:
 
 
 def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add what says where a page goes and how it looks."""
+    """Add the arguments for the target and the look of a page."""
     target = parser.add_mutually_exclusive_group()
     target.add_argument("--html", type=Path, metavar="FILE", help=f"HTML file to write (default: {default})")
     target.add_argument("--live", action="store_true", help="serve the page on this machine's loopback until Ctrl-C")
@@ -98,9 +98,7 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
         metavar=("WIDTH", "HEIGHT"),
         help="of the video [pixels] (default 640 480)",
     )
-    parser.add_argument(
-        "--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot beside the robot at first"
-    )
+    parser.add_argument("--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot first")
     parser.add_argument("--title", help="heading of the page (default: the robot's name)")
     parser.add_argument(
         "--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser, if there is a display"
@@ -118,8 +116,8 @@ def view(args: argparse.Namespace) -> int:
         walk(p, env=args.env, **dict(args.env_args))[0] if p else Rollout.load(path)
         for p, path in zip(policies, args.rollouts, strict=True)
     ]
-    beside = args.rollouts[0].with_suffix(".html")
-    return _present(rollouts, args, _page_of(policies[0]) if policies[0] else beside, overlay=args.overlay)
+    default = _page_of(policies[0]) if policies[0] else args.rollouts[0].with_suffix(".html")
+    return _present(rollouts, args, default, overlay=args.overlay)
 
 
 def play(args: argparse.Namespace) -> int:
@@ -147,10 +145,10 @@ def play(args: argparse.Namespace) -> int:
 
 
 def _check_target(args: argparse.Namespace, robots: int) -> None:
-    """See whether what is asked for can be made: that is told before all else, not after the simulation.
+    """Check the requested output before the simulation.
 
     Raises:
-        ViewerError: A package is missing, or a video of several robots is asked for.
+        ViewerError: A package is missing, or a video would show several robots.
     """
     from ce_gym.viewer.errors import ViewerError
     from ce_gym.viewer.page.html import meshcat_code
@@ -170,7 +168,7 @@ def _page_of(policy: Path) -> Path:
 
 
 def _present(rollouts: Sequence[Rollout], args: argparse.Namespace, default: Path, *, overlay: bool) -> int:
-    """Write or serve the page of rollouts, or write their video, as asked for; return the exit code."""
+    """Write or serve the page of rollouts, or write a video; return the exit code."""
     from ce_gym.viewer import show, write_html, write_video
 
     if args.video:

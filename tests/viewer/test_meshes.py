@@ -11,7 +11,7 @@ from ce_gym.dynamics import Model
 from ce_gym.model import LossyImportWarning, load_robot
 from ce_gym.model.description import Shape
 from ce_gym.viewer import Rollout
-from ce_gym.viewer.meshes.triangles import MOST, Triangles, drawn_meshes
+from ce_gym.viewer.meshes.triangles import MOST, Triangles, read_meshes
 from ce_gym.viewer.page.html import page
 from ce_gym.viewer.page.robot import body_paths, extent, robot_commands
 from ce_gym.viewer.raytrace.mesh import mesh_of
@@ -95,7 +95,7 @@ def test_meshes_of_a_urdf_are_where_it_says(name: str, where: str, text: str, tm
     file = urdf(tmp_path, f'<mesh filename="{name}"/>')
     (tmp_path / where).parent.mkdir(exist_ok=True)
     (tmp_path / where).write_text(text)
-    (shape,) = drawn_meshes(load_robot(file, floating=True))["base"]
+    (shape,) = read_meshes(load_robot(file, floating=True))["base"]
     assert isinstance(shape, Triangles)
     assert len(shape.faces) == 4
     np.testing.assert_allclose(points_of(shape), MOVED, atol=1e-6)
@@ -118,7 +118,7 @@ def test_meshes_of_an_mjcf_are_where_it_says(tmp_path: Path) -> None:
     )
     with pytest.warns(LossyImportWarning):
         robot = load_robot(file)
-    (shape,) = drawn_meshes(robot)["base"]  # not the box, which only touches
+    (shape,) = read_meshes(robot)["base"]  # not the box, which only touches
     assert isinstance(shape, Triangles)
     assert shape.color == (1.0, 0.0, 0.0, 1.0)
     expected = sorted_points((CORNERS - [0.1, 0, 0]) * [2, 1, 3] + [1, 2, 3])
@@ -131,7 +131,7 @@ def test_places_in_a_picture_that_is_not_there_are_no_colour(tmp_path: Path) -> 
     lines = obj(CORNERS, np.array(FACES)).replace("f ", "vt 0 0\nf ", 1).splitlines()
     faces = [" ".join(["f", *(f"{i}/1" for i in line.split()[1:])]) if line[0] == "f" else line for line in lines]
     (file.parent / "one.obj").write_text("\n".join(faces) + "\n")
-    (shape,) = drawn_meshes(load_robot(file, floating=True))["base"]
+    (shape,) = read_meshes(load_robot(file, floating=True))["base"]
     assert isinstance(shape, Triangles)
     assert shape.color == Shape.color
 
@@ -155,8 +155,8 @@ def round_robot(tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_meshes_are_thinned_and_keep_their_form(round_robot) -> None:
-    (all_of_it,) = drawn_meshes(round_robot)["base"]
-    (shape,) = drawn_meshes(round_robot, most=600)["base"]
+    (all_of_it,) = read_meshes(round_robot)["base"]
+    (shape,) = read_meshes(round_robot, most=600)["base"]
     assert isinstance(shape, Triangles)
     assert 300 < len(shape.faces) <= 600 < len(all_of_it.faces) <= MOST
     np.testing.assert_allclose(np.linalg.norm(shape.vertices, axis=1), 0.5, atol=0.02)
@@ -188,7 +188,7 @@ def test_what_cannot_be_read_is_drawn_by_shapes(text: str, tmp_path: Path) -> No
     (file.parent / name).write_text(text)
     robot = load_robot(file, floating=True)
     with pytest.warns(UserWarning, match="mesh is not drawn") as told:
-        assert drawn_meshes(robot) == {}
+        assert read_meshes(robot) == {}
     assert "\n" not in str(told[0].message)
 
 
@@ -213,7 +213,7 @@ def test_triangles_face_outwards_whatever_the_scale(kind: str, scale: str, tmp_p
             (file.parent / name.replace("model", "one")).write_bytes(data)
     else:
         (scene if kind.lower() == "glb" else solid).export(file.parent / f"one.{kind}", file_type=kind.lower())
-    (shape,) = drawn_meshes(load_robot(file, floating=True))["base"]
+    (shape,) = read_meshes(load_robot(file, floating=True))["base"]
     assert isinstance(shape, Triangles)
     factors = np.array([float(x) for x in scale.split()]) * np.ones(3)
     assert volume(shape) == pytest.approx(0.001 * abs(np.prod(factors)), rel=1e-5)
@@ -229,7 +229,7 @@ def test_meshes_that_an_mjcf_mirrors_face_outwards(tmp_path: Path) -> None:
         '<mujoco><asset><mesh name="one" file="one.stl" scale="1 -1 1"/></asset><worldbody><body name="base">'
         '<freejoint/><geom type="mesh" mesh="one"/></body></worldbody></mujoco>'
     )
-    (shape,) = drawn_meshes(load_robot(file))["base"]
+    (shape,) = read_meshes(load_robot(file))["base"]
     assert isinstance(shape, Triangles)
     assert volume(shape) == pytest.approx(0.001, rel=1e-5)
 
@@ -251,9 +251,9 @@ NANS = stl().replace("vertex 0", "vertex nan", 1)
         (
             "bad.step",
             b"ISO-10303-21;",
-            "1 meshes are of a kind that is not read, such as 'bad.step'; expected .stl, .obj",
+            "1 meshes are missing or of another kind, such as 'bad.step'; expected .stl, .obj",
         ),
-        ("other.stl", b"", "1 meshes are not there, such as 'bad.stl'"),
+        ("other.stl", b"", "1 meshes are missing or of another kind, such as 'bad.stl'"),
         ("good.stl", stl().encode(), "scale"),
     ],
 )
@@ -266,7 +266,7 @@ def test_a_bad_mesh_hides_only_itself(name: str, content: bytes, what: str, tmp_
     (file.parent / name).write_bytes(content)
     (file.parent / "good.stl").write_text(stl())
     with pytest.warns(UserWarning, match=what) as told:
-        (shape,) = drawn_meshes(load_robot(file, floating=True))["base"]
+        (shape,) = read_meshes(load_robot(file, floating=True))["base"]
     assert isinstance(shape, Triangles)
     assert len([one for one in told if one.category is UserWarning]) == 1
     np.testing.assert_allclose(points_of(shape), MOVED, atol=1e-6)
@@ -292,7 +292,7 @@ def test_paths_with_spaces_and_addresses(name: str, tmp_path: Path) -> None:
     file = urdf(tmp_path, f'<mesh filename="{name.format(folder=folder)}"/>')
     for each in ("a part.stl", "100%.stl"):
         (folder / each).write_text(stl())
-    assert len(drawn_meshes(load_robot(file, floating=True))["base"]) == 1
+    assert len(read_meshes(load_robot(file, floating=True))["base"]) == 1
 
 
 @pytest.mark.parametrize("name", ["missing.stl", "package://other/one.stl", "http://host/one.stl", "one.urdf"])
@@ -301,6 +301,6 @@ def test_what_is_not_there_is_drawn_by_shapes(name: str, tmp_path: Path) -> None
     with pytest.warns(
         UserWarning, match=r"one.urdf: 1 meshes are .*, such as .*; expected .stl, .obj, .dae, .ply, .glb, .gltf files"
     ):
-        assert drawn_meshes(robot) == {}
+        assert read_meshes(robot) == {}
     (shape,) = [one for one in robot_commands(robot, "/robot") if one["type"] == "set_object"]
     assert shape["object"]["geometries"][0]["type"] == "BoxGeometry"

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ce_gym import Terrain
 from ce_gym.model.description import ContactSphere
 from ce_gym.viewer import Rollout, ViewerError
-from ce_gym.viewer.page import animation, three
+from ce_gym.viewer.page import three
 from ce_gym.viewer.page.arrows import HIDDEN
 from ce_gym.viewer.page.fallback_shapes import frame_along, rotor_discs
 from ce_gym.viewer.page.scene import ROOT, places, pose_rollouts
@@ -218,7 +218,7 @@ def test_ghosts_share_ground_and_neighbours_have_their_own() -> None:
     apart = fields_of(build_scene(rollouts, models))
     assert [field["bodies"] for field in apart.values()] == [[f"{ROOT}/0/base"], [f"{ROOT}/1/base"]]
     runs = pose_rollouts(rollouts, models)
-    assert all(field["reach"] == pytest.approx(1.5 * runs[0].radius) for field in apart.values())  # no two meet
+    assert all(field["reach"] == pytest.approx(1.5 * runs[0].extent.radius) for field in apart.values())  # no two meet
     mixed = fields_of(build_scene([rollouts[0], make_rollout()], models))
     flat = mixed[f"{ROOT}/ground_1"]
     assert (flat["low"], flat["step"]) == (0.0, 0.0)
@@ -281,7 +281,7 @@ def test_what_does_not_fit_is_refused() -> None:
 def test_quaternions_invert_rotations(q: list[float]) -> None:
     unit = np.array(q) / np.linalg.norm(q)
     rotation = matrix_at({"quaternion": unit[None]}, 0)[:3, :3]
-    assert abs(animation.quaternions(rotation) @ unit) == pytest.approx(1, abs=1e-12)
+    assert abs(three.quaternions(rotation) @ unit) == pytest.approx(1, abs=1e-12)
 
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3))

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import threading
-import webbrowser
 from pathlib import Path
 from typing import Any
 
+from ce_gym.console import examples
 from ce_gym.policies import WHERE, add_env_arguments
-from ce_gym.viewer.console import examples, has_display
 
 
 def add_live_command(subparsers: Any) -> None:
@@ -18,7 +15,7 @@ def add_live_command(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "live",
         help="drive, push and throw a robot in a browser",
-        description="Let a robot walk in a browser on this machine, in real time, until Ctrl-C: drive it by keys, "
+        description="Simulate a robot in a browser on this machine, in real time, until Ctrl-C: drive it by keys, "
         "stick or\ngamepad, pull it with the mouse, change ground, friction, load, transmission level and policy while "
         "it runs.",
         epilog=examples(
@@ -29,41 +26,25 @@ def add_live_command(subparsers: Any) -> None:
     )
     parser.add_argument("name", metavar="NAME", help=f"{WHERE}; or the id of an environment, whose pose is held")
     add_env_arguments(parser)
-    parser.add_argument("--transmission", metavar="LEVEL", default="", help="level to begin with (default: as trained)")
-    parser.add_argument("--ghost", metavar="LEVEL", default="", help="level of a ghost beside it (default: none)")
-    parser.add_argument("--terrain", metavar="KIND", default="", help="ground to begin with (default: as trained)")
+    parser.add_argument("--transmission", metavar="LEVEL", default="", help="first level (default: as trained)")
+    parser.add_argument("--ghost", metavar="LEVEL", default="", help="level of a ghost (default: no ghost)")
+    parser.add_argument("--terrain", metavar="KIND", default="", help="first ground (default: as trained)")
     parser.add_argument("--folder", type=Path, default=Path(), help="where recordings are written (default: here)")
     parser.add_argument(
-        "--open", action=argparse.BooleanOptionalAction, default=True, help="open a browser, if there is one"
+        "--open", action=argparse.BooleanOptionalAction, default=True, help="open a browser, if there is a display"
     )
     parser.set_defaults(run=live)
 
 
 def live(args: argparse.Namespace) -> int:
     """Run `live`; return its exit code."""
+    from ce_gym.viewer.live.runner import Runner
     from ce_gym.viewer.live.setup import named
     from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.stream import serve
 
-    meshcat_code()  # fails at once if meshcat is missing
+    meshcat_code()  # a missing meshcat is reported before the compilation
     options = {name: getattr(args, name) for name in ("transmission", "ghost", "terrain")}
     setup = named(args.name, args.env or "", kwargs=dict(args.env_args), **options)
-    with contextlib.suppress(KeyboardInterrupt), serving(setup, args.folder) as url:
-        print(f"live at {url} (Ctrl-C to stop)", flush=True)
-        if args.open and has_display():
-            webbrowser.open(url, new=2)
-        threading.Event().wait()
+    serve(Runner(setup, args.folder), "live", open_browser=args.open)
     return 0
-
-
-@contextlib.contextmanager
-def serving(setup: Any, folder: Path) -> Any:
-    """Run a setup and serve its page; yield the address."""
-    from ce_gym.viewer.live.page import live_page
-    from ce_gym.viewer.live.runner import Runner
-    from ce_gym.viewer.server import PageServer
-
-    with contextlib.closing(Runner(setup, folder)) as runner:
-        server = PageServer(live_page(runner), runner.feed.events, runner.receive)
-        with contextlib.closing(server):
-            runner.start()
-            yield server.url

@@ -1,35 +1,17 @@
-// The page of a training run. Expects HORIZON, meshcat's viewer, ground.js, graph.js and plots.js.
+// The page of a training run: curves of all runs, and the robot under the newest policy. Expects scene.js, stream.js,
+// graph.js and plots.js.
 
-const find = id => document.getElementById(id);
-const viewer = new MeshCat.Viewer(find("pane"));
-const resize = viewer.set_3d_pane_size.bind(viewer);  // would take the height of the window
-viewer.set_3d_pane_size = () => resize(find("pane").offsetWidth, find("pane").offsetHeight);
-viewer.set_3d_pane_size();
-viewer.scene.fog = new MeshCat.THREE.Fog(HORIZON, 8, 40);
-viewer.gui.domElement.hidden = true;  // meshcat's own panel, by the key C
-document.addEventListener("keydown", event => {
-  if (event.key === "c") viewer.gui.domElement.hidden = !viewer.gui.domElement.hidden;
-});
-const node = path => viewer.scene_tree.find(path.split("/").filter(Boolean));
+let plots = null;
 
-let state = null, plots = null, received = 0, drawn = false;
-const events = new EventSource("events");
-events.onerror = () => { find("notice").textContent = "has stopped"; };
-
-// The robot, and the ground around it.
+// The robot and its surroundings, again for each new environment.
 events.addEventListener("scene", event => {
   viewer.handle_command({ type: "delete", path: "/world" });
-  for (const command of JSON.parse(event.data)) {
-    viewer.handle_command_bytearray(Uint8Array.from(atob(command), c => c.charCodeAt(0)));
-  }
-  drawn = true;
+  draw(JSON.parse(event.data));
   find("waiting").style.display = "none";
   find("pane").style.visibility = "visible";
 });
-events.addEventListener("ground", event => viewer.handle_command(JSON.parse(event.data)));
 
 // Curves: all runs over the steps.
-const unpacked = packed => Object.fromEntries(Object.entries(packed).map(([name, text]) => [name, numbers(text, Float32Array)]));
 events.addEventListener("curves", event => {
   const told = JSON.parse(event.data);
   const sources = told.sources.map(one => ({
@@ -46,17 +28,6 @@ events.addEventListener("curves", event => {
     plots = makePlots(find("plots"), sources, told.chosen, { span: told.span, unit: "steps", seek: null, file: document.title });
   }
 });
-
-events.onmessage = event => {
-  const told = JSON.parse(event.data);
-  for (const [path, matrix] of Object.entries(drawn ? told.moves : {})) {
-    viewer.handle_command({ type: "set_transform", path, matrix });
-  }
-  if (drawn) moveFields();
-  state = told.state;
-  received++;
-  tell();
-};
 
 const many = count => count >= 1e6 ? (count / 1e6).toFixed(2) + " M" : count >= 1e4 ? Math.round(count / 1e3) + " k" : String(count);
 function clock(seconds) {

@@ -1,30 +1,9 @@
-// The live page: draws what the server sends, posts what its user wants. Expects HORIZON, COMMANDS and OFFER, meshcat's
-// viewer and ground.js.
+// The live page: shows the state that the server sends, and posts what the user does. Expects OFFER, scene.js and stream.js.
 
-const find = id => document.getElementById(id);
-const viewer = new MeshCat.Viewer(find("pane"));
-for (const command of COMMANDS) {
-  viewer.handle_command_bytearray(Uint8Array.from(atob(command), c => c.charCodeAt(0)));
-}
-const THREE = MeshCat.THREE;
-viewer.scene.fog = new THREE.Fog(HORIZON, 8, 40);
-viewer.gui.domElement.hidden = true;  // meshcat's own panel
-const node = path => viewer.scene_tree.find(path.split("/").filter(Boolean));
-// In a narrow window the robot stands in it whole.
-function fit() {
-  viewer.camera.zoom = Math.min(1, 1.2 * window.innerWidth / window.innerHeight);
-  viewer.camera.updateProjectionMatrix();
-}
-window.addEventListener("resize", fit);
-fit();
-
-// A ghost in the same place as the robot is behind it, or their surfaces would flicker.
-node("/world/1").object.traverse(({ material }) => {
-  if (material) Object.assign(material, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4 });
-});
+drawBehind(node("/world/1").object);
 const show = (path, on) => { node(path).object.visible = on; };
 
-// Messages go one after the other; of those that follow each other quickly only the newest of a kind is sent.
+// Posts one message at a time. Of messages of one kind that wait, only the newest is sent.
 const waiting = new Map();
 let busy = false;
 function post(message) {
@@ -40,27 +19,11 @@ async function send() {
     try {
       const answer = await fetch("messages", { method: "POST", body: JSON.stringify(message) });
       if (!answer.ok) find("notice").textContent = "refused: " + JSON.stringify(message);
-    } catch { ended(); }
+    } catch { find("notice").textContent = "has stopped"; }
   }
   busy = false;
 }
 
-// What is seen.
-let state = null, received = 0;
-function ended() { find("notice").textContent = "has stopped"; }
-const events = new EventSource("events");
-events.onerror = ended;
-events.addEventListener("ground", event => viewer.handle_command(JSON.parse(event.data)));
-events.onmessage = event => {
-  const told = JSON.parse(event.data);
-  for (const [path, matrix] of Object.entries(told.moves)) {
-    viewer.handle_command({ type: "set_transform", path, matrix });
-  }
-  moveFields();
-  state = told.state;
-  received++;
-  tell();
-};
 function tell() {
   const [forward, left, turn] = state.command, [vx, vy] = state.base.velocity;
   find("speeds").textContent =
@@ -110,8 +73,7 @@ find("past").onchange = event => event.target.blur();
 const DRIVING = { w: [1, 0, 0], s: [-1, 0, 0], a: [0, 0, 1], d: [0, 0, -1], q: [0, 1, 0], e: [0, -1, 0],
                   arrowup: [1, 0, 0], arrowdown: [-1, 0, 0], arrowleft: [0, 0, 1], arrowright: [0, 0, -1] };
 const ACTIONS = { " ": () => find("pause").click(), ".": () => find("step").click(), t: () => find("throw").click(),
-                  l: () => find("drop").click(), r: () => find("reset").click(), g: () => find("align").click(),
-                  c: () => { viewer.gui.domElement.hidden = !viewer.gui.domElement.hidden; } };
+                  l: () => find("drop").click(), r: () => find("reset").click(), g: () => find("align").click() };
 const held = new Set();
 let stick = [0, 0, 0], pad = [0, 0, 0], told = "[0,0,0]";
 function drive() {
@@ -231,10 +193,7 @@ find("film").onclick = () => {
   film = new MediaRecorder(viewer.renderer.domElement.captureStream(60), { mimeType: kind, videoBitsPerSecond: 8e6 });
   film.ondataavailable = event => parts.push(event.data);
   film.onstop = () => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob(parts, { type: kind }));
-    link.download = "live." + kind.split("/")[1];
-    link.click();
+    download("live." + kind.split("/")[1], URL.createObjectURL(new Blob(parts, { type: kind })));
     film = null;
     find("film").textContent = "film";
     find("film").classList.remove("on");

@@ -7,6 +7,7 @@ const FONT = "11px system-ui, sans-serif";
 function numbers(text, kind) {
   return new kind(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
 }
+const unpacked = packed => Object.fromEntries(Object.entries(packed).map(([name, text]) => [name, numbers(text, Float32Array)]));
 
 // Last frame at or before a time.
 function frameAt(times, time) {

@@ -34,10 +34,10 @@ function fieldGeometry(field) {
     const a = i * columns + j, b = a + columns;
     corners.set([a, b, b + 1, a, b + 1, a + 1], at);
   }
-  const geometry = new MeshCat.THREE.BufferGeometry();
-  geometry.setAttribute("position", new MeshCat.THREE.BufferAttribute(positions, 3));
-  geometry.setAttribute("uv", new MeshCat.THREE.BufferAttribute(spots, 2));
-  geometry.setIndex(new MeshCat.THREE.BufferAttribute(corners, 1));
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  geometry.setAttribute("uv", new THREE.BufferAttribute(spots, 2));
+  geometry.setIndex(new THREE.BufferAttribute(corners, 1));
   geometry.computeVertexNormals();
   return geometry;
 }
@@ -45,11 +45,11 @@ function fieldGeometry(field) {
 // Only what is near a robot is drawn, by a few lines added to three.js' own shader.
 function drawField(mesh) {
   const field = mesh.userData.field, count = field.bodies.length;
-  const places = field.bodies.map(() => new MeshCat.THREE.Vector2());
+  const places = field.bodies.map(() => new THREE.Vector2());
   mesh.geometry = fieldGeometry(field);
   mesh.castShadow = false;
   mesh.material.onBeforeCompile = shader => {
-    const horizon = new MeshCat.THREE.Color(HORIZON);
+    const horizon = new THREE.Color(HORIZON);
     Object.assign(shader.uniforms, { places: { value: places }, reach: { value: field.reach }, horizon: { value: horizon } });
     shader.vertexShader = shader.vertexShader.replace("void main() {", "varying vec3 spot;\nvoid main() {\n  spot = vec3(position.xy, normal.z);");
     shader.fragmentShader = shader.fragmentShader
@@ -74,7 +74,7 @@ function drawField(mesh) {
 
 // What scans look at, dots on the field, and the rays of range scans, lines to them.
 function drawScans(mesh, { scans, color }) {
-  const { BufferGeometry, BufferAttribute, Points, PointsMaterial, LineSegments, LineBasicMaterial } = MeshCat.THREE;
+  const { BufferGeometry, BufferAttribute, Points, PointsMaterial, LineSegments, LineBasicMaterial } = THREE;
   const count = key => scans.reduce((sum, scan) => sum + (scan[key] || []).length, 0);
   const shape = size => new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(3 * size), 3));
   const dots = new Points(shape(count("points") + count("rays")), new PointsMaterial({ color, size: 5, sizeAttenuation: false }));
@@ -112,7 +112,7 @@ function hitOf(mesh, start, along, { reach, steps }) {
 
 // Grids turn with the heading of the base, not with roll and pitch; rays turn with their link.
 function moveScans({ mesh, dots, lines, bodies }) {
-  const { Vector3, Matrix4 } = MeshCat.THREE, base = node(bodies[0]).object, field = mesh.userData.field;
+  const { Vector3, Matrix4 } = THREE, base = node(bodies[0]).object, field = mesh.userData.field;
   const ahead = new Vector3(1, 0, 0).applyQuaternion(base.quaternion), length = Math.hypot(ahead.x, ahead.y) || 1;
   const c = ahead.x / length, s = ahead.y / length, [dot, end] = [dots, lines].map(drawn => drawn.geometry.attributes.position);
   let i = 0, j = 0;

@@ -11,13 +11,6 @@ function element(tag, parent, attributes = {}) {
   return made;
 }
 
-// Leaves a file with the browser.
-function download(name, url) {
-  const link = document.createElement("a");
-  Object.assign(link, { href: url, download: name });
-  link.click();
-}
-
 // Panel of plots.
 //   sources: {name, color, times, signals, commanded, limits}, see charts.py; names: of each plot at first, the signal or signals;
 //   span: first and last time; seek: is called with a time that was pointed at, or null where time cannot be chosen.
