@@ -1,4 +1,4 @@
-"""What is plotted: figures of the rollout under names with units, efforts as shares of limits."""
+"""Signals for plots, and torques as shares of their limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The server behind live pages: who may look, how many, and what is left of it. No browser, no clock."""
+"""The server of live pages: access, number of clients, and release of its resources."""
 
 from __future__ import annotations
 
