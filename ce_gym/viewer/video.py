@@ -53,8 +53,8 @@ def write_video(
         import imageio_ffmpeg
     except ImportError:
         raise ViewerError.missing("imageio-ffmpeg") from None
-    usual, encoding = KINDS[path.suffix.lower()]
-    fps = min(fps or usual, 1 / rollout.dt)
+    default_fps, encoding = KINDS[path.suffix.lower()]
+    fps = min(fps or default_fps, 1 / rollout.dt)
     model = model or load_model(rollout)
     width, height = size
     picture = Picture(model, _as_on_a_plane(rollout, model), width=width, height=height, terrain=rollout.ground)

@@ -39,8 +39,8 @@ def pulled(model: Model, q: Array, v: Array, dt: float, body: str, point: ArrayL
     inverse_mass = np.stack([point_velocity(model, q, column, index, arm) for column in responses.T], axis=1)
     K = model.total_mass * FREQUENCY**2
     C = 2 * K / FREQUENCY
-    later = K * (np.asarray(target, float) - place - dt * velocity) - C * velocity
-    force = np.linalg.solve(np.eye(3) + dt * (C + dt * K) * inverse_mass, later)
+    spring = K * (np.asarray(target, float) - place - dt * velocity) - C * velocity
+    force = np.linalg.solve(np.eye(3) + dt * (C + dt * K) * inverse_mass, spring)
     force *= min(1.0, MOST * model.total_mass * GRAVITY / max(float(np.linalg.norm(force)), 1e-9))
     return v + dt * responses @ force
 

@@ -158,8 +158,8 @@ def _source(name: str) -> str:
 
 def _data(runs: Sequence[PosedRollout], plot: Sequence[str], *, ghosts: bool) -> dict[str, Any]:
     """Return the plotted signals of the first robots for `player.js`."""
-    shown = runs[:ROW]
-    all_charts = [charts(run) for run in shown]
+    plotted = runs[:ROW]
+    all_charts = [charts(run) for run in plotted]
     robots = [
         {
             "name": name_of(run),
@@ -168,7 +168,7 @@ def _data(runs: Sequence[PosedRollout], plot: Sequence[str], *, ghosts: bool) ->
             "times": packed(run.times),
             **chart.as_json(),
         }
-        for index, (run, chart) in enumerate(zip(shown, all_charts, strict=True))
+        for index, (run, chart) in enumerate(zip(plotted, all_charts, strict=True))
     ]
     return {"robots": robots, "chosen": default_plots(all_charts, plot)}
 

@@ -111,7 +111,7 @@ def textured(path: str, geometry: Command, pixels: NDArray[np.uint8], matrix: Ar
         options: "repeat" (repetitions along both edges, default (1, 1)); "userData", for scripts of the page; other
             options belong to the material.
     """
-    more = {"userData": options.pop("userData")} if "userData" in options else {}
+    user_data = {"userData": options.pop("userData")} if "userData" in options else {}
     repeat = [float(times) for times in options.pop("repeat", (1, 1))]
     texture = {
         "image": f"{path}:image",
@@ -124,7 +124,7 @@ def textured(path: str, geometry: Command, pixels: NDArray[np.uint8], matrix: Ar
     url = "data:image/png;base64," + base64.b64encode(png(pixels)).decode()
     material = {"map": f"{path}:texture", "color": 0xFFFFFF, **options}
     parts = {"geometry": geometry, "material": material, "texture": texture, "image": {"url": url}}
-    return set_object(path, "Mesh", matrix, **parts, **more)
+    return set_object(path, "Mesh", matrix, **parts, **user_data)
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
@@ -205,8 +205,8 @@ def quaternions(rotations: Array) -> Array:
     candidates[..., :3, 3] = candidates[..., 3, :3] = off
     candidates[..., 3, 3] = 1 + trace
     best = np.argmax(candidates[..., range(4), range(4)], -1)
-    chosen = np.take_along_axis(candidates, best[..., None, None], -2)[..., 0, :]
-    return chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
+    quaternion = np.take_along_axis(candidates, best[..., None, None], -2)[..., 0, :]
+    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
 
 
 def clip(path: str, times: Array, end: float, values: dict[str, Array]) -> Command:

@@ -85,8 +85,8 @@ class Field:
         """
         centre, start = np.asarray(centre, float), np.asarray(start, float)
         piece = self._around(centre[:2])
-        here = start + centre - [*piece.middle, 0.0]
-        hits = self._embree.meet(piece.scene, np.broadcast_to(here.astype(np.float32), rays.shape), rays)
+        origin = start + centre - [*piece.middle, 0.0]
+        hits = self._embree.meet(piece.scene, np.broadcast_to(origin.astype(np.float32), rays.shape), rays)
         hit = hits["primID"] >= 0
         distance = np.where(hit, hits["tfar"], np.inf).astype(np.float32)
         u, v = hits["u"][hit, None], hits["v"][hit, None]

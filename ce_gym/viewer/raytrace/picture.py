@@ -163,11 +163,11 @@ class Picture:
     def _window(self, vertices: Array, view: _View, lowest: float) -> tuple[slice, slice]:
         """Return the rows and columns that may show the robot or its shadow; no ground is below `lowest` [m]."""
         onto_ground = vertices - np.maximum(vertices[:, 2:] - lowest, 0) / TO_SUN[2] * TO_SUN
-        seen = (np.concatenate([vertices, onto_ground]) - view.eye) @ view.axes.T
+        in_camera = (np.concatenate([vertices, onto_ground]) - view.eye) @ view.axes.T
         width, height = self._size
-        if (seen[:, 2] > -1e-3).any():  # part of the robot is beside or behind the camera
+        if (in_camera[:, 2] > -1e-3).any():  # part of the robot is beside or behind the camera
             return slice(None), slice(None)
-        spots = seen[:, :2] * [1, -1] / -seen[:, 2:] * self._focus + np.array([width, height]) / 2
+        spots = in_camera[:, :2] * [1, -1] / -in_camera[:, 2:] * self._focus + np.array([width, height]) / 2
         left, top = np.clip(np.floor(spots.min(0)) - 1, 0, [width, height]).astype(int).tolist()
         right, bottom = np.clip(np.ceil(spots.max(0)) + 1, 0, [width, height]).astype(int).tolist()
         return slice(top, bottom), slice(left, right)

@@ -60,8 +60,8 @@ def find_runs(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise ViewerError(f"{folder}: no such folder; expected the folder of a training run")
-    inside = sorted(run for run in folder.iterdir() if (run / LOG).is_file())
-    runs = [folder] if (folder / LOG).is_file() else inside
+    subfolders = sorted(run for run in folder.iterdir() if (run / LOG).is_file())
+    runs = [folder] if (folder / LOG).is_file() else subfolders
     if not runs:
         raise ViewerError(f"{folder}: no {LOG} in it or in its subfolders; expected the folder of a training run")
     return runs
@@ -78,13 +78,11 @@ def read_log(run: Path) -> RunLog:
         raise ViewerError(f"{run / LOG}: expected a column {STEPS}, as in the log of a training run")
     steps = columns.get(STEPS, np.zeros(0))
     seconds = columns.get(SECONDS, np.full(len(steps), np.nan))
-    others = {name: values for name, values in columns.items() if not name.startswith("time/")}
-    signals = {_name_of(name): values for name, values in others.items()}
+    signals = {_signal_name(name): values for name, values in columns.items() if not name.startswith("time/")}
     if len(steps) > 1:
         signals[SPEED] = _speed(steps, seconds)
     steps, signals = _with_earlier(run, steps, signals)
-    taken = seconds[np.isfinite(seconds)]
-    return RunLog(run.resolve().name, steps, float(taken[-1]) if len(taken) else 0.0, signals)
+    return RunLog(run.resolve().name, steps, float(np.nanmax(seconds, initial=0.0)), signals)
 
 
 def _table(file: Path) -> dict[str, Array]:
@@ -100,16 +98,16 @@ def _table(file: Path) -> dict[str, Array]:
         header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]  # whole lines only
         if len(header) > MOST_COLUMNS:
             raise ViewerError(f"{file}: {len(header)} columns; expected at most {MOST_COLUMNS}")
-        whole = [[float(cell or "nan") for cell in row] for row in rows if len(row) == len(header)]
+        values = [[float(cell or "nan") for cell in row] for row in rows if len(row) == len(header)]
     except FileNotFoundError:
         return {}
     except (ValueError, csv.Error) as error:
         raise ViewerError(f"{file}: expected a CSV file of numbers: {' '.join(str(error).split())[:100]}") from None
-    values = np.array(whole, float).reshape(len(whole), len(header))
-    return dict(zip(header, values.T, strict=True))
+    table = np.array(values, float).reshape(len(values), len(header))
+    return dict(zip(header, table.T, strict=True))
 
 
-def _name_of(column: str) -> str:
+def _signal_name(column: str) -> str:
     group, _, name = column.rpartition("/")
     return NAMES.get(column) or GROUPS.get(group, f"{group}: " if group else "") + name.replace("_", " ")
 
@@ -126,13 +124,12 @@ def _with_earlier(run: Path, steps: Array, signals: dict[str, Array]) -> tuple[A
     curve = _table(run / CURVE)
     if not {"steps", *FROM_CURVE.values()} <= set(curve):
         return steps, signals
-    early = curve["steps"] < (steps[0] if len(steps) else np.inf)
-    none = np.full(early.sum(), np.nan)
-    names = [*signals, *(name for name in FROM_CURVE if name not in signals)]
-    later = np.full(len(steps), np.nan)
-    fronts = {name: curve[FROM_CURVE[name]][early] if name in FROM_CURVE else none for name in names}
-    joined = {name: np.concatenate([fronts[name], signals.get(name, later)]) for name in names}
-    return np.concatenate([curve["steps"][early], steps]), joined
+    earlier = curve["steps"] < (steps[0] if len(steps) else np.inf)
+    joined = {}
+    for name in dict.fromkeys([*signals, *FROM_CURVE]):
+        front = curve[FROM_CURVE[name]][earlier] if name in FROM_CURVE else np.full(earlier.sum(), np.nan)
+        joined[name] = np.concatenate([front, signals.get(name, np.full(len(steps), np.nan))])
+    return np.concatenate([curve["steps"][earlier], steps]), joined
 
 
 def _block_means(values: Array, starts: NDArray[np.int64]) -> Array:

@@ -1,4 +1,4 @@
-// Belts: lets strands run and pulleys turn with the joints that they drive. Expects meshcat's viewer and its node().
+// Belts: moves strands and turns pulleys with their joints. Expects scene.js.
 
 const MARKS = 8;  // around a pulley
 const belts = [];

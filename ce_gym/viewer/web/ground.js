@@ -1,5 +1,5 @@
-// Ground that is not flat: draws the fields that the scene's commands carry, each around its robots, fading away from
-// them into the horizon. Expects meshcat's viewer, its node() and HORIZON. Knows nothing of robots.
+// Uneven ground: draws the fields of the scene's commands around their robots, fading into the horizon. Expects HORIZON
+// and scene.js.
 
 const TILE = 1.0;  // edge of the square that the ground's image repeats over [m]
 const fields = [];
@@ -42,7 +42,7 @@ function fieldGeometry(field) {
   return geometry;
 }
 
-// Only what is near a robot is drawn, by a few lines added to three.js' own shader.
+// Lines added to the shader of three.js draw only the ground near a robot.
 function drawField(mesh) {
   const field = mesh.userData.field, count = field.bodies.length;
   const places = field.bodies.map(() => new THREE.Vector2());
@@ -67,12 +67,12 @@ function drawField(mesh) {
         gl_FragColor.rgb = mix(gl_FragColor.rgb, horizon, smoothstep(float(${field.fading}) * reach, reach, away));`);
   };
   mesh.material.customProgramCacheKey = () => `field of ${count}`;
-  mesh.material.needsUpdate = true;  // it may have been drawn before
+  mesh.material.needsUpdate = true;  // it may be compiled already
   fields.push({ mesh, places, bodies: field.bodies, ...(field.scans && drawScans(mesh, field)) });
   viewer.set_dirty();
 }
 
-// What scans look at, dots on the field, and the rays of range scans, lines to them.
+// Scans: dots on the field, and lines for the rays of range scans.
 function drawScans(mesh, { scans, color }) {
   const { BufferGeometry, BufferAttribute, Points, PointsMaterial, LineSegments, LineBasicMaterial } = THREE;
   const count = key => scans.reduce((sum, scan) => sum + (scan[key] || []).length, 0);
@@ -83,7 +83,7 @@ function drawScans(mesh, { scans, color }) {
   return { dots, lines };
 }
 
-// Height of what is drawn of a field, between its vertices.
+// Height of the drawn field, interpolated between its vertices.
 function heightOf(mesh, x, y) {
   const field = mesh.userData.field, columns = 2 * field.columns - 3, rows = 2 * field.rows - 3;
   const vertices = mesh.geometry.attributes.position.array, step = field.cell / 2;
@@ -94,7 +94,7 @@ function heightOf(mesh, x, y) {
   return (1 - s) * ((1 - t) * z(0, 0) + t * z(0, 1)) + s * ((1 - t) * z(1, 0) + t * z(1, 1));
 }
 
-// Where a ray meets the field, marched as the sensor does it, or where it ends.
+// The point where a ray hits the field, by the sensor's steps, or its end.
 function hitOf(mesh, start, along, { reach, steps }) {
   const at = distance => start.clone().addScaledVector(along, distance);
   const above = distance => { const { x, y, z } = at(distance); return z - heightOf(mesh, x, y); };
@@ -139,9 +139,9 @@ function moveScans({ mesh, dots, lines, bodies }) {
 // Lets the ground follow the robots' bases. Objects with images appear some time after their commands.
 function moveFields() {
   const loaded = [];
-  viewer.scene.traverse(object => { if (object.userData.field && !fields.some(one => one.mesh === object)) loaded.push(object); });
+  viewer.scene.traverse(object => { if (object.userData.field && !fields.some(field => field.mesh === object)) loaded.push(object); });
   loaded.forEach(drawField);
-  fields.splice(0, fields.length, ...fields.filter(field => field.mesh.parent));  // others have been replaced
+  fields.splice(0, fields.length, ...fields.filter(field => field.mesh.parent));  // without replaced fields
   for (const { places, bodies } of fields) {
     bodies.forEach((path, i) => { const { x, y } = node(path).object.position; places[i].set(x, y); });
   }

@@ -28,7 +28,7 @@ document.addEventListener("keydown", event => {
   if (event.key in keys) { event.preventDefault(); keys[event.key](); }
 });
 
-// What is seen. The first action moves the world under the camera; without weight it leaves the world at rest.
+// The first action moves the world under the camera; without weight the world stays at rest.
 function follow(on) {
   animator.actions[0].setEffectiveWeight(on ? 1 : 0);
   animator.mixer.update(0);
@@ -54,7 +54,7 @@ function xray(on) {
   });
 }
 
-// Links of solid robots, each with the number of the joint that moves it; other links have none and stay grey.
+// Links of solid robots with the number of their joint; links without a motor stay grey.
 const REST = new THREE.Color(0xcfd8e1), HALF = new THREE.Color(0xf2b134), FULL = new THREE.Color(0xd7263d);
 const painted = [];
 robots.forEach(robot => {
@@ -89,13 +89,13 @@ for (const box of document.querySelectorAll("#about input")) {
     viewer.set_dirty();
   };
 }
-const few = window.innerWidth <= 820 ? 1 : DATA.chosen.length;  // where there is little room
+const few = window.innerWidth <= 820 ? 1 : DATA.chosen.length;
 const plots = makePlots(find("plots"), robots, DATA.chosen.slice(0, few), {
   span: [0, animator.duration], unit: "s", seek, file: document.title,
 });
 if (!DATA.chosen.length) for (const hidden of [find("plots"), find("charts").parentElement]) hidden.style.display = "none";
 
-// The address may say what to show: #t=4.2&xray&torque&charts=0 opens the page paused there.
+// Text after # in the address sets the view: #t=4.2&xray&torque&charts=0 opens the page paused at 4.2 s.
 for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
   if (key === "t") seek(Number(value));
   if (key in switches) {

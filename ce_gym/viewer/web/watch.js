@@ -13,19 +13,19 @@ events.addEventListener("scene", event => {
 
 // Curves: all runs over the steps.
 events.addEventListener("curves", event => {
-  const told = JSON.parse(event.data);
-  const sources = told.sources.map(one => ({
-    ...one, times: numbers(one.times, Float32Array), signals: unpacked(one.signals), commanded: {}, limits: {},
+  const message = JSON.parse(event.data);
+  const sources = message.sources.map(run => ({
+    ...run, times: numbers(run.times, Float32Array), signals: unpacked(run.signals), commanded: {}, limits: {},
   }));
   find("runs").replaceChildren();
-  for (const { name, color } of told.sources.length > 1 ? told.sources : []) {
+  for (const { name, color } of message.sources.length > 1 ? message.sources : []) {
     const text = element("span", find("runs"));
     element("i", text, { style: `background: ${color}` });
     text.append(name);
   }
-  if (plots) plots.replace(sources, told.span);
-  else if (told.chosen.length) {
-    plots = makePlots(find("plots"), sources, told.chosen, { span: told.span, unit: "steps", seek: null, file: document.title });
+  if (plots) plots.replace(sources, message.span);
+  else if (message.chosen.length) {
+    plots = makePlots(find("plots"), sources, message.chosen, { span: message.span, unit: "steps", seek: null, file: document.title });
   }
 });
 
