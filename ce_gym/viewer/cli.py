@@ -1,8 +1,9 @@
-"""The commands `python -m ce_gym view` and `play`."""
+"""The commands `python -m ce_gym view`, `play`, `live` and `watch`."""
 
 from __future__ import annotations
 
 import argparse
+import signal
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ce_gym.console import examples, has_display
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy
+from ce_gym.viewer.errors import ViewerError
 
 if TYPE_CHECKING:
     from ce_gym.viewer.rollouts.rollout import Rollout
@@ -78,6 +80,54 @@ def add_play_command(subparsers: Any) -> None:
     parser.set_defaults(run=play)
 
 
+def add_live_command(subparsers: Any) -> None:
+    """Add `live` to the subcommands of an argument parser."""
+    parser = subparsers.add_parser(
+        "live",
+        help="drive, push and throw a robot in a browser",
+        description="Simulate a robot in a browser on this machine, in real time, until Ctrl-C: drive it by keys, "
+        "stick or\ngamepad, pull it with the mouse, change ground, friction, load, transmission level and policy while "
+        "it runs.",
+        epilog=examples(
+            "live mini_cheetah_velocity",
+            "live mit_humanoid_velocity --ghost armature",
+            "live my_module:ce_gym/MyRobotVelocity-v0 --env-arg terrain=stairs",
+        ),
+    )
+    parser.add_argument("name", metavar="NAME", help=f"{WHERE}; or the id of an environment, whose pose is held")
+    add_env_arguments(parser)
+    parser.add_argument("--transmission", metavar="LEVEL", default="", help="first level (default: as trained)")
+    parser.add_argument("--ghost", metavar="LEVEL", default="", help="level of a ghost (default: no ghost)")
+    parser.add_argument("--terrain", metavar="KIND", default="", help="first ground (default: as trained)")
+    parser.add_argument("--folder", type=Path, default=Path(), help="where recordings are written (default: here)")
+    _add_open_argument(parser, default=True)
+    parser.set_defaults(run=live)
+
+
+def add_watch_command(subparsers: Any) -> None:
+    """Add `watch` to the subcommands of an argument parser."""
+    parser = subparsers.add_parser(
+        "watch",
+        help="show how training goes: learning curves, reward terms, the present policy",
+        description="Show training runs in a browser on this machine, during and after training, until Ctrl-C: "
+        "learning\ncurves, and a robot under the newest policy. `--page` of the training scripts shows their own run.",
+        epilog=examples(
+            "watch runs/mini_cheetah_velocity-fast",
+            "watch runs/one runs/other",
+            "watch runs/my_robot --env my_module:ce_gym/MyRobotVelocity-v0",
+        ),
+    )
+    parser.add_argument(
+        "folders", nargs="+", type=Path, metavar="FOLDER", help="folder of a training run, or of several runs"
+    )
+    add_env_arguments(parser)
+    _add_open_argument(parser, default=True)
+    parser.add_argument(
+        "--until-eof", action="store_true", help="end with the standard input, and wait for runs that begin later"
+    )
+    parser.set_defaults(run=watch)
+
+
 def _at_least_one(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number, at least 1")
@@ -100,8 +150,12 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     )
     parser.add_argument("--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot first")
     parser.add_argument("--title", help="heading of the page (default: the robot's name)")
+    _add_open_argument(parser, default=False)
+
+
+def _add_open_argument(parser: argparse.ArgumentParser, *, default: bool) -> None:
     parser.add_argument(
-        "--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser, if there is a display"
+        "--open", action=argparse.BooleanOptionalAction, default=default, help="open a browser, if there is a display"
     )
 
 
@@ -122,7 +176,6 @@ def view(args: argparse.Namespace) -> int:
 
 def play(args: argparse.Namespace) -> int:
     """Run `play`; return its exit code."""
-    from ce_gym.viewer.errors import ViewerError
     from ce_gym.viewer.rollouts.driving import SHOW, walk
 
     file = locate_policy(args.policy)
@@ -144,13 +197,40 @@ def play(args: argparse.Namespace) -> int:
     return _present(rollouts, args, page, overlay=len(levels) > 1)
 
 
+def live(args: argparse.Namespace) -> int:
+    """Run `live`; return its exit code."""
+    from ce_gym.viewer.live.runner import Runner
+    from ce_gym.viewer.live.setup import named
+    from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.stream import serve
+
+    meshcat_code()  # a missing meshcat is reported before the compilation
+    options = {name: getattr(args, name) for name in ("transmission", "ghost", "terrain")}
+    setup = named(args.name, args.env or "", kwargs=dict(args.env_args), **options)
+    serve(Runner(setup, args.folder), "live", open_browser=args.open)
+    return 0
+
+
+def watch(args: argparse.Namespace) -> int:
+    """Run `watch`; return its exit code."""
+    if args.until_eof:  # Ctrl-C is for the training script, which then closes the input
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.stream import serve
+    from ce_gym.viewer.watch.watcher import Watcher
+
+    meshcat_code()
+    watcher = Watcher(args.folders, args.env or "", dict(args.env_args), patient=args.until_eof)
+    serve(watcher, "watch", open_browser=args.open, until_eof=args.until_eof)
+    return 0
+
+
 def _check_target(args: argparse.Namespace, robots: int) -> None:
     """Check the requested output before the simulation.
 
     Raises:
         ViewerError: A package is missing, or a video would show several robots.
     """
-    from ce_gym.viewer.errors import ViewerError
     from ce_gym.viewer.page.html import meshcat_code
 
     if not args.video:

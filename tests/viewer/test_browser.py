@@ -191,7 +191,7 @@ def test_torque_at_its_limit_is_red(at_rest: Chromium) -> None:
     shown = colors()
     assert shown.pop("0") == "d7263d"
     assert set(shown.values()) == {"cfd8e1"}
-    assert len(shown) == 12  # eleven joints, and the links that none of them moves
+    assert len(shown) == 12  # eleven joints, and the links without a joint
     assert at_rest.run("getComputedStyle(find('scale')).display") == "block"
     click(at_rest, "#torque")
     assert colors() == plain

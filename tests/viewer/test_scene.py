@@ -120,7 +120,7 @@ def test_a_robot_with_a_fixed_base_is_in_the_middle_of_the_picture() -> None:
     q = np.tile(model.standing_q, (3, 1))
     rollout = Rollout("four_bar", "exact", 0.02, 0.02 * np.arange(3), q, np.zeros((3, 1)))
     shift = clips_of(build_scene([rollout], [model]))[ROOT]["position"]
-    np.testing.assert_allclose(shift[:, :2], [[-0.5, -0.25]] * len(shift), atol=0.02)  # a bar of 1 m, arms of 0.5 m
+    np.testing.assert_allclose(shift[:, :2], [[-0.5, -0.25]] * len(shift), atol=0.02)  # a bar 1 m long, arms 0.5 m long
 
 
 def test_clips_end_together_and_high_rates_are_thinned() -> None:
