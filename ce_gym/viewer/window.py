@@ -46,11 +46,6 @@ class Window:
             constants={"COMMANDS": packed_commands(self._scene.commands())},
         )
 
-    @property
-    def url(self) -> str | None:
-        """Address of the page after the first drawing."""
-        return self._server.url if self._server else None
-
     def draw(self, q: Array) -> None:
         """Show the robot at positions `q`, shape (nq,)."""
         if self._feed.closed:
@@ -58,7 +53,7 @@ class Window:
         if self._server is None:
             self._server = PageServer(self._text, self._feed.events)
             weakref.finalize(self, _stop, self._server, self._feed)
-            print(f"watch at {self.url}", flush=True)
+            print(f"watch at {self._server.url}", flush=True)
         if self._scene.send(self._feed, [self._model], [q]):
             time.sleep(max(0.0, self._due - time.monotonic()))
         self._due = max(self._due, time.monotonic() - self._period) + self._period

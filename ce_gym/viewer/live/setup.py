@@ -80,13 +80,10 @@ class Setup:
 
 def named(name: str, env_id: str = "", **options: Any) -> Setup:
     """Return the setup for the name of a policy or the id of an environment."""
-    if find_policy(name) is not None or not _looks_like_id(name):
-        return Setup(policy=name, env_id=env_id, **options)
-    return Setup(env_id=env_id or name, **options)
-
-
-def _looks_like_id(name: str) -> bool:
-    return name.rpartition("-v")[2].isdecimal()
+    is_id = name.rpartition("-v")[2].isdecimal()
+    if is_id and find_policy(name) is None:
+        return Setup(env_id=env_id or name, **options)
+    return Setup(policy=name, env_id=env_id, **options)
 
 
 def policies_for(robot: str, also: Sequence[str] = ()) -> list[str]:

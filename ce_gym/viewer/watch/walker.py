@@ -21,15 +21,12 @@ POLICIES = ("policy.*", "present/policy.*", "checkpoints/policy_*")
 
 def newest_policy(run: Path) -> Path | None:
     """Return the newest policy of a run, or None."""
-    files = [file for pattern in POLICIES for file in run.glob(pattern) if _is_policy(file)]
-    return max(files, key=_written, default=None)
+    files = [file for pattern in POLICIES for file in run.glob(pattern) if file.suffix in (".npz", ".zip")]
+    files = [file for file in files if not file.name.startswith(".") and not file.stem.endswith(".learner")]
+    return max(files, key=_modified, default=None)
 
 
-def _is_policy(file: Path) -> bool:
-    return file.suffix in (".npz", ".zip") and not file.name.startswith(".") and not file.stem.endswith(".learner")
-
-
-def _written(file: Path) -> float:
+def _modified(file: Path) -> float:
     try:
         return file.stat().st_mtime
     except OSError:  # replaced or deleted in the meantime
