@@ -141,6 +141,7 @@ function bodyOf(object) {
   return nearest;
 }
 function pick(event) {
+  viewer.scene.updateMatrixWorld();  // poses may be newer than the picture
   aim(event);
   for (const hit of caster.intersectObject(node("/world/0").object, true)) {
     const [object, body] = bodyOf(hit.object) ?? [];
