@@ -16,12 +16,10 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from ce_gym.console import Parser, examples, print_anything
 from ce_gym.identify.command import add_identify_command
 from ce_gym.policies import add_env_arg
-from ce_gym.viewer.cli import add_play_command, add_view_command
-from ce_gym.viewer.console import Parser, examples, print_anything
-from ce_gym.viewer.live.command import add_live_command
-from ce_gym.viewer.watch.command import add_watch_command
+from ce_gym.viewer.cli import add_live_command, add_play_command, add_view_command, add_watch_command
 
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
 

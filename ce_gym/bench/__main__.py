@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
+from ce_gym.console import Parser, print_anything
 from ce_gym.model import RobotError, load_robot
 from ce_gym.model.errors import listed_names
-from ce_gym.viewer.console import Parser, print_anything
 
 BENCHMARKS = (
     "speed", "beside", "instructions", "throughput", "tracking", "stability", "accuracy", "derivatives",

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from ce_gym.bench.measure.report import Report, Table, read_report
-from ce_gym.viewer.console import shown
+from ce_gym.console import progress
 
 ROUNDS = ("--rounds", "3")
 QUICK: dict[str, tuple[str, ...]] = {
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmarks and return a table of what came of each."""
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows = []
-    for name in shown(arguments.only, "benchmarks"):
+    for name in progress(arguments.only, "benchmarks"):
         start = time.perf_counter()
         outcome = run_one([name, *(QUICK[name] if arguments.quick else ())], arguments.out / f"{name}.json")
         rows.append((name, round((time.perf_counter() - start) / 60.0, 1), outcome))

@@ -7,8 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from ce_gym.console import examples
 from ce_gym.model.mechanism import ELASTIC, LEVELS
-from ce_gym.viewer.console import examples
 
 CONTROLS = ("position", "torque", "motor_position", "motor_torque")
 ENCODERS = ("joints", "rotors", "both")

@@ -1,4 +1,4 @@
-"""Recorded rollouts, shown as one HTML file, as a page served on the loopback interface, or as a video.
+"""Shows recorded rollouts as one HTML file, as a page served on the loopback interface, or as a video.
 
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0", contact_forces=True)
     rollout = record(env, lambda observation: env.action_space.sample(), seconds=5.0)
@@ -6,7 +6,7 @@
     write_html(Rollout.load("walk.npz"), "walk.html")
     write_video(Rollout.load("walk.npz"), "walk.gif")
 
-meshcat is needed only for pages, embreex and imageio-ffmpeg only for videos.
+Pages need meshcat; videos need embreex and imageio-ffmpeg.
 """
 
 from __future__ import annotations
@@ -16,12 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ce_gym.viewer.errors import ViewerError
-    from ce_gym.viewer.page.html import write_html
+    from ce_gym.viewer.page.html import show, write_html
     from ce_gym.viewer.rollouts.driving import SHOW, Script, drive, drive_many, walk
-    from ce_gym.viewer.rollouts.recorder import Recorder
-    from ce_gym.viewer.rollouts.recording import record, record_lanes
+    from ce_gym.viewer.rollouts.recording import Recorder, record, record_lanes
     from ce_gym.viewer.rollouts.rollout import Rollout, RolloutError
-    from ce_gym.viewer.server import show
     from ce_gym.viewer.video import write_video
 
 __all__ = [
@@ -49,18 +47,18 @@ _HOMES = {
     "walk": "rollouts.driving",
     "record": "rollouts.recording",
     "record_lanes": "rollouts.recording",
-    "Recorder": "rollouts.recorder",
+    "Recorder": "rollouts.recording",
     "Rollout": "rollouts.rollout",
     "RolloutError": "rollouts.rollout",
     "ViewerError": "errors",
-    "show": "server",
+    "show": "page.html",
     "write_html": "page.html",
     "write_video": "video",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for: the command line parses its arguments without numpy."""
+    """Import a public name at its first use: the command line parses its arguments without numpy."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,17 +1,19 @@
-"""The commands `python -m ce_gym view` and `play`."""
+"""The commands `python -m ce_gym view`, `play`, `live` and `watch`."""
 
 from __future__ import annotations
 
 import argparse
+import signal
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ce_gym.console import examples, has_display
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy
-from ce_gym.viewer.console import examples, has_display
+from ce_gym.viewer.errors import ViewerError
 
 if TYPE_CHECKING:
     from ce_gym.viewer.rollouts.rollout import Rollout
@@ -22,8 +24,8 @@ def add_view_command(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "view",
         help="show recorded rollouts and policies in a browser",
-        description="Show recorded rollouts, or what policies do: write one self-contained HTML file (default) or a "
-        "video, or\nserve the page on this machine until Ctrl-C.",
+        description="Show recorded rollouts or policies: write one self-contained HTML file (default) or a video, or "
+        "serve\nthe page on this machine until Ctrl-C.",
         epilog=examples(
             "view walk.npz", "view exact.npz armature.npz --overlay", "view walk.npz --plot 'torque of FL_knee' reward"
         ),
@@ -41,9 +43,9 @@ def add_play_command(subparsers: Any) -> None:
     """Add `play` to the subcommands of an argument parser."""
     parser = subparsers.add_parser(
         "play",
-        help="let a trained policy act, record it and show it in a browser",
-        description="Let a trained policy drive robots through a list of commands, and show them: several transmission "
-        "levels\nas ghosts of the first, from the same seed, or many robots in a square.",
+        help="simulate a trained policy, record it and show it in a browser",
+        description="Simulate a trained policy with a list of commands, and show it: several transmission levels as "
+        "ghosts\nof the first, from the same seed, or many robots in a square.",
         epilog=examples(
             "play mini_cheetah_velocity",
             "play mit_humanoid_velocity --transmission exact none",
@@ -61,7 +63,7 @@ def add_play_command(subparsers: Any) -> None:
         help=f"{', '.join(LEVELS)} or {ELASTIC} (default: as trained); all but the first become ghosts",
     )
     parser.add_argument(
-        "--robots", type=_at_least_one, default=1, metavar="N", help="robots, each with a seed of its own"
+        "--robots", type=_at_least_one, default=1, metavar="N", help="number of robots; each has its own seed"
     )
     parser.add_argument(
         "--command",
@@ -69,13 +71,61 @@ def add_play_command(subparsers: Any) -> None:
         type=float,
         action="append",
         metavar=("SECONDS", "FORWARD", "LEFT", "TURN"),
-        help="what to command [m/s, m/s, rad/s], and for how long; may be repeated (default: a short show)",
+        help="command [m/s, m/s, rad/s] and its duration; may be repeated (default: a short show)",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first robot (default 0)")
     add_env_arguments(parser)
-    parser.add_argument("--save", type=Path, metavar="FOLDER", help="also keep the rollouts as .npz files there")
+    parser.add_argument("--save", type=Path, metavar="FOLDER", help="also write the rollouts as .npz files there")
     _add_page_arguments(parser, "here, named after the policy's folder")
     parser.set_defaults(run=play)
+
+
+def add_live_command(subparsers: Any) -> None:
+    """Add `live` to the subcommands of an argument parser."""
+    parser = subparsers.add_parser(
+        "live",
+        help="drive, push and throw a robot in a browser",
+        description="Simulate a robot in a browser on this machine, in real time, until Ctrl-C: drive it by keys, "
+        "stick or\ngamepad, pull it with the mouse, change ground, friction, load, transmission level and policy while "
+        "it runs.",
+        epilog=examples(
+            "live mini_cheetah_velocity",
+            "live mit_humanoid_velocity --ghost armature",
+            "live my_module:ce_gym/MyRobotVelocity-v0 --env-arg terrain=stairs",
+        ),
+    )
+    parser.add_argument("name", metavar="NAME", help=f"{WHERE}; or the id of an environment, whose pose is held")
+    add_env_arguments(parser)
+    parser.add_argument("--transmission", metavar="LEVEL", default="", help="first level (default: as trained)")
+    parser.add_argument("--ghost", metavar="LEVEL", default="", help="level of a ghost (default: no ghost)")
+    parser.add_argument("--terrain", metavar="KIND", default="", help="first ground (default: as trained)")
+    parser.add_argument("--folder", type=Path, default=Path(), help="where recordings are written (default: here)")
+    _add_open_argument(parser, default=True)
+    parser.set_defaults(run=live)
+
+
+def add_watch_command(subparsers: Any) -> None:
+    """Add `watch` to the subcommands of an argument parser."""
+    parser = subparsers.add_parser(
+        "watch",
+        help="show how training goes: learning curves, reward terms, the present policy",
+        description="Show training runs in a browser on this machine, during and after training, until Ctrl-C: "
+        "learning\ncurves, and a robot under the newest policy. `--page` of the training scripts shows their own run.",
+        epilog=examples(
+            "watch runs/mini_cheetah_velocity-fast",
+            "watch runs/one runs/other",
+            "watch runs/my_robot --env my_module:ce_gym/MyRobotVelocity-v0",
+        ),
+    )
+    parser.add_argument(
+        "folders", nargs="+", type=Path, metavar="FOLDER", help="folder of a training run, or of several runs"
+    )
+    add_env_arguments(parser)
+    _add_open_argument(parser, default=True)
+    parser.add_argument(
+        "--until-eof", action="store_true", help="end with the standard input, and wait for runs that begin later"
+    )
+    parser.set_defaults(run=watch)
 
 
 def _at_least_one(text: str) -> int:
@@ -85,7 +135,7 @@ def _at_least_one(text: str) -> int:
 
 
 def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add what says where a page goes and how it looks."""
+    """Add the arguments for the target and the look of a page."""
     target = parser.add_mutually_exclusive_group()
     target.add_argument("--html", type=Path, metavar="FILE", help=f"HTML file to write (default: {default})")
     target.add_argument("--live", action="store_true", help="serve the page on this machine's loopback until Ctrl-C")
@@ -98,12 +148,14 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
         metavar=("WIDTH", "HEIGHT"),
         help="of the video [pixels] (default 640 480)",
     )
-    parser.add_argument(
-        "--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot beside the robot at first"
-    )
+    parser.add_argument("--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot first")
     parser.add_argument("--title", help="heading of the page (default: the robot's name)")
+    _add_open_argument(parser, default=False)
+
+
+def _add_open_argument(parser: argparse.ArgumentParser, *, default: bool) -> None:
     parser.add_argument(
-        "--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser, if there is a display"
+        "--open", action=argparse.BooleanOptionalAction, default=default, help="open a browser, if there is a display"
     )
 
 
@@ -118,13 +170,12 @@ def view(args: argparse.Namespace) -> int:
         walk(p, env=args.env, **dict(args.env_args))[0] if p else Rollout.load(path)
         for p, path in zip(policies, args.rollouts, strict=True)
     ]
-    beside = args.rollouts[0].with_suffix(".html")
-    return _present(rollouts, args, _page_of(policies[0]) if policies[0] else beside, overlay=args.overlay)
+    default = _page_of(policies[0]) if policies[0] else args.rollouts[0].with_suffix(".html")
+    return _present(rollouts, args, default, overlay=args.overlay)
 
 
 def play(args: argparse.Namespace) -> int:
     """Run `play`; return its exit code."""
-    from ce_gym.viewer.errors import ViewerError
     from ce_gym.viewer.rollouts.driving import SHOW, walk
 
     file = locate_policy(args.policy)
@@ -146,13 +197,40 @@ def play(args: argparse.Namespace) -> int:
     return _present(rollouts, args, page, overlay=len(levels) > 1)
 
 
+def live(args: argparse.Namespace) -> int:
+    """Run `live`; return its exit code."""
+    from ce_gym.viewer.live.runner import Runner
+    from ce_gym.viewer.live.setup import named
+    from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.stream import serve
+
+    meshcat_code()  # a missing meshcat is reported before the compilation
+    options = {name: getattr(args, name) for name in ("transmission", "ghost", "terrain")}
+    setup = named(args.name, args.env or "", kwargs=dict(args.env_args), **options)
+    serve(Runner(setup, args.folder), "live", open_browser=args.open)
+    return 0
+
+
+def watch(args: argparse.Namespace) -> int:
+    """Run `watch`; return its exit code."""
+    if args.until_eof:  # Ctrl-C is for the training script, which then closes the input
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.stream import serve
+    from ce_gym.viewer.watch.watcher import Watcher
+
+    meshcat_code()
+    watcher = Watcher(args.folders, args.env or "", dict(args.env_args), patient=args.until_eof)
+    serve(watcher, "watch", open_browser=args.open, until_eof=args.until_eof)
+    return 0
+
+
 def _check_target(args: argparse.Namespace, robots: int) -> None:
-    """See whether what is asked for can be made: that is told before all else, not after the simulation.
+    """Check the requested output before the simulation.
 
     Raises:
-        ViewerError: A package is missing, or a video of several robots is asked for.
+        ViewerError: A package is missing, or a video would show several robots.
     """
-    from ce_gym.viewer.errors import ViewerError
     from ce_gym.viewer.page.html import meshcat_code
 
     if not args.video:
@@ -170,7 +248,7 @@ def _page_of(policy: Path) -> Path:
 
 
 def _present(rollouts: Sequence[Rollout], args: argparse.Namespace, default: Path, *, overlay: bool) -> int:
-    """Write or serve the page of rollouts, or write their video, as asked for; return the exit code."""
+    """Write or serve the page of rollouts, or write a video; return the exit code."""
     from ce_gym.viewer import show, write_html, write_video
 
     if args.video:

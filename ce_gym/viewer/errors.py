@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
+_NEEDS = {
+    "meshcat": ("the viewer needs", "viewer"),
+    "embreex": ('pictures (render_mode="rgb_array") need', "video"),
+    "imageio-ffmpeg": ("videos need", "video"),
+}
+
 
 class ViewerError(RuntimeError):
     """A rollout cannot be shown; the message is one line."""
 
     @classmethod
-    def missing_meshcat(cls) -> ViewerError:
-        """Return the error for a missing meshcat, with the command that installs it."""
-        return cls('the viewer needs meshcat, which is not installed: pip install "ce_gym[viewer]"')
-
-    @classmethod
-    def missing_embreex(cls) -> ViewerError:
-        """Return the error for a missing embreex, with the command that installs it."""
-        return cls(
-            'pictures (render_mode="rgb_array") need embreex, which is not installed: pip install "ce_gym[video]"'
-        )
-
-    @classmethod
-    def missing_ffmpeg(cls) -> ViewerError:
-        """Return the error for a missing imageio-ffmpeg, with the command that installs it."""
-        return cls('videos need imageio-ffmpeg, which is not installed: pip install "ce_gym[video]"')
+    def missing(cls, package: str) -> ViewerError:
+        """Return the error for a package that is not installed, with the command that installs it."""
+        purpose, extra = _NEEDS[package]
+        return cls(f'{purpose} {package}, which is not installed: pip install "ce_gym[{extra}]"')

@@ -1,11 +1,9 @@
-"""Pages served on this machine's loopback for as long as a call lasts.
+"""An HTTP server on the loopback interface that serves one page until it is closed.
 
-meshcat's own server is not used: it listens on every network interface, runs as another process that outlives its
-window, and takes one blocking message at a time. The page carries the whole animation, so a plain HTTP server inside
-this process does, and there is nothing to leave behind.
+meshcat's own server is not used: it listens on every network interface and runs as another process.
 
-Who may look: browsers of this machine that were given the address. It has a random part, so that pages of other sites
-cannot guess it, and requests that came here by another name than the loopback's are refused.
+Only browsers on this machine that know the address can read the page. The address has a random part, which pages of
+other sites cannot guess, and requests with another host name are refused.
 """
 
 from __future__ import annotations
@@ -15,47 +13,18 @@ import secrets
 import socket
 import sys
 import threading
-import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from ce_gym.viewer.page.html import page
-from ce_gym.viewer.rollouts.rollout import Rollout
-
 LOOPBACK = "127.0.0.1"
-MOST_CLIENTS = 16  # connections at a time, a thread each; more are closed at once
-PATIENCE = 10.0  # of a connection over which nothing comes or goes [s]
+MOST_CLIENTS = 16  # connections at a time, each with a thread; further ones are closed
+PATIENCE = 10.0  # a connection without traffic is closed after this time [s]
 MOST_BYTES = 1 << 14  # of a message from a page
 
 Events = Callable[[], Iterator[bytes]]
 Receive = Callable[[bytes], None]
-
-
-def show(
-    rollouts: Rollout | Sequence[Rollout],
-    *,
-    open_browser: bool = False,
-    seconds: float | None = None,
-    **options: Any,
-) -> None:
-    """Play rollouts in browsers on this machine, in real time and over and over, until Ctrl-C.
-
-    Args:
-        rollouts: What to show; several stand side by side.
-        open_browser: Open a browser at the page.
-        seconds: Stop by itself after this time [s].
-        options: Title, models, spacing and frame rate; see `ce_gym.viewer.page.html.page`.
-
-    Raises:
-        ViewerError: meshcat is not installed, or a rollout does not fit its robot.
-    """
-    with contextlib.closing(PageServer(page(rollouts, **options))) as server, contextlib.suppress(KeyboardInterrupt):
-        print(f"playing at {server.url} (Ctrl-C to stop)", flush=True)
-        if open_browser:
-            webbrowser.open(server.url, new=2)
-        threading.Event().wait(seconds)
 
 
 class PageServer:
@@ -63,9 +32,9 @@ class PageServer:
 
     Args:
         text: The page.
-        events: Gives what the page's browsers get as server-sent events from `events`; none if not given.
-        receive: Is given what browsers post to `messages`, in a thread of theirs; raises ValueError for what makes no
-            sense. None if not given.
+        events: Returns the server-sent events of the address `events` for one browser; None for a page without.
+        receive: Takes the body of each message posted to `messages`, in the thread of its connection; raises
+            ValueError for an invalid message. None for a page that posts nothing.
 
     Attributes:
         url: Address of the page.
@@ -80,59 +49,59 @@ class PageServer:
         self._thread.start()
 
     def stop(self) -> None:
-        """Let the server end soon, and do not wait: for finalizers, which may run in any thread, its own included."""
+        """Ask the server to end, without waiting: finalizers may run in the thread of the server."""
         self._stop.set()
 
     def close(self) -> None:
-        """Stop the server and free its port; harmless if done before."""
+        """Stop the server and free its port; may be called again."""
         self.stop()
         self._thread.join()
 
 
 def _serve(server: _Server, stop: threading.Event) -> None:
-    """Take connections until told to stop."""
+    """Accept connections until `stop` is set."""
     with server:
         while not stop.is_set():
             server.handle_request()
 
 
 class _Server(ThreadingHTTPServer):
-    """A server whose threads are limited in number, and that says nothing of browsers that leave."""
+    """A server with a limited number of threads, silent about browsers that disconnect."""
 
     daemon_threads = True
-    timeout = 0.05  # between two looks at whether to stop [s]
+    timeout = 0.05  # between two checks of `stop` [s]
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self._places = threading.BoundedSemaphore(MOST_CLIENTS)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Give a connection a thread, or close it if there are too many."""
+        """Start a thread for a connection, or close the connection if there are too many."""
         if not self._places.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Serve a connection, in its thread."""
+        """Serve a connection in its thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Be silent about connections that broke; all else is a mistake of ours."""
+        """Report errors other than broken connections."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 
 
 def _handler(body: bytes, path: str, events: Events | None, receive: Receive | None) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"  # who posts often keeps the connection
+        protocol_version = "HTTP/1.1"  # posts of a page share a connection
         timeout = PATIENCE
 
         def do_GET(self) -> None:
-            if not self._is_for_us():
+            if not self._has_loopback_host():
                 self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             elif self.path == f"{path}events" and events is not None:
                 self._send_events(events())
@@ -144,7 +113,7 @@ def _handler(body: bytes, path: str, events: Events | None, receive: Receive | N
 
         def do_POST(self) -> None:
             length = self.headers.get("Content-Length", "")
-            if not self._is_for_us():
+            if not self._has_loopback_host():
                 self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             elif self.path != f"{path}messages" or receive is None:
                 self.send_error(HTTPStatus.NOT_FOUND)
@@ -153,13 +122,13 @@ def _handler(body: bytes, path: str, events: Events | None, receive: Receive | N
             else:
                 try:
                     receive(self.rfile.read(int(length)))
-                except ValueError as problem:
-                    self.send_error(HTTPStatus.BAD_REQUEST, explain=" ".join(str(problem).split()))
+                except ValueError as error:
+                    self.send_error(HTTPStatus.BAD_REQUEST, explain=" ".join(str(error).split()))
                     return
                 self.send_response(HTTPStatus.NO_CONTENT)
                 self.end_headers()
 
-        def _is_for_us(self) -> bool:
+        def _has_loopback_host(self) -> bool:
             server: Any = self.server
             port = server.server_port
             return self.headers.get("Host") in (f"{LOOPBACK}:{port}", f"localhost:{port}")
@@ -169,14 +138,14 @@ def _handler(body: bytes, path: str, events: Events | None, receive: Receive | N
             self.send_header("Content-Type", kind)
             self.send_header("Cache-Control", "no-store")
             self.send_header("Referrer-Policy", "no-referrer")
-            if length is None:  # it ends with its connection
+            if length is None:  # a stream ends with its connection
                 self.send_header("Connection", "close")
             else:
                 self.send_header("Content-Length", str(length))
             self.end_headers()
 
         def _send_events(self, items: Iterator[bytes]) -> None:
-            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**16)  # who does not read is seen soon
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**16)  # to notice slow browsers
             self.close_connection = True
             self._send_head("text/event-stream")
             with contextlib.closing(items):  # type: ignore[type-var]
@@ -184,6 +153,6 @@ def _handler(body: bytes, path: str, events: Events | None, receive: Receive | N
                     self.wfile.write(item)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Say nothing: requests are of no interest to whoever watches."""
+            """Log nothing."""
 
     return Handler

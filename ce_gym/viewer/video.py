@@ -1,4 +1,4 @@
-"""Rollouts as moving pictures: MP4, WebM or GIF files, drawn by rays, without a display or a browser."""
+"""Videos of rollouts: ray-traced MP4, WebM or GIF files, without a display or a browser."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.viewer.console import shown
+from ce_gym.console import progress
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.page.scene import load_model
 from ce_gym.viewer.raytrace.picture import Picture
 from ce_gym.viewer.rollouts.rollout import Rollout
 
-# Of a GIF, ffmpeg chooses the colours that the whole film needs most, and stores what changes between frames.
+# For a GIF, ffmpeg chooses one palette for the whole film, and stores differences between frames.
 _PALETTE = "split[a][b];[a]palettegen=max_colors=128[p];[b][p]paletteuse=dither=bayer:bayer_scale=5:diff_mode=rectangle"
 KINDS: dict[str, tuple[float, dict[str, Any]]] = {
     ".mp4": (50.0, {"codec": "libx264", "output_params": ["-crf", "23", "-movflags", "+faststart"]}),
     ".webm": (50.0, {"codec": "libvpx-vp9", "output_params": ["-crf", "36", "-b:v", "0"]}),
     ".gif": (20.0, {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-vf", _PALETTE]}),
 }
-"""Most pictures in a second, and how ffmpeg encodes them, by the ending of a file."""
+"""Largest frame rate [1/s] and ffmpeg options, by the ending of the file."""
 SMALLEST, LARGEST = 16, 4096  # edge of a picture [pixels]
 
 
@@ -37,50 +37,54 @@ def write_video(
     """Write a rollout as a video in real time and return its path.
 
     Args:
-        rollout: What to show: one robot.
+        rollout: The rollout.
         path: A name that ends in .mp4, .webm or .gif.
         size: Width and height [pixels], even numbers.
-        fps: Pictures in a second, at most the rollout's frames [1/s]; by default up to 50, of a GIF up to 20.
+        fps: Frame rate, at most the rollout's rate [1/s]; by default up to 50, for a GIF up to 20.
         model: The `Model` of the robot; built from the rollout if not given.
 
     Raises:
-        ViewerError: The name or the size is of no video, embreex or imageio-ffmpeg is not installed, or the file cannot
-            be written.
+        ViewerError: The name or the size is invalid, embreex or imageio-ffmpeg is not installed, or the file cannot be
+            written.
     """
     path = Path(path)
     check_video(path, size)
-    writer = _ffmpeg()
-    usual, encoding = KINDS[path.suffix.lower()]
-    fps = min(fps or usual, 1 / rollout.dt)
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise ViewerError.missing("imageio-ffmpeg") from None
+    default_fps, encoding = KINDS[path.suffix.lower()]
+    fps = min(fps or default_fps, 1 / rollout.dt)
     model = model or load_model(rollout)
     width, height = size
     picture = Picture(model, _as_on_a_plane(rollout, model), width=width, height=height, terrain=rollout.ground)
-    fresh = path.with_name(f".{path.name}")  # a film is whole or not there
-    film = writer(str(fresh), size, fps=fps, macro_block_size=2, ffmpeg_log_level="error", **encoding)
+    temporary = path.with_name(f".{path.name}")  # no partial film under the final name
+    write_frames: Any = imageio_ffmpeg.write_frames
+    film = write_frames(str(temporary), size, fps=fps, macro_block_size=2, ffmpeg_log_level="error", **encoding)
     try:
         film.send(None)
         for pixels in _pictures(rollout, picture, fps):
             film.send(pixels)
         film.close()
-        fresh.replace(path)
+        temporary.replace(path)
     except OSError as error:
         raise ViewerError(f"{path}: ffmpeg cannot write it ({' '.join(str(error).split())[:200]})") from None
     finally:
         film.close()
-        fresh.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     return path
 
 
 def check_video(path: Path, size: tuple[int, int]) -> None:
-    """See whether a file and a size can be those of a video, before time is spent on it.
+    """Check the name and the size of a video, before a simulation.
 
     Raises:
-        ViewerError: They cannot.
+        ViewerError: The name or the size is invalid.
     """
     if path.suffix.lower() not in KINDS:
         raise ViewerError(f"{path}: expected a name that ends in {', '.join(KINDS)}")
     if not path.resolve().parent.is_dir():
-        raise ViewerError(f"{path}: no such folder; expected one that is there")
+        raise ViewerError(f"{path}: no such folder; expected an existing one")
     for edge in size:
         if edge % 2 or not SMALLEST <= edge <= LARGEST:
             raise ViewerError(
@@ -89,7 +93,7 @@ def check_video(path: Path, size: tuple[int, int]) -> None:
 
 
 def _as_on_a_plane(rollout: Rollout, model: Any) -> NDArray[np.float64]:
-    """Return the first positions of a rollout as they were if its ground were the plane z = 0, shape (nq,)."""
+    """Return the first positions of a rollout, moved onto the plane z = 0, shape (nq,)."""
     q = rollout.q[0].copy()
     if rollout.ground is not None and model.robot.floating:
         q[2] -= rollout.ground.at(*q[:2])[0]
@@ -97,16 +101,8 @@ def _as_on_a_plane(rollout: Rollout, model: Any) -> NDArray[np.float64]:
 
 
 def _pictures(rollout: Rollout, picture: Picture, fps: float) -> Iterator[NDArray[np.uint8]]:
-    """Draw the frame that is nearest to each moment of the film."""
+    """Draw the frame nearest to each time of the film."""
     moments = rollout.times[0] + np.arange(int(rollout.duration * fps) + 1) / fps
     nearest = np.abs(rollout.times - moments[:, None]).argmin(1)
-    for frame in shown(nearest.tolist(), "drawing"):
+    for frame in progress(nearest.tolist(), "drawing"):
         yield picture.draw(rollout.q[frame])
-
-
-def _ffmpeg() -> Any:
-    try:
-        from imageio_ffmpeg import write_frames
-    except ImportError:
-        raise ViewerError.missing_ffmpeg() from None
-    return write_frames

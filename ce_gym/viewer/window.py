@@ -1,56 +1,50 @@
-"""A live window: meshcat's page, served on the loopback interface, that receives each new pose.
-
-No browser is opened and no call waits for one; without a connected browser drawing costs almost nothing.
-"""
+"""The window of `render_mode="human"`: a page on the loopback interface that receives each new pose."""
 
 from __future__ import annotations
 
-import json
 import time
 import weakref
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.sim.terrain import Terrain
-from ce_gym.viewer.feed import Feed
-from ce_gym.viewer.page.html import filled
+from ce_gym.viewer.page.html import filled, packed_commands
 from ce_gym.viewer.page.moving import MovingScene
-from ce_gym.viewer.page.poses import PosedModel
 from ce_gym.viewer.server import PageServer
+from ce_gym.viewer.stream import Feed
+
+if TYPE_CHECKING:
+    from ce_gym.dynamics.model import Model
 
 Array = NDArray[np.float64]
 
-_PAGE = Path(__file__).with_name("window.html")
-
 
 class Window:
-    """Shows one robot to every browser that looks.
+    """Shows one robot to every connected browser; without a browser drawing costs almost nothing.
 
-    The address is printed when the window is first drawn into; a server runs until `close`, or until the window is
-    dropped.
+    The first drawing starts the server and prints its address. The server ends with `close`, or with the window.
 
     Args:
-        model: The robot and its forward kinematics.
-        q: Positions in a typical pose, shape (nq,); they set how far the camera is away.
-        fps: Poses in a second of real time: drawing waits for it while a browser is connected [1/s].
-        terrain: The ground, the plane z = 0 if None.
+        model: The robot.
+        q: Positions in a typical pose, shape (nq,); they set the distance of the camera.
+        fps: Poses per second of real time: drawing waits while a browser is connected [1/s].
+        terrain: The ground; None for the plane z = 0.
 
     Raises:
         ViewerError: meshcat is not installed.
     """
 
-    def __init__(self, model: PosedModel, q: Array, *, fps: float, terrain: Terrain | None = None) -> None:
+    def __init__(self, model: Model, q: Array, *, fps: float, terrain: Terrain | None = None) -> None:
         self._model, self._scene, self._period = model, MovingScene(model, q, terrain=terrain), 1 / fps
-        self._text = self._page()
-        self._feed, self._due = Feed(), 0.0
-        self._server: PageServer | None = None
-
-    @property
-    def url(self) -> str | None:
-        """Address of the page, once something has been drawn."""
-        return self._server.url if self._server else None
+        self._feed, self._server, self._due = Feed(), None, 0.0
+        self._text = filled(
+            "window",
+            model.robot.name,
+            scripts=("stream",),
+            constants={"COMMANDS": packed_commands(self._scene.commands())},
+        )
 
     def draw(self, q: Array) -> None:
         """Show the robot at positions `q`, shape (nq,)."""
@@ -58,23 +52,17 @@ class Window:
             return
         if self._server is None:
             self._server = PageServer(self._text, self._feed.events)
-            weakref.finalize(self, _stop, self._server, self._feed)  # a window that is dropped leaves nothing behind
-            print(f"watch at {self.url}", flush=True)
-        moves = self._scene.moves([self._model], [q])
-        if ground := self._scene.new_ground(moves):
-            self._feed.keep("ground", ground)
-        if self._feed.publish(f"data: {json.dumps(moves)}\n\n".encode()):
+            weakref.finalize(self, _stop, self._server, self._feed)
+            print(f"watch at {self._server.url}", flush=True)
+        if self._scene.send(self._feed, [self._model], [q]):
             time.sleep(max(0.0, self._due - time.monotonic()))
         self._due = max(self._due, time.monotonic() - self._period) + self._period
 
     def close(self) -> None:
-        """Stop the server and free its port; harmless if done before."""
+        """Stop the server and free its port; may be called again."""
         self._feed.close()
         if self._server:
             self._server.close()
-
-    def _page(self) -> str:
-        return filled(_PAGE, self._scene.robot.name, commands=json.dumps(self._scene.commands()))
 
 
 def _stop(server: PageServer, feed: Feed) -> None:

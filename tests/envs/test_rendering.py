@@ -176,7 +176,7 @@ def test_environments_show_their_ground(capsys: pytest.CaptureFixture[str]):
         command = json.loads(events.readline()[len("data: ") :])
         assert command["object"]["object"]["userData"]["field"]["reach"] > 1.0
         events.readline()
-        moves = json.loads(events.readline()[len("data: ") :])
+        moves = json.loads(events.readline()[len("data: ") :])["moves"]
         x, y = env.batch.rows("q")[0, :2]
         np.testing.assert_allclose(moves["/world"][12:14], [-x, -y], atol=1e-6)
         env.close()
@@ -259,18 +259,18 @@ def test_a_page_gets_every_pose_and_closing_frees_the_port(capsys: pytest.Captur
     with urllib.request.urlopen(url, timeout=5) as page:
         assert b"EventSource" in page.read()
     with urllib.request.urlopen(url + "events", timeout=5) as events:
-        first = json.loads(events.readline()[len("data: ") :])
+        first = json.loads(events.readline()[len("data: ") :])["moves"]
         events.readline()
         for _ in range(20):
             env.step(np.ones(12, np.float32))
-        moves = json.loads(events.readline()[len("data: ") :])
+        moves = json.loads(events.readline()[len("data: ") :])["moves"]
         assert moves.keys() == first.keys()
         assert moves != first
         x, y = env.batch.rows("q")[0, :2]
         newest = moves
         while (line := events.readline()) and not np.allclose(newest["/world"][12:14], [-x, -y], atol=1e-6):
             if line.startswith(b"data: "):
-                newest = json.loads(line[len("data: ") :])
+                newest = json.loads(line[len("data: ") :])["moves"]
         assert np.allclose(newest["/world"][12:14], [-x, -y], atol=1e-6)
         env.close()
         assert b"data" not in events.read()  # the stream ends

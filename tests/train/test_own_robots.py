@@ -16,9 +16,10 @@ import transfer
 
 from ce_gym.__main__ import main
 from ce_gym.model import load_robot
-from ce_gym.viewer.live.command import serving
+from ce_gym.viewer.live.runner import Runner
 from ce_gym.viewer.live.setup import named
-from ce_gym.viewer.meshes.triangles import Triangles, drawn_meshes
+from ce_gym.viewer.meshes.triangles import Triangles, read_meshes
+from ce_gym.viewer.stream import serving
 
 for package in ("mujoco", "meshcat", "trimesh", "fast_simplification"):
     pytest.importorskip(package)
@@ -73,9 +74,9 @@ def test_everything_takes_it(write, name, seen, tmp_path: Path, monkeypatch: pyt
         assert main(["inspect", env, "--no-timing"]) == 0
         assert main(["play", "run", "--env", env, "--command", "0.1", "0", "0", "0"]) == 0
         assert Path("run.html").exists()
-        with serving(named("run", env), tmp_path):
+        with serving(Runner(named("run", env), tmp_path)):
             pass
-        drawn = drawn_meshes(load_robot(file))
+        drawn = read_meshes(load_robot(file))
         assert sum(isinstance(one, Triangles) for shapes in drawn.values() for one in shapes) >= seen
         assert "not drawn" not in capfd.readouterr().err
     finally:

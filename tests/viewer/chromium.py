@@ -40,8 +40,8 @@ class Chromium:
         size: Of the window [pixels].
 
     Attributes:
-        requests: Addresses that the page has asked for.
-        errors: What went wrong in its scripts.
+        requests: Addresses that the page requested.
+        errors: Errors of its scripts.
     """
 
     def __init__(self, url: str, size: tuple[int, int] = (1280, 800)) -> None:
@@ -100,24 +100,24 @@ class Chromium:
             time.sleep(0.1)
 
     def settle(self) -> None:
-        """Wait until what has been changed is drawn."""
+        """Wait until changes are drawn."""
         self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 50))))")
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Press the mouse at one place of the window, move it to another and let go [pixels]."""
+        """Press the mouse at a place of the window, move it to another and release it [pixels]."""
         for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
             self.mouse(kind, x, y)
 
     def mouse(self, kind: str, x: float, y: float) -> None:
-        """Press, move or let go the left button of the mouse at a place of the window [pixels]."""
+        """Send "mousePressed", "mouseMoved" or "mouseReleased" of the left button at a place of the window [pixels]."""
         self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
     def key(self, kind: str, character: str) -> None:
-        """Press a key ("keyDown") or let it go ("keyUp")."""
+        """Send "keyDown" or "keyUp" of a key."""
         self._call("Input.dispatchKeyEvent", type=kind, key=character)
 
     def picture(self, path: Path) -> Path:
-        """Write what the page shows as a PNG file and return its path."""
+        """Write a picture of the page as a PNG file and return its path."""
         answer = self._call("Page.captureScreenshot", format="png")
         path.write_bytes(base64.b64decode(answer["data"]))
         return path

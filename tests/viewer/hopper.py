@@ -42,7 +42,7 @@ def make_robot(*, shapes: bool = True, rotor_shape: bool = True) -> Robot:
 
 
 class StandIn:
-    """Has what the viewer asks of a model; q = base position, yaw, leg angle, rotor angle."""
+    """The part of `Model` that the viewer uses; q = base position, yaw, leg angle, rotor angle."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot

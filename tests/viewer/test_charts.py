@@ -1,4 +1,4 @@
-"""What is plotted: figures of the rollout under names with units, efforts as shares of limits."""
+"""Signals for plots, and torques as shares of their limits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hopper import StandIn, make_robot, make_rollout
 
 from ce_gym.dynamics import Model
 from ce_gym.viewer import Rollout, ViewerError
-from ce_gym.viewer.page.charts import charts, chosen
+from ce_gym.viewer.page.charts import charts, default_plots
 from ce_gym.viewer.page.scene import pose_rollouts
 
 FRAMES = 40
@@ -77,11 +77,11 @@ def test_without_torques_there_is_no_effort() -> None:
 
 def test_chosen_by_name_and_by_default(rollout: Rollout, found) -> None:
     hardest = Model("mini_cheetah").robot.independent[int(found.effort.max(0).argmax())].removesuffix("_link")
-    assert chosen([found], []) == ["forward speed [m/s]", f"torque of {hardest} [N m]", "reward"]
-    assert chosen([found], ["reward", "turn", "FL_knee"])[:2] == ["reward", "turning [rad/s]"]
-    assert "FL_knee" in chosen([found], ["FL_knee"])[0]
+    assert default_plots([found], []) == ["forward speed [m/s]", f"torque of {hardest} [N m]", "reward"]
+    assert default_plots([found], ["reward", "turn", "FL_knee"])[:2] == ["reward", "turning [rad/s]"]
+    assert "FL_knee" in default_plots([found], ["FL_knee"])[0]
     with pytest.raises(ViewerError, match=r"no signal 'smell' to plot; expected one of forward speed \[m/s\], "):
-        chosen([found], ["smell"])
+        default_plots([found], ["smell"])
 
 
 def test_torques_that_do_not_fit_are_refused(rollout: Rollout) -> None:

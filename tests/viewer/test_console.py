@@ -1,4 +1,4 @@
-"""Progress is for people: on a terminal a bar, elsewhere nothing."""
+"""Progress: a bar on a terminal, otherwise no output."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ import sys
 
 import pytest
 
-from ce_gym.viewer.console import shown
+from ce_gym.console import progress
 
 
-def test_nothing_is_said_where_nobody_looks(capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(shown({"a": 1, "b": 2}.items(), "letters")) == [("a", 1), ("b", 2)]
-    assert capsys.readouterr() == ("", "")
-
-
-def test_a_terminal_shows_how_far_it_is(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("tqdm")
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert list(shown(range(3), "rounds")) == [0, 1, 2]
-    assert "rounds" in capsys.readouterr().err
-
-
-def test_no_bar_without_tqdm(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "tqdm", None)
-    assert list(shown(range(3), "rounds")) == [0, 1, 2]
+@pytest.mark.parametrize("has_tqdm", [True, False])
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_bar_is_shown_on_a_terminal_with_tqdm(
+    terminal: bool, has_tqdm: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if has_tqdm:
+        pytest.importorskip("tqdm")
+    else:
+        monkeypatch.setitem(sys.modules, "tqdm", None)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    assert list(progress(range(3), "rounds")) == [0, 1, 2]
+    assert ("rounds" in capsys.readouterr().err) == (terminal and has_tqdm)

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from chromium import PROGRAM, Chromium
 
-from ce_gym.viewer.live.command import serving
+from ce_gym.viewer.live.runner import Runner
 from ce_gym.viewer.live.setup import named
+from ce_gym.viewer.stream import serving
 
 pytest.importorskip("meshcat")
 pytestmark = [
@@ -24,7 +25,10 @@ BASE = """(place => [(1 + place.x) / 2 * innerWidth, (1 - place.y) / 2 * innerHe
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    with serving(named("mini_cheetah_velocity"), tmp_path_factory.mktemp("live")) as url, Chromium(url) as browser:
+    with (
+        serving(Runner(named("mini_cheetah_velocity"), tmp_path_factory.mktemp("live"))) as url,
+        Chromium(url) as browser,
+    ):
         browser.until("received > 3")
         yield browser
         assert not browser.errors

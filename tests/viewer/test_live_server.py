@@ -1,4 +1,4 @@
-"""The server behind live pages: who may look, how many, and what is left of it. No browser, no clock."""
+"""The server of live pages: access, number of clients, and release of its resources."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ce_gym.viewer.feed import Feed
 from ce_gym.viewer.server import MOST_CLIENTS, PageServer
+from ce_gym.viewer.stream import Feed
 
 
 @pytest.fixture
 def server() -> Iterator[PageServer]:
     feed = Feed()
-    feed.publish(b"data: 1\n\n")
+    feed.publish(1)
     with closing(PageServer("<p>robot</p>", feed.events)) as server:
         server.feed = feed  # type: ignore[attr-defined]
         yield server
@@ -88,9 +88,9 @@ def test_browsers_that_leave_are_not_mentioned(capfd: pytest.CaptureFixture[str]
                 one.recv(12)
             one.close()
             left.append(text)
-        feed.publish(b"data: 1\n\n")
+        feed.publish(1)
         threads = [t for t in threading.enumerate() if "process_request_thread" in t.name]
-        feed.publish(b"data: 2\n\n")
+        feed.publish(2)
         feed.close()
         for thread in threads:
             while thread.ident is None:  # listed, but not started yet

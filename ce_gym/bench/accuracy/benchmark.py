@@ -26,7 +26,7 @@ from ce_gym.bench.accuracy.curves import (
 )
 from ce_gym.bench.accuracy.scenarios import SCENES
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
-from ce_gym.viewer.console import shown
+from ce_gym.console import progress
 
 REQUIRED = 20.0
 """How many times as long as ours a peer has to take at every error that both reach."""
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
         more = [drake_sides]
     mujoco_steps = peer_steps if "MuJoCo" in peers else ()
-    measured = [measure(SCENES[name](), our_steps, mujoco_steps, rounds, more) for name in shown(names, "scenes")]
+    measured = [measure(SCENES[name](), our_steps, mujoco_steps, rounds, more) for name in progress(names, "scenes")]
     report = Report("accuracy")
     for peer in peers:
         scenes = [m for m in measured if any(curve.code == peer for curve in m.curves)]

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ce_gym.bench.digests.cases import KINDS, Case, cases
 from ce_gym.bench.measure.report import Report, Requirement, Table
+from ce_gym.console import progress
 from ce_gym.model import robots
-from ce_gym.viewer.console import shown
 
 SAMPLES = 16
 """Numbers of an array that are recorded as they are."""
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Report:
     """Record, write and compare."""
     chosen = cases(arguments.robots, arguments.only, arguments.quick)
-    rows = {case.key: row(case) for case in shown(chosen, "digests")}
+    rows = {case.key: row(case) for case in progress(chosen, "digests")}
     report = Report("digests")
     if arguments.out:
         record = {"machine": report.machine, "rows": rows}

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
+from ce_gym.console import progress
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device, to_numpy
-from ce_gym.viewer.console import shown
 
 BOUND = {"float64": 1e-11, "float32": 1e-5}
 """Largest difference allowed, relative to a robot's largest position or velocity, or to 1. There should be none."""
@@ -60,7 +60,7 @@ def measure(
     """
     rows: list[tuple[Cell, ...]] = []
     worst = dict.fromkeys(BOUND, 0.0)
-    for name in shown(names, "robots"):
+    for name in progress(names, "robots"):
         for level in levels:
             model = Model(name, level)
             for dtype in BOUND:

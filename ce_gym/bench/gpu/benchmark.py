@@ -16,6 +16,7 @@ from ce_gym.bench.gpu import speed as gpu_speed
 from ce_gym.bench.measure.report import Report, Requirement, Table
 from ce_gym.compile.cuda import CudaUnavailable, nvrtc
 from ce_gym.compile.cuda.source import BLOCK, emit_source
+from ce_gym.console import progress
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.runtime.batch import programs
 from ce_gym.envs.runtime.setup import make_program
@@ -23,7 +24,6 @@ from ce_gym.model import robots
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device, Emulated, device_named
-from ce_gym.viewer.console import shown
 
 DTYPES = ("float32", "float64")
 ARCHITECTURES = ("sm_80", "sm_90")
@@ -80,7 +80,7 @@ def _speed(
         ("environment steps/s, exact, best batch", required["environment"], _environment),
         ("times as fast as MuJoCo Warp", required["warp"], _warp),
     ]
-    for what, bar, measure in shown(rows, "measurements"):
+    for what, bar, measure in progress(rows, "measurements"):
         if reason:
             missing.append((what, bar, reason))
             continue

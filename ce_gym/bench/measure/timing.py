@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from ce_gym.viewer.console import shown
+from ce_gym.console import progress
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ def interleaved(
     Returns:
         Timing of one unit of work, by name.
     """
-    for competitor in shown(competitors.values(), "first run"):
+    for competitor in progress(competitors.values(), "first run"):
         competitor.run()
     seconds: dict[str, list[float]] = {name: [] for name in competitors}
-    for _ in shown(range(rounds), "rounds"):
+    for _ in progress(range(rounds), "rounds"):
         for name, competitor in competitors.items():
             start = clock()
             competitor.run()

@@ -20,13 +20,13 @@ from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import Competitor, Timing, interleaved, ratio
 from ce_gym.bench.peers import mujoco_settings, stand
 from ce_gym.bench.speed import competitors
+from ce_gym.console import progress
 from ce_gym.dynamics.model import Model
 from ce_gym.export.mujoco_batch import STATE, Batch
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.errors import RobotError
 from ce_gym.sim.derivatives import StepDerivatives
 from ce_gym.sim.simulator import Simulator
-from ce_gym.viewer.console import shown
 
 LEVELS, SCENES = ("exact", "armature"), ("in flight", "standing")
 WINDOW = 32
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> Report:
     competitors.silence_mujoco()
     report, robot = Report("derivatives"), stand.bare(load_robot(arguments.robot), "foot")
     sides: dict[str, Competitor] = {}
-    for level in shown(LEVELS, "set up"):
+    for level in progress(LEVELS, "set up"):
         sides |= _ours(Model(robot, level), arguments)
     sides |= _mujoco(robot, LEVELS[1], arguments.dt)
     _steps(sides, interleaved(sides, arguments.rounds, time.thread_time), report)

@@ -18,10 +18,10 @@ from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.measure.timing import interleaved
 from ce_gym.bench.peers import stand
 from ce_gym.bench.speed import competitors
+from ce_gym.console import progress
 from ce_gym.dynamics.model import Model
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Pose, Robot, load_robot
 from ce_gym.model.mechanism import LEVELS
-from ce_gym.viewer.console import shown
 
 JOINTS = (2, 5, 10, 20, 50, 100, 200)
 CONTACTS = (0, 1, 4, 16, 36, 64)
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> Report:
 def joints(lengths: Collection[int], rounds: int, report: Report) -> None:
     """Let a chain on a floating base grow: instructions at every level, times beside peers, time to compile."""
     rows: list[tuple[Cell, ...]] = []
-    for n in shown(lengths, "joints"):
+    for n in progress(lengths, "joints"):
         robot = link_and_rotor_chain(1, n)
         counts = [Model(robot, transmission=level).n_instructions("forward_dynamics") for level in LEVELS]
         start = time.perf_counter()
@@ -81,7 +81,7 @@ def joints(lengths: Collection[int], rounds: int, report: Report) -> None:
 def contacts(numbers: Collection[int], dt: float, rounds: int) -> Table:
     """Let the spheres under a plate grow: time of a sub-step beside MuJoCo's."""
     rows: list[tuple[Cell, ...]] = []
-    for n in shown(numbers, "contacts"):
+    for n in progress(numbers, "contacts"):
         robot = plate(n)
         sides = {"ours": competitors.sub_steps(Model(robot), "float64", 256, 1, dt)}
         sides["MuJoCo"] = competitors.mujoco_steps(competitors.mujoco_batch(robot, "none", 32, 1, dt), robot)
@@ -97,7 +97,7 @@ def crowd(robot: Robot, sizes: Collection[int], dt: float, rounds: int) -> Table
     model = Model(robot)
     rows: list[tuple[Cell, ...]] = []
     each = {dtype: competitors.bytes_per_robot(model, dtype, dt) for dtype in ("float64", "float32")}
-    for size in shown(sizes, "robots"):
+    for size in progress(sizes, "robots"):
         sides = {dtype: competitors.sub_steps(model, dtype, size, 1, dt) for dtype in each}
         timings = interleaved(sides, min(rounds, 3) if size > 1 << 16 else rounds, time.thread_time)
         row = [cell for d in each for cell in (1e6 * timings[d].best, 2.0**-20 * each[d] * size)]

@@ -13,8 +13,8 @@ import numpy as np
 
 from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.bench.stability import grid, plots
+from ce_gym.console import progress
 from ce_gym.dynamics.model import Model
-from ce_gym.viewer.console import shown
 
 ROBOTS = ("mini_cheetah", "mit_humanoid", "tello", "jvrc1")
 PATIENCE, COLLAPSE = 120.0, 3.0
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> Report:
     patience, collapse = (QUICK_PATIENCE, QUICK_COLLAPSE) if arguments.quick else (PATIENCE, COLLAPSE)
     models = {name: Model(name) for name in names}
     maps: dict[str, list[grid.Map]] = {name: [] for name in names}
-    for name, dt in shown(list(itertools.product(names, steps)), "map"):
+    for name, dt in progress(list(itertools.product(names, steps)), "map"):
         maps[name].append(grid.measure(models[name], dt, patience, collapse))
     if arguments.picture:
         plots.draw(maps, arguments.picture)

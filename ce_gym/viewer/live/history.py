@@ -1,4 +1,4 @@
-"""The last seconds of a session: moments to look back at and to continue from."""
+"""The last seconds of a session."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Moment:
     """All robots at one time.
 
     Attributes:
-        time: Since the session began [s].
+        time: Time since the start of the session [s].
         poses: Positions of each robot, shape (nq,) each.
-        snapshots: What each continues from, bit for bit.
+        snapshots: Snapshot of each robot.
     """
 
     time: float
@@ -32,21 +32,17 @@ class Moment:
 
 
 class History:
-    """Keeps moments of the last `seconds`, oldest first."""
+    """Moments of the last `seconds` [s], oldest first."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self._moments: deque[Moment] = deque()
 
     def add(self, moment: Moment) -> None:
-        """Append the newest moment and forget those that are too old."""
+        """Append the newest moment and remove moments that are too old."""
         self._moments.append(moment)
         while self._moments[0].time < moment.time - self._seconds:
             self._moments.popleft()
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._moments.clear()
 
     @property
     def span(self) -> tuple[float, float]:
@@ -54,20 +50,20 @@ class History:
         return self._moments[0].time, self._moments[-1].time
 
     def around(self, time: float) -> tuple[Moment, Moment]:
-        """Return the moments before and after a time, the same one twice at an end."""
+        """Return the moments before and after a time; at an end of the history both are the same."""
         after = min(bisect_left(self._moments, time, key=lambda moment: moment.time), len(self._moments) - 1)
         before = after if self._moments[after].time <= time else max(after - 1, 0)
         return self._moments[before], self._moments[after]
 
     def return_to(self, time: float) -> Moment:
-        """Forget what came after a time; return the last moment that is left, the oldest one at least."""
+        """Remove the moments after a time, except the oldest moment; return the last one left."""
         while len(self._moments) > 1 and self._moments[-1].time > time + 1e-9:
             self._moments.pop()
         return self._moments[-1]
 
 
 def between(before: Moment, after: Moment, time: float, layouts: Iterable[Layout]) -> tuple[Array, ...]:
-    """Return positions of the robots at a time between two moments, linear but for the length of quaternions."""
+    """Return the robots' positions at a time between two moments: linear interpolation, quaternions normalised."""
     length = after.time - before.time
     share = 0.0 if length <= 0 else float(np.clip((time - before.time) / length, 0.0, 1.0))
     poses = zip(before.poses, after.poses, layouts, strict=True)

@@ -1,4 +1,4 @@
-"""Requests of a live page, as JSON: `{"do": name, ...}`. Any other message is refused in one line."""
+"""Requests of a live page, as JSON: `{"do": name, ...}`. Invalid messages give an error of one line."""
 
 from __future__ import annotations
 
@@ -12,29 +12,33 @@ from ce_gym.viewer.live.session import Session
 
 MOST_SPEED = 4.0
 
+Message = Mapping[str, Any]
 Request = Callable[[Session], None]
+Reader = Callable[[Message], Any]
 
 
-def request_of(message: Mapping[str, Any]) -> Request:
-    """Return what a message does to a session.
+def request_of(message: Message) -> Request:
+    """Return the change of a session that a message requests.
 
     Raises:
-        ValueError: If it is not a valid request.
+        ValueError: The message is not a valid request.
     """
     name = message.get("do")
     if not isinstance(name, str) or name not in REQUESTS:
         raise ValueError(f"do={name!r}; expected one of {', '.join(REQUESTS)}")
+    method, readers = REQUESTS[name]
     try:
-        return REQUESTS[name](message)
+        values = [read(message) for read in readers]
     except KeyError as missing:
         raise ValueError(f"do={name!r}: {missing} is missing") from None
+    return lambda session: method(session, *values)
 
 
 def parsed(body: bytes) -> dict[str, Any]:
-    """Return the object that a page posted.
+    """Return a posted message.
 
     Raises:
-        ValueError: If it is no JSON object.
+        ValueError: The body is not a JSON object.
     """
     try:
         message = json.loads(body)
@@ -45,78 +49,54 @@ def parsed(body: bytes) -> dict[str, Any]:
     return message
 
 
-def _number(message: Mapping[str, Any], name: str, low: float, high: float) -> float:
-    value = message[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise ValueError(f"{name}={value!r}; expected a number from {low:g} to {high:g}")
-    return float(value)
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _vector(message: Mapping[str, Any], name: str) -> list[float]:
-    value = message[name]
-    if not isinstance(value, list) or len(value) != 3 or not all(_is_coordinate(x) for x in value):
-        raise ValueError(f"{name}={value!r}; expected three numbers")
-    return [float(x) for x in value]
+def _number(name: str, low: float, high: float) -> Reader:
+    def read(message: Message) -> float:
+        value = message[name]
+        if not _is_number(value) or not low <= value <= high:
+            raise ValueError(f"{name}={value!r}; expected a number from {low:g} to {high:g}")
+        return float(value)
+
+    return read
 
 
-def _is_coordinate(x: Any) -> bool:
-    return isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) and abs(x) < 1e6
+def _vector(name: str) -> Reader:
+    def read(message: Message) -> list[float]:
+        value = message[name]
+        if not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) and abs(x) < 1e6 for x in value):
+            raise ValueError(f"{name}={value!r}; expected three numbers")
+        return [float(x) for x in value]
+
+    return read
 
 
-def _switch(message: Mapping[str, Any]) -> bool:
+def _on(message: Message) -> bool:
     if not isinstance(on := message["on"], bool):
         raise ValueError(f"on={on!r}; expected true or false")
     return on
 
 
-def _drive(message: Mapping[str, Any]) -> Request:
-    shares = _vector(message, "shares")
-    return lambda session: session.drive(shares)
-
-
-def _pause(message: Mapping[str, Any]) -> Request:
-    on = _switch(message)
-    return lambda session: session.pause(on)
-
-
-def _set_speed(message: Mapping[str, Any]) -> Request:
-    speed = _number(message, "speed", 0.01, MOST_SPEED)
-    return lambda session: setattr(session, "speed", speed)
-
-
-def _look_back(message: Mapping[str, Any]) -> Request:
-    seconds = _number(message, "seconds", 0.0, 1e4)
-    return lambda session: session.look_back(seconds)
-
-
-def _drag(message: Mapping[str, Any]) -> Request:
-    body, point, target = message["body"], _vector(message, "point"), _vector(message, "target")
-
-    def request(session: Session) -> None:
-        if body in session.robots[0].model.body_names:
-            session.drag(body, point, target)
-
-    return request
-
-
-def _set_figure(message: Mapping[str, Any]) -> Request:
+def _figure(message: Message) -> dict[str, float]:
     if (name := message["name"]) not in RANGES:
         raise ValueError(f"name={name!r}; expected one of {', '.join(RANGES)}")
-    value = _number(message, "value", *RANGES[name])
-    return lambda session: session.set_figures({name: value})
+    return {name: _number("value", *RANGES[name])(message)}
 
 
-REQUESTS: Mapping[str, Callable[[Mapping[str, Any]], Request]] = {
-    "drive": _drive,
-    "pause": _pause,
-    "speed": _set_speed,
-    "step": lambda _: Session.step_once,
-    "look_back": _look_back,
-    "drag": _drag,
-    "release": lambda _: Session.release,
-    "throw": lambda _: Session.throw,
-    "drop": lambda _: Session.drop,
-    "reset": lambda _: Session.reset,
-    "align": lambda _: Session.align_ghost,
-    "figure": _set_figure,
+REQUESTS: Mapping[str, tuple[Callable[..., None], tuple[Reader, ...]]] = {
+    "drive": (Session.drive, (_vector("shares"),)),
+    "pause": (Session.pause, (_on,)),
+    "speed": (Session.set_speed, (_number("speed", 0.01, MOST_SPEED),)),
+    "step": (Session.step_once, ()),
+    "look_back": (Session.look_back, (_number("seconds", 0.0, 1e4),)),
+    "drag": (Session.drag, (lambda message: message["body"], _vector("point"), _vector("target"))),
+    "release": (Session.release, ()),
+    "throw": (Session.throw, ()),
+    "drop": (Session.drop, ()),
+    "reset": (Session.reset, ()),
+    "align": (Session.align_ghost, ()),
+    "figure": (Session.set_figures, (_figure,)),
 }
+"""The method of `Session` and the readers of its arguments, by the name of a request."""

@@ -1,4 +1,4 @@
-"""A damped spring that pulls on a point of a body, integrated implicitly: stable however stiff it is."""
+"""A damped spring that pulls on a point of a body; implicit integration keeps it stable at any stiffness."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from ce_gym.dynamics.model import Model
 
 Array = NDArray[np.float64]
 
-FREQUENCY = 10.0  # of the robot's mass on the spring, critically damped [rad/s]
-MOST = 1.5  # pull, in weights of the robot
+FREQUENCY = 10.0  # natural frequency of the robot's mass on the spring, critically damped [rad/s]
+MOST = 1.5  # largest pull, in weights of the robot
 GRAVITY = 9.81
 
 
 def pulled(model: Model, q: Array, v: Array, dt: float, body: str, point: ArrayLike, target: ArrayLike) -> Array:
-    """Return the velocities after a pull has acted for a control step, as an impulse.
+    """Return the velocities after a pull over a control step, applied as an impulse.
 
-    The force `f` is that of the spring at the end of the step, `f = K (target - x - dt u) - C u`, where the point's
-    velocity there is `u = J (v + dt M^-1 J^T f)`: three linear equations. Motors do not count in them, so that a light
-    limb that its motors hold is pulled less than the spring would.
+    The spring force at the end of the step is `f = K (target - x - dt u) - C u` with the velocity of the point
+    `u = J (v + dt M^-1 J^T f)`: three linear equations. They leave out the motors, so that motors which hold a light
+    limb reduce its pull.
 
     Args:
         model: The robot.
         q: Positions, shape (nq,).
         v: Velocities, shape (nv,).
         dt: Length of the step [s].
-        body: Which body is held.
-        point: Where, in its frame [m], shape (3,).
+        body: Name of the pulled body.
+        point: Point of the body, in its frame [m], shape (3,).
         target: Where to, in the world [m], shape (3,).
     """
     index = model.body_names.index(body)
@@ -39,14 +39,14 @@ def pulled(model: Model, q: Array, v: Array, dt: float, body: str, point: ArrayL
     inverse_mass = np.stack([point_velocity(model, q, column, index, arm) for column in responses.T], axis=1)
     K = model.total_mass * FREQUENCY**2
     C = 2 * K / FREQUENCY
-    later = K * (np.asarray(target, float) - place - dt * velocity) - C * velocity
-    force = np.linalg.solve(np.eye(3) + dt * (C + dt * K) * inverse_mass, later)
+    spring = K * (np.asarray(target, float) - place - dt * velocity) - C * velocity
+    force = np.linalg.solve(np.eye(3) + dt * (C + dt * K) * inverse_mass, spring)
     force *= min(1.0, MOST * model.total_mass * GRAVITY / max(float(np.linalg.norm(force)), 1e-9))
     return v + dt * responses @ force
 
 
 def force_responses(model: Model, q: Array, v: Array, body: str, place: Array) -> Array:
-    """Return the accelerations that forces of 1 N along the world's axes at a place of a body cause, shape (nv, 3)."""
+    """Return the accelerations from forces of 1 N along the world's axes at a place of a body, shape (nv, 3)."""
     wrenches = np.concatenate([np.cross(place, np.eye(3)), np.eye(3)], axis=1)
     rows = np.concatenate([np.zeros((1, 6)), wrenches])
     q, v = np.tile(q, (4, 1)), np.tile(v, (4, 1))

@@ -10,20 +10,19 @@ from numpy.typing import NDArray
 
 from ce_gym.viewer.live.robot import LiveRobot
 from ce_gym.viewer.page.html import write_html
-from ce_gym.viewer.rollouts.recorder import Recorder
-from ce_gym.viewer.rollouts.recording import reference
+from ce_gym.viewer.rollouts.recording import Recorder, robot_reference
 
 Array = NDArray[np.float64]
 
 
 class LiveRecording:
-    """Collects frames of some robots from now on."""
+    """Collects frames of the robots of a session."""
 
     def __init__(self, robots: Sequence[LiveRobot]) -> None:
         self._dt = robots[0].dt
         self._recorders = [
             Recorder(
-                reference(robot.model.robot),
+                robot_reference(robot.model.robot),
                 robot.model.transmission,
                 robot.dt,
                 label=robot.model.transmission,
@@ -34,13 +33,13 @@ class LiveRecording:
         ]
 
     def add(self, frames: Sequence[Mapping[str, Array]]) -> None:
-        """Append what `LiveRobot.frame` returns of each robot."""
+        """Append a frame of each robot, see `LiveRobot.frame`."""
         for recorder, frame in zip(self._recorders, frames, strict=True):
             time = len(recorder) * self._dt
             recorder.add(time, frame["q"], frame["v"], command=frame["command"], torque=frame["torque"])
 
     def write(self, folder: Path) -> Path | None:
-        """Write the rollouts and their page, and return the page; None if nothing was recorded."""
+        """Write the rollouts and their page; return the page, or None without frames."""
         if not len(self._recorders[0]):
             return None
         page = _unused(folder)
@@ -51,7 +50,7 @@ class LiveRecording:
 
 
 def _unused(folder: Path) -> Path:
-    """Return the name of a page that does not exist yet."""
+    """Return an unused name of a page."""
     number = 1
     while (page := folder / f"live_{number}.html").exists():
         number += 1

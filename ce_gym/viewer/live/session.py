@@ -1,12 +1,11 @@
-"""The simulation behind a live page, without clock, thread or browser.
+"""The simulation of a live page, without clock, thread or browser.
 
-`advance` steps the driven robot and its ghost, which gets the same commands and the same pushes on another transmission
-level.
+`advance` steps the driven robot and its ghost: a robot at another transmission level with the same commands and pulls.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,14 +26,14 @@ class Session:
     """Robots under one command.
 
     Args:
-        robots: The driven robot, then its ghost if there is one.
+        robots: The driven robot, and optionally its ghost.
 
     Attributes:
-        robots: The same.
+        robots: The same robots.
         command: Forward [m/s], sideways [m/s], yaw rate [rad/s].
         paused: Whether the simulation is paused.
-        speed: Seconds of simulation in a second.
-        time: The time that is shown [s].
+        speed: Seconds of simulation per second.
+        time: Time of the shown moment [s].
     """
 
     def __init__(self, robots: list[LiveRobot]) -> None:
@@ -44,7 +43,7 @@ class Session:
         self.take(robots)
 
     def take(self, robots: list[LiveRobot]) -> None:
-        """Replace the robots; the history starts anew."""
+        """Replace the robots, and clear history and recording."""
         self.robots, self.dt = robots, robots[0].dt
         self._steps = 0
         self._start = self.time
@@ -52,10 +51,8 @@ class Session:
         self.recording = None
         self._remember()
 
-    # Time.
-
     def advance(self, seconds: float) -> None:
-        """Simulate some seconds of real time [s], scaled by `speed`."""
+        """Simulate some real time [s], scaled by `speed`."""
         if self.paused:
             return
         self.time += seconds * self.speed
@@ -69,21 +66,25 @@ class Session:
         self._step()
         self.time = self._simulated
 
+    def set_speed(self, speed: float) -> None:
+        """Set the seconds of simulation per second."""
+        self.speed = speed
+
     def pause(self, on: bool) -> None:
-        """Pause, or continue from the moment that is shown."""
+        """Pause, or continue from the shown moment."""
         if not on and self.paused:
             self._continue_here()
         self.paused = on
 
     def look_back(self, seconds: float) -> None:
-        """Pause, and show the moment some seconds before the newest one [s]."""
+        """Pause, and show the moment `seconds` before the newest one [s]."""
         self.paused = True
         first, last = self._history.span
         self.time = float(np.clip(last - seconds, first, last))
 
     @property
     def past(self) -> tuple[float, float]:
-        """Length of the history, and the age of the moment that is shown [s]."""
+        """Length of the history, and age of the shown moment [s]."""
         first, last = self._history.span
         return last - first, max(last - self.time, 0.0)
 
@@ -92,7 +93,7 @@ class Session:
         return self._start + self._steps * self.dt
 
     def _continue_here(self) -> None:
-        """Go back to the moment that is shown, if it is not the newest."""
+        """Return to the shown moment, if it is not the newest."""
         moment = self._history.return_to(self.time)
         if moment.time < self._simulated - self.dt / 2:
             for robot, snapshot in zip(self.robots, moment.snapshots, strict=True):
@@ -114,33 +115,33 @@ class Session:
         self._history.add(Moment(self._simulated, poses, tuple(robot.snapshot() for robot in self.robots)))
 
     def poses(self) -> tuple[Array, ...]:
-        """Return the positions to show, shape (nq,) each; at most one control step old."""
+        """Return the positions to show, at most one control step old, shape (nq,) each."""
         shown = self.time if self.paused else self.time - self.dt
         return between(*self._history.around(shown), shown, [robot.model.robot.layout for robot in self.robots])
 
-    # Commands and disturbances.
-
     def drive(self, shares: ArrayLike) -> None:
-        """Command shares from -1 to 1 of the largest forward, sideways and turning speeds of the task."""
+        """Command shares (-1 to 1) of the task's largest forward, sideways and turning speeds."""
         low, high = self.robots[0].command_range.T
         shares = np.clip(np.asarray(shares, float), -1.0, 1.0)
         self.command = np.where(shares < 0, -shares * low, shares * high)
 
     def drag(self, body: str, point: ArrayLike, target: ArrayLike) -> None:
         """Pull a point of a body, in its frame [m], towards a place in the world [m], until `release`."""
+        if body not in self.robots[0].model.body_names:
+            return
         self._drag = body, np.asarray(point, float), np.asarray(target, float)
 
     @property
     def pulled(self) -> str | None:
-        """The body that is dragged."""
+        """Name of the pulled body."""
         return self._drag[0] if self._drag else None
 
     def release(self) -> None:
-        """End the pull of `drag`."""
+        """End the pull."""
         self._drag = None
 
     def _pull(self) -> None:
-        """Apply the pull for a control step."""
+        """Apply the pull of a control step."""
         if self._drag:
             for robot in self.robots:
                 q, v = robot.state()
@@ -148,19 +149,20 @@ class Session:
 
     def throw(self) -> None:
         """Throw the robots into the air."""
-
-        def thrown(robot: LiveRobot, q: Array, v: Array) -> tuple[Array, Array]:
-            base = robot.model.body_poses(q)[1][0]
-            return q, v + np.r_[np.zeros(3), base.T @ THROW, np.zeros(len(v) - 6)]
-
-        self._change(thrown)
+        for robot in self.robots:
+            q, v = robot.state()
+            v[3:6] += robot.model.body_poses(q)[1][0].T @ THROW
+            robot.write(q, v)
 
     def drop(self) -> None:
-        """Lift the robots and let them fall."""
-        self._change(lambda robot, q, v: (q + np.r_[0.0, 0.0, DROP, np.zeros(len(q) - 3)], 0 * v))
+        """Lift the robots by `DROP` and stop them in the air, from where they fall."""
+        for robot in self.robots:
+            q, v = robot.state()
+            q[2] += DROP
+            robot.write(q, 0 * v)
 
     def align_ghost(self) -> None:
-        """Put the ghost where the robot is."""
+        """Move the ghost to the robot."""
         q, v = self.robots[0].state()
         for ghost in self.robots[1:]:
             ghost.write(q, v)
@@ -175,12 +177,6 @@ class Session:
         """Change friction or added mass; see `live.robot.RANGES`."""
         for robot in self.robots:
             robot.set_figures(figures)
-
-    def _change(self, change: Callable[[LiveRobot, Array, Array], tuple[Array, Array]]) -> None:
-        for robot in self.robots:
-            robot.write(*change(robot, *robot.state()))
-
-    # Recording.
 
     def record(self, on: bool) -> LiveRecording | None:
         """Start a recording, or end it and return it."""

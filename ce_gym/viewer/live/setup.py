@@ -1,4 +1,4 @@
-"""The setup of a live page, as data: policy, transmission levels, ground. Makes the robots of a session."""
+"""The setup of a live page: policy, transmission levels and ground."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GROUNDS: Mapping[str, Mapping[str, Any]] = {
     "flat": {"kind": "flat"},
     **{kind: {"kind": kind, "curriculum": False, "levels": 2} for kind in ("slope", "rough", "stairs")},
 }
-"""Grounds that can be chosen: other than flat, half of their field is level, half has the task's figure."""
+"""Arguments `terrain` by name: half of the field is level, the other half has the task's slope, roughness or stairs."""
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,15 @@ class Setup:
     """A policy on a robot at one or two transmission levels.
 
     Attributes:
-        policy: A file, a folder or the name of a shipped policy; "" for none, which holds the standing pose.
-        env_id: Registered environment id; the one that the policy was trained in if "".
-        transmission: Level of the robot; the policy's own if "".
-        ghost: Level of its ghost, "" for no ghost.
-        terrain: Kind of the ground; the policy's own if "".
-        kwargs: Further arguments of the environment, which replace the policy's own.
+        policy: A file, a folder or the name of a shipped policy; "" holds the standing pose.
+        env_id: Registered environment id; "" for the environment of the training.
+        transmission: Level of the robot; "" for the level of the training.
+        ghost: Level of the ghost; "" for no ghost.
+        terrain: Ground, one of `GROUNDS`; "" for the ground of the training.
+        kwargs: Further arguments of the environment, in place of the training's.
 
     Raises:
-        ViewerError: There is neither a policy nor an environment, or a figure is unknown or not to be chosen.
+        ViewerError: Policy and environment are missing, or an argument is unknown or set by the page itself.
     """
 
     policy: str = ""
@@ -49,19 +49,19 @@ class Setup:
                 raise ViewerError(f"{name}={getattr(self, name)!r}; expected one of {', '.join(known)}")
         for name in self.kwargs:
             if name in UNDISTURBED or name == "randomise":
-                raise ViewerError(f"{name}: expected an argument that the page does not choose itself, as it does this")
+                raise ViewerError(f"{name}: expected another argument; the page sets this one")
 
     def changed(self, changes: Mapping[str, str]) -> Setup:
-        """Return the setup with some attributes replaced; another policy brings its own environment, none keeps it."""
+        """Return the setup with some attributes replaced; a new policy brings its own environment."""
         env_id = self._policy()[1] if changes.get("policy") == "" else "" if "policy" in changes else self.env_id
         return replace(self, **{"env_id": env_id, **changes})
 
     def robots(self) -> list[LiveRobot]:
-        """Make the robot, and its ghost; compiles what is not in the cache yet.
+        """Make the robot and its ghost, with a compilation if the cache lacks their kernels.
 
         Raises:
-            PolicyError: If the policy's file is missing, damaged or of another robot.
-            ViewerError: If the environment cannot be made.
+            PolicyError: The policy's file is missing, damaged or of another robot.
+            ViewerError: The environment cannot be made.
         """
         act, env_id, kwargs = self._policy()
         if self.terrain:
@@ -79,17 +79,14 @@ class Setup:
 
 
 def named(name: str, env_id: str = "", **options: Any) -> Setup:
-    """Return the setup for a name that may be a policy's or an environment's id."""
-    if find_policy(name) is not None or not _looks_like_id(name):
-        return Setup(policy=name, env_id=env_id, **options)
-    return Setup(env_id=env_id or name, **options)
-
-
-def _looks_like_id(name: str) -> bool:
-    return name.rpartition("-v")[2].isdecimal()
+    """Return the setup for the name of a policy or the id of an environment."""
+    is_id = name.rpartition("-v")[2].isdecimal()
+    if is_id and find_policy(name) is None:
+        return Setup(env_id=env_id or name, **options)
+    return Setup(policy=name, env_id=env_id, **options)
 
 
 def policies_for(robot: str, also: Sequence[str] = ()) -> list[str]:
-    """Return the policies that a page offers for a robot: those given, then the shipped ones."""
+    """Return the policies that a page offers for a robot: `also`, then the shipped policies."""
     shipped = [name for name in shipped_policies() if name.startswith(f"{robot}_")]
     return list(dict.fromkeys([*(name for name in also if name), *shipped]))

@@ -1,1 +1,1 @@
-"""Meshes of a robot's own files: which there are, and their triangles."""
+"""Meshes of robot files."""

@@ -1,6 +1,6 @@
-"""What a URDF or MJCF file lets one see of a robot that has meshes: mesh files and primitives, body by body.
+"""Mesh files and primitives of each body of a URDF or MJCF file.
 
-Physics knows nothing of meshes, so that they are no part of a `Robot`; its file is read again when it is drawn.
+A `Robot` has no meshes, since physics does not use them; the viewer reads the robot's file again.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ Color = tuple[float, float, float, float]
 
 KINDS = (".stl", ".obj", ".dae", ".ply", ".glb", ".gltf")
 SEEN_GROUPS = 3  # MuJoCo's viewer shows geoms of the groups 0, 1 and 2; collision geoms usually are in group 3
-_PLAIN = (0.5, 0.5, 0.5, 1.0)  # a geom's colour where its material's counts
+_PLAIN = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour, for which the material's colour counts
 
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh of a file.
+    """A mesh in a file.
 
     Attributes:
-        file: A file of one of `KINDS`, or the MJCF file that has the mesh.
+        file: A file of one of `KINDS`, or the MJCF file of the mesh.
         index: Number of the mesh in an MJCF file.
         scale: Factors along its axes.
         placement: Pose in the frame of its body.
-        color: Red, green, blue, alpha in 0..1; None for the file's own.
+        color: Red, green, blue, alpha in 0..1; None for the colour in the file.
     """
 
     file: Path
@@ -59,87 +59,76 @@ Visual = MeshFile | Shape
 
 
 def visuals_of(robot: Robot) -> dict[str, tuple[Visual, ...]]:
-    """Return what is seen of those bodies of a robot that have meshes, by name; nothing if its file is gone."""
+    """Return meshes and primitives of the bodies with meshes, by name; an empty mapping without the robot's file."""
     source = Path(robot.source)
     if not robot.source or not source.is_file():
         return {}
     names = frozenset(body.name for body in robot.bodies)
-    found = _read(source, source.stat().st_mtime_ns, robot.floating, names)
-    return {name: seen for name, seen in found.items() if name in names}
+    visuals = _read(source, source.stat().st_mtime_ns, robot.floating, names)
+    return {name: items for name, items in visuals.items() if name in names}
 
 
 @lru_cache(maxsize=32)
-def _read(source: Path, changed: int, floating: bool, names: frozenset[str]) -> dict[str, tuple[Visual, ...]]:
-    """Read a file as it was at the time `changed`.
+def _read(source: Path, modified: int, floating: bool, names: frozenset[str]) -> dict[str, tuple[Visual, ...]]:
+    """Read a file in its version of the time `modified`.
 
     Warns:
-        UserWarning: Meshes that it names are not there.
+        UserWarning: Mesh files are missing, or of another kind.
     """
     try:
         if source.suffix.lower() in (".yaml", ".yml"):
             data = read_yaml(source).data
             source = source.parent / str(data.get("urdf") or data.get("mjcf"))
-        items = list(_of_mjcf(source) if source.suffix.lower() == ".xml" else _of_urdf(source, floating, names))
-    except (RobotError, OSError) as error:  # the robot itself was read, perhaps from another state of the file
+        visuals = list(_read_mjcf(source) if source.suffix.lower() == ".xml" else _read_urdf(source, floating, names))
+    except (RobotError, OSError) as error:  # the file may have changed since the robot was read
         warnings.warn(f"{source}: meshes are not drawn: {one_line(error)}", stacklevel=2)
         return {}
-    bodies = {body: tuple(one for name, one in items if name == body) for body, _ in items}
-    return {body: seen for body, seen in bodies.items() if any(isinstance(one, MeshFile) for one in seen)}
+    bodies = {body: tuple(visual for name, visual in visuals if name == body) for body, _ in visuals}
+    return {body: items for body, items in bodies.items() if any(isinstance(item, MeshFile) for item in items)}
 
 
-def _of_urdf(path: Path, floating: bool, names: Collection[str]) -> Iterator[tuple[str, Visual]]:
-    graph, undrawn = UrdfGraph(path), dict[str, list[str]]()
-    frames, colors = (
-        read_tree(graph, "floating" if floating else "fixed", tied=names).frames,
-        read.colors_of(graph.file, graph.robot),
-    )
+def _read_urdf(path: Path, floating: bool, names: Collection[str]) -> Iterator[tuple[str, Visual]]:
+    graph = UrdfGraph(path)
+    frames = read_tree(graph, "floating" if floating else "fixed", tied=names).frames
+    colors = read.colors_of(graph.file, graph.robot)
+    missing: list[str] = []
     for link, element in graph.links.items():
         body, frame = frames[link]
         for visual in element.findall("visual") if body else ():
-            where = f"link {link!r}"
             try:
-                seen = _seen(graph.file, where, visual, colors)
-            except FileNotFoundError as missing:
-                undrawn.setdefault("not there", []).append(str(missing))
-            except _OtherKind as other:
-                undrawn.setdefault("of a kind that is not read", []).append(str(other))
+                item = _visual(graph.file, f"link {link!r}", visual, colors)
+            except FileNotFoundError as error:
+                missing.append(str(error))
             except RobotError as error:
                 warnings.warn(f"{error}: its mesh is not drawn", stacklevel=2)
             else:
-                if seen is not None and body is not None:
-                    yield body, replace(seen, placement=compose(frame, seen.placement))
-    for problem, names in undrawn.items():
-        told = f"{len(names)} meshes are {problem}, such as {names[0]!r}; expected {', '.join(KINDS)} files"
-        warnings.warn(f"{path}: {told}: shapes are drawn", stacklevel=2)
+                if item is not None and body is not None:
+                    yield body, replace(item, placement=compose(frame, item.placement))
+    if missing:
+        problem = f"{len(missing)} meshes are missing or of another kind, such as {missing[0]!r}"
+        warnings.warn(f"{path}: {problem}; expected {', '.join(KINDS)} files: shapes are drawn", stacklevel=2)
 
 
-class _OtherKind(Exception):
-    """A file that is there, but not of one of `KINDS`."""
-
-
-def _seen(file: str, where: str, visual: Any, colors: dict[str, Color]) -> Visual | None:
+def _visual(file: str, where: str, visual: Any, colors: dict[str, Color]) -> Visual | None:
     """Return a mesh or a primitive of a <visual>, in the frame of its link.
 
     Raises:
-        FileNotFoundError: A mesh is not there.
-        _OtherKind: It is of a kind that is not read.
+        FileNotFoundError: A mesh file is missing, or of another kind.
         RobotError: The element is malformed.
     """
     mesh = visual.find("geometry/mesh")
     if mesh is None:
         return read.shape(file, where, visual, colors)
     name = mesh.get("filename", "")
-    found = resolved(name, Path(file).parent)
-    if found is None:
+    path = resolved(name, Path(file).parent)
+    if path is None or path.suffix.lower() not in KINDS:
         raise FileNotFoundError(name)
-    if found.suffix.lower() not in KINDS:
-        raise _OtherKind(name)
-    color, place = _own_color(visual, colors, where, file), read.placement(file, where, visual)
-    return MeshFile(found, scale=_scale(file, where, mesh), placement=place, color=color)
+    color, pose = _own_color(visual, colors, where, file), read.placement(file, where, visual)
+    return MeshFile(path, scale=_scale(file, where, mesh), placement=pose, color=color)
 
 
 def _scale(file: str, where: str, mesh: Any) -> Vec3:
-    """Return the factors along the axes of a mesh; one number counts for all of them."""
+    """Return the factors along the axes of a mesh; a single number is the factor of all three axes."""
     words = mesh.get("scale", "").split()
     if len(words) < 2:
         factor = read.number(file, where, mesh if words else None, "scale", 1.0)
@@ -157,17 +146,17 @@ def _own_color(visual: Any, colors: dict[str, Color], where: str, file: str) -> 
 
 
 def resolved(name: str, folder: Path) -> Path | None:
-    """Return the file that a URDF in a folder names; None if it is not there.
+    """Return the path of a file named in a URDF in `folder`; None without such a file.
 
-    Of the address of a package or model, the folder of that name is that of the URDF or above it, or lies beside one of
-    these. Characters such as spaces may be written as `%20`, as addresses have them.
+    The folder of a package or model is the URDF's folder, a folder above, or a neighbour of these. `%20` stands for a
+    space, as in addresses.
     """
-    places = (place for spelled in (name, unquote(name)) for place in _places(spelled, folder))
-    return next((one for one in places if "\0" not in str(one) and one.is_file()), None)
+    candidates = (path for spelled in (name, unquote(name)) for path in _candidates(spelled, folder))
+    return next((path for path in candidates if "\0" not in str(path) and path.is_file()), None)
 
 
-def _places(name: str, folder: Path) -> list[Path]:
-    """Return where a file may be."""
+def _candidates(name: str, folder: Path) -> list[Path]:
+    """Return the possible paths of a file."""
     kind, colons, rest = name.partition("://")
     if not colons:
         return [folder / name.removeprefix("file:")]
@@ -177,10 +166,10 @@ def _places(name: str, folder: Path) -> list[Path]:
         return []
     package, _, inside = rest.partition("/")
     above = [folder.resolve(), *folder.resolve().parents]
-    return [one / inside for one in above if one.name == package] + [one / package / inside for one in above]
+    return [path / inside for path in above if path.name == package] + [path / package / inside for path in above]
 
 
-def _of_mjcf(path: Path) -> Iterator[tuple[str, Visual]]:
+def _read_mjcf(path: Path) -> Iterator[tuple[str, Visual]]:
     source = read_mjcf(path)
     model, kinds = source.model, source.mujoco.mjtGeom
     frames = read_bodies(source, locked_joints(source), balls_in_loops(source)).frames

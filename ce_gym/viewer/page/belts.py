@@ -1,10 +1,9 @@
-"""Belts, visible through transparent links: between a rotor and a joint that it drives from another axis.
+"""Belts between a rotor and a joint that it drives from another axis, visible through transparent links.
 
-A robot file says how fast a rotor turns with which joints, not by what. Where axes are parallel and farther apart than
-a pulley is wide, something flexible must run between them, and it is drawn: two strands, tangents to pulleys of one
-size, and a pulley that turns on each joint's axis. A belt that goes on to a further joint runs over a pulley that is
-free on the axis between, so that its rotor turns equally far with every joint on the way; a rotor that turns otherwise,
-or with a joint that no belt could reach, is part of a differential, and nothing is drawn.
+A robot file gives the ratio of rotor and joints, not the kind of transmission. A belt is drawn where both axes are
+parallel and farther apart than a pulley is wide: two strands, tangents to pulleys of one size, and a pulley on each
+joint's axis. A belt that continues to a further joint runs over a free pulley on the axis between, so that its rotor
+turns equally far with every joint on the way. Rotors with other ratios belong to differentials and have no belt.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from ce_gym.viewer.page.fallback_shapes import DARK, LIGHT, frame_along, rotor_d
 
 Array = NDArray[np.float64]
 
-PULLEY = 0.6  # radius over that of the rotor's disc
+PULLEY = 0.6  # radius of a pulley over the radius of the rotor's disc
 
 
 @dataclass(frozen=True)
@@ -29,10 +28,10 @@ class Part:
     """A strand or a pulley.
 
     Attributes:
-        shape: What is drawn, in the frame of the body that carries it; a strand is a box along its x.
-        links: Whose joint angles, added, turn the pulley against that body, or move the strand; each with 1 or -1.
-        axis: Of a pulley, through the body's origin, shape (3,); None for a strand.
-        reach: How far a strand moves along its x for each radian [m]; 0 for a pulley.
+        shape: In the frame of its body; a strand is a box along its x.
+        links: Links, each with 1 or -1; the sum of their joint angles turns the pulley or moves the strand.
+        axis: Axis of a pulley through the origin of its body, shape (3,); None for a strand.
+        reach: Motion of a strand along its x per radian [m]; 0 for a pulley.
     """
 
     shape: Shape
@@ -43,21 +42,21 @@ class Part:
 
 @dataclass(frozen=True)
 class _Stage:
-    """A belt from one axis to the next, in the frame of the body that carries both."""
+    """A belt from one axis to the next, in the frame of the body with both axes."""
 
-    carrier: str
+    carrier: str  # name of that body
     link: Body
     at: Array  # a point of the first axis [m], shape (3,)
-    across: Array  # from there to the second [m]
-    axis: Array  # direction of both
-    sign: int  # 1, or -1 if the link's joint turns against it
+    across: Array  # from there to the second axis [m], shape (3,)
+    axis: Array  # direction of both axes, shape (3,)
+    sign: int  # 1, or -1 if the link's joint axis has the opposite direction
 
 
 def belt_parts(robot: Robot) -> dict[str, list[Part]]:
-    """Return strands and pulleys by the name of the body that carries them.
+    """Return strands and pulleys by the name of their body.
 
-    A rotor that turns with several joints in a row, such as knee and ankle, has one belt to the first and from there
-    one to the next.
+    A rotor that drives several joints in a row, such as knee and ankle, has one belt to the first joint and one from
+    there to the next.
     """
     discs = rotor_discs(robot)
     parts: dict[str, list[Part]] = {}
@@ -78,7 +77,7 @@ def belt_parts(robot: Robot) -> dict[str, list[Part]]:
 
 
 def _stages(robot: Robot, constraint: LinearConstraint, rotor: Body, radius: float) -> list[_Stage]:
-    """Return the belts that could do what a constraint says, one after the other; none if belts could not."""
+    """Return the belts, one after the other, that fulfil a constraint; an empty list if belts cannot."""
     stages: list[_Stage] = []
     turns: list[float] = []
     waiting = {name: coefficient for name, coefficient in constraint.coefficients if name != rotor.name}
@@ -108,7 +107,7 @@ def _strands(stage: _Stage, radius: float, links: tuple[tuple[str, int], ...]) -
     side = np.cross(stage.axis, stage.across / length)
     frame = np.column_stack([stage.across / length, side, stage.axis])
     size, middle = (length, 0.12 * radius, 0.5 * radius), stage.at + stage.across / 2
-    # A pulley that turns about z moves what is above it, on the side of y, against x.
+    # A pulley that turns about z moves its side of y against x.
     return [
         Part(Shape("box", size, _placed(middle + s * radius * side, frame), (*DARK, 1.0)), links, reach=-s * radius)
         for s in (1, -1)

@@ -1,4 +1,4 @@
-"""The signals that a page can plot, and each joint's torque as a share of its limit."""
+"""Signals for plots, and each joint's torque as a share of its limit."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Charts:
 
     Attributes:
         signals: By name with unit, each shape (F,).
-        commanded: What was commanded, by the name of the signal, each shape (F,).
-        limits: Largest size that the robot allows, by the name of the signal.
-        effort: Size of each joint's torque over its limit, 0 where it has none, shape (F, n_joints) or (F, 0).
-        paths: Scene path of the body that each of these joints moves.
+        commanded: Commands, by the name of their signal, each shape (F,).
+        limits: Largest absolute value of a signal, by name.
+        effort: Absolute torque of each joint over its limit, 0 without a limit, shape (F, n_joints) or (F, 0).
+        paths: Scene path of the link of each of these joints.
     """
 
     signals: Mapping[str, Array]
@@ -40,7 +40,7 @@ class Charts:
     paths: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Return this for the page: signals as base64 of float32, effort as that of bytes, 255 at the limit."""
+        """Return the data for the page: signals as base64 of float32, effort as base64 of bytes, 255 at the limit."""
         effort = np.clip(np.rint(255 * self.effort), 0, 255).astype(np.uint8)
         return {
             "signals": {name: packed(values) for name, values in self.signals.items()},
@@ -57,10 +57,10 @@ def packed(values: Array) -> str:
 
 
 def charts(run: PosedRollout) -> Charts:
-    """Return what can be plotted of a posed rollout.
+    """Return the signals of a posed rollout.
 
     Raises:
-        ViewerError: Torques do not fit the robot's joints.
+        ViewerError: The number of torques is not the robot's number of joints.
     """
     rollout, rows, robot = run.rollout, run.frames, run.robot
     joints, torques, v = robot.commanded, rollout.torques[rows], rollout.v[rows]
@@ -86,33 +86,33 @@ def charts(run: PosedRollout) -> Charts:
             signals[name] = column
             limits |= {name: limit} if np.isfinite(limit) else {}
     paths = body_paths(robot, run.path)
-    largest = np.array([body.joint.torque or np.inf for body in bodies])  # a passive joint has 0 of 0
+    largest = np.array([body.joint.torque or np.inf for body in bodies])  # the limit of a passive joint is 0
     effort = np.abs(torques) / largest if torques.shape[1] else np.empty((len(rows), 0))
     return Charts(signals, commanded, limits, effort, tuple(paths[name] for name in joints))
 
 
-def chosen(found: Sequence[Charts], wanted: Sequence[str], count: int = 3) -> list[str]:
-    """Return the names of the signals to plot at first.
+def default_plots(all_charts: Sequence[Charts], wanted: Sequence[str]) -> list[str]:
+    """Return the names of the signals to plot first.
 
     Args:
-        found: What there is.
-        wanted: Names or beginnings of names; if none, the speed, the joint closest to its torque limit and the reward.
-        count: How many, if none are wanted.
+        all_charts: Signals of each rollout.
+        wanted: Names, or beginnings of names; if empty, the speed, the joint closest to its torque limit and the
+            reward are plotted.
 
     Raises:
-        ViewerError: There is no such signal; names those there are.
+        ViewerError: There is no such signal; the message lists the known ones.
     """
-    known = list(dict.fromkeys(name for one in found for name in one.signals))
+    known = list(dict.fromkeys(name for chart in all_charts for name in chart.signals))
     names = []
     for word in wanted:
         matches = [name for name in known if name.startswith(word)] or [name for name in known if word in name]
         if not matches:
             raise ViewerError(f"no signal {word!r} to plot; expected one of {listed_names(word, known)}")
         names.append(matches[0])
-    if names or not found:
+    if names or not all_charts:
         return names
-    first = found[0]
+    first = all_charts[0]
     torques = [name for name in first.signals if name.startswith("torque of")]
     hardest = [torques[int(first.effort.max(0).argmax())]] if torques else []
     order = ["forward speed [m/s]", *hardest, "reward", "force from the ground [N]", *known]
-    return [name for name in dict.fromkeys(order) if name in known][:count]
+    return [name for name in dict.fromkeys(order) if name in known][:3]

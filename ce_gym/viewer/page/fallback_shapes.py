@@ -1,4 +1,4 @@
-"""What is drawn of bodies: meshes, shapes; where there is neither, stick figures of whole robots, discs of rotors."""
+"""The shapes of a robot's bodies: meshes, its file's shapes, or a stick figure; and discs for rotors without shapes."""
 
 from __future__ import annotations
 
@@ -7,32 +7,31 @@ from numpy.typing import NDArray
 
 from ce_gym.model.description import Body, ContactSphere, Robot, Shape
 from ce_gym.model.frames import Placement, Vec3
-from ce_gym.viewer.meshes.triangles import MOST, Triangles, drawn_meshes
+from ce_gym.viewer.meshes.triangles import MOST, Triangles, read_meshes
 from ce_gym.viewer.meshes.visuals import visuals_of
 from ce_gym.viewer.page.three import Color
 
 Array = NDArray[np.float64]
 
-AT_ORIGIN = Placement()
 LIGHT, DARK = (0.93, 0.94, 0.95), (0.16, 0.18, 0.21)
 STICK_COLORS = {"link": (0.30, 0.45, 0.62), "rotor": (0.90, 0.55, 0.20)}
 
 
-def drawn_of(robot: Robot, triangles: int = MOST) -> dict[str, tuple[Shape | Triangles, ...]]:
-    """Return what is drawn for each body: its meshes, its shapes, or a stick figure if no body has any.
+def shapes_of(robot: Robot, triangles: int = MOST) -> dict[str, tuple[Shape | Triangles, ...]]:
+    """Return the shapes of each body, by name: its meshes, else its file's shapes; a stick figure if no body has any.
 
     Args:
-        robot: Which robot.
-        triangles: How many all its meshes may have.
+        robot: The robot.
+        triangles: Most triangles of all meshes together.
     """
-    meshes = drawn_meshes(robot, triangles)
+    meshes = read_meshes(robot, triangles)
     if meshes or any(body.shapes for body in robot.bodies):
         return {body.name: meshes.get(body.name, body.shapes) for body in robot.bodies}
     return {**stick_figure(robot)}
 
 
 def stick_figure(robot: Robot) -> dict[str, tuple[Shape, ...]]:
-    """Return shapes for a robot that has none: a ball at each body's origin, sticks to its children and contacts."""
+    """Return a ball at each body's origin, and sticks from there to its children and contacts."""
     ends = [(body.parent, body.placement.position) for body in robot.bodies if body.parent is not None]
     ends += [(sphere.body, sphere.position) for sphere in robot.contacts]
     radius = 0.07 * max((float(np.linalg.norm(end)) for _, end in ends), default=0.0) or 0.05
@@ -41,21 +40,21 @@ def stick_figure(robot: Robot) -> dict[str, tuple[Shape, ...]]:
         if np.linalg.norm(end) > 1e-6:
             shapes[name].append(_stick(np.array(end), 0.5 * radius))
     for sphere in robot.contacts:
-        shapes[sphere.body].append(_touching(sphere, max(sphere.radius, 0.5 * radius)))
+        shapes[sphere.body].append(_contact_shape(sphere, max(sphere.radius, 0.5 * radius)))
     return {name: tuple(items) for name, items in shapes.items()}
 
 
-def _touching(sphere: ContactSphere, radius: float) -> Shape:
-    """Return a ball for a contact sphere, a disc for one that moves around a rim."""
+def _contact_shape(sphere: ContactSphere, radius: float) -> Shape:
+    """Return a ball for a contact sphere, a disc for a sphere that moves around a rim."""
     if not sphere.rim:
         return _ball(DARK, radius, Placement(sphere.position))
     size = sphere.rim + sphere.radius, 2 * sphere.radius or 0.2 * radius
     return Shape("cylinder", size, _along(np.array(sphere.axis), sphere.position), (*DARK, 1.0))
 
 
-def _ball(color: Color, radius: float, placement: Placement = AT_ORIGIN) -> Shape:
+def _ball(color: Color, radius: float, placement: Placement | None = None) -> Shape:
     red, green, blue = color
-    return Shape("sphere", (radius,), placement, (red, green, blue, 1.0))
+    return Shape("sphere", (radius,), placement or Placement(), (red, green, blue, 1.0))
 
 
 def _stick(end: Array, radius: float) -> Shape:
@@ -64,16 +63,14 @@ def _stick(end: Array, radius: float) -> Shape:
 
 
 def rotor_discs(robot: Robot) -> dict[str, Shape]:
-    """Return a disc for each rotor without shapes: the solid cylinder that has the rotor's mass and inertia.
-
-    Rotors without mass get none, nor do robots that are stick figures anyway.
-    """
+    """Return a disc for each rotor with mass but without shapes; none for stick figures."""
     if not visuals_of(robot) and not any(body.shapes for body in robot.bodies):
         return {}
     return {body.name: _disc(body) for body in robot.rotors() if not body.shapes and body.inertial.mass > 0}
 
 
 def _disc(rotor: Body) -> Shape:
+    """Return the solid cylinder with the mass and inertia of a rotor."""
     # A solid cylinder has m r^2 / 2 about its axis and m (3 r^2 + h^2) / 12 across it.
     mass, inertia, axis = rotor.inertial.mass, np.array(rotor.inertial.inertia), np.array(rotor.joint.axis)
     along = float(axis @ inertia @ axis)

@@ -1,4 +1,4 @@
-"""What surrounds the robot: ground, sky, lights and camera."""
+"""Ground, sky, lights and camera."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from ce_gym.viewer.rollouts.ground_patch import as_json
 HORIZON = (0.91, 0.93, 0.95)
 ZENITH = (0.50, 0.66, 0.82)
 TILE = 1.0  # edge of the square that the ground's image repeats over [m]
-GROUND_MARGIN = 45.0  # beyond it the sky's dome hides the ground anyway [m]
+GROUND_MARGIN = 45.0  # the sky's dome hides the ground beyond [m]
 SKY_RADIUS = 45.0
 FIELD_OF_VIEW = 35.0  # vertical [degrees]
+VIEW = [0.62, -0.80, 0.30]  # from the robot towards the camera
+SUN = [0.45, -0.55, 1.0]  # towards the sun
 SCAN_COLOR = (0.80, 0.30, 0.75)
-FADING = 0.4  # from this share of what is drawn of it, ground that is not flat fades into the horizon
-STEEP = 0.5  # how much darker than level ground a vertical face of it is, besides light and shadow
+FADING = 0.4  # uneven ground fades into the horizon from this share of its radius on
+STEEP = 0.5  # darkening of a vertical face of uneven ground, in addition to light and shadow
 
 _MESHCAT_OWN = (
     "/Grid",
@@ -42,9 +44,9 @@ def surroundings(
     Args:
         low: Smallest x and y that the robots visit [m].
         high: Largest x and y [m].
-        root: Scene path that moves with the robots' world; the ground goes there.
-        radius: Size of what is looked at [m].
-        flat: Whether the ground is the plane z = 0; other ground comes by `field_command`.
+        root: Scene path of the robots' world; the ground belongs to it.
+        radius: Radius of the robots [m].
+        flat: Whether the ground is the plane z = 0; `field_command` draws uneven ground.
     """
     for path in _MESHCAT_OWN:
         yield three.set_property(path, "visible", False)
@@ -54,19 +56,13 @@ def surroundings(
     yield from _lights(radius)
 
 
-def eye(radius: float, aspect: float = 1.6) -> NDArray[np.float64]:
-    """Return from where a ball of `radius` [m] around the origin is looked at [m], shape (3,).
-
-    That is from the front right, a little above.
-    """
-    return 1.3 * radius / np.sin(np.radians(FIELD_OF_VIEW / 2)) * max(1.0, 1.0 / aspect) * _unit([0.62, -0.80, 0.30])
+def eye(radius: float) -> NDArray[np.float64]:
+    """Return the camera's place for a ball of `radius` [m] around the origin [m], shape (3,)."""
+    return 1.3 * radius / np.sin(np.radians(FIELD_OF_VIEW / 2)) * _unit(VIEW)
 
 
 def camera_commands(place: NDArray[np.float64]) -> Iterator[Command]:
-    """Look at the origin from a place [m], shape (3,).
-
-    meshcat's camera turns about the origin whatever is done to it, so what is looked at is brought there.
-    """
+    """Look at the origin from a place [m], shape (3,). meshcat's camera always turns about the origin."""
     x, y, z = place.tolist()
     lens = "/Cameras/default/rotated/<object>"
     yield three.set_property(lens, "fov", FIELD_OF_VIEW)
@@ -81,15 +77,15 @@ def field_command(
     fading: float = FADING,
     scans: Sequence[Mapping[str, Any]] = (),
 ) -> Command:
-    """Return the command that draws ground that is not flat; `ground.js` gives it its shape.
+    """Return the command that draws uneven ground; `ground.js` computes its shape.
 
     Args:
         path: Scene path, in the frame of the robots' worlds.
-        ground: A piece of it.
-        bodies: Scene paths of the bodies around which it is drawn.
-        reach: How far around them [m].
-        fading: Share of that from which on it fades into the horizon.
-        scans: See `Rollout.scan`, each with the scene path of its link as `path`; points turn with the first body.
+        ground: A piece of the ground.
+        bodies: Scene paths of the bodies around which the ground is drawn.
+        reach: Radius of the drawn ground around each body [m].
+        fading: The ground fades into the horizon from this share of `reach` on.
+        scans: See `placed_scans`; points turn with the first body.
     """
     data = {**as_json(ground), "bodies": list(bodies), "reach": float(reach), "fading": fading, "steep": STEEP}
     if scans:
@@ -102,7 +98,7 @@ def _unit(vector: list[float]) -> NDArray[np.float64]:
 
 
 def _ground(path: str, low: NDArray[np.float64], high: NDArray[np.float64]) -> Command:
-    # Corners on multiples of the tile keep the lines at whole metres of the world.
+    # Corners at multiples of the tile keep the lines at whole metres of the world.
     first = np.floor(low - GROUND_MARGIN)
     edges = np.ceil(high + GROUND_MARGIN) - first
     pose = three.transform([*(first + edges / 2), 0.0])
@@ -145,12 +141,12 @@ def _lights(radius: float) -> Iterator[Command]:
         "mapSize": [2048, 2048],
         "radius": 2.0,
         "bias": -0.0002,
-        "normalBias": 3 * 2 * reach / 2048,  # three texels, or round bodies shade themselves in stripes
+        "normalBias": 3 * 2 * reach / 2048,  # three texels; with less, round bodies shade themselves in stripes
     }
-    position = three.transform(6.0 * radius * _unit([0.45, -0.55, 1.0]))
+    position = three.transform(6.0 * radius * _unit(SUN))
     yield three.set_object("/Lights/sun", "DirectionalLight", position, color=0xFFF6E8, intensity=0.56, shadow=shadow)
     fill = {"color": 0xDCE8FF, "intensity": 0.18}
     yield three.set_object("/Lights/fill", "DirectionalLight", three.transform([-3.0, 4.0, 2.0]), **fill)
-    # meshcat's page makes everything cast shadows, lights included; one sun is enough.
+    # In meshcat's page all lights cast shadows; here only the sun does.
     for path in ("/Lights/sky", "/Lights/fill"):
         yield three.set_property(f"{path}/<object>", "castShadow", False)

@@ -1,9 +1,8 @@
-"""The few three.js objects and meshcat commands that a scene is made of, as plain dictionaries.
+"""three.js objects, meshcat commands and animation tracks, as plain dictionaries.
 
-meshcat's browser page takes commands (`set_object`, `set_property`, `set_animation`) packed with MessagePack. Building
-them here, instead of through meshcat's Python classes, needs no server, gives identical bytes for identical scenes, and
-reaches what those classes lack (capsules, lights with shadows, packed animation tracks). The formats are those of
-three.js r132, which meshcat 0.3.2 carries, and of meshcat's `commands.py`.
+meshcat's page takes commands (`set_object`, `set_property`, `set_animation`) packed with MessagePack. Unlike meshcat's
+Python classes these functions need no server, give identical bytes for identical scenes, and have capsules, lights with
+shadows and packed animation tracks. Formats: three.js r132, which meshcat 0.3.2 contains, and meshcat's `commands.py`.
 """
 
 from __future__ import annotations
@@ -23,28 +22,23 @@ Array = NDArray[np.float64]
 Command = dict[str, Any]
 Color = Sequence[float]
 
-_EXTENSIONS = {"u2": 0x14, "u4": 0x16, "f4": 0x17}  # MessagePack codes that meshcat's page decodes as typed arrays
+_EXTENSIONS = {"u2": 0x14, "u4": 0x16, "f4": 0x17}  # MessagePack codes of typed arrays in meshcat's page
 FRONT, BACK = 0, 1  # three.js: which faces of a mesh are drawn
 _REPEAT, _LINEAR, _LINEAR_MIPMAP = 1000, 1006, 1008  # three.js texture constants
 
 
 def pack(command: Command) -> bytes:
     """Return a command as the MessagePack bytes that meshcat's page reads."""
-    umsgpack = _umsgpack()
-    return umsgpack.packb(command, ext_handlers={np.ndarray: lambda array: _pack_array(umsgpack, array)})
-
-
-def _pack_array(umsgpack: Any, array: NDArray[Any]) -> Any:
-    kind = array.dtype.str[1:] if array.dtype.kind == "u" else "f4"
-    return umsgpack.Ext(_EXTENSIONS[kind], np.ascontiguousarray(array, dtype=f"<{kind}").tobytes())
-
-
-def _umsgpack() -> Any:
     try:
         import umsgpack
     except ImportError:
-        raise ViewerError.missing_meshcat() from None
-    return umsgpack
+        raise ViewerError.missing("meshcat") from None
+
+    def pack_array(array: NDArray[Any]) -> Any:
+        kind = array.dtype.str[1:] if array.dtype.kind == "u" else "f4"
+        return umsgpack.Ext(_EXTENSIONS[kind], np.ascontiguousarray(array, dtype=f"<{kind}").tobytes())
+
+    return umsgpack.packb(command, ext_handlers={np.ndarray: pack_array})
 
 
 def hex_color(color: Color) -> int:
@@ -62,7 +56,7 @@ def transform(position: ArrayLike = (0, 0, 0), rotation: ArrayLike | None = None
     return matrix
 
 
-# three.js turns its cylinders, lathes and spheres about y; robots and this package use z.
+# The axis of three.js cylinders, lathes and spheres is y; this package uses z.
 Y_TO_Z = transform(rotation=[[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
@@ -73,8 +67,8 @@ def set_object(path: str, kind: str, matrix: Array, **parts: Any) -> Command:
         path: Scene path.
         kind: three.js type, such as "Mesh".
         matrix: Pose in the frame of the path, shape (4, 4).
-        parts: "geometry", "material", "texture" and "image" become shared resources named after the path; anything
-            else is a property of the object.
+        parts: "geometry", "material", "texture" and "image" become resources named after the path; other parts are
+            properties of the object.
     """
     scene: Command = {"metadata": {"version": 4.5, "type": "Object"}}
     item: Command = {"uuid": path, "type": kind, "matrix": matrix.T.ravel().tolist()}
@@ -92,7 +86,7 @@ def set_object(path: str, kind: str, matrix: Array, **parts: Any) -> Command:
 def mesh(
     path: str, geometry: Command, color: Color, matrix: Array, *, opacity: float = 1.0, flat: bool = False
 ) -> Command:
-    """Return the command that draws a solid; `flat` shades each triangle by itself, so that edges stay sharp."""
+    """Return the command that draws a solid; `flat` gives each triangle its own normal, which keeps edges sharp."""
     material: Command = {
         "type": "MeshStandardMaterial",
         "color": hex_color(color),
@@ -111,13 +105,13 @@ def textured(path: str, geometry: Command, pixels: NDArray[np.uint8], matrix: Ar
 
     Args:
         path: Scene path.
-        geometry: As returned by `box` and its fellows.
+        geometry: The solid, such as `box(...)`.
         pixels: Red, green, blue, shape (height, width, 3).
         matrix: Pose, shape (4, 4).
-        options: "repeat" (times in each direction, default (1, 1)) and "userData", which scripts in the page may read;
-            anything else belongs to the material.
+        options: "repeat" (repetitions along both edges, default (1, 1)); "userData", for scripts of the page; other
+            options belong to the material.
     """
-    more = {"userData": options.pop("userData")} if "userData" in options else {}
+    user_data = {"userData": options.pop("userData")} if "userData" in options else {}
     repeat = [float(times) for times in options.pop("repeat", (1, 1))]
     texture = {
         "image": f"{path}:image",
@@ -130,7 +124,7 @@ def textured(path: str, geometry: Command, pixels: NDArray[np.uint8], matrix: Ar
     url = "data:image/png;base64," + base64.b64encode(png(pixels)).decode()
     material = {"map": f"{path}:texture", "color": 0xFFFFFF, **options}
     parts = {"geometry": geometry, "material": material, "texture": texture, "image": {"url": url}}
-    return set_object(path, "Mesh", matrix, **parts, **more)
+    return set_object(path, "Mesh", matrix, **parts, **user_data)
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
@@ -147,7 +141,7 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def set_transform(path: str, matrix: Array) -> Command:
-    """Return the command that places everything at a path; `matrix` has shape (4, 4)."""
+    """Return the command that sets the pose of a path; `matrix` has shape (4, 4)."""
     return {"type": "set_transform", "path": path, "matrix": matrix.T.ravel().tolist()}
 
 
@@ -167,13 +161,13 @@ def sphere(radius: float) -> Command:
 
 
 def cylinder(radius: float, length: float, *, top: float | None = None) -> Command:
-    """Return a cylinder about y [m]; `top` is the radius at +y if it differs, zero for a cone."""
+    """Return a cylinder about y [m]; `top` is the radius at +y if different, zero for a cone."""
     radii = {"radiusTop": float(radius if top is None else top), "radiusBottom": float(radius)}
     return {"type": "CylinderGeometry", **radii, "height": float(length), "radialSegments": 40}
 
 
 def capsule(radius: float, length: float) -> Command:
-    """Return a capsule about y: a half circle, a line of `length` [m] and a half circle, turned about y."""
+    """Return a capsule about y; `length` is the distance between the centres of its ends [m]."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 22)
     heights = radius * np.sin(angles) + np.where(angles > 0, 0.5, -0.5) * length
     points = [{"x": float(x), "y": float(y)} for x, y in zip(radius * np.cos(angles), heights, strict=True)]
@@ -194,3 +188,51 @@ def triangles(vertices: Array, faces: NDArray[Any]) -> Command:
 def plane(x: float, y: float) -> Command:
     """Return a rectangle in the xy plane that faces +z [m]."""
     return {"type": "PlaneGeometry", "width": float(x), "height": float(y)}
+
+
+def quaternions(rotations: Array) -> Array:
+    """Return quaternions in three.js order (x, y, z, w), shape (..., 4), of rotation matrices, shape (..., 3, 3).
+
+    Shepperd's method (1978): of four formulas the one with the largest divisor is used.
+    """
+    r = rotations
+    diagonal = np.diagonal(r, axis1=-2, axis2=-1)
+    trace = diagonal.sum(-1)
+    off = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1)
+    candidates = np.empty((*r.shape[:-2], 4, 4))
+    candidates[..., :3, :3] = r + np.swapaxes(r, -1, -2)
+    candidates[..., [0, 1, 2], [0, 1, 2]] = 1 + 2 * diagonal - trace[..., None]
+    candidates[..., :3, 3] = candidates[..., 3, :3] = off
+    candidates[..., 3, 3] = 1 + trace
+    best = np.argmax(candidates[..., range(4), range(4)], -1)
+    quaternion = np.take_along_axis(candidates, best[..., None, None], -2)[..., 0, :]
+    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+
+
+def clip(path: str, times: Array, end: float, values: dict[str, Array]) -> Command:
+    """Return the animation of one scene path, which holds its last value until `end` [s].
+
+    Args:
+        path: Scene path.
+        times: [s], shape (T,).
+        end: End of the animation [s].
+        values: "position" and "scale", shape (T, 3), and "quaternion", shape (T, 4).
+    """
+    if times[-1] < end:
+        times = np.append(times, end)
+        values = {name: np.concatenate([value, value[-1:]]) for name, value in values.items()}
+    tracks = [_track(name, times, value) for name, value in values.items()]
+    return {"path": path, "clip": {"fps": 1, "name": path, "tracks": tracks}}  # fps 1: times are in seconds
+
+
+def _track(name: str, times: Array, values: Array) -> Command:
+    constant = np.abs(values - values[0]).max() < 1e-6
+    keys = [0, -1] if constant else slice(None)
+    kind = "quaternion" if name == "quaternion" else "vector3"
+    return {"name": f".{name}", "type": kind, "times": times[keys], "values": values[keys].ravel()}
+
+
+def set_animation(clips: list[Command]) -> Command:
+    """Return the command that loads clips and plays them in a loop."""
+    options = {"play": True, "repetitions": float("inf")}
+    return {"type": "set_animation", "path": "", "animations": clips, "options": options}

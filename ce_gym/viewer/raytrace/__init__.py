@@ -1,1 +1,1 @@
-"""Pictures of robots without a display: rays and triangles on the CPU."""
+"""Ray-traced pictures of robots on the CPU, without a display."""

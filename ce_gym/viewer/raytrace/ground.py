@@ -1,4 +1,4 @@
-"""Intersections of rays with a height field, for pictures."""
+"""Intersections of rays with the ground: a plane or a height field."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ MOST = 1 << 15  # heights of a piece
 
 
 class _Piece(NamedTuple):
-    """The ground about one block."""
+    """The ground around one block."""
 
-    scene: Any  # around the middle of the block
+    scene: Any  # of `Embree.scene`, with the origin in the middle of the block
     middle: Array  # of the block [m], shape (2,)
     slopes: Floats  # of the surface at the vertices, shape (n, 2)
     triangles: NDArray[np.int32]
-    reach: float  # how far it goes to every side of the block [m]
-    lowest: float  # [m]
+    reach: float  # distance from the block to the border of the piece [m]
+    lowest: float  # smallest height [m]
 
 
-class Met(NamedTuple):
-    """Where rays meet the ground.
+class GroundHits(NamedTuple):
+    """The points where rays hit the ground.
 
     Attributes:
-        distance: [m], infinite where they do not, shape (n,).
+        distance: [m], infinite without a hit, shape (n,).
         normals: Shape (n, 3).
-        away: How far that is from the middle, as a share of how far the ground is drawn, shape (n,).
+        away: Distance of the point from the middle over the radius of the drawn ground, shape (n,).
     """
 
     distance: Floats
@@ -40,13 +40,30 @@ class Met(NamedTuple):
     away: Floats
 
 
-class Field:
-    """Ground that is not flat, of which only what is around a place is built.
+class Plane:
+    """The plane z = 0, with the interface of `Field`."""
 
-    The mesh depends on the block of the world around that place only, not on earlier calls.
+    terrain = None
+
+    def lowest(self, place: ArrayLike) -> float:
+        """Return 0."""
+        return 0.0
+
+    def meet(self, centre: ArrayLike, start: ArrayLike, rays: Floats) -> GroundHits:
+        """Return the hits of rays; see `Field.meet`."""
+        down = rays[:, 2] < -1e-3
+        distance = np.where(down, np.asarray(start, float)[2] / np.where(down, -rays[:, 2], 1.0), np.inf)
+        normals = np.broadcast_to(np.array([0, 0, 1], np.float32), rays.shape)
+        return GroundHits(distance.astype(np.float32), normals, np.zeros(len(rays), np.float32))
+
+
+class Field:
+    """A height field, of which only the surroundings of a place are built.
+
+    The mesh depends on the block of the world at that place only, not on earlier calls.
 
     Args:
-        embree: Sends rays.
+        embree: The ray tracer.
         terrain: The whole field.
     """
 
@@ -55,32 +72,32 @@ class Field:
         self._built: tuple[tuple[int, int], _Piece] | None = None
 
     def lowest(self, place: ArrayLike) -> float:
-        """Return a height that nothing around a place (x, y) [m] is below [m]."""
+        """Return the smallest height around a place (x, y) [m]."""
         return self._around(place).lowest
 
-    def meet(self, centre: ArrayLike, start: ArrayLike, rays: Floats) -> Met:
-        """Return where rays meet the ground.
+    def meet(self, centre: ArrayLike, start: ArrayLike, rays: Floats) -> GroundHits:
+        """Return the points where rays hit the ground.
 
         Args:
-            centre: Around which place it is drawn [m], shape (3,).
-            start: Of all rays, against the centre [m], shape (3,).
+            centre: Middle of the drawn ground [m], shape (3,).
+            start: Start of all rays, relative to the centre [m], shape (3,).
             rays: Unit vectors, shape (n, 3).
         """
         centre, start = np.asarray(centre, float), np.asarray(start, float)
         piece = self._around(centre[:2])
-        here = start + centre - [*piece.middle, 0.0]
-        found = self._embree.meet(piece.scene, np.broadcast_to(here.astype(np.float32), rays.shape), rays)
-        hit = found["primID"] >= 0
-        distance = np.where(hit, found["tfar"], np.inf).astype(np.float32)
-        u, v = found["u"][hit, None], found["v"][hit, None]
-        a, b, c = piece.slopes[piece.triangles[found["primID"][hit]]].swapaxes(0, 1)
+        origin = start + centre - [*piece.middle, 0.0]
+        hits = self._embree.meet(piece.scene, np.broadcast_to(origin.astype(np.float32), rays.shape), rays)
+        hit = hits["primID"] >= 0
+        distance = np.where(hit, hits["tfar"], np.inf).astype(np.float32)
+        u, v = hits["u"][hit, None], hits["v"][hit, None]
+        a, b, c = piece.slopes[piece.triangles[hits["primID"][hit]]].swapaxes(0, 1)
         normals = np.tile(np.array([0, 0, 1], np.float32), (len(rays), 1))
         normals[hit, :2] = -((1 - u - v) * a + u * b + v * c)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         spots = start[:2].astype(np.float32) + np.where(hit, distance, 0)[:, None] * rays[:, :2]
         away = (np.linalg.norm(spots, axis=1) / piece.reach).astype(np.float32)
         distance[away > 1] = np.inf
-        return Met(distance, normals, away)
+        return GroundHits(distance, normals, away)
 
     def _around(self, place: ArrayLike) -> _Piece:
         row, column = np.floor(np.asarray(place, float) / BLOCK).astype(int).tolist()

@@ -1,4 +1,4 @@
-"""The robot's scene commands as triangles: what a ray tracer needs of `three.mesh`."""
+"""Triangles of a robot's scene commands (`three.mesh`), for the ray tracer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ce_gym.viewer.page.three import Command
 Array = NDArray[np.float64]
 Indices = NDArray[np.signedinteger[Any]]
 
-SEGMENTS = 18  # around a round body; normals are smooth, so that only its outline shows them
+SEGMENTS = 18  # around a round body; its normals are smooth, so that only the outline shows segments
 ROWS = 9  # from pole to pole of a sphere
 
 
@@ -40,10 +40,10 @@ class Mesh:
 
 
 def mesh_of(commands: Iterable[Command], paths: dict[str, int]) -> Mesh:
-    """Return the solids that commands put directly at the paths of bodies.
+    """Return the solids that commands draw directly at the paths of bodies.
 
     Args:
-        commands: Of a robot; those that draw no solid, or draw one elsewhere (inside a hidden group), are left out.
+        commands: Commands of a robot; solids in hidden groups are left out.
         paths: Index of the body at each scene path.
     """
     parts: list[tuple[Array, Array, Indices, int, list[float]]] = []
@@ -81,14 +81,14 @@ def _solid(geometry: dict[str, Any]) -> tuple[Array, Array, Indices]:
         angles = np.linspace(-np.pi / 2, np.pi / 2, ROWS)
         outward = np.column_stack([np.cos(angles), np.sin(angles)])
         return _turned(geometry["radius"] * outward, outward)
-    outline = np.array([[point["x"], point["y"]] for point in geometry["points"]])[::3]  # a capsule, thinned
+    outline = np.array([[point["x"], point["y"]] for point in geometry["points"]])[::3]  # a capsule, with fewer rows
     along = np.gradient(outline, axis=0)
     outward = np.column_stack([along[:, 1], -along[:, 0]])
     return _turned(outline, outward / np.linalg.norm(outward, axis=1, keepdims=True))
 
 
 def _faceted(data: dict[str, Any]) -> tuple[Array, Array, Indices]:
-    """Triangles that share no corners, each with its own normal."""
+    """Return triangles without common corners, each with its own normal."""
     vertices = np.reshape(data["attributes"]["position"]["array"], (-1, 3))
     corners = vertices[np.reshape(data["index"]["array"], (-1, 3)).astype(np.intp)]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -97,7 +97,7 @@ def _faceted(data: dict[str, Any]) -> tuple[Array, Array, Indices]:
 
 
 def _box(half: Array) -> tuple[Array, Array, Indices]:
-    """Six faces of four corners each, so that edges stay sharp."""
+    """Return six faces of four corners each, with sharp edges."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     points, normals = np.empty((6, 4, 3)), np.zeros((6, 4, 3))
     for face in range(6):

@@ -1,1 +1,1 @@
-"""Rollouts: what a robot did, recorded and kept in a file."""
+"""Rollouts: recorded motions of robots, in memory and in files."""

@@ -15,7 +15,7 @@ from ce_gym.viewer.rollouts.recording import Act, record_lanes
 from ce_gym.viewer.rollouts.rollout import Rollout
 
 Script = Sequence[tuple[float, tuple[float, float, float]]]
-"""Commands one after the other: for how long [s], then forward, sideways [m/s] and yaw rate [rad/s]."""
+"""Commands in sequence, each with its duration [s], forward and sideways speed [m/s] and yaw rate [rad/s]."""
 
 SHOW: Script = (
     (1.0, (0.0, 0.0, 0.0)),
@@ -25,24 +25,21 @@ SHOW: Script = (
     (4.0, (1.0, 0.0, 0.0)),
     (1.0, (0.0, 0.0, 0.0)),
 )
-"""Stand, walk, turn, step sideways, walk faster, stand; each within what the task commands."""
+"""Stand, walk, turn, step sideways, walk faster, stand; clipped to the command range of the task."""
 
 
 def drive(act: Act, env_id: str, script: Script = SHOW, *, seed: int = 0, label: str = "", **kwargs: Any) -> Rollout:
-    """Drive one robot through a list of commands and record every step.
+    """Drive one robot through a list of commands and record every control step.
 
-    Recording ends with the script, or with the episode should the robot fall.
+    Recording ends with the script, or with the episode if the robot falls.
 
     Args:
         act: The policy.
         env_id: Registered environment id.
-        script: What to command.
-        seed: Of the environment.
+        script: The commands.
+        seed: Seed of the environment.
         label: A few words for the viewer's legend.
-        **kwargs: Given to the environment, such as `transmission`.
-
-    Returns:
-        One frame per step of the environment.
+        **kwargs: Arguments of the environment, such as `transmission`.
     """
     return drive_many(act, env_id, script, robots=1, seed=seed, label=label, **kwargs)[0]
 
@@ -52,25 +49,24 @@ def drive_many(
 ) -> list[Rollout]:
     """Drive several robots through the same commands; robot `i` has seed `seed + i`. See `drive`."""
     seconds = sum(time for time, _ in script)
-    # Commands come from the script: the environment draws no new ones before the end of time.
-    options = {**kwargs, "contact_forces": True, "command_period": 1e6}
-    envs, native = made(env_id, robots, options)
+    # With this period the environment draws no commands of its own.
+    envs, native = make_envs(env_id, robots, {**kwargs, "contact_forces": True, "command_period": 1e6})
     try:
         commands = np.repeat([c for _, c in script], [round(t / native.dt) for t, _ in script], axis=0)
         if script is SHOW:
             low, high = np.transpose(native.batch.program.task.command_range)
             commands = np.clip(commands, low, high)
-        more: dict[str, Any] = {"seed": seed, "commands": commands, "label": label, "info": {"env": env_id}}
-        return record_lanes(envs, act, seconds, lanes=range(robots), **more)
+        options: dict[str, Any] = {"seed": seed, "commands": commands, "label": label, "info": {"env": env_id}}
+        return record_lanes(envs, act, seconds, lanes=range(robots), **options)
     finally:
         envs.close()
 
 
-def made(env_id: str, robots: int, options: Mapping[str, Any]) -> tuple[Any, BaseEnv]:
-    """Make an environment of several robots; return it and what is inside its wrappers.
+def make_envs(env_id: str, robots: int, options: Mapping[str, Any]) -> tuple[Any, BaseEnv]:
+    """Return an environment of several robots, and the environment inside its wrappers.
 
     Raises:
-        ViewerError: If it cannot be made, or is none of ce_gym.
+        ViewerError: The environment cannot be made, or is not of ce_gym.
     """
     import gymnasium
 
@@ -81,22 +77,22 @@ def made(env_id: str, robots: int, options: Mapping[str, Any]) -> tuple[Any, Bas
     native = envs.unwrapped
     if not isinstance(native, BaseEnv):
         envs.close()
-        raise ViewerError(f"environment {env_id!r}: expected one of ce_gym, of its own robots or registered ones")
+        raise ViewerError(f"environment {env_id!r}: expected an environment of ce_gym or of a registered robot")
     return envs, native
 
 
 def walk(file: Path, script: Script = SHOW, *, env: str | None = None, **options: Any) -> list[Rollout]:
-    """Run a policy through a list of commands in the environment it was trained in.
+    """Run a policy through a list of commands in the environment of its training.
 
     Args:
-        file: Of the policy.
-        script: What to command.
-        env: Id of the environment, if not the one that the policy's record names; see `policies.environment_of`.
-        **options: See `drive_many`; anything else replaces what the policy was trained with, such as `transmission`.
+        file: File of the policy.
+        script: The commands.
+        env: Id of another environment than in the policy's record; see `policies.environment_of`.
+        **options: Arguments of `drive_many`, and of the environment in place of the training's, such as `transmission`.
 
     Raises:
-        PolicyError: If the file is damaged or no policy, or its environment is not registered.
-        ViewerError: If the environment cannot be made, or is none of ce_gym.
+        PolicyError: The file is not a policy, or its environment is not registered.
+        ViewerError: The environment cannot be made, or is not of ce_gym.
     """
     policy = load_policy(file)
     record = policy.record

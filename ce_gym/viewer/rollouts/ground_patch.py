@@ -1,4 +1,4 @@
-"""A piece of a height field around a robot, small enough to be stored and drawn."""
+"""Pieces of height fields around robots, small enough for files and pages."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ce_gym.sim.terrain import Terrain
 
 Array = NDArray[np.float64]
 
-MARGIN = 8.0  # so much of the ground is kept on every side of a path [m]
-LEAST_MARGIN = 1.5  # before less than this is kept, heights are taken farther apart [m]
+MARGIN = 8.0  # of the piece around a path [m]
+LEAST_MARGIN = 1.5  # a smaller margin is avoided by a coarser grid [m]
 MOST = 1 << 16  # heights of one piece
-STEPS = (1 << 16) - 1  # heights are kept as 16-bit shares of the piece's range
+STEPS = (1 << 16) - 1  # largest 16-bit number
 
 
 class Heights(NamedTuple):
@@ -41,14 +41,14 @@ class Heights(NamedTuple):
 def around(terrain: Terrain, places: ArrayLike, margin: float = MARGIN, most: int = MOST) -> Terrain:
     """Return the piece of a field around places.
 
-    The piece has the field's own heights, and those that its straight continuation has beyond its border. If these are
-    more than `most`, less is kept on every side; if places are too far apart even so, heights that are farther apart.
+    Beyond the border of the field its slope continues. With more than `most` heights first the margin shrinks, then the
+    grid becomes coarser.
 
     Args:
         terrain: The field.
         places: x and y [m], shape (n, 2).
-        margin: How far the piece reaches beyond the places [m].
-        most: Number of heights.
+        margin: Distance from the places to the border of the piece [m].
+        most: Largest number of heights.
     """
     places = np.asarray(places, float)
     low, high = places.min(0), places.max(0)
@@ -68,7 +68,7 @@ def around(terrain: Terrain, places: ArrayLike, margin: float = MARGIN, most: in
 
 
 def _continued(heights: Array, rows: NDArray[np.integer[Any]]) -> Array:
-    """Return rows of heights by number, those outside on the straight line through the two nearest."""
+    """Return rows of heights by number; rows outside continue the line through the two nearest rows."""
     inside = np.clip(rows, 0, len(heights) - 1)
     beyond = (rows - inside)[:, None]
     slope = np.where(beyond < 0, heights[1] - heights[0], heights[-1] - heights[-2])
@@ -76,7 +76,7 @@ def _continued(heights: Array, rows: NDArray[np.integer[Any]]) -> Array:
 
 
 def _coarser(terrain: Terrain, low: Array, high: Array) -> Terrain:
-    """Return the surface of a field about a box, by heights that are twice as far apart."""
+    """Return the surface of a field around a box on a grid with twice the distance."""
     cell = 2 * terrain.cell
     first, last = (np.floor((low - 2 * LEAST_MARGIN) / cell), np.ceil((high + 2 * LEAST_MARGIN) / cell))
     x, y = (cell * np.arange(i, j + 1) for i, j in zip(first, last, strict=True))
@@ -84,7 +84,7 @@ def _coarser(terrain: Terrain, low: Array, high: Array) -> Terrain:
 
 
 def reach(terrain: Terrain, places: ArrayLike) -> float:
-    """Return how far a piece of ground goes at least to every side of places [m], shape (n, 2); negative outside."""
+    """Return the smallest distance from places [m], shape (n, 2), to the border of a piece; negative outside [m]."""
     low = np.array(terrain.origin) + terrain.cell / 2
     high = np.array(terrain.origin) + terrain.cell * (np.array(terrain.heights.shape) - 1.5)
     places = np.asarray(places, float)
@@ -92,12 +92,12 @@ def reach(terrain: Terrain, places: ArrayLike) -> float:
 
 
 def level(terrain: Terrain | None, places: ArrayLike, radius: float) -> Array:
-    """Return the mean height of the ground about places [m], shape (n,): roughness averaged out, slopes kept.
+    """Return the mean height of the ground around places [m], shape (n,).
 
     Args:
-        terrain: The ground, None where it is flat.
+        terrain: The ground; None if flat.
         places: x and y [m], shape (n, 2).
-        radius: Half the edge of the square that is averaged over [m].
+        radius: Half the edge of the averaged square [m].
     """
     places = np.asarray(places, float)
     if terrain is None:
@@ -109,13 +109,13 @@ def level(terrain: Terrain | None, places: ArrayLike, radius: float) -> Array:
 
 
 def clear_view(terrain: Terrain | None, target: ArrayLike, eye: ArrayLike, room: float) -> Array:
-    """Return where an eye may look at a target from above the ground: as high as is needed, straight above `eye`.
+    """Return the eye, raised until the ground does not hide the target, shape (3,).
 
     Args:
-        terrain: The ground, None where it is flat.
-        target: What is looked at [m], shape (3,).
-        eye: Where from [m], shape (3,).
-        room: How far above the ground the line of sight is to stay on the half next to the eye [m].
+        terrain: The ground; None if flat.
+        target: Target of the camera [m], shape (3,).
+        eye: Place of the camera [m], shape (3,).
+        room: Least height of the line of sight above the ground, on the half next to the eye [m].
     """
     target, eye = np.array(target, float), np.array(eye, float)
     if terrain is None:
@@ -128,7 +128,7 @@ def clear_view(terrain: Terrain | None, target: ArrayLike, eye: ArrayLike, room:
 
 
 def surface(terrain: Terrain) -> tuple[Array, Array, Array]:
-    """Return the surface of a field where `ground.js` has it too, at every height and halfway between.
+    """Return the surface of a field at the vertices of `ground.js`: at every height and halfway between.
 
     Returns:
         x [m], shape (n,), y [m], shape (m,), heights and slopes there, shape (n, m, 3).

@@ -1,6 +1,6 @@
-"""Recorded rollouts: what a robot did, frame by frame, as one small file.
+"""Recorded rollouts: the motion of a robot, frame by frame, and its file.
 
-A rollout names its robot and holds arrays; poses of bodies are computed from it when it is shown.
+A rollout contains the robot's name and arrays; the viewer computes the poses of bodies from them.
 """
 
 from __future__ import annotations
@@ -20,18 +20,27 @@ from ce_gym.viewer.rollouts.ground_patch import Heights
 
 FORMAT = "ce_gym rollout"
 VERSION = 3
-READABLE = (2, 3)  # version 2 knew no ground but the flat
-
-MOST_BYTES = 2**30  # of a rollout in memory: an hour of a humanoid at 50 frames a second takes a tenth
+MOST_BYTES = 2**30  # of a rollout in memory; an hour of a humanoid at 50 frames per second takes a tenth
 
 ARRAYS = {"times": 1, "q": 2, "v": 2, "contact_forces": 3, "commands": 2, "torques": 2, "signals": 2}
-"""What a rollout consists of: the number of axes of each array, the first of which is time."""
+"""Number of axes of each array of a rollout; the first axis is time."""
+
+HEADER: dict[str, Any] = {
+    "robot": str,
+    "transmission": str,
+    "dt": int | float,
+    "label": str,
+    "info": dict,
+    "contact_names": list,
+    "signal_names": list,
+}
+"""Type of each entry of a file's header."""
 
 Array = NDArray[np.float64]
 
 
 class RolloutError(ValueError):
-    """A rollout, or a file that should hold one, is not usable; the message is one line."""
+    """A rollout or its file is invalid; the message is one line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,28 +49,27 @@ class Rollout:
 
     Attributes:
         robot: Name of a robot, or path of its file.
-        transmission: Transmission level it was simulated with.
+        transmission: Transmission level of the simulation.
         dt: Time between frames [s].
         times: Time of each frame, strictly increasing [s], shape (T,).
         q: Positions, shape (T, nq).
         v: Velocities, shape (T, nv).
         contact_forces: Force of the ground on each contact, world axes [N], shape (T, n_contacts, 3); n_contacts may
             be zero. None means zero contacts.
-        commands: The robot's commands, shape (T, n); n may be zero. The first two columns are drawn as
-            speed forward and to the left in the frame of the base's heading [m/s]. None means n = 0.
-        torques: Torque of the motors at each independent joint over the control step that led here [N m], shape
-            (T, n_joints); n_joints may be zero. None means none.
-        signals: Anything else to plot, such as reward terms, shape (T, n). None means n = 0.
-        signal_names: Of the columns of `signals`.
+        commands: Commands, shape (T, n); n may be zero. The first two columns are drawn as speed forward and to the
+            left in the frame of the base's heading [m/s]. None means n = 0.
+        torques: Motor torque at each independent joint over the control step before the frame [N m], shape
+            (T, n_joints); n_joints may be zero. None means n_joints = 0.
+        signals: Further signals to plot, such as reward terms, shape (T, n). None means n = 0.
+        signal_names: Names of the columns of `signals`.
         label: A few words for the legend.
-        info: Anything else worth keeping, as text.
-        contact_names: Which contacts the forces belong to, for simulations of some contacts only; empty means all of
-            the robot's, in its order.
+        info: Further entries, as text.
+        contact_names: Names of the contacts of the forces; empty for all contacts of the robot, in its order.
         ground: The ground around the robot's path, see `rollouts.ground_patch.around`; None if flat.
-        scan: Where the robot's scans look, a mapping for each. `link` ("" for the base) has a sensor in the mean of the
-            places `at`, in its frame [m]. It looks straight down on `points`, pairs ahead of and to the left of there
-            [m], which turn with the base's heading; or along `rays`, unit vectors in the link's frame, `reach` [m] far
-            in so many `steps`. Pairs alone are points about the base.
+        scan: The robot's scans, a mapping for each. The sensor sits on `link` ("" for the base) at the mean of the
+            places `at` in the link's frame [m]. A height scan has `points`: pairs of distances ahead and to the left
+            [m], which turn with the base's heading. A range scan has `rays`: unit vectors in the link's frame, with
+            their length `reach` [m] and the number of `steps` along them.
     """
 
     robot: str
@@ -94,11 +102,11 @@ class Rollout:
         if self.contact_forces.shape[2] != 3:
             raise RolloutError(f"contact_forces has shape {self.contact_forces.shape}; expected (T, n_contacts, 3)")
         object.__setattr__(self, "contact_names", tuple(self.contact_names))
-        named, found = len(self.contact_names), self.contact_forces.shape[1]
-        if named and found and named != found:
-            raise RolloutError(f"contact_names has {named} names; contact_forces has {found} contacts")
+        names, contacts = len(self.contact_names), self.contact_forces.shape[1]
+        if names and contacts and names != contacts:
+            raise RolloutError(f"contact_names has {names} names; contact_forces has {contacts} contacts")
         object.__setattr__(self, "signal_names", tuple(self.signal_names))
-        object.__setattr__(self, "scan", _scans(self.scan))
+        object.__setattr__(self, "scan", tuple(_scan(scan) for scan in self.scan))
         if len(self.signal_names) != self.signals.shape[1]:
             raise RolloutError(
                 f"signal_names has {len(self.signal_names)} names; signals has {self.signals.shape[1]} columns"
@@ -113,7 +121,7 @@ class Rollout:
         return float(self.times[-1] - self.times[0])
 
     def save(self, path: str | Path) -> Path:
-        """Write the rollout as a compressed npz, values in single precision, and return its path.
+        """Write the rollout as a compressed npz in single precision, and return its path.
 
         Examples:
             >>> still = Rollout("four_bar", "exact", dt=0.02, times=[0.0, 0.02], q=[[1.5], [1.5]], v=[[0.0], [0.0]])
@@ -130,14 +138,14 @@ class Rollout:
             "info": {str(key): str(value) for key, value in self.info.items()},
             "contact_names": list(self.contact_names),
             "signal_names": list(self.signal_names),
-            **({"scans": list(self.scan)} if self.scan else {}),
+            "scans": list(self.scan),
         }
         ground: dict[str, Any] = {}
         if self.ground is not None:
             ground["ground"], low, step = Heights.of(self.ground)
             header["ground"] = {"cell": self.ground.cell, "origin": self.ground.origin, "low": low, "step": step}
         path = Path(path)
-        # An open file, since numpy would append .npz to a name that lacks it.
+        # numpy would append .npz to a name without.
         with path.open("wb") as file:
             np.savez_compressed(
                 file,
@@ -150,10 +158,10 @@ class Rollout:
 
     @classmethod
     def load(cls, path: str | Path) -> Rollout:
-        """Read what `save` wrote.
+        """Read a file of `save`.
 
         Raises:
-            RolloutError: The file is missing, damaged, of another kind or of a newer version.
+            RolloutError: The file is missing, damaged, of another kind or of another version.
         """
         entries = _read_entries(Path(path))
         try:
@@ -173,28 +181,22 @@ def _numbers(name: str, value: Any) -> Array:
         raise RolloutError(f"{name} is not an array of numbers") from None
 
 
-def _scans(given: Any) -> tuple[dict[str, Any], ...]:
-    """Return scans as plain data, checked."""
-    if not len(given):
-        return ()
-    if not isinstance(given[0], Mapping):
-        given = [{"link": "", "at": [[0.0, 0.0, 0.0]], "points": given}]
-    return tuple(_scan(one) for one in given)
-
-
-def _scan(given: Mapping[str, Any]) -> dict[str, Any]:
-    looks, march = ("rays", 3) if "rays" in given else ("points", 2), ("reach", "steps")
-    found: dict[str, Any] = {"link": str(given.get("link", ""))}
-    for name, size in (("at", 3), looks):
-        rows = _numbers("scan", given.get(name, ()))
+def _scan(scan: Any) -> dict[str, Any]:
+    """Return one scan as plain data, checked."""
+    if not isinstance(scan, Mapping):
+        raise RolloutError(f"scan: {type(scan).__name__}; expected a mapping")
+    has_rays = "rays" in scan
+    checked: dict[str, Any] = {"link": str(scan.get("link", ""))}
+    for name, size in (("at", 3), ("rays", 3) if has_rays else ("points", 2)):
+        rows = _numbers("scan", scan.get(name, ()))
         if rows.ndim != 2 or rows.shape[1] != size or not np.isfinite(rows).all():
             raise RolloutError(f"scan: {name} has shape {rows.shape}; expected rows of {size} finite numbers")
-        found[name] = rows.tolist()
-    for name in march if "rays" in given else ():
-        if not (isinstance(given.get(name), int | float) and 0 < given[name] <= 1e4):
-            raise RolloutError(f"scan: {name} is {given.get(name)!r}; expected a number above 0, at most 10000")
-        found[name] = given[name]
-    return found
+        checked[name] = rows.tolist()
+    for name in ("reach", "steps") if has_rays else ():
+        if not (isinstance(scan.get(name), int | float) and 0 < scan[name] <= 1e4):
+            raise RolloutError(f"scan: {name} is {scan.get(name)!r}; expected a number above 0, at most 10000")
+        checked[name] = scan[name]
+    return checked
 
 
 def _check_array(name: str, value: Array, ndim: int, frames: int) -> None:
@@ -220,7 +222,7 @@ def _read_entries(path: Path) -> dict[str, Any]:
         entries = read_npz(path, MOST_BYTES)
     except FileNotFoundError:
         raise RolloutError(f"{path}: no such file; expected a rollout (.npz)") from None
-    except Exception as error:  # damage shows in every kind of them
+    except Exception as error:  # damaged files raise errors of many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RolloutError(f"{path}: cannot be read as a rollout ({reason})") from None
     if "header" not in entries:
@@ -236,37 +238,24 @@ def _read_header(entry: NDArray[Any]) -> dict[str, Any]:
     if not isinstance(header, dict) or header.pop("format", None) != FORMAT:
         raise RolloutError(f"not a ce_gym rollout; expected a header with format {FORMAT!r}")
     version = header.pop("version", None)
-    if version not in READABLE:
-        raise RolloutError(f"version is {version!r}; this ce_gym reads versions {', '.join(map(str, READABLE))}")
-    expected = {
-        "robot": str,
-        "transmission": str,
-        "dt": (int, float),
-        "label": str,
-        "info": dict,
-        "contact_names": list,
-        "signal_names": list,
-    }
-    for key, kind in expected.items():
+    if version != VERSION:
+        raise RolloutError(f"version is {version!r}; expected {VERSION}")
+    for key, kind in HEADER.items():
         if not isinstance(header.get(key), kind):
-            raise RolloutError(
-                f"header key {key!r} is {header.get(key)!r}; expected {getattr(kind, '__name__', 'a number')}"
-            )
-    return {key: header[key] for key in expected} | {
-        "ground": header.get("ground"),
-        "scan": header.get("scans", header.get("scan", [])),
-    }
+            name = "a number" if kind == int | float else kind.__name__
+            raise RolloutError(f"header key {key!r} is {header.get(key)!r}; expected {name}")
+    return {key: header[key] for key in HEADER} | {"ground": header.get("ground"), "scan": header.get("scans", [])}
 
 
-def _read_ground(figures: Any, numbers: Any) -> Terrain | None:
-    """Return the ground that a header's figures and an entry describe; None if there is none."""
-    if figures is None:
+def _read_ground(header: Any, numbers: Any) -> Terrain | None:
+    """Return the ground from its entry of the header and its heights; None without such an entry."""
+    if header is None:
         return None
     try:
         if numbers.dtype != np.uint16:
             raise RolloutError(f"ground has numbers of type {numbers.dtype}; expected uint16")
-        heights = Heights(numbers, float(figures["low"]), float(figures["step"])).metres()
-        return Terrain(heights, figures["cell"], figures["origin"])
+        heights = Heights(numbers, float(header["low"]), float(header["step"])).metres()
+        return Terrain(heights, header["cell"], header["origin"])
     except RolloutError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Where a robot's height and range scans look: what is drawn on ground that is not flat."""
+"""The height and range scans of a task, for drawing."""
 
 from __future__ import annotations
 
@@ -14,31 +14,26 @@ from ce_gym.envs.terms.range_scan import range_scan
 from ce_gym.model import Robot
 
 Scan = dict[str, Any]
-"""One sensor, plain data, see `Rollout.scan`."""
-
-BASE: Scan = {"link": "", "at": [[0.0, 0.0, 0.0]]}
+"""One sensor, see `Rollout.scan`."""
 
 
 def scans_of(program: TaskProgram) -> tuple[Scan, ...]:
-    """Return where the observations or the critic's blocks `height_scan` and `range_scan` look, see `Rollout.scan`.
-
-    Errors and delay of the sensors are left out. Empty if there are none.
-    """
-    terms, found = {**program.critic_terms, **program.observation_terms}, list[Scan]()
+    """Return the scans among the observations and the critic's blocks, without errors and delay of the sensors."""
+    terms, scans = {**program.critic_terms, **program.observation_terms}, list[Scan]()
     for sensor in (height_scan, range_scan):
         if (term := terms.get(sensor.__name__)) is not None:
-            given = signature(sensor).bind(None, **term.parameters)
-            given.apply_defaults()
+            arguments = signature(sensor).bind(None, **term.parameters)
+            arguments.apply_defaults()
             robot = program.model.robot
-            found += _grids(given.arguments, robot) if sensor is height_scan else [_rays(given.arguments)]
-    return tuple(found)
+            scans += _grids(arguments.arguments, robot) if sensor is height_scan else [_rays(arguments.arguments)]
+    return tuple(scans)
 
 
-def _grids(chosen: dict[str, Any], robot: Robot) -> list[Scan]:
-    """The grid about the base, or that about each foot, the mean of the middles of its contacts."""
-    points = grid_points(chosen["size"], chosen["spacing"], chosen["centre"]).T.tolist()
-    if chosen["around"] == "base":
-        return [{**BASE, "points": points}]
+def _grids(options: dict[str, Any], robot: Robot) -> list[Scan]:
+    """Return the grid around the base, or a grid around each foot: the mean of the foot's contact centres."""
+    points = grid_points(options["size"], options["spacing"], options["centre"]).T.tolist()
+    if options["around"] == "base":
+        return [{"link": "", "at": [[0.0, 0.0, 0.0]], "points": points}]
     feet: dict[str, list[list[float]]] = {}
     for contact in robot.contacts:
         if contact.group == "foot":
@@ -46,8 +41,8 @@ def _grids(chosen: dict[str, Any], robot: Robot) -> list[Scan]:
     return [{"link": link, "at": places, "points": points} for link, places in feet.items()]
 
 
-def _rays(chosen: dict[str, Any]) -> Scan:
-    along = rotation_matrix(chosen["rotation"]) @ ray_directions(chosen["rays"], chosen["view"], chosen["pattern"])
-    at = [np.array(chosen["position"], float).tolist()]
-    march = {"reach": float(chosen["reach"]), "steps": int(chosen["steps"])}
-    return {"link": chosen["link"], "at": at, "rays": along.T.tolist(), **march}
+def _rays(options: dict[str, Any]) -> Scan:
+    along = rotation_matrix(options["rotation"]) @ ray_directions(options["rays"], options["view"], options["pattern"])
+    at = [np.array(options["position"], float).tolist()]
+    march = {"reach": float(options["reach"]), "steps": int(options["steps"])}
+    return {"link": options["link"], "at": at, "rays": along.T.tolist(), **march}

@@ -1,4 +1,4 @@
-"""What a training run has written of itself: where runs are, and their figures over the steps."""
+"""Logs of training runs: finds the folders of runs and reads their signals over the steps."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ MOST_BYTES, MOST_COLUMNS = 2**26, 500
 REWARD, LENGTH, SPEED = "reward of an episode", "length of an episode [steps]", "speed of training [steps/s]"
 TERM = "reward: "
 FROM_CURVE = {REWARD: "reward", LENGTH: "length"}
-"""Signals that `curve.csv` has as well: of training before this run, too, if it went on from a policy."""
+"""Columns of `curve.csv` by signal. For a run that continues a policy they include the earlier training."""
 NAMES = {"rollout/ep_rew_mean": REWARD, "rollout/ep_len_mean": LENGTH}
 GROUPS = {"reward": TERM, "metrics": "", "train": "learning: "}
 
 
 @dataclass(frozen=True)
 class RunLog:
-    """Figures of a training run.
+    """Signals of a training run.
 
     Attributes:
-        name: Of its folder.
-        steps: Environment steps done, shape (n,).
-        seconds: How long it has trained [s].
-        signals: By name, each shape (n,); NaN where there is no figure.
+        name: Name of the run's folder.
+        steps: Environment steps, shape (n,).
+        seconds: Duration of the training [s].
+        signals: By name, each shape (n,); NaN for missing values.
     """
 
     name: str
@@ -42,7 +42,7 @@ class RunLog:
     signals: Mapping[str, Array]
 
     def thinned(self, most: int) -> RunLog:
-        """Return means over neighbours, at most `most` of them, each at the last of its steps."""
+        """Return the log with at most `most` rows: means over neighbours, at the last step of each."""
         count = len(self.steps)
         if count <= most:
             return self
@@ -53,45 +53,43 @@ class RunLog:
 
 
 def find_runs(folder: Path) -> list[Path]:
-    """Return the folders of training runs: the folder itself, or those in it, by name.
+    """Return the folder itself if it has a log, otherwise its subfolders with a log, by name.
 
     Raises:
-        ViewerError: There is none.
+        ViewerError: There is no log.
     """
     if not folder.is_dir():
-        raise ViewerError(f"{folder}: no such folder; expected that of a training run")
-    inside = sorted(one for one in folder.iterdir() if (one / LOG).is_file())
-    runs = [folder] if (folder / LOG).is_file() else inside
+        raise ViewerError(f"{folder}: no such folder; expected the folder of a training run")
+    subfolders = sorted(run for run in folder.iterdir() if (run / LOG).is_file())
+    runs = [folder] if (folder / LOG).is_file() else subfolders
     if not runs:
-        raise ViewerError(f"{folder}: no {LOG} in it, nor in a folder in it; expected the folder of a training run")
+        raise ViewerError(f"{folder}: no {LOG} in it or in its subfolders; expected the folder of a training run")
     return runs
 
 
 def read_log(run: Path) -> RunLog:
-    """Return the figures that a run has written so far; it may be writing more meanwhile.
+    """Return the log of a run, which may still be training.
 
     Raises:
-        ViewerError: A file is no log of a training run.
+        ViewerError: A file is not the log of a training run.
     """
     columns = _table(run / LOG)
     if columns and STEPS not in columns:
         raise ViewerError(f"{run / LOG}: expected a column {STEPS}, as in the log of a training run")
     steps = columns.get(STEPS, np.zeros(0))
     seconds = columns.get(SECONDS, np.full(len(steps), np.nan))
-    others = {name: values for name, values in columns.items() if not name.startswith("time/")}
-    signals = {_name_of(name): values for name, values in others.items()}
+    signals = {_signal_name(name): values for name, values in columns.items() if not name.startswith("time/")}
     if len(steps) > 1:
         signals[SPEED] = _speed(steps, seconds)
     steps, signals = _with_earlier(run, steps, signals)
-    taken = seconds[np.isfinite(seconds)]
-    return RunLog(run.resolve().name, steps, float(taken[-1]) if len(taken) else 0.0, signals)
+    return RunLog(run.resolve().name, steps, float(np.nanmax(seconds, initial=0.0)), signals)
 
 
 def _table(file: Path) -> dict[str, Array]:
-    """Return the columns of a CSV file of numbers; no columns if there is no file yet, or nothing in it.
+    """Return the columns of a CSV file of numbers; a missing or empty file has no columns.
 
     Raises:
-        ViewerError: It is something else.
+        ViewerError: The file is not a CSV file of numbers, or too large.
     """
     try:
         if file.stat().st_size > MOST_BYTES:
@@ -100,16 +98,16 @@ def _table(file: Path) -> dict[str, Array]:
         header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]  # whole lines only
         if len(header) > MOST_COLUMNS:
             raise ViewerError(f"{file}: {len(header)} columns; expected at most {MOST_COLUMNS}")
-        whole = [[float(cell or "nan") for cell in row] for row in rows if len(row) == len(header)]
+        values = [[float(cell or "nan") for cell in row] for row in rows if len(row) == len(header)]
     except FileNotFoundError:
         return {}
     except (ValueError, csv.Error) as error:
         raise ViewerError(f"{file}: expected a CSV file of numbers: {' '.join(str(error).split())[:100]}") from None
-    values = np.array(whole, float).reshape(len(whole), len(header))
-    return dict(zip(header, values.T, strict=True))
+    table = np.array(values, float).reshape(len(values), len(header))
+    return dict(zip(header, table.T, strict=True))
 
 
-def _name_of(column: str) -> str:
+def _signal_name(column: str) -> str:
     group, _, name = column.rpartition("/")
     return NAMES.get(column) or GROUPS.get(group, f"{group}: " if group else "") + name.replace("_", " ")
 
@@ -117,26 +115,25 @@ def _name_of(column: str) -> str:
 def _speed(steps: Array, seconds: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         speed = np.diff(steps) / np.diff(seconds)
-    speed[~np.isfinite(speed)] = np.nan  # SB3's clock counts whole seconds
+    speed[~np.isfinite(speed)] = np.nan  # Stable-Baselines3 logs whole seconds
     return np.append(speed[:1], speed)
 
 
 def _with_earlier(run: Path, steps: Array, signals: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
-    """Put what came before this run in front, of the signals that have it."""
+    """Return steps and signals, preceded by the earlier training of `curve.csv`."""
     curve = _table(run / CURVE)
     if not {"steps", *FROM_CURVE.values()} <= set(curve):
         return steps, signals
-    early = curve["steps"] < (steps[0] if len(steps) else np.inf)
-    none = np.full(early.sum(), np.nan)
-    names = [*signals, *(name for name in FROM_CURVE if name not in signals)]
-    later = np.full(len(steps), np.nan)
-    fronts = {name: curve[FROM_CURVE[name]][early] if name in FROM_CURVE else none for name in names}
-    joined = {name: np.concatenate([fronts[name], signals.get(name, later)]) for name in names}
-    return np.concatenate([curve["steps"][early], steps]), joined
+    earlier = curve["steps"] < (steps[0] if len(steps) else np.inf)
+    joined = {}
+    for name in dict.fromkeys([*signals, *FROM_CURVE]):
+        front = curve[FROM_CURVE[name]][earlier] if name in FROM_CURVE else np.full(earlier.sum(), np.nan)
+        joined[name] = np.concatenate([front, signals.get(name, np.full(len(steps), np.nan))])
+    return np.concatenate([curve["steps"][earlier], steps]), joined
 
 
 def _block_means(values: Array, starts: NDArray[np.int64]) -> Array:
-    """Return the mean of the finite values of each block that begins at `starts`, NaN where there is none."""
+    """Return the mean of the finite values of each block that begins at `starts`, NaN for a block without."""
     finite = np.isfinite(values)
     counts = np.add.reduceat(finite.astype(float), starts)
     sums = np.add.reduceat(np.where(finite, values, 0.0), starts)

@@ -1,4 +1,4 @@
-"""The robot of a training run, under its newest policy, in the environment that the policy is trained for."""
+"""The robot of a training run, under the newest policy, in the environment of the training."""
 
 from __future__ import annotations
 
@@ -11,53 +11,51 @@ import numpy as np
 from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.policies import Policy, environment_of
 from ce_gym.viewer.page.moving import MovingScene
-from ce_gym.viewer.rollouts.driving import made
+from ce_gym.viewer.rollouts.driving import make_envs
 from ce_gym.viewer.rollouts.scan import scans_of
+from ce_gym.viewer.stream import Feed
 
 POLICIES = ("policy.*", "present/policy.*", "checkpoints/policy_*")
-"""Where a run keeps policies."""
+"""Policies in the folder of a run."""
 
 
 def newest_policy(run: Path) -> Path | None:
-    """Return the policy that a run wrote last; None if there is none yet."""
-    found = [file for pattern in POLICIES for file in run.glob(pattern) if _is_policy(file)]
-    return max(found, key=_written, default=None)
+    """Return the newest policy of a run, or None."""
+    files = [file for pattern in POLICIES for file in run.glob(pattern) if file.suffix in (".npz", ".zip")]
+    files = [file for file in files if not file.name.startswith(".") and not file.stem.endswith(".learner")]
+    return max(files, key=_modified, default=None)
 
 
-def _is_policy(file: Path) -> bool:
-    return file.suffix in (".npz", ".zip") and not file.name.startswith(".") and not file.stem.endswith(".learner")
-
-
-def _written(file: Path) -> float:
+def _modified(file: Path) -> float:
     try:
         return file.stat().st_mtime
-    except OSError:  # replaced or deleted meanwhile
+    except OSError:  # replaced or deleted in the meantime
         return 0.0
 
 
 class Walker:
-    """One robot that acts on its task's own commands; episodes end and begin as in training.
+    """One robot that follows the commands and episodes of its task.
 
     Args:
-        policy: The policy, with its record.
-        env_id: Environment that the user named; that of the record if "".
-        kwargs: Arguments of the environment that replace those of the record.
+        policy: The policy with its record.
+        env_id: Environment from the command line; "" for the record's environment.
+        kwargs: Arguments of the environment, in place of the record's.
 
     Attributes:
-        policy: The policy that acts; may be replaced by another one of the same environment.
+        policy: The acting policy; another policy of the same environment can replace it.
         dt: Length of a control step [s].
-        scene: What is drawn of it.
+        scene: The scene of the robot.
 
     Raises:
-        PolicyError: The environment must be named by the user.
-        ViewerError: It cannot be made, or is none of ce_gym.
+        PolicyError: The environment must be named on the command line.
+        ViewerError: The environment cannot be made, or is not of ce_gym.
     """
 
     def __init__(self, policy: Policy, env_id: str, kwargs: Mapping[str, Any]) -> None:
         env_id = environment_of(policy.record, env_id or None)
         options = {"command_curriculum": 1.0, **policy.record["env_kwargs"], **kwargs}
-        self._env, native = made(env_id, 1, options)
-        self.policy, self._native, self.dt = policy, native, native.dt
+        self._env, native = make_envs(env_id, 1, options)
+        self.policy, self._batch, self.dt = policy, native.batch, native.dt
         self._observation, _ = self._env.reset(seed=0)
         program = native.batch.program
         self._model = program.model
@@ -65,23 +63,22 @@ class Walker:
         self.scene = MovingScene(self._model, self._model.standing_q, terrain=ground, scan=scan)
 
     def fits(self, policy: Policy) -> bool:
-        """Whether a policy acts in the same environment."""
+        """Return whether a policy acts in the same environment."""
         return all(policy.record[key] == self.policy.record[key] for key in ("env", "env_kwargs", "observation_size"))
 
-    def step(self) -> None:
-        """Carry out one control step."""
+    def step(self, feed: Feed, state: Mapping[str, Any]) -> bool:
+        """Simulate one control step and publish it; return whether a browser is connected.
+
+        Args:
+            feed: Where to publish.
+            state: Text for the page; command and velocity [m/s, rad/s] are added.
+        """
         self._observation, *_ = self._env.step(self.policy.predict(self._observation)[0])
-
-    def moves(self) -> dict[str, list[float]]:
-        """Return what has moved, see `MovingScene.moves`."""
-        return self.scene.moves([self._model], [self._native.batch.rows("q")[0].astype(float)])
-
-    def state(self) -> dict[str, Any]:
-        """Return what the page says of it: what is commanded, and how fast it is [m/s, rad/s]."""
-        command, v = (self._native.batch.rows(name)[0].astype(float) for name in ("command", "v"))
+        q, v, command = (self._batch.rows(name)[0].astype(float) for name in ("q", "v", "command"))
         moves = v[[3, 4, 2]] if self._model.robot.floating else np.zeros(3)
-        return {"command": command.round(3).tolist(), "moves": moves.round(3).tolist()}
+        speeds = {"command": command.round(3).tolist(), "moves": moves.round(3).tolist()}
+        return self.scene.send(feed, [self._model], [q], {**state, **speeds})
 
     def close(self) -> None:
-        """Give back what the environment holds."""
+        """Close the environment."""
         self._env.close()

@@ -1,129 +1,112 @@
-"""Follows training runs: a thread reads what they write, lets the newest policy walk, and sends both to the page.
+"""Follows training runs: reads their files, simulates the newest policy, and sends both to the page.
 
-Training knows nothing of it: runs are read from their folders. Reading policies and compiling their environment is done
-in another thread.
+The training does not take part. Another thread reads policies and compiles their environments.
 """
 
 from __future__ import annotations
 
-import json
-import threading
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ce_gym.policies import load_policy
-from ce_gym.viewer.feed import Feed
 from ce_gym.viewer.page.charts import packed
-from ce_gym.viewer.page.html import color_of, css
+from ce_gym.viewer.page.html import color_of, css, filled, packed_commands
+from ce_gym.viewer.stream import LivePage
 from ce_gym.viewer.watch.run_log import LENGTH, LOG, REWARD, TERM, RunLog, find_runs, read_log
 from ce_gym.viewer.watch.walker import Walker, newest_policy
 
-PERIOD = 1.0  # between two looks at the folders [s]
-IDLE = 0.25  # between two messages while nothing walks [s]
-MOST_ROWS = 1000  # of a run's figures that are sent
-MOST_TERMS = 5  # reward terms that are plotted at first
+PERIOD = 1.0  # between two readings of the folders [s]
+IDLE = 0.25  # between two messages without a robot [s]
+MOST_ROWS = 1000  # of a run's log that are sent
+MOST_TERMS = 5  # reward terms in their first plot
 MOST_RUNS = 8
 
 
-class Watcher:
+class Watcher(LivePage):
     """Follows some training runs until it is closed.
 
     Args:
-        folders: Of training runs, or folders that have them.
-        env_id: The environment that the user named; policies name it otherwise.
-        kwargs: Arguments of the environment that replace those of policies.
-        patient: Whether folders may be empty yet.
-
-    Attributes:
-        feed: The events that the page receives.
+        folders: Folders of training runs, or folders with such folders.
+        env_id: Environment from the command line; "" for the environment of each policy's record.
+        kwargs: Arguments of the environment, in place of the record's.
+        patient: Whether runs may begin later.
 
     Raises:
-        ViewerError: A folder has no training run, or its log is none.
+        ViewerError: A folder has no training run, or a log cannot be read.
     """
 
     def __init__(
         self, folders: Sequence[Path], env_id: str = "", kwargs: Mapping[str, Any] | None = None, patient: bool = False
     ) -> None:
+        super().__init__("watch")
         self._folders, self._env_id, self._kwargs = list(folders), env_id, dict(kwargs or {})
-        self.feed, self._ended = Feed(), threading.Event()
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="watch")
-        self._thread = threading.Thread(target=self._follow, daemon=True)
         self._runs: list[Path] = []
-        self._logs: dict[Path, tuple[float, RunLog]] = {}
+        self._logs: dict[Path, tuple[float, RunLog]] = {}  # time of each file, content
         self._walker: Walker | None = None
-        self._tried: tuple[Path, float] | None = None
-        self._making: Future[Walker | None] | None = None
+        self._newest: tuple[float, Path] | None = None  # time and file of the policy read last
         self._record: dict[str, Any] = {}
-        self._notice, self._next_look = "", 0.0
+        self._next_reading = 0.0
         if not patient:
             self._runs = [run for folder in self._folders for run in find_runs(folder)]
-            self._read()
+            self._read_logs()
 
-    @property
-    def name(self) -> str:
-        """What is watched, in a word."""
-        return ", ".join(folder.resolve().name for folder in self._folders)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
+    def html(self) -> str:
+        """Return the page."""
+        title = ", ".join(folder.resolve().name for folder in self._folders)
+        return filled("watch", title, scripts=("stream", "graph", "plots", "watch"), constants={"COMMANDS": []})
 
     def close(self) -> None:
-        """Stop the thread, and wait until it has ended."""
-        self._ended.set()
-        self.feed.close()
-        if self._thread.is_alive():
-            self._thread.join()
-        self._beside.shutdown(cancel_futures=True)
+        """Stop the threads, wait until they have ended, and close the environment."""
+        super().close()
         if self._walker:
             self._walker.close()
 
-    def _follow(self) -> None:
-        due = time.monotonic()
-        while not self._ended.is_set():
-            if time.monotonic() >= self._next_look:
-                self._look()
-            watched = self._show()
-            due = max(due + (self._walker.dt if self._walker and watched else IDLE), time.monotonic())
-            self._ended.wait(due - time.monotonic())
-
-    def _look(self) -> None:
-        """See what is new in the folders."""
+    def update(self) -> float:
+        """Read new files, simulate and send one control step; return the time until the next update [s]."""
         start = time.monotonic()
-        try:
-            self._runs = self._found()
-            self._read()
-        except Exception as problem:  # half-written files, and damage, show in every kind of them
-            self._notice = " ".join(str(problem).split())
-        self._take()
-        taken = time.monotonic() - start
-        self._next_look = start + max(PERIOD, 20 * taken)  # of a long log, less often
+        if start >= self._next_reading:
+            self._read_folders()
+            self._next_reading = start + max(PERIOD, 20 * (time.monotonic() - start))  # long logs are read less often
+        if self._walker:
+            try:
+                return self._walker.dt if self._walker.step(self.feed, self.state()) else IDLE
+            except ValueError as error:  # the policy does not fit the environment of its record
+                self.notice, self._walker = str(error), None
+        self.feed.publish({"moves": {}, "state": self.state()})
+        return IDLE
 
-    def _found(self) -> list[Path]:
+    def _read_folders(self) -> None:
+        try:
+            self._runs = self._present_runs()
+            self._read_logs()
+        except Exception as error:  # damaged and half-written files raise errors of many kinds
+            self.notice = " ".join(str(error).split())
+        if walker := self._finished_job():
+            self._use(walker)
+        self._read_newest_policy()
+
+    def _present_runs(self) -> list[Path]:
         runs = []
         for folder in self._folders:
             if folder.is_dir() and ((folder / LOG).is_file() or any(folder.glob(f"*/{LOG}"))):
                 runs += find_runs(folder)
         return runs[:MOST_RUNS]
 
-    # Curves.
-
-    def _read(self) -> None:
+    def _read_logs(self) -> None:
         changed = False
         for run in self._runs:
-            stamp = (run / LOG).stat().st_mtime
-            if self._logs.get(run, (0.0,))[0] != stamp:
-                self._logs[run], changed = (stamp, read_log(run)), True
+            modified = (run / LOG).stat().st_mtime
+            if self._logs.get(run, (0.0,))[0] != modified:
+                self._logs[run], changed = (modified, read_log(run)), True
         if changed:
-            self.feed.keep("curves", json.dumps(self.curves()).encode())
+            self.feed.keep("curves", self._curves())
 
-    def curves(self) -> dict[str, Any]:
-        """Return the figures of all runs, as the page's plots take them."""
+    def _curves(self) -> dict[str, Any]:
+        """Return the logs of all runs for the page's plots."""
         logs = [self._logs[run][1].thinned(MOST_ROWS) for run in self._runs if run in self._logs]
         sources = [
             {
@@ -135,30 +118,20 @@ class Watcher:
             for index, log in enumerate(logs)
         ]
         last = max((log.steps[-1] for log in logs if len(log.steps)), default=0.0)
-        return {"sources": sources, "span": [0.0, float(last)], "chosen": chosen(logs)}
+        return {"sources": sources, "span": [0.0, float(last)], "chosen": first_plots(logs)}
 
-    # The robot.
-
-    def _take(self) -> None:
-        """Let the newest policy act, or have it read, and its environment made, if there is another."""
-        if self._making is not None:
-            if not self._making.done():
-                return
-            making, self._making = self._making, None
-            try:
-                self._replace(making.result())
-            except Exception as problem:  # the page keeps the robot it has
-                self._notice = " ".join(str(problem).split())
+    def _read_newest_policy(self) -> None:
+        """Have the newest policy read in the background, if it is new."""
         files = [file for run in self._runs if (file := newest_policy(run))]
         try:
             newest = max(((file.stat().st_mtime, file) for file in files), default=None)
-        except OSError:  # replaced meanwhile: next time
+        except OSError:  # replaced in the meantime; the next reading finds the file
             return
-        if newest and (newest[1], newest[0]) != self._tried:
-            self._tried = newest[1], newest[0]
-            self._making = self._beside.submit(self._made, newest[1])
+        if newest and newest != self._newest and self._job is None:
+            self._newest = newest
+            self._job = self._background.submit(self._make_walker, newest[1])
 
-    def _made(self, file: Path) -> Walker | None:
+    def _make_walker(self, file: Path) -> Walker:
         policy = load_policy(file)
         walker = self._walker
         self._record = policy.record
@@ -167,29 +140,13 @@ class Watcher:
         walker.policy = policy
         return walker
 
-    def _replace(self, walker: Walker | None) -> None:
-        self._notice = ""
-        if walker is self._walker or walker is None:
+    def _use(self, walker: Walker) -> None:
+        if walker is self._walker:
             return
         old, self._walker = self._walker, walker
-        self.feed.keep("scene", json.dumps(walker.scene.commands()).encode())
+        self.feed.keep("scene", packed_commands(walker.scene.commands()))
         if old:
             old.close()
-
-    def _show(self) -> bool:
-        """Send a message, and the pose after a control step if a robot is there; return whether anybody looks."""
-        moves, told = {}, dict[str, Any]()
-        if self._walker:
-            try:
-                self._walker.step()
-            except ValueError as problem:  # the policy is of another environment than it says
-                self._notice, self._walker = str(problem), None
-        if self._walker:
-            moves, told = self._walker.moves(), self._walker.state()
-            if ground := self._walker.scene.new_ground(moves):
-                self.feed.keep("ground", ground)
-        message = {"moves": moves, "state": {**self.state(), **told}}
-        return self.feed.publish(f"data: {json.dumps(message)}\n\n".encode())
 
     def state(self) -> dict[str, Any]:
         """Return the state that the page shows as text."""
@@ -202,19 +159,15 @@ class Watcher:
             "seconds": newest.seconds if newest else 0.0,
             "total": total if isinstance(total, int | float) else None,
             "policy_steps": self._record.get("steps"),
-            "ended": self._has_ended(),
+            "ended": self._newest is not None and self._newest[1].parent in self._runs,  # a run's final policy
             "finished": self._record.get("finished") is True,
-            "making": self._making is not None and self._walker is None,
-            "notice": self._notice,
+            "making": self._job is not None and self._walker is None,
+            "notice": self.notice,
         }
 
-    def _has_ended(self) -> bool:
-        """Whether the newest policy is the one that a run leaves at its end."""
-        return self._tried is not None and self._tried[0].parent in self._runs
 
-
-def chosen(logs: Sequence[RunLog]) -> list[list[str]]:
-    """Return the signals of each plot at first: reward, length, and the largest terms of the reward in one."""
+def first_plots(logs: Sequence[RunLog]) -> list[list[str]]:
+    """Return the signals of each first plot: reward, length, and the largest reward terms in one plot."""
     sizes: dict[str, float] = {}
     for log in logs:
         for name, values in log.signals.items():

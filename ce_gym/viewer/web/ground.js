@@ -1,5 +1,5 @@
-// Ground that is not flat: draws the fields that the scene's commands carry, each around its robots, fading away from
-// them into the horizon. Expects meshcat's viewer, its node() and HORIZON. Knows nothing of robots.
+// Uneven ground: draws the fields of the scene's commands around their robots, fading into the horizon. Expects HORIZON
+// and scene.js.
 
 const TILE = 1.0;  // edge of the square that the ground's image repeats over [m]
 const fields = [];
@@ -34,22 +34,22 @@ function fieldGeometry(field) {
     const a = i * columns + j, b = a + columns;
     corners.set([a, b, b + 1, a, b + 1, a + 1], at);
   }
-  const geometry = new MeshCat.THREE.BufferGeometry();
-  geometry.setAttribute("position", new MeshCat.THREE.BufferAttribute(positions, 3));
-  geometry.setAttribute("uv", new MeshCat.THREE.BufferAttribute(spots, 2));
-  geometry.setIndex(new MeshCat.THREE.BufferAttribute(corners, 1));
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  geometry.setAttribute("uv", new THREE.BufferAttribute(spots, 2));
+  geometry.setIndex(new THREE.BufferAttribute(corners, 1));
   geometry.computeVertexNormals();
   return geometry;
 }
 
-// Only what is near a robot is drawn, by a few lines added to three.js' own shader.
+// Lines added to the shader of three.js draw only the ground near a robot.
 function drawField(mesh) {
   const field = mesh.userData.field, count = field.bodies.length;
-  const places = field.bodies.map(() => new MeshCat.THREE.Vector2());
+  const places = field.bodies.map(() => new THREE.Vector2());
   mesh.geometry = fieldGeometry(field);
   mesh.castShadow = false;
   mesh.material.onBeforeCompile = shader => {
-    const horizon = new MeshCat.THREE.Color(HORIZON);
+    const horizon = new THREE.Color(HORIZON);
     Object.assign(shader.uniforms, { places: { value: places }, reach: { value: field.reach }, horizon: { value: horizon } });
     shader.vertexShader = shader.vertexShader.replace("void main() {", "varying vec3 spot;\nvoid main() {\n  spot = vec3(position.xy, normal.z);");
     shader.fragmentShader = shader.fragmentShader
@@ -67,14 +67,14 @@ function drawField(mesh) {
         gl_FragColor.rgb = mix(gl_FragColor.rgb, horizon, smoothstep(float(${field.fading}) * reach, reach, away));`);
   };
   mesh.material.customProgramCacheKey = () => `field of ${count}`;
-  mesh.material.needsUpdate = true;  // it may have been drawn before
+  mesh.material.needsUpdate = true;  // it may be compiled already
   fields.push({ mesh, places, bodies: field.bodies, ...(field.scans && drawScans(mesh, field)) });
   viewer.set_dirty();
 }
 
-// What scans look at, dots on the field, and the rays of range scans, lines to them.
+// Scans: dots on the field, and lines for the rays of range scans.
 function drawScans(mesh, { scans, color }) {
-  const { BufferGeometry, BufferAttribute, Points, PointsMaterial, LineSegments, LineBasicMaterial } = MeshCat.THREE;
+  const { BufferGeometry, BufferAttribute, Points, PointsMaterial, LineSegments, LineBasicMaterial } = THREE;
   const count = key => scans.reduce((sum, scan) => sum + (scan[key] || []).length, 0);
   const shape = size => new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(3 * size), 3));
   const dots = new Points(shape(count("points") + count("rays")), new PointsMaterial({ color, size: 5, sizeAttenuation: false }));
@@ -83,7 +83,7 @@ function drawScans(mesh, { scans, color }) {
   return { dots, lines };
 }
 
-// Height of what is drawn of a field, between its vertices.
+// Height of the drawn field, interpolated between its vertices.
 function heightOf(mesh, x, y) {
   const field = mesh.userData.field, columns = 2 * field.columns - 3, rows = 2 * field.rows - 3;
   const vertices = mesh.geometry.attributes.position.array, step = field.cell / 2;
@@ -94,7 +94,7 @@ function heightOf(mesh, x, y) {
   return (1 - s) * ((1 - t) * z(0, 0) + t * z(0, 1)) + s * ((1 - t) * z(1, 0) + t * z(1, 1));
 }
 
-// Where a ray meets the field, marched as the sensor does it, or where it ends.
+// The point where a ray hits the field, by the sensor's steps, or its end.
 function hitOf(mesh, start, along, { reach, steps }) {
   const at = distance => start.clone().addScaledVector(along, distance);
   const above = distance => { const { x, y, z } = at(distance); return z - heightOf(mesh, x, y); };
@@ -112,7 +112,7 @@ function hitOf(mesh, start, along, { reach, steps }) {
 
 // Grids turn with the heading of the base, not with roll and pitch; rays turn with their link.
 function moveScans({ mesh, dots, lines, bodies }) {
-  const { Vector3, Matrix4 } = MeshCat.THREE, base = node(bodies[0]).object, field = mesh.userData.field;
+  const { Vector3, Matrix4 } = THREE, base = node(bodies[0]).object, field = mesh.userData.field;
   const ahead = new Vector3(1, 0, 0).applyQuaternion(base.quaternion), length = Math.hypot(ahead.x, ahead.y) || 1;
   const c = ahead.x / length, s = ahead.y / length, [dot, end] = [dots, lines].map(drawn => drawn.geometry.attributes.position);
   let i = 0, j = 0;
@@ -139,9 +139,9 @@ function moveScans({ mesh, dots, lines, bodies }) {
 // Lets the ground follow the robots' bases. Objects with images appear some time after their commands.
 function moveFields() {
   const loaded = [];
-  viewer.scene.traverse(object => { if (object.userData.field && !fields.some(one => one.mesh === object)) loaded.push(object); });
+  viewer.scene.traverse(object => { if (object.userData.field && !fields.some(field => field.mesh === object)) loaded.push(object); });
   loaded.forEach(drawField);
-  fields.splice(0, fields.length, ...fields.filter(field => field.mesh.parent));  // others have been replaced
+  fields.splice(0, fields.length, ...fields.filter(field => field.mesh.parent));  // without replaced fields
   for (const { places, bodies } of fields) {
     bodies.forEach((path, i) => { const { x, y } = node(path).object.position; places[i].set(x, y); });
   }

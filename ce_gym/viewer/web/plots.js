@@ -1,26 +1,25 @@
-// Plots beside a scene: each shows some signals of every source (a robot, a run) over time, or over whatever `unit` says,
-// and their values at the present moment. All share one view of time. Expects graph.js; knows nothing of scenes.
+// Plots beside a scene: signals of every source (a robot, a run) over time or steps, and their present values. All plots
+// share one view of time. Expects graph.js and scene.js.
 
 const COLORS = ["#1f2933", "#d9480f", "#1c7ed6", "#2b8a3e", "#9c36b5", "#c2255c"];  // of several signals in one plot
 const COMMANDED = "#21a659", DASHED = [6, 3], TALL = 118;
 
 function element(tag, parent, attributes = {}) {
-  const made = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  parent.appendChild(made);
-  return made;
+  const child = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) child.setAttribute(name, value);
+  parent.appendChild(child);
+  return child;
 }
 
-// Leaves a file with the browser.
-function download(name, url) {
-  const link = document.createElement("a");
-  Object.assign(link, { href: url, download: name });
-  link.click();
+function button(parent, text, title, act) {
+  const made = element("button", parent, { title, "aria-label": title });
+  made.textContent = text;
+  made.onclick = () => { act(); made.blur(); };
 }
 
 // Panel of plots.
-//   sources: {name, color, times, signals, commanded, limits}, see charts.py; names: of each plot at first, the signal or signals;
-//   span: first and last time; seek: is called with a time that was pointed at, or null where time cannot be chosen.
+//   sources: {name, color, times, signals, commanded, limits}, see charts.py; names: the signal or signals of each first plot;
+//   span: first and last time; seek: called with the time at the pointer, null where time cannot be chosen.
 function makePlots(parent, sources, names, { span, unit, seek, file }) {
   let view = [...span], now = seek ? span[0] : null, drawn = "";
   const plots = [], redraw = () => { drawn = ""; };
@@ -29,13 +28,13 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
   const known = () => [...new Set(sources.flatMap(source => Object.keys(source.signals)))];
   function curvesOf(signals) {
     return signals.flatMap((signal, k) => {
-      const told = sources.find(source => signal in source.commanded);
+      const commanded = sources.find(source => signal in source.commanded);
       const curves = sources.filter(source => signal in source.signals).map((source, i) => ({
         signal, name: source.name, times: source.times, values: source.signals[signal],
         color: signals.length > 1 ? COLORS[k % COLORS.length] : source.color, dash: signals.length > 1 && i ? DASHED : [],
       }));
       const command = { signal, name: "commanded", color: COMMANDED, dash: [4, 3] };
-      return told ? [...curves, { ...command, times: told.times, values: told.commanded[signal] }] : curves;
+      return commanded ? [...curves, { ...command, times: commanded.times, values: commanded.commanded[signal] }] : curves;
     });
   }
   function contentOf(plot) {
@@ -55,15 +54,10 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
       for (const name of known()) element("option", select, { value: name }).textContent = name;
       select.value = signal;
       select.onchange = () => { plot.signals[k] = select.value; fill(plot); };
-      const button = (text, title, act) => {
-        const made = element("button", row, { title, "aria-label": title });
-        made.textContent = text;
-        made.onclick = () => { act(); made.blur(); };
-      };
-      if (k === plot.signals.length - 1) button("+", "Another signal in this plot", () => { plot.signals.push(signal); fill(plot); });
-      button("×", "Remove this signal", () => { plot.signals.splice(k, 1); plot.signals.length ? fill(plot) : remove(plot); });
+      if (k === plot.signals.length - 1) button(row, "+", "Another signal in this plot", () => { plot.signals.push(signal); fill(plot); });
+      button(row, "×", "Remove this signal", () => { plot.signals.splice(k, 1); plot.signals.length ? fill(plot) : remove(plot); });
       const curves = plot.content.curves.filter(one => one.signal === signal);
-      const inline = plot.signals.length > 1 && curves.length === 1;  // or many signals would take more room than their plot
+      const inline = plot.signals.length > 1 && curves.length === 1;  // to save room
       const values = element("div", inline ? row : plot.rows, { class: "values" });
       for (const curve of curves) {
         const text = element("span", values, { title: curve.name, style: `color: ${curve.color}` });
@@ -140,7 +134,7 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
     drawn = wanted;
   }
 
-  // Files: all frames of the signals that are shown; the plots as they are, with a legend.
+  // Files: all frames of the shown signals; a picture of the plots with a legend.
   function csv() {
     const columns = [...new Set(plots.flatMap(plot => plot.signals))], quoted = text => `"${String(text).replaceAll('"', '""')}"`;
     const rows = [["source", `time [${unit}]`, ...columns, ...columns.map(name => `${name}, commanded`)].map(quoted).join()];
@@ -174,19 +168,14 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
     }
     return canvas.toDataURL("image/png");
   }
-  const tool = (text, title, act) => {
-    const made = element("button", tools, { title, "aria-label": title });
-    made.textContent = text;
-    made.onclick = () => { act(); made.blur(); };
-  };
-  tool("+ plot", "Another plot", () => add(known()[0]));
-  tool("−", "See more of the time (wheel)", () => zoom(1 / 1.6));
-  tool("+", "See less of the time (wheel)", () => zoom(1.6));
-  tool("CSV", "Save the signals shown as a table", () => download(`${file}.csv`, URL.createObjectURL(new Blob([csv()], { type: "text/csv" }))));
-  tool("PNG", "Save the plots as a picture", () => download(`${file}.png`, png()));
+  button(tools, "+ plot", "Another plot", () => add(known()[0]));
+  button(tools, "−", "See more of the time (wheel)", () => zoom(1 / 1.6));
+  button(tools, "+", "See less of the time (wheel)", () => zoom(1.6));
+  button(tools, "CSV", "Save the signals shown as a table", () => download(`${file}.csv`, URL.createObjectURL(new Blob([csv()], { type: "text/csv" }))));
+  button(tools, "PNG", "Save the plots as a picture", () => download(`${file}.png`, png()));
   names.forEach(add);
 
-  // Takes other figures of the same kind, and keeps what is chosen; whoever looks at all goes on to do so.
+  // Replaces the data and keeps the chosen signals; a view of the whole span stays whole.
   function replace(newSources, newSpan) {
     const all = view[0] === span[0] && view[1] === span[1];
     [sources, span] = [newSources, newSpan];
@@ -195,7 +184,7 @@ function makePlots(parent, sources, names, { span, unit, seek, file }) {
     plots.forEach(plot => update(plot, choosing));
     redraw();
   }
-  // Rows stay where they are if they would be the same, so that a list somebody has opened does not close.
+  // Unchanged rows stay, so that an open list does not close.
   function update(plot, choosing) {
     const before = plot.content, options = plot.rows.querySelector("select")?.options.length, after = contentOf(plot);
     const names = content => content.curves.map(curve => `${curve.name} ${curve.signal}`).join();

@@ -1,4 +1,4 @@
-"""Command-line parsers whose errors are one line, and a progress bar."""
+"""Command lines: a parser with errors of one line, and a progress bar."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Parser(argparse.ArgumentParser):
 
 
 def print_anything() -> None:
-    """Print question marks for characters that the output's encoding lacks, as that of files on Windows may."""
+    """Replace characters that the output's encoding lacks by question marks, for example in files on Windows."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 
 def examples(*lines: str) -> str:
-    """Return an epilog with commands to try."""
+    """Return an epilog with example commands."""
     return "\n".join(["examples:", *(f"  python -m ce_gym {line}" for line in lines)])
 
 
@@ -43,10 +43,10 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def shown(items: Collection[T], what: str) -> Iterator[T]:
+def progress(items: Collection[T], label: str) -> Iterator[T]:
     """Iterate over items with a progress bar on stderr, if that is a terminal and tqdm is installed."""
     try:
         from tqdm import tqdm
     except ImportError:
         return iter(items)
-    return iter(tqdm(items, what, leave=False, disable=None, dynamic_ncols=True))
+    return iter(tqdm(items, label, leave=False, disable=None, dynamic_ncols=True))

@@ -1,30 +1,9 @@
-// The live page: draws what the server sends, posts what its user wants. Expects HORIZON, COMMANDS and OFFER, meshcat's
-// viewer and ground.js.
+// The live page: shows the state that the server sends, and posts what the user does. Expects OFFER, scene.js and stream.js.
 
-const find = id => document.getElementById(id);
-const viewer = new MeshCat.Viewer(find("pane"));
-for (const command of COMMANDS) {
-  viewer.handle_command_bytearray(Uint8Array.from(atob(command), c => c.charCodeAt(0)));
-}
-const THREE = MeshCat.THREE;
-viewer.scene.fog = new THREE.Fog(HORIZON, 8, 40);
-viewer.gui.domElement.hidden = true;  // meshcat's own panel
-const node = path => viewer.scene_tree.find(path.split("/").filter(Boolean));
-// In a narrow window the robot stands in it whole.
-function fit() {
-  viewer.camera.zoom = Math.min(1, 1.2 * window.innerWidth / window.innerHeight);
-  viewer.camera.updateProjectionMatrix();
-}
-window.addEventListener("resize", fit);
-fit();
-
-// A ghost in the same place as the robot is behind it, or their surfaces would flicker.
-node("/world/1").object.traverse(({ material }) => {
-  if (material) Object.assign(material, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4 });
-});
+drawBehind(node("/world/1").object);
 const show = (path, on) => { node(path).object.visible = on; };
 
-// Messages go one after the other; of those that follow each other quickly only the newest of a kind is sent.
+// Posts one message at a time. Of messages of one kind that wait, only the newest is sent.
 const waiting = new Map();
 let busy = false;
 function post(message) {
@@ -40,27 +19,11 @@ async function send() {
     try {
       const answer = await fetch("messages", { method: "POST", body: JSON.stringify(message) });
       if (!answer.ok) find("notice").textContent = "refused: " + JSON.stringify(message);
-    } catch { ended(); }
+    } catch { find("notice").textContent = "has stopped"; }
   }
   busy = false;
 }
 
-// What is seen.
-let state = null, received = 0;
-function ended() { find("notice").textContent = "has stopped"; }
-const events = new EventSource("events");
-events.onerror = ended;
-events.addEventListener("ground", event => viewer.handle_command(JSON.parse(event.data)));
-events.onmessage = event => {
-  const told = JSON.parse(event.data);
-  for (const [path, matrix] of Object.entries(told.moves)) {
-    viewer.handle_command({ type: "set_transform", path, matrix });
-  }
-  moveFields();
-  state = told.state;
-  received++;
-  tell();
-};
 function tell() {
   const [forward, left, turn] = state.command, [vx, vy] = state.base.velocity;
   find("speeds").textContent =
@@ -88,7 +51,7 @@ function tell() {
   }
 }
 
-// What is simulated. Where there is little room the panel opens when asked.
+// The panel, closed at first in a narrow window.
 find("panel").open = window.innerWidth > 560;
 for (const [name, choices] of Object.entries(OFFER.choices)) {
   for (const [value, text] of choices) find(name).add(new Option(text, value));
@@ -106,22 +69,21 @@ find("speed").onchange = event => { post({ do: "speed", speed: Number(event.targ
 find("past").oninput = event => post({ do: "look_back", seconds: -Number(event.target.value) });
 find("past").onchange = event => event.target.blur();
 
-// Driving: keys, stick and gamepad each have a say; the largest of each direction counts.
+// Driving by keys, stick and gamepad: the largest share of each direction counts.
 const DRIVING = { w: [1, 0, 0], s: [-1, 0, 0], a: [0, 0, 1], d: [0, 0, -1], q: [0, 1, 0], e: [0, -1, 0],
                   arrowup: [1, 0, 0], arrowdown: [-1, 0, 0], arrowleft: [0, 0, 1], arrowright: [0, 0, -1] };
 const ACTIONS = { " ": () => find("pause").click(), ".": () => find("step").click(), t: () => find("throw").click(),
-                  l: () => find("drop").click(), r: () => find("reset").click(), g: () => find("align").click(),
-                  c: () => { viewer.gui.domElement.hidden = !viewer.gui.domElement.hidden; } };
+                  l: () => find("drop").click(), r: () => find("reset").click(), g: () => find("align").click() };
 const held = new Set();
-let stick = [0, 0, 0], pad = [0, 0, 0], told = "[0,0,0]";
+let stick = [0, 0, 0], pad = [0, 0, 0], posted = "[0,0,0]";
 function drive() {
   const sources = [...[...held].map(key => DRIVING[key]), stick, pad];
   const shares = [0, 1, 2].map(i => {
     const largest = Math.max(0, ...sources.map(s => s[i])), least = Math.min(0, ...sources.map(s => s[i]));
     return largest + least;
   });
-  if (JSON.stringify(shares) === told) return;
-  told = JSON.stringify(shares);
+  if (JSON.stringify(shares) === posted) return;
+  posted = JSON.stringify(shares);
   post({ do: "drive", shares });
 }
 document.addEventListener("keydown", event => {
@@ -152,13 +114,13 @@ find("stick").onpointerup = find("stick").onpointercancel = () => {
 };
 const dead = x => Math.abs(x) < 0.12 ? 0 : x;
 function readGamepad() {
-  const one = [...navigator.getGamepads()].find(Boolean);
-  if (one) { pad = [-dead(one.axes[1]), -dead(one.axes[0]), -dead(one.axes[2] ?? 0)]; drive(); }
+  const gamepad = [...navigator.getGamepads()].find(Boolean);
+  if (gamepad) { pad = [-dead(gamepad.axes[1]), -dead(gamepad.axes[0]), -dead(gamepad.axes[2] ?? 0)]; drive(); }
   requestAnimationFrame(readGamepad);
 }
 readGamepad();
 
-// Dragging a body: a spring from where it is held to where the pointer is, in the plane that faces the camera.
+// Dragging a body: a spring to the pointer, in the plane that faces the camera.
 const bodies = Object.entries(OFFER.bodies).map(([path, name]) => [node(path).object, name]);
 const caster = new THREE.Raycaster(), plane = new THREE.Plane(), line = new THREE.Line(
   new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: 0xd7263d }));
@@ -171,18 +133,19 @@ function aim(event) {
   caster.setFromCamera(place, viewer.camera);
 }
 function bodyOf(object) {
-  let found = null;
+  let nearest = null;
   for (; object; object = object.parent) {
     if (!object.visible) return null;
-    found ??= bodies.find(([body]) => body === object) ?? null;
+    nearest ??= bodies.find(([body]) => body === object) ?? null;
   }
-  return found;
+  return nearest;
 }
 function pick(event) {
+  viewer.scene.updateMatrixWorld();  // poses may be newer than the picture
   aim(event);
   for (const hit of caster.intersectObject(node("/world/0").object, true)) {
-    const found = bodyOf(hit.object);
-    if (found) return { object: found[0], body: found[1], at: hit.point };
+    const [object, body] = bodyOf(hit.object) ?? [];
+    if (object) return { object, body, at: hit.point };
   }
   return null;
 }
@@ -223,7 +186,7 @@ function drawPull() {
 }
 drawPull();
 
-// Filming what is seen here.
+// A film of the scene.
 let film = null;
 find("film").onclick = () => {
   if (film) { film.stop(); return; }
@@ -231,10 +194,7 @@ find("film").onclick = () => {
   film = new MediaRecorder(viewer.renderer.domElement.captureStream(60), { mimeType: kind, videoBitsPerSecond: 8e6 });
   film.ondataavailable = event => parts.push(event.data);
   film.onstop = () => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob(parts, { type: kind }));
-    link.download = "live." + kind.split("/")[1];
-    link.click();
+    download("live." + kind.split("/")[1], URL.createObjectURL(new Blob(parts, { type: kind })));
     film = null;
     find("film").textContent = "film";
     find("film").classList.remove("on");

@@ -1,4 +1,4 @@
-// Draws curves over axes with numbers into a canvas. Knows nothing of robots, scenes and controls.
+// Draws curves over axes with numbers into a canvas.
 
 const MARGIN = { left: 46, right: 10, top: 6, bottom: 20 };  // of a graph, for the numbers [pixels]
 const FONT = "11px system-ui, sans-serif";
@@ -7,6 +7,7 @@ const FONT = "11px system-ui, sans-serif";
 function numbers(text, kind) {
   return new kind(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
 }
+const unpacked = packed => Object.fromEntries(Object.entries(packed).map(([name, text]) => [name, numbers(text, Float32Array)]));
 
 // Last frame at or before a time.
 function frameAt(times, time) {
@@ -37,7 +38,7 @@ function label(value, step) {
   return text(value, step);
 }
 
-// A number to read: 0.0123, 4.56, 1234, 1.2e-5; nothing of what is none.
+// A number as text: 0.0123, 4.56, 1234, 1.2e-5; no text for NaN.
 function figure(value) {
   const size = Math.abs(value);
   if (!Number.isFinite(value)) return "";

@@ -1,4 +1,4 @@
-// Belts: lets strands run and pulleys turn with the joints that they drive. Expects meshcat's viewer and its node().
+// Belts: moves strands and turns pulleys with their joints. Expects scene.js.
 
 const MARKS = 8;  // around a pulley
 const belts = [];
@@ -10,7 +10,7 @@ function findBelts() {
 
 // Light bars along a strand, one after each eighth of a pulley.
 function mark(strand) {
-  const { length, width, height, reach } = strand.userData.belt, THREE = MeshCat.THREE;
+  const { length, width, height, reach } = strand.userData.belt;
   const pitch = 2 * Math.PI * Math.abs(reach) / MARKS, row = new THREE.Group();
   const material = strand.material.clone();
   material.color.set(0xedf0f2);
@@ -25,7 +25,7 @@ function mark(strand) {
 
 // Angle of a joint [rad]; whole turns are lost, and a belt of whole marks looks the same after one.
 function angle({ path, rest, axis, sign }) {
-  const turned = new MeshCat.THREE.Quaternion(...rest).invert().multiply(node(path).object.quaternion);
+  const turned = new THREE.Quaternion(...rest).invert().multiply(node(path).object.quaternion);
   return sign * 2 * Math.atan2(turned.x * axis[0] + turned.y * axis[1] + turned.z * axis[2], turned.w);
 }
 
@@ -34,6 +34,6 @@ function moveBelts() {
     const { links, axis, reach, pitch, row } = object.userData.belt;
     const turn = links.reduce((sum, link) => sum + angle(link), 0);
     if (row) row.position.x = ((reach * turn) % pitch + pitch) % pitch;
-    else object.parent.quaternion.setFromAxisAngle(new MeshCat.THREE.Vector3(...axis), turn);
+    else object.parent.quaternion.setFromAxisAngle(new THREE.Vector3(...axis), turn);
   }
 }

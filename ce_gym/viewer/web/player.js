@@ -1,26 +1,10 @@
-// The controls of the page. Expects commands, data, FRAME and HORIZON, meshcat's viewer,
-// ground.js, belts.js, graph.js and plots.js.
+// The controls of a page that plays rollouts. Expects DATA and FRAME, scene.js, belts.js, graph.js and plots.js.
 
-const find = id => document.getElementById(id);
-const unpacked = packed => Object.fromEntries(Object.entries(packed).map(([k, v]) => [k, numbers(v, Float32Array)]));
-const robots = data.robots.map(robot => ({
+const robots = DATA.robots.map(robot => ({
   ...robot, times: numbers(robot.times, Float32Array), signals: unpacked(robot.signals),
   commanded: unpacked(robot.commanded), effort: numbers(robot.effort, Uint8Array),
 }));
 
-let viewer;
-try {
-  viewer = new MeshCat.Viewer(find("pane"));
-} catch (error) {
-  find("error").style.display = "block";
-  throw error;
-}
-for (const command of commands) {
-  viewer.handle_command_bytearray(Uint8Array.from(atob(command), c => c.charCodeAt(0)));
-}
-viewer.scene.fog = new MeshCat.THREE.Fog(HORIZON, 8, 40);
-viewer.gui.domElement.hidden = true;  // meshcat's own panel, by the key C
-const node = path => viewer.scene_tree.find(path.split("/").filter(Boolean));
 findBelts();
 
 // Time.
@@ -33,7 +17,6 @@ function seek(time) {
   animator.display_progress(Math.max(0, Math.min(animator.duration, time)));
 }
 function toggle() { animator.playing ? animator.pause() : animator.play(); }
-function panel() { viewer.gui.domElement.hidden = !viewer.gui.domElement.hidden; }
 function step(frames) { seek(animator.time + frames * FRAME); }
 
 find("play").onclick = toggle;
@@ -41,21 +24,22 @@ find("time").oninput = event => seek(Number(event.target.value));
 find("speed").onchange = event => { animator.mixer.timeScale = Number(event.target.value); };
 document.addEventListener("keydown", event => {
   if (event.target.tagName === "SELECT") return;
-  const keys = { " ": toggle, ArrowLeft: () => step(-1), ArrowRight: () => step(1), Home: () => seek(0), c: panel };
+  const keys = { " ": toggle, ArrowLeft: () => step(-1), ArrowRight: () => step(1), Home: () => seek(0) };
   if (event.key in keys) { event.preventDefault(); keys[event.key](); }
 });
 
-// What is seen. The first action moves the world under the camera; without weight it leaves the world at rest.
+// The first action moves the world under the camera; without weight the world stays at rest.
 function follow(on) {
   animator.actions[0].setEffectiveWeight(on ? 1 : 0);
   animator.mixer.update(0);
 }
-// Ghosts stay as they are, in their own colour: of two robots that both were transparent nobody could tell which is which.
+// X-ray leaves ghosts unchanged: two transparent robots could not be told apart.
 const ghostly = new Set();
-robots.forEach((robot, i) => { if (robot.ghost) node(`/world/${i}`).object.traverse(object => ghostly.add(object)); });
-for (const { material } of ghostly) {  // in the same place as the robot they are behind it, or their surfaces would flicker
-  if (material) Object.assign(material, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4 });
-}
+robots.forEach((robot, i) => {
+  if (!robot.ghost) return;
+  node(`/world/${i}`).object.traverse(object => ghostly.add(object));
+  drawBehind(node(`/world/${i}`).object);
+});
 function xray(on) {
   viewer.scene.traverse(object => {
     if (ghostly.has(object)) return;
@@ -70,8 +54,8 @@ function xray(on) {
   });
 }
 
-// Links of solid robots, each with the number of the joint that moves it; other links have none and stay grey.
-const REST = new MeshCat.THREE.Color(0xcfd8e1), HALF = new MeshCat.THREE.Color(0xf2b134), FULL = new MeshCat.THREE.Color(0xd7263d);
+// Links of solid robots with the number of their joint; links without a motor stay grey.
+const REST = new THREE.Color(0xcfd8e1), HALF = new THREE.Color(0xf2b134), FULL = new THREE.Color(0xd7263d);
 const painted = [];
 robots.forEach(robot => {
   if (robot.ghost || !robot.paths.length) return;
@@ -105,13 +89,13 @@ for (const box of document.querySelectorAll("#about input")) {
     viewer.set_dirty();
   };
 }
-const few = window.innerWidth <= 820 ? 1 : data.chosen.length;  // where there is little room
-const plots = makePlots(find("plots"), robots, data.chosen.slice(0, few), {
+const few = window.innerWidth <= 820 ? 1 : DATA.chosen.length;
+const plots = makePlots(find("plots"), robots, DATA.chosen.slice(0, few), {
   span: [0, animator.duration], unit: "s", seek, file: document.title,
 });
-if (!data.chosen.length) for (const hidden of [find("plots"), find("charts").parentElement]) hidden.style.display = "none";
+if (!DATA.chosen.length) for (const hidden of [find("plots"), find("charts").parentElement]) hidden.style.display = "none";
 
-// The address may say what to show: #t=4.2&xray&torque&charts=0 opens the page paused there.
+// Text after # in the address sets the view: #t=4.2&xray&torque&charts=0 opens the page paused at 4.2 s.
 for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
   if (key === "t") seek(Number(value));
   if (key in switches) {
@@ -120,17 +104,16 @@ for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
   }
 }
 
-// Where the window is narrow, the robot stands in the part of it that plots and bar leave, whole.
-function fit() {
-  const width = find("pane").offsetWidth, height = window.innerHeight, narrow = width <= 820;
-  viewer.camera.zoom = narrow ? Math.min(1, 1.2 * width / height) : 1;
-  const hidden = narrow ? find("low").offsetHeight - find("about").offsetHeight : 0;
+// In a narrow window the robot stands above plots and bar.
+function shift() {
+  const width = find("pane").offsetWidth, height = find("pane").offsetHeight;
+  const hidden = width <= 820 ? find("low").offsetHeight - find("about").offsetHeight : 0;
   viewer.camera.setViewOffset(width, height, 0, hidden / 2, width, height);
   viewer.set_dirty();
 }
-window.addEventListener("resize", fit);
-find("charts").addEventListener("change", fit);
-fit();
+window.addEventListener("resize", shift);
+find("charts").addEventListener("change", shift);
+shift();
 
 function refresh() {
   moveFields();
