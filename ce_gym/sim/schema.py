@@ -20,7 +20,7 @@ from ce_gym.dynamics.laws.scene_laws import output_sizes, state_fields
 from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.step_size import control_sizes
-from ce_gym.sim.arguments import check, is_number
+from ce_gym.model.arguments import check, is_number
 from ce_gym.sim.devices import Array
 from ce_gym.sim.substeps import DT, FRAME
 

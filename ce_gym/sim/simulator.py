@@ -23,9 +23,9 @@ from ce_gym.dynamics.laws.scene_parameters import check_parameter, parameter_def
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.parameter_effects import check_effects
 from ce_gym.model import ContactMaterial
+from ce_gym.model.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.errors import check_names, listed_names
-from ce_gym.sim.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.ground_clearance import GroundClearance

@@ -18,10 +18,10 @@ from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.checks import checked_value, merged_rewards
 from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS, Task
+from ce_gym.model.arguments import check, check_choice, check_whole
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, listed_names, unknown
 from ce_gym.model.mechanism import ELASTIC, LEVELS
-from ce_gym.sim.arguments import check, check_choice, check_whole
 from ce_gym.sim.devices import Device, device_named
 
 KNOWN = {**TASKS, **SKILLS}

@@ -12,8 +12,8 @@ from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.envs.task.tasks import STARTS, Actions
 from ce_gym.envs.task.terrain_tiles import checked_terrain
 from ce_gym.envs.terms.registry import terms_of
+from ce_gym.model.arguments import check, check_choice, check_whole, is_number
 from ce_gym.model.errors import check_names, listed_names
-from ce_gym.sim.arguments import check, check_choice, check_whole, is_number
 
 CHOICES = {"actions": get_args(Actions), "friction": FRICTION, "motors": MOTORS, "method": METHODS}
 POSITIVE = ("action_scale", "command_period", "gait_period", "dt", "tolerance")
