@@ -6,18 +6,14 @@ machine code comes from `ce_gym.compile`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, get_args
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import CriticalSection
-from ce_gym.dynamics.forces.friction import FRICTION
-from ce_gym.dynamics.forces.motors import MOTORS
-from ce_gym.dynamics.forces.normal import NORMAL_LAWS
-from ce_gym.dynamics.forces.scene import Control, StepOptions, target_names
-from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.forces.scene import SceneOptions, target_names
 from ce_gym.dynamics.laws.scene_laws import OUTPUTS, state_fields
 from ce_gym.dynamics.laws.scene_parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.model import Model
@@ -26,14 +22,15 @@ from ce_gym.model import ContactMaterial
 from ce_gym.model.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.errors import check_names, listed_names
+from ce_gym.model.options import check_fields
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.ground_clearance import GroundClearance
 from ce_gym.sim.interruptible_runs import longest_run, run_substeps
-from ce_gym.sim.kernels import load_step_kernel, select_contacts, select_pairs
-from ce_gym.sim.schema import Row, Steps, checked_tolerance, physics_rows
+from ce_gym.sim.kernels import load_step_kernel
+from ce_gym.sim.scene import resolve_scene
+from ce_gym.sim.schema import Row, Steps, physics_rows
 from ce_gym.sim.terrain import Terrain
-from ce_gym.sim.terrain.hulls import hulls_on
 
 FAILURES = Row("failures", 0, "host", dtype="int64")
 """How often a robot has diverged and been set anew, and how often it has been stepped again."""
@@ -55,38 +52,23 @@ class Simulator:
     Args:
         model: The robot at a transmission level.
         num_envs: Number of robots.
-        dt: Length of a sub-step [s]; the default method is stable to 10 ms and more.
+        dt: Length of a sub-step [s]; that of `scene` if None.
         dtype: "float64" or "float32" for state and arithmetic.
         num_threads: Threads the robots are split over; results do not depend on it.
+        scene: How contacts, motors and time steps are simulated; the default options if None.
         control: What `target` means: "position" for joint positions [rad] through the robot's PD gains, "torque" for
-            joint torques [N m]; "motor_position" and "motor_torque" for the same of the motors' rotors.
-        contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
+            joint torques [N m]; "motor_position" and "motor_torque" for angles and torques of the motors' rotors.
         material: Compliance and friction of the contacts; the robot's own if None.
         outputs: Which of "torque", "motor_torque", "motor_speed", "power", "contact_forces", "energy", "error",
             "loop_gap", "nearness", "winding_temperature", "battery_voltage" to compute; others read as errors.
-        method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
-            scenes); or "adaptive": every robot advances by `dt` in extrapolated steps of its own, which are as long as
-            `tolerance` allows.
-        tolerance: Of "adaptive", the error of positions that is asked for [rad or m]; 1e-3 if None.
-        normal_law: "kelvin_voigt" or "hunt_crossley", of the contacts' normal force; that of the material if None.
-        friction: "tangent" iterates where a contact changes between stick and slip; "secant" is faster and slow to
-            break away.
-        motors: "ideal" for the joints' torque limits; "limited" for torque, torque-speed line and friction of the
-            motors themselves.
         parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
         terrain: The ground; the plane z = 0 if None, which is faster.
-        self_collisions: Which links push each other apart: "listed" for the pairs of the robot's file, "all" for pairs
-            of links that are neither adjacent nor in each other in the standing pose, or pairs of names.
-        seldom: Contacts, as in `contacts`, that are computed only where they are near the ground, such as "knee"; while
-            they are not near, that saves their time.
-        retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move too far, see
-            `ce_gym.dynamics.stepping.halving.LARGEST_MOVE`; it alone then makes the sub-step in parts.
-        control_period: Controllers of positions look every so often, a multiple of `dt`, and hold their torques in
-            between [s]; 0 for controllers so fast that they never stop looking.
         device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
+        **options: Fields of `SceneOptions` that replace those of `scene`, such as `contacts="foot"`.
 
     Attributes:
         device: Name of the device.
+        scene: The scene options, those of `options` included.
         target_names: What each entry of a target is for: joints, or the motors' rotors and then joints without one.
 
     Raises:
@@ -106,64 +88,39 @@ class Simulator:
         self,
         model: Model,
         num_envs: int = 1,
-        dt: float = 0.005,
+        dt: float | None = None,
         dtype: str = "float64",
         num_threads: int = 1,
         *,
+        scene: SceneOptions | None = None,
         control: str = "position",
-        contacts: str | Sequence[str] = "all",
         material: ContactMaterial | None = None,
         outputs: Sequence[str] = ("torque", "contact_forces"),
-        method: str = "euler",
-        tolerance: float | None = None,
-        normal_law: str | None = None,
-        friction: str = "tangent",
-        motors: str = "ideal",
         parameters: Sequence[str] = (),
         terrain: Terrain | None = None,
-        self_collisions: str | Sequence[Sequence[str]] = (),
-        seldom: str | Sequence[str] = (),
-        retry: int = 6,
-        control_period: float = 0.0,
         device: str | Device = "cpu",
+        **options: Any,
     ) -> None:
-        self._made_with = {name: value for name, value in locals().items() if name != "self"}
+        arguments = {name: value for name, value in locals().items() if name not in ("self", "options")}
+        self._made_with = arguments | options
         check_whole("num_envs", num_envs, 1)
         check_whole("num_threads", num_threads, 1)
-        check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
-        check("retry", retry, 0 <= retry <= 10, "between 0 and 10 halvings of the step")
+        check("scene", scene, scene is None or isinstance(scene, SceneOptions), "SceneOptions or None")
         check("terrain", terrain, terrain is None or isinstance(terrain, Terrain), "a Terrain or None")
-        choices: dict[str, Iterable[object]] = {"dtype": ("float64", "float32"), "control": get_args(Control)}
-        choices |= {"method": METHODS, "friction": FRICTION, "motors": MOTORS, "normal_law": (None, *NORMAL_LAWS)}
-        for argument, known in choices.items():
-            check_choice(argument, self._made_with[argument], known)
+        check_choice("dtype", dtype, ("float64", "float32"))
         check_names("outputs", outputs, OUTPUTS, "one of")
+        check_fields(SceneOptions, options, others=arguments)
         defaults = parameter_defaults(model.robot, material or model.robot.material, parameters)
-        self.tolerance = checked_tolerance(method, tolerance)
+        given = options if dt is None else {"dt": dt, **options}
+        self.scene = SceneOptions(**(scene or SceneOptions()).shared | given)
+        self.options = resolve_scene(self.scene, model, terrain, control, parameters, material)
+        check_effects(model.mechanism, self.options)
         self._device = device_named(device)
         self.device = self._device.name
-        self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
+        self.model, self.num_envs, self.dt, self.terrain = model, num_envs, self.scene.dt, terrain
         self.dtype, self.num_threads = dtype, num_threads
-        self.contact_names = select_contacts(model.robot, contacts)
-        hulls = hulls_on(model.robot, self.contact_names, terrain)
-        self._placement = GroundClearance(model, self.contact_names, terrain, hulls)
-        self.options = StepOptions(
-            control=control,  # type: ignore[arg-type]
-            contacts=self.contact_names,
-            material=material or model.robot.material,
-            normal_law=normal_law,
-            friction=friction,
-            method=method,
-            motors=motors,
-            ground="field" if terrain is not None and self.contact_names else "flat",
-            parameters=tuple(parameters),
-            self_collisions=select_pairs(model.mechanism, self_collisions),
-            seldom=tuple(name for name in select_contacts(model.robot, seldom, "seldom") if name in self.contact_names),
-            retry=retry,
-            control_period=control_period,
-            hulls=hulls,
-        )
-        check_effects(model.mechanism, self.options)
+        self.contact_names = self.options.contacts
+        self._placement = GroundClearance(model, self.contact_names, terrain, self.options.hulls)
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
@@ -171,7 +128,7 @@ class Simulator:
         fields = state_fields(model.mechanism, self.options)
         self._memory = [field for field in fields if field.name not in ("q", "v", "dependent")]
         ground = terrain if self.options.ground == "field" else None
-        rows = [*physics_rows(model, self.options, asked, dt, self.tolerance), FAILURES]
+        rows = [*physics_rows(model, self.options, asked, self.dt, self.scene.tolerance), FAILURES]
         self._batch = Batch(rows, num_envs, dtype, self._device, ground)
         self._arrays = self._batch.arrays
         ends = np.cumsum([0, *(len(default) for default in defaults.values())])

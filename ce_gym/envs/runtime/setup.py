@@ -15,21 +15,18 @@ from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
-from ce_gym.envs.task.checks import checked_value, merged_rewards
+from ce_gym.envs.task.checks import merged_rewards
 from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.arguments import check, check_choice, check_whole
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, bad, listed_names, unknown
 from ce_gym.model.mechanism import ELASTIC, LEVELS
+from ce_gym.model.options import check_fields
 from ce_gym.sim.devices import Device, device_named
 
 KNOWN = {**TASKS, **SKILLS}
 """Every task by name."""
-
-
-class UnknownArgument(TypeError, ValueError):
-    """An argument that nothing takes: Python's own kind of error, and a ValueError as all mistakes in arguments are."""
 
 
 def make_batch(
@@ -152,12 +149,9 @@ def changed_task(task: Task, changes: Mapping[str, Any]) -> Task:
         UnknownArgument: If there is no such attribute.
         ValueError: One line that names the argument, its value and what was expected.
     """
-    known, given = [f.name for f in fields(Task) if f.name != "rewards"], {}
-    for name, value in changes.items():
-        if name not in known:
-            raise UnknownArgument(
-                f"unexpected keyword argument {name!r}; expected one of {listed_names(name, ['rewards', *known])}"
-            )
-        if value is not None:
-            given[name] = checked_value(name, value, getattr(task, name))
+    check_fields(Task, changes)
+    given = {name: value for name, value in changes.items() if value is not None}
+    for each in fields(Task):
+        if each.metadata.get("merges") and each.name in given:
+            given[each.name] = {**getattr(task, each.name), **each.metadata["check"](each.name, given[each.name])}
     return replace(task, **given)

@@ -8,25 +8,47 @@ description has what those functions ask for. Change one with `dataclasses.repla
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
+
+from ce_gym.dynamics.forces.scene import SceneOptions
+from ce_gym.envs.task.checks import (
+    command_ranges,
+    list_of_names,
+    magnitudes,
+    ranges,
+    some_terms,
+    terms,
+    whole_range,
+)
+from ce_gym.envs.task.terrain_tiles import checked_terrain
+from ce_gym.model.options import flag, names, number, one_of, option, positive, whole
 
 Range = tuple[float, float]
 Terms = tuple[str, ...] | Mapping[str, Mapping[str, Any]]
 """Names of terms, or their parameters by name."""
 Actions = Literal["joint_pd", "joint_torque", "motor_pd", "motor_torque"]
 
+RESET_NOISE = {"joint_position": 0.1, "joint_velocity": 0.2, "base_velocity": 0.2}
+"""Largest deviations from the standing pose at the start, see `Task.reset_noise`."""
 
-@dataclass(frozen=True)
-class Task:
-    """What a robot is asked to do.
+STARTS = {
+    "height": "of the base above its standing height [m]",
+    "lean": "angle of the base to upright, to any side [rad]",
+}
+"""What can be said of how episodes begin."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task(SceneOptions):
+    """What a robot is asked to do; the fields of `SceneOptions` say how its physics is simulated.
 
     Attributes:
         rewards: Weight of each reward term, or a mapping of `weight` and parameters, by the name of its function; the
             reward is the weighted sum times the control step.
         observations: Observation blocks, in order: names, or parameters by name. So are the following three.
-        terminations: Conditions that end an episode as a failure.
+        terminations: Conditions that end an episode as a failure; contacts that they read need not be in `contacts`.
         metrics: Figures averaged over each episode.
         critic: Blocks that the critic sees besides the policy's, without noise, if observations come as a dictionary.
         noise: Largest error of observation blocks, uniform, by name, in their own units.
@@ -49,19 +71,9 @@ class Task:
         randomise: Range of physical figures that are drawn for each episode, by name; see `RANDOMISED`.
         push_period: Time between pushes [s]; 0 for none.
         push_speed: Largest change of the base's horizontal velocity by a push, each way [m/s].
-        dt: Length of a physics sub-step [s].
         n_substeps: Sub-steps in a control step.
         episode_length: Control steps until time is up.
         terrain: The ground, by its `kind` and the arguments of that, see `ce_gym.envs.task.terrain_tiles`.
-        contacts: Which contact spheres take part: "all", or names of groups or spheres. Spheres that end the episode
-            when they touch the ground need not.
-        seldom: Those of them that are computed only where they are near, see `ce_gym.Simulator`.
-        self_collisions: Which links push each other apart: "listed", "all" or pairs, see `ce_gym.Simulator`.
-        friction: "tangent" or "secant", see `ce_gym.Simulator`.
-        motors: "ideal" or "limited", see `ce_gym.Simulator`.
-        control_period: Of the motors' controllers [s], a multiple of `dt`; 0 for none, see `ce_gym.Simulator`.
-        method: How sub-steps are made, "euler" or another, see `ce_gym.Simulator`.
-        tolerance: Of method "adaptive" [rad or m]; every robot then makes steps of its own within each sub-step.
         only_positive: Whether a negative total reward counts as zero, so that ending an episode early never pays.
         reset_noise: Largest deviation from the standing pose at the start: of joints [rad], joint velocities [rad/s]
             and base velocities [rad/s and m/s].
@@ -69,42 +81,32 @@ class Task:
     """
 
     rewards: Mapping[str, float | Mapping[str, Any]]
-    observations: Terms
-    terminations: Terms
-    metrics: Terms
-    critic: Terms = ()
-    noise: Mapping[str, float] = field(default_factory=dict)
-    history: int = 1
-    actions: Actions = "joint_pd"
-    action_scale: float = 0.5
-    action_joints: tuple[str, ...] = ("*",)
-    latency: tuple[int, int] = (0, 0)
-    command_range: tuple[Range, ...] = ((-1.0, 1.0), (-0.5, 0.5), (-1.0, 1.0))
-    command_curriculum: float = 1.0
-    command_period: float = 5.0
-    standing_fraction: float = 0.1
-    heading: bool = False
-    gait_period: float = 0.8
-    randomise: Mapping[str, Range] = field(default_factory=dict)
-    push_period: float = 0.0
-    push_speed: float = 0.5
-    dt: float = 0.005
-    n_substeps: int = 4
-    episode_length: int = 1000
-    terrain: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({"kind": "flat"}))
-    contacts: str | tuple[str, ...] = ("foot", "knee")
-    seldom: str | tuple[str, ...] = ()
-    self_collisions: str | tuple[tuple[str, ...], ...] = ()
-    friction: Literal["tangent", "secant"] = "tangent"
-    motors: Literal["ideal", "limited"] = "ideal"
-    control_period: float = 0.0
-    method: str = "euler"
-    tolerance: float | None = None
-    only_positive: bool = True
-    reset_noise: Mapping[str, float] = field(
-        default_factory=lambda: MappingProxyType({"joint_position": 0.1, "joint_velocity": 0.2, "base_velocity": 0.2})
-    )
-    start: Mapping[str, Range] = field(default_factory=dict)
+    observations: Terms = option(some_terms)
+    terminations: Terms = option(terms)
+    metrics: Terms = option(terms)
+    critic: Terms = option(terms, ())
+    noise: Mapping[str, float] = option(magnitudes(), {}, merges=True)
+    history: int = option(whole(1), 1)
+    actions: Actions = option(one_of(get_args(Actions)), "joint_pd")
+    action_scale: float = option(positive(), 0.5)
+    action_joints: tuple[str, ...] = option(list_of_names, ("*",))
+    latency: tuple[int, int] = option(whole_range, (0, 0))
+    command_range: tuple[Range, ...] = option(command_ranges, ((-1.0, 1.0), (-0.5, 0.5), (-1.0, 1.0)))
+    command_curriculum: float = option(positive(1), 1.0)
+    command_period: float = option(positive(), 5.0)
+    standing_fraction: float = option(number(0, 1), 0.1)
+    heading: bool = option(flag, False)
+    gait_period: float = option(positive(), 0.8)
+    randomise: Mapping[str, Range] = option(ranges(), {})
+    push_period: float = option(number(0), 0.0)
+    push_speed: float = option(number(0), 0.5)
+    n_substeps: int = option(whole(1), 4)
+    episode_length: int = option(whole(1), 1000)
+    terrain: Mapping[str, Any] = option(lambda _, value: checked_terrain(value), {"kind": "flat"})
+    contacts: str | tuple[str, ...] = option(names, ("foot", "knee"))
+    only_positive: bool = option(flag, True)
+    reset_noise: Mapping[str, float] = option(magnitudes(RESET_NOISE), RESET_NOISE, merges=True)
+    start: Mapping[str, Range] = option(ranges(STARTS), {})
 
 
 RANDOMISED = {
@@ -126,12 +128,6 @@ RANDOMISED = {
     "com_shift": "shift of the base's centre of mass, each axis [m]; com_shift:BODY for another body",
 }
 """What can be drawn for each episode."""
-
-STARTS = {
-    "height": "of the base above its standing height [m]",
-    "lean": "angle of the base to upright, to any side [rad]",
-}
-"""What can be said of how episodes begin."""
 
 
 VELOCITY = Task(
