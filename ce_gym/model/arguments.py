@@ -1,4 +1,4 @@
-"""Checks of arguments. An error is one line with the argument, its value and the expected values."""
+"""Checks of arguments. An error is one line with the argument, its value and the allowed values."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def check_shape(argument: str, value: Any, *expected: tuple[int, ...]) -> None:
         raise ValueError(f"{argument} has shape {tuple(value.shape)}; expected {' or '.join(map(str, expected))}")
 
 
-def is_number(value: object) -> bool:
+def is_number(value: Any) -> bool:
     """Return whether a value is a finite number."""
     number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
     return number and math.isfinite(value)

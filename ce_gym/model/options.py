@@ -23,7 +23,7 @@ def option(check: Check, default: Any = MISSING, merges: bool = False) -> Any:
 
     Args:
         check: Check of its values.
-        default: Value of the field if none is given; without a default the field is required.
+        default: Default of the field; without a default the field is required.
         merges: Whether a user's mapping changes some entries of the default and keeps the others.
     """
     metadata = {"check": check, "merges": merges}
@@ -52,7 +52,7 @@ def check_fields(options: type[Options], names: Iterable[str], others: Iterable[
         others: Further arguments that exist, listed in the error.
 
     Raises:
-        UnknownArgument: One line with the first wrong name, the names that exist, and the closest of them.
+        UnknownArgument: One line with the first wrong name, the names that exist, and the closest name.
     """
     known = [each.name for each in fields(options)]
     for name in names:

@@ -1,7 +1,7 @@
 """`Simulator`: many copies of one robot, stepped together by one compiled kernel.
 
-Holds state arrays and knows when to call the kernel; the physics is `ce_gym.dynamics.stepping.step`, the
-machine code comes from `ce_gym.compile`.
+`Simulator` holds the state arrays and calls the kernel. `ce_gym.dynamics.stepping.step` has the physics, and
+`ce_gym.compile` makes the machine code.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from ce_gym.sim.schema import Row, Steps, physics_rows
 from ce_gym.sim.terrain import Terrain
 
 FAILURES = Row("failures", 0, "host", dtype="int64")
-"""How often a robot has diverged and been set anew, and how often it has been stepped again."""
+"""How many times each robot has diverged and been reset."""
 
 
 def _reading(name: str, document: str, scalar: bool = False) -> property:
-    """Return a property that reads a state buffer or an output; `scalar` if it is one number of each robot."""
+    """Return a property that reads a state buffer or an output; `scalar` for one number per robot."""
 
     def read(sim: Simulator) -> Array:
         rows = sim._read(name)
@@ -52,24 +52,26 @@ class Simulator:
     Args:
         model: The robot at a transmission level.
         num_envs: Number of robots.
-        dt: Length of a sub-step [s]; that of `scene` if None.
+        dt: Length of a sub-step [s]; the `dt` of `scene` if None.
         dtype: "float64" or "float32" for state and arithmetic.
-        num_threads: Threads the robots are split over; results do not depend on it.
+        num_threads: Number of threads; results do not depend on the number.
         scene: How contacts, motors and time steps are simulated; the default options if None.
-        control: What `target` means: "position" for joint positions [rad] through the robot's PD gains, "torque" for
+        control: Meaning of `target`: "position" for joint positions [rad] through the robot's PD gains, "torque" for
             joint torques [N m]; "motor_position" and "motor_torque" for angles and torques of the motors' rotors.
         material: Compliance and friction of the contacts; the robot's own if None.
-        outputs: Which of "torque", "motor_torque", "motor_speed", "power", "contact_forces", "energy", "error",
-            "loop_gap", "nearness", "winding_temperature", "battery_voltage" to compute; others read as errors.
-        parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
+        outputs: Quantities to compute: some of "torque", "motor_torque", "motor_speed", "power", "contact_forces",
+            "energy", "error", "loop_gap", "nearness", "winding_temperature", "battery_voltage". Reading another one
+            raises a ValueError.
+        parameters: Names of physical parameters that can then differ from robot to robot, see `set_parameter`.
         terrain: The ground; the plane z = 0 if None, which is faster.
-        device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
-        **options: Fields of `SceneOptions` that replace those of `scene`, such as `contacts="foot"`.
+        device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and outputs are torch tensors.
+        **options: New values of fields of `scene`, such as `contacts="foot"`.
 
     Attributes:
         device: Name of the device.
-        scene: The scene options, those of `options` included.
-        target_names: What each entry of a target is for: joints, or the motors' rotors and then joints without one.
+        scene: The scene options, with the new values of `options`.
+        target_names: Joint of each entry of a target; for control at the motors, the rotors and then the joints without
+            a motor.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -139,7 +141,7 @@ class Simulator:
         """Put robots at rest into the standing pose, on terrain as high as their contacts need.
 
         Args:
-            mask: Which robots, bool, shape (num_envs,); all of them if None.
+            mask: Which robots, bool, shape (num_envs,); all robots if None.
         """
         q = self.model.standing_q.copy()
         if self.model.robot.floating:
@@ -152,7 +154,7 @@ class Simulator:
         Args:
             q: Positions, shape (num_envs, nq) or (nq,).
             v: Velocities, shape (num_envs, nv) or (nv,).
-            mask: Which robots, bool, shape (num_envs,); all of them if None.
+            mask: Which robots, bool, shape (num_envs,); all robots if None.
 
         Raises:
             ValueError: If a shape is wrong, a number is not finite, the norm of a quaternion is not within 1e-3 of 1,
@@ -182,18 +184,18 @@ class Simulator:
             self._batch.write("failures", failures, chosen)
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
-        """Advance all robots by `n_substeps` sub-steps, or none of them by any.
+        """Advance all robots by `n_substeps` sub-steps.
 
-        Ctrl-C waits for the end of a short call; a long one is taken back, within a second.
+        Ctrl-C waits for the end of a short call. It stops a long call within a second and restores the state before.
 
         Args:
-            target: Positions [rad] or torques [N m], shape (num_envs, n) or (n,), in the order of `target_names`:
-                that of `model.joint_links` unless the motors are controlled.
-                On a GPU they are not checked for NaN, because that would need waiting.
+            target: Positions [rad] or torques [N m], shape (num_envs, n) or (n,), in the order of `target_names`, which
+                is the order of `model.joint_links` unless the motors are controlled. Targets on a GPU are not checked
+                for NaN, because that would need waiting.
             n_substeps: Number of sub-steps of length `dt`; 0 does nothing.
 
         Raises:
-            ValueError: If a shape is wrong, a target is not finite, or `n_substeps` is no such number.
+            ValueError: If a shape is wrong, a target is not finite, or `n_substeps` is not a whole number from 0.
             RuntimeError: If another thread steps or sets the same robots.
         """
         n = len(self.target_names)
@@ -207,7 +209,7 @@ class Simulator:
             self._advance({"target": rows}, n_substeps)
 
     def _advance(self, given: dict[str, Array], n_substeps: int) -> None:
-        """Step all robots; the state is as before if that raises, by Ctrl-C in a long call."""
+        """Step all robots; if Ctrl-C interrupts a long call, restore the state before."""
         keep = n_substeps > longest_run(self.num_envs)
         before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
         arrays = self._arrays | self._batch.tables | given
@@ -219,14 +221,14 @@ class Simulator:
             raise
 
     def set_parameter(self, name: str, value: ArrayLike, mask: ArrayLike | None = None) -> None:
-        """Set a figure that was declared in `parameters`.
+        """Set a physical parameter that was declared in `parameters`.
 
         Args:
             name: "gravity", "friction", "slip_speed", "stiffness", "damping", "kp", "kd", "motor_strength",
                 "rotor_inertia", "ratio", "added_mass:BODY" or "com_shift:BODY"; sizes and units are in
                 `ce_gym.dynamics.laws.scene_laws.PARAMETERS`.
             value: Shape (num_envs, size) or (size,) or ().
-            mask: Which robots, bool, shape (num_envs,); all of them if None.
+            mask: Which robots, bool, shape (num_envs,); all robots if None.
 
         Raises:
             ValueError: If the parameter was not declared, a shape is wrong, or a number is out of range.
@@ -244,10 +246,10 @@ class Simulator:
             self._batch.write("parameters", rows, chosen)
 
     def snapshot(self, file: File | None = None) -> Snapshot:
-        """Return all that the robots carry, from which `restore` continues bit for bit.
+        """Return the state of all robots, from which `restore` continues bit for bit.
 
         Args:
-            file: Where to write it besides, as `.npz`.
+            file: Name of an `.npz` file to write, too.
 
         Returns:
             Arrays by name, a row for each robot, copies in the memory of the CPU.
@@ -255,13 +257,13 @@ class Simulator:
         return self._batch.snapshot(file)
 
     def restore(self, snapshot: Snapshot | File) -> None:
-        """Continue from a snapshot of such a simulator.
+        """Continue from a snapshot of a simulator of the same robot, number of robots and scene.
 
         Args:
-            snapshot: What `snapshot` returned, or the name of the file that it wrote.
+            snapshot: Result of `snapshot`, or the name of its file.
 
         Raises:
-            ValueError: If it is of other robots or another scene.
+            ValueError: If the snapshot is of other robots or another scene.
         """
         with self._section:
             self._batch.restore(snapshot)
@@ -275,9 +277,13 @@ class Simulator:
     q = _reading("q", "Positions, a copy, shape (num_envs, nq).")
     v = _reading("v", "Velocities, a copy, shape (num_envs, nv).")
     torque = _reading("torque", "Motor torques at the joints, mean of the last sub-step [N m], shape (num_envs, nj).")
-    motor_torque = _reading("motor_torque", "Of motors' windings, before losses [N m], shape (num_envs, n_motors).")
+    motor_torque = _reading(
+        "motor_torque", "Torques of motors' windings, before losses [N m], shape (num_envs, n_motors)."
+    )
     motor_speed = _reading("motor_speed", "Speeds of motors' rotors after a step [rad/s], shape (num_envs, n_motors).")
-    winding_temperature = _reading("winding_temperature", "Of motors that grow warm [deg C], shape (num_envs, n_warm).")
+    winding_temperature = _reading(
+        "winding_temperature", "Windings of motors with heat [deg C], shape (num_envs, n_warm)."
+    )
     battery_voltage = _reading("battery_voltage", "Voltage of the battery after a step [V], shape (num_envs,).", True)
     power = _reading("power", "Mechanical power of the motors at the joints after a step [W], shape (num_envs, nj).")
     error = _reading("error", "Estimated error of the last sub-step in `v` [rad/s or m/s], shape (num_envs,).", True)
@@ -287,22 +293,22 @@ class Simulator:
 
     @property
     def diverged(self) -> Array:
-        """Robots whose state went out of bounds; they stay frozen at their last good state, shape (num_envs,)."""
+        """Robots whose state went out of bounds, frozen at their last good state, shape (num_envs,)."""
         return self._read("diverged")[:, 0] > 0.5
 
     @property
     def n_diverged(self) -> int:
-        """How many robots have been frozen so far, those that have been reset since included."""
+        """Number of robots that have been frozen so far, including robots that have been reset since."""
         return int(self._arrays["failures"].sum()) + int(self.diverged.sum())
 
     @property
     def n_retried(self) -> int:
-        """How many sub-steps robots have made in parts, see `retry`; how many steps "adaptive" has refused."""
+        """Number of halved sub-steps, see `SceneOptions.retry`; with method "adaptive", number of refused steps."""
         return int(self._read("retries").sum())
 
     @property
     def steps(self) -> Steps:
-        """What steps each robot has made so far, of method "adaptive"; ValueError for others."""
+        """Steps of each robot so far, with method "adaptive"; other methods raise a ValueError."""
         if "step_length" not in self._arrays:
             raise ValueError(f"method={self.options.method!r} makes no steps of its own; expected 'adaptive'")
         names = {"taken": "steps_taken", "refused": "retries", "missed": "steps_missed", "length": "step_length"}
@@ -341,7 +347,7 @@ class Simulator:
         return chosen
 
     def _resting_load(self, q: ArrayLike) -> NDArray:
-        """Return the springs' forces on the contacts [N], shape (..., n_contacts): what friction has to go by."""
+        """Return the forces of the contacts' springs, for the first friction cone [N], shape (..., n_contacts)."""
         stiffness: float | NDArray = self.options.material.stiffness
         if "stiffness" in self._columns:
             rows = to_numpy(self._batch.rows("parameters"))

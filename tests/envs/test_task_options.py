@@ -172,7 +172,7 @@ def test_headings_are_turned_to():
         ({"rewards": ["torques"]}, r"rewards=\['torques'\]; expected weights, or mappings"),
         ({"rewards": {"torques": float("nan")}}, r"rewards\['torques'\]=nan; expected a finite number"),
         ({"observations": ["smell"]}, "no observation term 'smell'; expected one of"),
-        ({"observations": []}, r"observations=\[\]; expected at least one name"),
+        ({"observations": []}, r"observations=\(\); expected at least one name"),
         ({"terminations": ["boredom"]}, "no termination term 'boredom'"),
         ({"metrics": ["luck"]}, "no metric term 'luck'"),
         ({"critic": ["luck"]}, "no observation term 'luck'"),

@@ -26,13 +26,6 @@ def terms(name: str, value: Any) -> Any:
     return parameters
 
 
-def some_terms(name: str, value: Any) -> Any:
-    """Check terms, at least one."""
-    listed = terms(name, value)
-    check(name, value, len(listed) > 0, "at least one name")
-    return listed
-
-
 def list_of_names(name: str, value: Any) -> tuple[str, ...]:
     """Check a list of names."""
     items = tuple(_sequence(name, value))
@@ -80,14 +73,14 @@ def magnitudes(known: Collection[str] = ()) -> Check:
 
 
 def merged_rewards(old: Mapping[str, Any], given: Any) -> dict[str, Any]:
-    """Return reward terms of a task with some replaced or added, those of weight 0 left out.
+    """Return reward terms of a task with some replaced or added, and without terms of weight 0.
 
     Args:
-        old: What the task has, a weight or a mapping of `weight` and parameters by the name of the term.
-        given: What a user gave, likewise; parameters alone leave the weight as it was.
+        old: Rewards of the task: a weight, or a mapping of `weight` and parameters, by the name of the term.
+        given: Rewards of a user, in the same form; parameters alone keep the weight of the task.
 
     Raises:
-        ValueError: If it is nothing of the kind, or a term of weight 0 does not exist.
+        ValueError: If `given` has another form, or a term of weight 0 does not exist.
     """
     check("rewards", given, isinstance(given, Mapping), "weights, or mappings of weight and parameters, by name")
     rewards = dict(old)
@@ -110,7 +103,7 @@ def number(name: str, value: Any) -> float:
     """Return a finite number.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If the value is not a finite number.
     """
     check(name, value, is_number(value), "a finite number")
     return float(value)
