@@ -79,7 +79,7 @@ class SceneOptions(Options):
 
 @dataclass(frozen=True)
 class StepOptions(SceneOptions):
-    """Options of the steps of one robot: its scene options with names resolved, and what the scene adds to them.
+    """Scene options with names resolved for one robot, and further options of its steps.
 
     Attributes:
         dt: Length of the step [s], a constant of the traced step; None makes it an input, as in kernels.
