@@ -21,7 +21,7 @@ from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
 from ce_gym.envs.runtime.symmetry import Symmetry, left_right
-from ce_gym.sim.arguments import check, check_choice
+from ce_gym.model.arguments import check, check_choice
 from ce_gym.sim.batch import File, Snapshot
 from ce_gym.sim.devices import Array
 

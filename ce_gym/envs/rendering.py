@@ -14,7 +14,7 @@ from gymnasium import logger
 from numpy.typing import NDArray
 
 from ce_gym.envs.runtime.batch import TaskBatch
-from ce_gym.sim.arguments import check_whole
+from ce_gym.model.arguments import check_whole
 
 RENDER_MODES = ("human", "rgb_array")
 

@@ -15,7 +15,7 @@ from ce_gym.envs.base import BaseEnv, check_options, checked_action, spaces
 from ce_gym.envs.rendering import RENDER_MODES
 from ce_gym.envs.runtime.batch import Outcome
 from ce_gym.envs.runtime.setup import make_batch
-from ce_gym.envs.task.checks import checked_value
+from ce_gym.model.arguments import check_whole
 from ce_gym.sim.devices import Array, Device, device_named
 
 
@@ -76,7 +76,7 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         if place.fuses and render_mode is not None:
             raise ValueError(f"render_mode={render_mode!r}; expected None on device {place.name!r}")
         if max_episode_steps is not None:
-            checked_value("max_episode_steps", max_episode_steps, 1)
+            check_whole("max_episode_steps", max_episode_steps, 1)
         self._attach(make_batch(robot, task, num_envs=num_envs, device=place, **kwargs), task, arguments)
         program, self.num_envs = self.batch.program, num_envs
         self.max_episode_steps = max_episode_steps or program.task.episode_length

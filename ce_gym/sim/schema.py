@@ -20,7 +20,7 @@ from ce_gym.dynamics.laws.scene_laws import output_sizes, state_fields
 from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.step_size import control_sizes
-from ce_gym.sim.arguments import check, is_number
+from ce_gym.model.arguments import check
 from ce_gym.sim.devices import Array
 from ce_gym.sim.substeps import DT, FRAME
 
@@ -58,7 +58,7 @@ class Row:
 
 
 def physics_rows(
-    model: Model, options: StepOptions, outputs: Sequence[str], dt: float, tolerance: float = TOLERANCE
+    model: Model, options: StepOptions, outputs: Sequence[str], dt: float, tolerance: float | None = None
 ) -> list[Row]:
     """Return the rows of what the sub-steps of a scene read and write.
 
@@ -67,14 +67,13 @@ def physics_rows(
         options: The scene.
         outputs: What is computed besides the state.
         dt: Length of a sub-step [s].
-        tolerance: Of a method with steps of its own [rad or m].
+        tolerance: Of a method with steps of its own [rad or m]; `TOLERANCE` if None.
     """
     start = {"q": model.standing_q, "dependent": model.guess}
     fields = state_fields(model.mechanism, options)
     if isinstance(METHODS[options.method].end, Rates):
         for field in fields:
             check("method", options.method, field.explicit, f"an implicit one: the state has the {field.meaning}")
-    check_control_period(options, dt)
     turns = {"q": tuple(i for i, _ in model.robot.layout.turns)}
     rows = [
         Row(field.name, field.size, "physics", start.get(field.name, 0.0), quaternions=turns.get(field.name, ()))
@@ -91,23 +90,9 @@ def physics_rows(
         first = {"step_length": dt / FIRST}
         sizes = control_sizes(model.robot.layout)
         rows += [Row(name, size, "physics", first.get(name, 0.0)) for name, size in sizes.items() if name != TOLERATED]
-        rows.append(Row(TOLERATED, 1, "scene", tolerance))
+        rows.append(Row(TOLERATED, 1, "scene", TOLERANCE if tolerance is None else tolerance))
     rows.append(Row(DT, 1, "scene", dt))
     return rows + ([Row(FRAME, 3, "host")] if options.ground == "field" else [])
-
-
-def check_control_period(options: StepOptions, dt: float) -> None:
-    """Refuse a period of controllers that steps of a length [s] do not come to, or of controllers that there are not.
-
-    Raises:
-        ValueError: It is not 0 and not a multiple of the step, or control is of torques, or steps have other lengths.
-    """
-    period = options.control_period
-    steps = period / dt if is_number(period) else -1.0
-    fits = 0 <= steps < np.inf and abs(steps - round(steps)) < 1e-6 * max(steps, 1.0)
-    check("control_period", period, fits, f"0, or a multiple of dt={dt:g} s: faster controllers are as those of 0")
-    follows = options.control.endswith("position") and not METHODS[options.method].controlled
-    check("control_period", period, period == 0 or follows, "0, but for control of positions in steps of one length")
 
 
 def state_buffers(rows: Iterable[Row]) -> list[Buffer]:
@@ -132,12 +117,3 @@ class Steps:
     missed: Array
     length: Array
     error: Array
-
-
-def checked_tolerance(method: str, tolerance: float | None) -> float:
-    """Return the tolerance of a method [rad or m], `TOLERANCE` if None; ValueError if it has none or it is none."""
-    controlled = METHODS[method].controlled
-    check("tolerance", tolerance, controlled or tolerance is None, f"None, because method is {method!r}")
-    found = TOLERANCE if tolerance is None else tolerance
-    check("tolerance", tolerance, is_number(found) and 1e-9 <= found <= 1, "between 1e-9 and 1 rad or m")
-    return found

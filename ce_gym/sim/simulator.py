@@ -1,46 +1,43 @@
 """`Simulator`: many copies of one robot, stepped together by one compiled kernel.
 
-Holds state arrays and knows when to call the kernel; the physics is `ce_gym.dynamics.stepping.step`, the
-machine code comes from `ce_gym.compile`.
+`Simulator` holds the state arrays and calls the kernel. `ce_gym.dynamics.stepping.step` has the physics, and
+`ce_gym.compile` makes the machine code.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, get_args
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import CriticalSection
-from ce_gym.dynamics.forces.friction import FRICTION
-from ce_gym.dynamics.forces.motors import MOTORS
-from ce_gym.dynamics.forces.normal import NORMAL_LAWS
-from ce_gym.dynamics.forces.scene import Control, StepOptions, target_names
-from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.forces.scene import SceneOptions, target_names
 from ce_gym.dynamics.laws.scene_laws import OUTPUTS, state_fields
 from ce_gym.dynamics.laws.scene_parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.parameter_effects import check_effects
 from ce_gym.model import ContactMaterial
+from ce_gym.model.arguments import check, check_choice, check_shape, check_whole
 from ce_gym.model.checks.collisions import colliding
 from ce_gym.model.errors import check_names, listed_names
-from ce_gym.sim.arguments import check, check_choice, check_shape, check_whole
+from ce_gym.model.options import check_fields
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.ground_clearance import GroundClearance
 from ce_gym.sim.interruptible_runs import longest_run, run_substeps
-from ce_gym.sim.kernels import load_step_kernel, select_contacts, select_pairs
-from ce_gym.sim.schema import Row, Steps, checked_tolerance, physics_rows
+from ce_gym.sim.kernels import load_step_kernel
+from ce_gym.sim.scene import resolve_scene
+from ce_gym.sim.schema import Row, Steps, physics_rows
 from ce_gym.sim.terrain import Terrain
-from ce_gym.sim.terrain.hulls import hulls_on
 
 FAILURES = Row("failures", 0, "host", dtype="int64")
-"""How often a robot has diverged and been set anew, and how often it has been stepped again."""
+"""How many times each robot has diverged and been reset."""
 
 
 def _reading(name: str, document: str, scalar: bool = False) -> property:
-    """Return a property that reads a state buffer or an output; `scalar` if it is one number of each robot."""
+    """Return a property that reads a state buffer or an output; `scalar` for one number per robot."""
 
     def read(sim: Simulator) -> Array:
         rows = sim._read(name)
@@ -55,39 +52,26 @@ class Simulator:
     Args:
         model: The robot at a transmission level.
         num_envs: Number of robots.
-        dt: Length of a sub-step [s]; the default method is stable to 10 ms and more.
+        dt: Length of a sub-step [s]; the `dt` of `scene` if None.
         dtype: "float64" or "float32" for state and arithmetic.
-        num_threads: Threads the robots are split over; results do not depend on it.
-        control: What `target` means: "position" for joint positions [rad] through the robot's PD gains, "torque" for
-            joint torques [N m]; "motor_position" and "motor_torque" for the same of the motors' rotors.
-        contacts: Which contact spheres can touch the ground: "all", or names of groups such as "foot" or of spheres.
+        num_threads: Number of threads; results do not depend on the number.
+        scene: How contacts, motors and time steps are simulated; the default options if None.
+        control: Meaning of `target`: "position" for joint positions [rad] through the robot's PD gains, "torque" for
+            joint torques [N m]; "motor_position" and "motor_torque" for angles and torques of the motors' rotors.
         material: Compliance and friction of the contacts; the robot's own if None.
-        outputs: Which of "torque", "motor_torque", "motor_speed", "power", "contact_forces", "energy", "error",
-            "loop_gap", "nearness", "winding_temperature", "battery_voltage" to compute; others read as errors.
-        method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
-            scenes); or "adaptive": every robot advances by `dt` in extrapolated steps of its own, which are as long as
-            `tolerance` allows.
-        tolerance: Of "adaptive", the error of positions that is asked for [rad or m]; 1e-3 if None.
-        normal_law: "kelvin_voigt" or "hunt_crossley", of the contacts' normal force; that of the material if None.
-        friction: "tangent" iterates where a contact changes between stick and slip; "secant" is faster and slow to
-            break away.
-        motors: "ideal" for the joints' torque limits; "limited" for torque, torque-speed line and friction of the
-            motors themselves.
-        parameters: Names of figures that can then differ from robot to robot, see `set_parameter`.
+        outputs: Quantities to compute: some of "torque", "motor_torque", "motor_speed", "power", "contact_forces",
+            "energy", "error", "loop_gap", "nearness", "winding_temperature", "battery_voltage". Reading another one
+            raises a ValueError.
+        parameters: Names of physical parameters that can then differ from robot to robot, see `set_parameter`.
         terrain: The ground; the plane z = 0 if None, which is faster.
-        self_collisions: Which links push each other apart: "listed" for the pairs of the robot's file, "all" for pairs
-            of links that are neither adjacent nor in each other in the standing pose, or pairs of names.
-        seldom: Contacts, as in `contacts`, that are computed only where they are near the ground, such as "knee"; while
-            they are not near, that saves their time.
-        retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move too far, see
-            `ce_gym.dynamics.stepping.halving.LARGEST_MOVE`; it alone then makes the sub-step in parts.
-        control_period: Controllers of positions look every so often, a multiple of `dt`, and hold their torques in
-            between [s]; 0 for controllers so fast that they never stop looking.
-        device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and what is read are torch tensors.
+        device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and outputs are torch tensors.
+        **options: New values of fields of `scene`, such as `contacts="foot"`.
 
     Attributes:
         device: Name of the device.
-        target_names: What each entry of a target is for: joints, or the motors' rotors and then joints without one.
+        scene: The scene options, with the new values of `options`.
+        target_names: Joint of each entry of a target; for control at the motors, the rotors and then the joints without
+            a motor.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -106,64 +90,39 @@ class Simulator:
         self,
         model: Model,
         num_envs: int = 1,
-        dt: float = 0.005,
+        dt: float | None = None,
         dtype: str = "float64",
         num_threads: int = 1,
         *,
+        scene: SceneOptions | None = None,
         control: str = "position",
-        contacts: str | Sequence[str] = "all",
         material: ContactMaterial | None = None,
         outputs: Sequence[str] = ("torque", "contact_forces"),
-        method: str = "euler",
-        tolerance: float | None = None,
-        normal_law: str | None = None,
-        friction: str = "tangent",
-        motors: str = "ideal",
         parameters: Sequence[str] = (),
         terrain: Terrain | None = None,
-        self_collisions: str | Sequence[Sequence[str]] = (),
-        seldom: str | Sequence[str] = (),
-        retry: int = 6,
-        control_period: float = 0.0,
         device: str | Device = "cpu",
+        **options: Any,
     ) -> None:
-        self._made_with = {name: value for name, value in locals().items() if name != "self"}
+        arguments = {name: value for name, value in locals().items() if name not in ("self", "options")}
+        self._made_with = arguments | options
         check_whole("num_envs", num_envs, 1)
         check_whole("num_threads", num_threads, 1)
-        check("dt", dt, 0 < dt <= 0.1, "between 0 and 0.1 s")
-        check("retry", retry, 0 <= retry <= 10, "between 0 and 10 halvings of the step")
+        check("scene", scene, scene is None or isinstance(scene, SceneOptions), "SceneOptions or None")
         check("terrain", terrain, terrain is None or isinstance(terrain, Terrain), "a Terrain or None")
-        choices: dict[str, Iterable[object]] = {"dtype": ("float64", "float32"), "control": get_args(Control)}
-        choices |= {"method": METHODS, "friction": FRICTION, "motors": MOTORS, "normal_law": (None, *NORMAL_LAWS)}
-        for argument, known in choices.items():
-            check_choice(argument, self._made_with[argument], known)
+        check_choice("dtype", dtype, ("float64", "float32"))
         check_names("outputs", outputs, OUTPUTS, "one of")
+        check_fields(SceneOptions, options, others=arguments)
         defaults = parameter_defaults(model.robot, material or model.robot.material, parameters)
-        self.tolerance = checked_tolerance(method, tolerance)
+        given = options if dt is None else {"dt": dt, **options}
+        self.scene = SceneOptions(**(scene or SceneOptions()).shared | given)
+        self.options = resolve_scene(self.scene, model, terrain, control, parameters, material)
+        check_effects(model.mechanism, self.options)
         self._device = device_named(device)
         self.device = self._device.name
-        self.model, self.num_envs, self.dt, self.terrain = model, num_envs, dt, terrain
+        self.model, self.num_envs, self.dt, self.terrain = model, num_envs, self.scene.dt, terrain
         self.dtype, self.num_threads = dtype, num_threads
-        self.contact_names = select_contacts(model.robot, contacts)
-        hulls = hulls_on(model.robot, self.contact_names, terrain)
-        self._placement = GroundClearance(model, self.contact_names, terrain, hulls)
-        self.options = StepOptions(
-            control=control,  # type: ignore[arg-type]
-            contacts=self.contact_names,
-            material=material or model.robot.material,
-            normal_law=normal_law,
-            friction=friction,
-            method=method,
-            motors=motors,
-            ground="field" if terrain is not None and self.contact_names else "flat",
-            parameters=tuple(parameters),
-            self_collisions=select_pairs(model.mechanism, self_collisions),
-            seldom=tuple(name for name in select_contacts(model.robot, seldom, "seldom") if name in self.contact_names),
-            retry=retry,
-            control_period=control_period,
-            hulls=hulls,
-        )
-        check_effects(model.mechanism, self.options)
+        self.contact_names = self.options.contacts
+        self._placement = GroundClearance(model, self.contact_names, terrain, self.options.hulls)
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
@@ -171,7 +130,7 @@ class Simulator:
         fields = state_fields(model.mechanism, self.options)
         self._memory = [field for field in fields if field.name not in ("q", "v", "dependent")]
         ground = terrain if self.options.ground == "field" else None
-        rows = [*physics_rows(model, self.options, asked, dt, self.tolerance), FAILURES]
+        rows = [*physics_rows(model, self.options, asked, self.dt, self.scene.tolerance), FAILURES]
         self._batch = Batch(rows, num_envs, dtype, self._device, ground)
         self._arrays = self._batch.arrays
         ends = np.cumsum([0, *(len(default) for default in defaults.values())])
@@ -182,7 +141,7 @@ class Simulator:
         """Put robots at rest into the standing pose, on terrain as high as their contacts need.
 
         Args:
-            mask: Which robots, bool, shape (num_envs,); all of them if None.
+            mask: Which robots, bool, shape (num_envs,); all robots if None.
         """
         q = self.model.standing_q.copy()
         if self.model.robot.floating:
@@ -195,7 +154,7 @@ class Simulator:
         Args:
             q: Positions, shape (num_envs, nq) or (nq,).
             v: Velocities, shape (num_envs, nv) or (nv,).
-            mask: Which robots, bool, shape (num_envs,); all of them if None.
+            mask: Which robots, bool, shape (num_envs,); all robots if None.
 
         Raises:
             ValueError: If a shape is wrong, a number is not finite, the norm of a quaternion is not within 1e-3 of 1,
@@ -225,18 +184,18 @@ class Simulator:
             self._batch.write("failures", failures, chosen)
 
     def step(self, target: ArrayLike, n_substeps: int = 1) -> None:
-        """Advance all robots by `n_substeps` sub-steps, or none of them by any.
+        """Advance all robots by `n_substeps` sub-steps.
 
-        Ctrl-C waits for the end of a short call; a long one is taken back, within a second.
+        Ctrl-C waits for the end of a short call. It stops a long call within a second and restores the state before.
 
         Args:
-            target: Positions [rad] or torques [N m], shape (num_envs, n) or (n,), in the order of `target_names`:
-                that of `model.joint_links` unless the motors are controlled.
-                On a GPU they are not checked for NaN, because that would need waiting.
+            target: Positions [rad] or torques [N m], shape (num_envs, n) or (n,), in the order of `target_names`, which
+                is the order of `model.joint_links` unless the motors are controlled. Targets on a GPU are not checked
+                for NaN, because that would need waiting.
             n_substeps: Number of sub-steps of length `dt`; 0 does nothing.
 
         Raises:
-            ValueError: If a shape is wrong, a target is not finite, or `n_substeps` is no such number.
+            ValueError: If a shape is wrong, a target is not finite, or `n_substeps` is not a whole number from 0.
             RuntimeError: If another thread steps or sets the same robots.
         """
         n = len(self.target_names)
@@ -250,7 +209,7 @@ class Simulator:
             self._advance({"target": rows}, n_substeps)
 
     def _advance(self, given: dict[str, Array], n_substeps: int) -> None:
-        """Step all robots; the state is as before if that raises, by Ctrl-C in a long call."""
+        """Step all robots; if Ctrl-C interrupts a long call, restore the state before."""
         keep = n_substeps > longest_run(self.num_envs)
         before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
         arrays = self._arrays | self._batch.tables | given
@@ -262,14 +221,14 @@ class Simulator:
             raise
 
     def set_parameter(self, name: str, value: ArrayLike, mask: ArrayLike | None = None) -> None:
-        """Set a figure that was declared in `parameters`.
+        """Set a physical parameter that was declared in `parameters`.
 
         Args:
             name: "gravity", "friction", "slip_speed", "stiffness", "damping", "kp", "kd", "motor_strength",
                 "rotor_inertia", "ratio", "added_mass:BODY" or "com_shift:BODY"; sizes and units are in
                 `ce_gym.dynamics.laws.scene_laws.PARAMETERS`.
             value: Shape (num_envs, size) or (size,) or ().
-            mask: Which robots, bool, shape (num_envs,); all of them if None.
+            mask: Which robots, bool, shape (num_envs,); all robots if None.
 
         Raises:
             ValueError: If the parameter was not declared, a shape is wrong, or a number is out of range.
@@ -287,10 +246,10 @@ class Simulator:
             self._batch.write("parameters", rows, chosen)
 
     def snapshot(self, file: File | None = None) -> Snapshot:
-        """Return all that the robots carry, from which `restore` continues bit for bit.
+        """Return the state of all robots, from which `restore` continues bit for bit.
 
         Args:
-            file: Where to write it besides, as `.npz`.
+            file: Name of an `.npz` file to write, too.
 
         Returns:
             Arrays by name, a row for each robot, copies in the memory of the CPU.
@@ -298,13 +257,13 @@ class Simulator:
         return self._batch.snapshot(file)
 
     def restore(self, snapshot: Snapshot | File) -> None:
-        """Continue from a snapshot of such a simulator.
+        """Continue from a snapshot of a simulator of the same robot, number of robots and scene.
 
         Args:
-            snapshot: What `snapshot` returned, or the name of the file that it wrote.
+            snapshot: Result of `snapshot`, or the name of its file.
 
         Raises:
-            ValueError: If it is of other robots or another scene.
+            ValueError: If the snapshot is of other robots or another scene.
         """
         with self._section:
             self._batch.restore(snapshot)
@@ -318,9 +277,13 @@ class Simulator:
     q = _reading("q", "Positions, a copy, shape (num_envs, nq).")
     v = _reading("v", "Velocities, a copy, shape (num_envs, nv).")
     torque = _reading("torque", "Motor torques at the joints, mean of the last sub-step [N m], shape (num_envs, nj).")
-    motor_torque = _reading("motor_torque", "Of motors' windings, before losses [N m], shape (num_envs, n_motors).")
+    motor_torque = _reading(
+        "motor_torque", "Torques of motors' windings, before losses [N m], shape (num_envs, n_motors)."
+    )
     motor_speed = _reading("motor_speed", "Speeds of motors' rotors after a step [rad/s], shape (num_envs, n_motors).")
-    winding_temperature = _reading("winding_temperature", "Of motors that grow warm [deg C], shape (num_envs, n_warm).")
+    winding_temperature = _reading(
+        "winding_temperature", "Windings of motors with heat [deg C], shape (num_envs, n_warm)."
+    )
     battery_voltage = _reading("battery_voltage", "Voltage of the battery after a step [V], shape (num_envs,).", True)
     power = _reading("power", "Mechanical power of the motors at the joints after a step [W], shape (num_envs, nj).")
     error = _reading("error", "Estimated error of the last sub-step in `v` [rad/s or m/s], shape (num_envs,).", True)
@@ -330,22 +293,22 @@ class Simulator:
 
     @property
     def diverged(self) -> Array:
-        """Robots whose state went out of bounds; they stay frozen at their last good state, shape (num_envs,)."""
+        """Robots whose state went out of bounds, frozen at their last good state, shape (num_envs,)."""
         return self._read("diverged")[:, 0] > 0.5
 
     @property
     def n_diverged(self) -> int:
-        """How many robots have been frozen so far, those that have been reset since included."""
+        """Number of robots that have been frozen so far, including robots that have been reset since."""
         return int(self._arrays["failures"].sum()) + int(self.diverged.sum())
 
     @property
     def n_retried(self) -> int:
-        """How many sub-steps robots have made in parts, see `retry`; how many steps "adaptive" has refused."""
+        """Number of halved sub-steps, see `SceneOptions.retry`; with method "adaptive", number of refused steps."""
         return int(self._read("retries").sum())
 
     @property
     def steps(self) -> Steps:
-        """What steps each robot has made so far, of method "adaptive"; ValueError for others."""
+        """Steps of each robot so far, with method "adaptive"; other methods raise a ValueError."""
         if "step_length" not in self._arrays:
             raise ValueError(f"method={self.options.method!r} makes no steps of its own; expected 'adaptive'")
         names = {"taken": "steps_taken", "refused": "retries", "missed": "steps_missed", "length": "step_length"}
@@ -384,7 +347,7 @@ class Simulator:
         return chosen
 
     def _resting_load(self, q: ArrayLike) -> NDArray:
-        """Return the springs' forces on the contacts [N], shape (..., n_contacts): what friction has to go by."""
+        """Return the forces of the contacts' springs, for the first friction cone [N], shape (..., n_contacts)."""
         stiffness: float | NDArray = self.options.material.stiffness
         if "stiffness" in self._columns:
             rows = to_numpy(self._batch.rows("parameters"))

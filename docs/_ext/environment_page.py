@@ -5,10 +5,11 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import Field, fields
 from typing import Any
 
+from ce_gym.dynamics.forces.scene import SceneOptions
 from ce_gym.envs.registration import STRETCHING, camel_case
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.setup import make_program
@@ -175,10 +176,17 @@ def _info(program: TaskProgram) -> str:
 def _arguments(task: Task) -> Iterable[tuple[str, str, str]]:
     for name, (default, meaning) in FIRST.items():
         yield f"`{name}`", f"`{default}`", meaning
-    described = attributes_of(inspect.getdoc(Task) or "")
-    for field in fields(Task):
+    for field, meaning in task_fields():
         if field.name not in ("rewards", "metrics"):
-            yield f"`{field.name}`", f"`{plain(getattr(task, field.name))}`", described[field.name]
+            yield f"`{field.name}`", f"`{plain(getattr(task, field.name))}`", meaning
+
+
+def task_fields() -> Iterator[tuple[Field, str]]:
+    """Yield each field of tasks with its meaning, scene options last."""
+    meanings = attributes_of(inspect.getdoc(SceneOptions) or "") | attributes_of(inspect.getdoc(Task) or "")
+    of_scene = {field.name for field in fields(SceneOptions)}
+    for field in sorted(fields(Task), key=lambda field: field.name in of_scene):
+        yield field, meanings[field.name]
 
 
 def plain(value: Any) -> str:

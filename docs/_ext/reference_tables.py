@@ -11,18 +11,18 @@ import ast
 import inspect
 import re
 from collections.abc import Iterator
-from dataclasses import MISSING, fields
+from dataclasses import MISSING
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import yaml
-from environment_page import attributes_of, plain, table
+from environment_page import attributes_of, plain, table, task_fields
 
 from ce_gym.__main__ import _parser
 from ce_gym.bench.measure.report import Report, cell_text, read_report
 from ce_gym.dynamics.laws.scene_laws import OUTPUTS, PARAMETERS
-from ce_gym.envs.task.tasks import RANDOMISED, Task
+from ce_gym.envs.task.tasks import RANDOMISED
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.registry import OWN
 
@@ -58,15 +58,15 @@ def context() -> str:
 
 def task_arguments() -> str:
     """Return the table of a task's arguments with defaults, and the table of figures that can be randomised."""
-    described, rows = attributes_of(inspect.getdoc(Task) or ""), []
-    for field in fields(Task):
+    rows = []
+    for field, meaning in task_fields():
         if field.default is not MISSING:
             default = f"`{plain(field.default)}`"
         elif field.default_factory is not MISSING:
             default = f"`{plain(field.default_factory())}`"
         else:
             default = "of the task"
-        rows.append((f"`{field.name}`", default, described[field.name]))
+        rows.append((f"`{field.name}`", default, meaning))
     drawn = []
     for name, text in RANDOMISED.items():
         unit = re.search(r"\[([^\]]+)\]", text)

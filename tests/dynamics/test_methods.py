@@ -44,7 +44,7 @@ def swinging_robot() -> Robot:
 
 def run(method: str, dt: float, time: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
     model = Model(swinging_robot())
-    step = step_function(model.mechanism, StepOptions(dt, "torque", method=method))
+    step = step_function(model.mechanism, StepOptions(dt, control="torque", method=method))
     start = ca.vertcat(
         *[0.0, 0.0, 0.0], *(np.array([0.9, 0.1, -0.3, 0.2]) / np.linalg.norm([0.9, 0.1, -0.3, 0.2])), 0.3, -0.4
     )
@@ -57,7 +57,7 @@ def run(method: str, dt: float, time: float = 0.4) -> tuple[np.ndarray, np.ndarr
 @pytest.mark.parametrize("method", METHODS)
 def test_a_length_that_is_an_input_makes_the_same_step(method: str):
     """Stages of length 0 too: they divide by no symbol that happens to be 0."""
-    mechanism, options = Model(swinging_robot()).mechanism, StepOptions(0.01, "torque", method=method)
+    mechanism, options = Model(swinging_robot()).mechanism, StepOptions(0.01, control="torque", method=method)
     fixed, free = step_function(mechanism, options), step_function(mechanism, replace(options, dt=None))
     given = {"q": ca.DM([0, 0, 0, 0.8, 0, 0.6, 0, 0.3, -0.4]), "v": ca.DM([1, -2, 3, 0.5, 0.2, -0.1, 2, -3])}
     given |= {"diverged": 0.0, "target": ca.DM([0.3, -0.2])}
@@ -95,7 +95,8 @@ def test_extrapolation_keeps_its_order_where_a_foot_slides_and_turns():
     start = {"q": ca.DM([0, 0, 0.319, 1, 0, 0, 0]), "v": ca.DM([0, 5.0, 0, -0.3, 0, 0]), "load": ca.DM([10.0])}
 
     def end(dt: float) -> np.ndarray:
-        step = step_function(model.mechanism, StepOptions(dt, "torque", ("foot",), material, method="extrapolated"))
+        options = StepOptions(dt, control="torque", contacts=("foot",), material=material, method="extrapolated")
+        step = step_function(model.mechanism, options)
         names = [name for name in step.name_in() if f"{name}_next" in step.name_out()]
         path = step.mapaccum("path", round(0.02 / dt), names, [f"{name}_next" for name in names])
         given = {name: start.get(name, ca.DM.zeros(step.size1_in(name))) for name in names}
@@ -123,7 +124,7 @@ def test_error_estimate_of_the_extrapolated_step():
     v, target = np.array([1.0, -2.0, 3.0, 0.5, 0.2, -0.1, 2.0, -3.0]), np.array([0.3, -0.2])
     ends = {}
     for method, dt, n in (("rk8", 0.002, 1), ("extrapolated", 0.002, 1), ("euler", 0.001, 2)):
-        step = step_function(model.mechanism, StepOptions(dt, "torque", method=method), ("error",))
+        step = step_function(model.mechanism, StepOptions(dt, control="torque", method=method), ("error",))
         state = {"q": q, "v": v, "diverged": 0.0}
         for _ in range(n):
             result = step(**state, target=target)
@@ -141,7 +142,7 @@ def test_free_flight_keeps_its_momentum(method: str):
         swinging_robot(), gravity=(0.0, 0.0, 0.0), bodies=swinging_robot().bodies[:1], constraints=(), independent=()
     )
     model = Model(robot)
-    step = step_function(model.mechanism, StepOptions(0.01, "torque", method=method))
+    step = step_function(model.mechanism, StepOptions(0.01, control="torque", method=method))
     state = {
         "q": np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]),
         "v": np.array([3.0, -2.0, 5.0, 0.4, 0.2, -0.3]),

@@ -100,7 +100,9 @@ def test_a_parameter_acts_or_is_refused(make, level: str, motors: str, control: 
     robot = make()
     model, names = Model(robot, level), tuple(names_of(robot))
     feet = tuple(contact.name for contact in robot.contacts if contact.group == "foot")
-    options = StepOptions(0.004, control, feet, robot.material, motors=motors, parameters=names)  # type: ignore[arg-type]
+    options = StepOptions(
+        0.004, control=control, contacts=feet, material=robot.material, motors=motors, parameters=names
+    )  # type: ignore[arg-type]
     accepted = set()
     for name in names:
         with suppress(ValueError):

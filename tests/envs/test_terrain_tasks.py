@@ -357,8 +357,8 @@ def test_specs_survive_json():
         ({"terrain": {"kind": "slope", "angle": 2.0}}, r"terrain\['angle'\]=2.0; expected an angle"),
         ({"terrain": {"kind": "slope", "curriculum": 1}}, r"terrain\['curriculum'\]=1; expected true or false"),
         ({"terrain": {"kind": "slope", "size": 8000.0}}, "terrain has .* heights; expected at most"),
-        ({"command_curriculum": 0}, "command_curriculum=0; expected a share above 0 and up to 1"),
-        ({"command_curriculum": 1.5}, "command_curriculum=1.5; expected a share"),
+        ({"command_curriculum": 0}, "command_curriculum=0; expected a positive number, at most 1"),
+        ({"command_curriculum": 1.5}, "command_curriculum=1.5; expected a positive number, at most 1"),
     ],
 )
 def test_bad_arguments(arguments: dict, message: str):

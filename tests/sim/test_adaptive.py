@@ -53,7 +53,7 @@ def falling(sim: Simulator, heights: np.ndarray) -> None:
 def test_the_error_follows_the_tolerance_over_four_decades():
     """In proportion, within a factor: the estimate is of the order of the error that is left after a given time."""
     model, (q, v) = pendulum(), (np.array([1.0, -0.5]), np.array([2.0, 0.0]))
-    step = step_function(model.mechanism, StepOptions(INTERVAL / 10, "torque", method="rk8"))
+    step = step_function(model.mechanism, StepOptions(INTERVAL / 10, control="torque", method="rk8"))
     state = {"q": ca.DM(q), "v": ca.DM(v), "diverged": 0.0}
     for _ in range(250):
         result = step(**state, target=ca.DM([0.0, 0.0]))
@@ -244,7 +244,7 @@ def test_what_does_not_fit_is_refused_in_one_line():
     with pytest.raises(ValueError, match=r"^tolerance=0.001; expected None, because method is 'euler'$"):
         Simulator(model, tolerance=1e-3)
     for bad in (0.0, -1.0, 2.0, np.nan, "small", True):
-        with pytest.raises(ValueError, match=r"^tolerance=.*; expected between 1e-9 and 1 rad or m$"):
+        with pytest.raises(ValueError, match=r"^tolerance=.*; expected a number between 1e-09 and 1 rad or m$"):
             Simulator(model, method="adaptive", tolerance=bad)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"^method='euler' makes no steps of its own; expected 'adaptive'$"):
         _ = Simulator(model).steps

@@ -25,7 +25,7 @@ from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, 
 from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.state import Field, Output, State
-from ce_gym.envs.task.checks import checked_value
+from ce_gym.envs.task.tasks import VELOCITY
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Motor, Placement, Robot
 from ce_gym.sim.kernel_key import laws_key
 
@@ -68,7 +68,7 @@ def test_a_friction_law(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ValueError, match="expected 'tangent' or 'secant' or 'oil'"):
         Simulator(Model(block()), friction="water")
     with pytest.raises(ValueError, match="expected 'tangent' or 'secant' or 'oil'"):
-        checked_value("friction", "water", "tangent")
+        replace(VELOCITY, friction="water")
 
 
 class Hardening:

@@ -164,5 +164,5 @@ def test_light_links_under_torques_that_a_step_cannot_follow(dtype: str):
 
 
 def test_a_wrong_number_of_halvings_is_refused(model: Model):
-    with pytest.raises(ValueError, match="retry=-1; expected between 0 and 10"):
+    with pytest.raises(ValueError, match="retry=-1; expected a whole number between 0 and 10"):
         Simulator(model, retry=-1)

@@ -129,7 +129,7 @@ def test_dropped_robots_come_to_rest(model: Model, dt: float, stiffness: float, 
     ("arguments", "message"),
     [
         ({"num_envs": 0}, "num_envs=0; expected a whole number, at least 1"),
-        ({"dt": -1.0}, "dt=-1.0; expected between 0 and 0.1 s"),
+        ({"dt": -1.0}, "dt=-1.0; expected a positive number, at most 0.1 s"),
         ({"dtype": "float16"}, "dtype='float16'; expected 'float64' or 'float32'"),
         ({"control": "velocity"}, "control='velocity'; expected 'position' or 'torque'"),
         ({"contacts": "wing"}, "contacts='wing'; expected 'all', groups or names among"),

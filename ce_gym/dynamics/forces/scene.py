@@ -3,60 +3,105 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.forces.friction import FRICTION
+from ce_gym.dynamics.forces.motors import MOTORS
+from ce_gym.dynamics.forces.normal import NORMAL_LAWS
 from ce_gym.dynamics.hulls import Hull, poles_of
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant
+from ce_gym.model.arguments import check
 from ce_gym.model.description import ContactMaterial, ContactSphere
 from ce_gym.model.mechanism import Mechanism
+from ce_gym.model.options import Options, names, number, one_of, option, optional, pairs_of_names, positive, whole
 
 Control = Literal["position", "torque", "motor_position", "motor_torque"]
 Ground = Literal["flat", "field"]
 
 
-@dataclass(frozen=True)
-class StepOptions:
-    """The contents of a scene and its time stepping.
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(Options):
+    """How contacts, motors and time steps are simulated; `Simulator` takes these options, a `Task` has them as fields.
 
     Attributes:
-        dt: Length of the step [s], a constant of the traced step; None makes it an input, which kernels have.
-        control: "position" for joint targets [rad or m] through the robot's gains, "torque" for joint torques;
-            "motor_position" and "motor_torque" for angles and torques of the motors' rotors instead.
-        contacts: Names of the contact spheres that can touch the ground.
-        material: Compliance and friction of the contacts.
-        normal_law: Name among `NORMAL_LAWS` of the contacts' normal force; None for the law of the material.
-        friction: Name among `FRICTION` of the contacts' friction law.
-        method: Name among `METHODS` of a time-stepping method.
-        motors: Name among `MOTORS` of the model of the motors.
-        ground: "flat" for the plane z = 0, "field" for a height and slope under each contact that the caller supplies.
-        parameters: Names of figures that are inputs rather than constants, see `PARAMETERS`.
-        self_collisions: Pairs of links that push each other apart.
-        seldom: Contacts that are looked at only where they are near, see `stepping/broad_phase.py`.
-        control_period: Of position control: it looks at joints or motors every so often and holds its torques in
-            between [s]; 0 for controllers that never stop, see `forces/motor_control.py`.
-        hulls: Convex shapes with further contacts between their corners, on a field.
-        retry: How often a kernel may halve a step for a robot that fails in it, see `stepping/halving.py`.
+        contacts: Contact spheres that can touch the ground: "all", or names of spheres or of groups such as "foot".
+        seldom: Contacts, as in `contacts`, that are computed only while they are near the ground, which saves time.
+        self_collisions: Links that push each other apart: "listed" for the pairs of the robot's file, "all" for links
+            that are not adjacent and do not overlap in the standing pose, or pairs of names.
+        normal_law: Normal force of contacts: "kelvin_voigt" or "hunt_crossley"; None for the law of the material.
+        friction: Friction of contacts: "tangent" iterates where a contact changes between stick and slip; "secant" is
+            faster and breaks away late.
+        motors: "ideal" for the torque limits of joints; "limited" for the torque limits, torque-speed lines and
+            friction of motors.
+        control_period: Sampling period of position controllers, which hold their torque between samples [s], a multiple
+            of `dt`; 0 for continuous controllers.
+        dt: Length of a sub-step [s]; the default method is stable to 10 ms and more.
+        method: "euler" (linearly implicit, order 1), "extrapolated" (order 2), "rk4" or "rk8" (explicit, for smooth
+            scenes), or "adaptive": extrapolated steps within each sub-step, as long as `tolerance` allows.
+        tolerance: Error of positions that a step of method "adaptive" may have [rad or m]; 1e-3 if None.
+        retry: How often a sub-step may be halved for a robot that diverges in it, or whose joints move too far, see
+            `ce_gym.dynamics.stepping.halving.LARGEST_MOVE`; the other robots of the batch keep the whole sub-step.
     """
 
-    dt: float | None = None
-    control: Control = "position"
+    contacts: str | tuple[str, ...] = option(names, "all")
+    seldom: str | tuple[str, ...] = option(names, ())
+    self_collisions: str | tuple[tuple[str, ...], ...] = option(pairs_of_names, ())
+    normal_law: str | None = option(optional(one_of(NORMAL_LAWS)), None)
+    friction: str = option(one_of(FRICTION), "tangent")
+    motors: str = option(one_of(MOTORS), "ideal")
+    control_period: float = option(number(0), 0.0)
+    dt: float = option(positive(0.1, "s"), 0.005)
+    method: str = option(one_of(METHODS), "euler")
+    tolerance: float | None = option(optional(number(1e-9, 1, "rad or m")), None)
+    retry: int = option(whole(0, 10), 6)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = METHODS[self.method].controlled or self.tolerance is None
+        check("tolerance", self.tolerance, known, f"None, because method is {self.method!r}")
+        if self.dt is None:  # in `StepOptions`
+            return
+        steps = self.control_period / self.dt
+        expected = f"0, or a multiple of dt={self.dt:g} s: faster controllers are as those of 0"
+        check("control_period", self.control_period, abs(steps - round(steps)) < 1e-6 * max(steps, 1.0), expected)
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The fields of this class by name, without fields that a subclass adds."""
+        return {each.name: getattr(self, each.name) for each in fields(SceneOptions)}
+
+
+@dataclass(frozen=True)
+class StepOptions(SceneOptions):
+    """Scene options with names resolved for one robot, and further options of its steps.
+
+    Attributes:
+        dt: Length of the step [s], a constant of the traced step; None makes it an input, as in kernels.
+        contacts: Names of contact spheres.
+        seldom: Names of contact spheres, see `stepping/broad_phase.py`.
+        self_collisions: Pairs of names of links.
+        control: Meaning of targets, see `ce_gym.Simulator`.
+        material: Compliance and friction of the contacts.
+        parameters: Names of parameters that are inputs rather than constants, see `PARAMETERS`.
+        ground: "flat" for the plane z = 0, "field" for a height and slope under each contact that the caller supplies.
+        hulls: Convex shapes with further contacts between their corners, on a field.
+    """
+
+    dt: float | None = None  # type: ignore[assignment]
+    _: KW_ONLY
     contacts: tuple[str, ...] = ()
-    material: ContactMaterial = field(default_factory=ContactMaterial)
-    normal_law: str | None = None
-    friction: str = "tangent"
-    method: str = "euler"
-    motors: str = "ideal"
-    ground: Ground = "flat"
-    parameters: tuple[str, ...] = ()
-    self_collisions: tuple[tuple[str, str], ...] = ()
     seldom: tuple[str, ...] = ()
-    control_period: float = 0.0
-    retry: int = 6
+    self_collisions: tuple[tuple[str, str], ...] = ()
+    control: Control = "position"
+    material: ContactMaterial = field(default_factory=ContactMaterial)
+    parameters: tuple[str, ...] = ()
+    ground: Ground = "flat"
     hulls: tuple[Hull, ...] = ()
 
     @property

@@ -17,7 +17,7 @@ from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, Step
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.runtime.spec import TaskSpec
 from ce_gym.envs.runtime.stages import OUTCOME, Stages
-from ce_gym.sim.schema import Row, checked_tolerance, physics_rows, state_buffers
+from ce_gym.sim.schema import Row, physics_rows, state_buffers
 from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
 HOST_ROWS = (
@@ -57,8 +57,7 @@ class TaskProgram(TaskSpec):
             "target": len(self.actions.targets) if late else 0,
             **self.curriculum.sizes,
         }
-        tolerance = checked_tolerance(self.task.method, self.task.tolerance)
-        physics = physics_rows(self.model, self.options, outputs, self.task.dt, tolerance)
+        physics = physics_rows(self.model, self.options, outputs, self.task.dt, self.task.tolerance)
         rows = [replace(row, writer="task") if row.name == "parameters" else row for row in (*physics, *HOST_ROWS)]
         rows += [Row(name, size, "task") for name, size in sizes.items() if size]
         rows += [Row(FRAME, 3, "host")] if self.ground and not self.contacts else []

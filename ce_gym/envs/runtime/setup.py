@@ -15,21 +15,18 @@ from ce_gym.compile.system import usable_cores
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
-from ce_gym.envs.task.checks import checked_value, merged_rewards
+from ce_gym.envs.task.checks import merged_rewards
 from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS, Task
+from ce_gym.model.arguments import check, check_choice, check_whole
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, invalid_value, listed_names, unknown_name
 from ce_gym.model.mechanism import ELASTIC, LEVELS
-from ce_gym.sim.arguments import check, check_choice, check_whole
+from ce_gym.model.options import check_fields
 from ce_gym.sim.devices import Device, device_named
 
 KNOWN = {**TASKS, **SKILLS}
 """Every task by name."""
-
-
-class UnknownArgument(TypeError, ValueError):
-    """An argument that nothing takes: Python's own kind of error, and a ValueError as all mistakes in arguments are."""
 
 
 def make_batch(
@@ -53,7 +50,7 @@ def make_batch(
         num_threads: Threads; the number of usable cores if None.
         device: "cpu", or "cuda" or "cuda:N" for a GPU.
         max_episode_steps: Control steps until time is up.
-        **arguments: What `make_program` takes besides.
+        **arguments: Further arguments of `make_program`.
 
     Raises:
         ValueError: If there is no such device, or an argument is not one of the choices.
@@ -83,10 +80,10 @@ def make_program(
         task: Name of a task.
         transmission: "exact", "coupled", "armature", "none" or "elastic".
         contact_forces: Whether contact forces are computed, for recording.
-        rewards: What replaces or adds to the rewards of the task, by the name of the term: a weight, 0 to remove it, or
-            a mapping of `weight` and parameters, such as `{"weight": 1.5, "width": 0.25}`.
-        **changes: Attributes of `Task` that replace those of the task, such as command_range, contacts, actions,
-            noise, history, latency, randomise, push_period or episode_length.
+        rewards: Rewards that replace or add to the rewards of the task, by the name of the term: a weight, 0 to remove
+            the term, or a mapping of `weight` and parameters, such as `{"weight": 1.5, "width": 0.25}`.
+        **changes: New values of fields of the task, such as command_range, contacts, actions, noise, history,
+            latency, randomise, push_period or episode_length, see `Task`.
 
     Raises:
         ValueError: If an argument is not one of the choices.
@@ -103,6 +100,7 @@ def make_program(
     figures = own_task(model.robot, task)
     figures = replace(figures, rewards=merged_rewards(figures.rewards, {} if rewards is None else rewards))
     figures = changed_task(figures, changes)
+    check("observations", figures.observations, figures.observations, "at least one name")
     if figures.actions.endswith("_pd") and not model.robot.gains.kp:
         file, expected = model.robot.source or model.robot.name, f"gains, because actions={figures.actions!r} need them"
         raise invalid_value(file, "gains.kp", None, expected)
@@ -112,10 +110,10 @@ def make_program(
 
 
 def own_task(robot: Robot, task: str) -> Task:
-    """Return a task with the figures that a robot's file has for it.
+    """Return a task with the changes that a robot's file makes to it.
 
     Raises:
-        RobotError: A figure cannot be, or a task in the file does not exist.
+        RobotError: If a value in the file is not allowed, or a task in the file does not exist.
     """
     file = robot.source or robot.name
     for name, _ in robot.tasks:
@@ -142,22 +140,19 @@ def _thawed(key: str, value: Any) -> Any:
 
 
 def changed_task(task: Task, changes: Mapping[str, Any]) -> Task:
-    """Return a task with some of its figures replaced, checked.
+    """Return a task with some fields replaced.
 
     Args:
         task: A task.
-        changes: Attributes of `Task` but `rewards`; lists, as JSON has them, count as tuples, and None as no change.
+        changes: New values by name of the field; lists, as in JSON, count as tuples, and None as no change.
 
     Raises:
-        UnknownArgument: If there is no such attribute.
-        ValueError: One line that names the argument, its value and what was expected.
+        UnknownArgument: If a field does not exist.
+        ValueError: One line that names the argument, its value and the allowed values.
     """
-    known, given = [f.name for f in fields(Task) if f.name != "rewards"], {}
-    for name, value in changes.items():
-        if name not in known:
-            raise UnknownArgument(
-                f"unexpected keyword argument {name!r}; expected one of {listed_names(name, ['rewards', *known])}"
-            )
-        if value is not None:
-            given[name] = checked_value(name, value, getattr(task, name))
+    check_fields(Task, changes, others=("rewards",))
+    given = {name: value for name, value in changes.items() if value is not None}
+    for each in fields(Task):
+        if each.metadata.get("merges") and each.name in given:
+            given[each.name] = {**getattr(task, each.name), **each.metadata["check"](each.name, given[each.name])}
     return replace(task, **given)

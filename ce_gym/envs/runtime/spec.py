@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.task.actions import ActionMap
 from ce_gym.envs.task.curriculum import Curriculum
@@ -12,8 +11,7 @@ from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.task.terrain_tiles import field_of
 from ce_gym.envs.terms.registry import Term, terms_of
 from ce_gym.model.errors import check_names
-from ce_gym.sim.kernels import select_contacts, select_pairs
-from ce_gym.sim.terrain.hulls import hulls_on
+from ce_gym.sim.scene import resolve_scene
 
 
 class TaskSpec:
@@ -50,29 +48,16 @@ class TaskSpec:
         self.observation_terms = terms_of("observation", task.observations)
         self.critic_terms = terms_of("observation", task.critic)
         check_names("noise", task.noise, self.observation_terms, "an observation among")
-        self.contacts = select_contacts(robot, task.contacts)
         if task.latency[1] > task.n_substeps:
             expected = f"at most the {task.n_substeps} sub-steps of a control step"
             raise ValueError(f"latency={task.latency}; expected {expected}")
         self.field = field_of(task.terrain)
-        hulls = hulls_on(robot, self.contacts, self.field)
-        self.ground = Ground(self.model.mechanism, self.contacts, hulls) if self.curriculum.on_field else None
         self.randomised = Randomised(robot, task.randomise)
-        self.actions = ActionMap(self.model.mechanism, task)
-        self.options = StepOptions(
-            control=self.actions.control,
-            contacts=self.contacts,
-            material=robot.material,
-            friction=task.friction,
-            method=task.method,
-            motors=task.motors,
-            control_period=task.control_period,
-            ground="field" if self.ground and self.contacts else "flat",
-            parameters=self.randomised.parameters,
-            self_collisions=select_pairs(self.model.mechanism, task.self_collisions),
-            seldom=tuple(name for name in select_contacts(robot, task.seldom, "seldom") if name in self.contacts),
-            hulls=hulls,
-        )
+        self.actions = ActionMap(model.mechanism, task)
+        self.options = resolve_scene(task, model, self.field, self.actions.control, self.randomised.parameters)
+        self.contacts = self.options.contacts
+        on_field = self.curriculum.on_field
+        self.ground = Ground(model.mechanism, self.contacts, self.options.hulls) if on_field else None
 
     @property
     def terms(self) -> list[Term]:

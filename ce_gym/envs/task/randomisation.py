@@ -10,9 +10,9 @@ import numpy as np
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.laws.scene_parameters import check_parameter, parameter_defaults
 from ce_gym.envs.task.tasks import RANDOMISED, Range
+from ce_gym.model.arguments import check
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import listed_names
-from ce_gym.sim.arguments import check
 
 FACTORS = (
     *("stiffness", "kp", "kd", "motor_strength", "rotor_inertia", "ratio"),

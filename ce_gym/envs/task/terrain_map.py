@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ce_gym.model.arguments import check, is_number
 from ce_gym.model.errors import listed_names
-from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.terrain import Terrain
 
 ARGUMENTS = ("field", "file", "cell", "height", "begin")

@@ -15,8 +15,8 @@ import numpy as np
 
 from ce_gym.envs.task.terrain_kinds import BORDER, KINDS, PLATFORM, Tiles
 from ce_gym.envs.task.terrain_map import checked_map
+from ce_gym.model.arguments import check, is_number
 from ce_gym.model.errors import listed_names
-from ce_gym.sim.arguments import check, is_number
 from ce_gym.sim.terrain import Terrain
 from ce_gym.sim.terrain.files import MOST_HEIGHTS
 

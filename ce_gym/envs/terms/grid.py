@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.sim.arguments import check, is_number
+from ce_gym.model.arguments import check, is_number
 
 MAX_POINTS = 2000
 """Largest number of points of a grid."""

@@ -16,8 +16,8 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.recursion.kinematics import constant
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.grid import are_numbers, check_term, ray_directions, rotation_matrix
+from ce_gym.model.arguments import is_number
 from ce_gym.model.errors import listed_names
-from ce_gym.sim.arguments import is_number
 
 MAX_PLACES = 4000
 """Largest number of look-ups of one sensor, rays times steps."""

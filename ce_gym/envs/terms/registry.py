@@ -29,8 +29,8 @@ from ce_gym.envs.terms import (
     terminations,
 )
 from ce_gym.envs.terms.context import TermContext
+from ce_gym.model.arguments import is_number
 from ce_gym.model.errors import listed_names
-from ce_gym.sim.arguments import is_number
 
 Function = Callable[..., SX]
 _F = TypeVar("_F", bound=Callable)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.sim.arguments import check, is_number
+from ce_gym.model.arguments import check, is_number
 from ce_gym.sim.terrain.files import read_heights
 
 

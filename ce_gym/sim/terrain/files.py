@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.sim.arguments import check
+from ce_gym.model.arguments import check
 
 MOST_HEIGHTS = 2**24
 """Most heights that a kernel takes."""

@@ -41,7 +41,7 @@ def hulls_on(robot: Robot, contacts: Sequence[str], terrain: Terrain | None) -> 
             warnings.warn(
                 f"{robot.name}: {MOST_POINTS} points on contact shape {shape or 'foot'!r} of {body} are more than two "
                 f"cells of {terrain.cell:g} m apart; narrower ridges pass between them. Use a longer cell.",
-                stacklevel=3,
+                stacklevel=4,
             )
     return tuple(hulls)
 

@@ -33,7 +33,7 @@ def ours(scene: Scene, n: int, level: str | None = None) -> Array:
         level: Transmission level; the one that leaves nothing out if None.
     """
     model = Model(scene.robot, transmission=level or scene.exact)
-    step = step_function(model.mechanism, StepOptions(HOLD / n, scene.control, method="rk8"))
+    step = step_function(model.mechanism, StepOptions(HOLD / n, control=scene.control, method="rk8"))
     q, v = (np.pad(x, (0, n_all - len(x))) for x, n_all in ((scene.q, model.nq), (scene.v, model.nv)))
     state = {"q": q, "v": v, "diverged": np.zeros(1)}
     if "dependent" in step.name_in():

@@ -1,4 +1,4 @@
-"""Checks of arguments. An error is one line with the argument, its value and the expected values."""
+"""Checks of arguments. An error is one line with the argument, its value and the allowed values."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ def check_choice(argument: str, value: object, choices: Iterable[object]) -> Non
 
 def check_whole(argument: str, value: Any, least: int, unit: str = "") -> None:
     """Raise a ValueError unless a value is a whole number, at least `least`."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    check(argument, value, whole and value >= least, f"a whole number{unit}, at least {least}")
+    check(argument, value, is_whole(value) and value >= least, f"a whole number{unit}, at least {least}")
 
 
 def check_shape(argument: str, value: Any, *expected: tuple[int, ...]) -> None:
@@ -36,6 +35,12 @@ def check_shape(argument: str, value: Any, *expected: tuple[int, ...]) -> None:
         raise ValueError(f"{argument} has shape {tuple(value.shape)}; expected {' or '.join(map(str, expected))}")
 
 
-def is_number(value: object) -> bool:
+def is_number(value: Any) -> bool:
     """Return whether a value is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    return number and math.isfinite(value)
+
+
+def is_whole(value: object) -> bool:
+    """Return whether a value is a whole number."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
