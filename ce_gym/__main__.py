@@ -87,14 +87,14 @@ def _parser() -> argparse.ArgumentParser:
     list_.set_defaults(run=_list)
     inspect = commands.add_parser(
         "inspect",
-        help="what a robot is made of, or what an environment costs",
-        description="Say what a robot is made of and what each transmission level drops, or what a step of an "
-        "environment\ncosts, feature by feature.",
+        help="print the structure of a robot, or the operations of an environment's step",
+        description="Print the clusters and gears of a robot and the errors of each transmission level, or the "
+        "scalar operations\nof an environment's step, feature by feature.",
         epilog=examples(
             "inspect mini_cheetah",
             "inspect my_robot.yaml --levels",
-            "inspect ce_gym/TelloVelocity-v0 --no-timing",
-            "inspect ce_gym/TelloVelocity-v0 --no-timing --env-arg terrain=stairs",
+            "inspect ce_gym/TelloVelocity-v0",
+            "inspect ce_gym/TelloVelocity-v0 --env-arg terrain=stairs",
         ),
     )
     inspect.add_argument("name", metavar="NAME", help="name of a robot, path of its file, or id of an environment")
@@ -103,9 +103,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_env_arg(inspect)
     inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")
-    inspect.add_argument("--levels", action="store_true", help="robot: only what simplified levels get wrong of it")
+    inspect.add_argument("--levels", action="store_true", help="robot: print only the errors of the simplified levels")
     inspect.add_argument(
-        "--no-timing", action="store_true", help="compile nothing: do not time an environment, nor let a robot stand"
+        "--no-standing", action="store_true", help="robot: do not simulate whether it stands without a policy"
     )
     inspect.set_defaults(run=_inspect)
     new = commands.add_parser(
@@ -165,10 +165,9 @@ def _new(args: argparse.Namespace) -> int:
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    from ce_gym.diagnostics.levels_text import levels_report
-    from ce_gym.diagnostics.standing import seconds_to_compile
-    from ce_gym.diagnostics.standing_text import standing_report
-    from ce_gym.diagnostics.transmission_text import transmission_report
+    from ce_gym.diagnostics.levels import levels_report
+    from ce_gym.diagnostics.standing import seconds_to_compile, standing_report
+    from ce_gym.diagnostics.transmission import transmission_report
     from ce_gym.dynamics import Model
     from ce_gym.envs.custom import missing, zero_limits
 
@@ -187,24 +186,24 @@ def _inspect(args: argparse.Namespace) -> int:
     print("".join(f"Joints have {line}\n" for line in zero_limits(model.robot)), flush=True)
     print("Environments: it has what every task needs\n" if not problems else "Environments lack:")
     print("".join(f"  {problem}\n" for problem in problems), flush=True)
-    if model.robot.gains.kp and not (problems or args.no_timing):
+    if model.robot.gains.kp and not (problems or args.no_standing):
         if (seconds := seconds_to_compile(model)) > 5:
             told = f"letting it stand compiles a kernel of about {seconds:.0f} s once"
-            print(f"ce_gym: {told}; --no-timing leaves that out", file=sys.stderr, flush=True)
+            print(f"ce_gym: {told}; --no-standing omits that", file=sys.stderr, flush=True)
         print(f"{standing_report(model)}\n", flush=True)
     print(transmission_report(model, states=0) if args.no_errors else transmission_report(model))
     return 0
 
 
 def _inspect_environment(args: argparse.Namespace) -> int:
-    from ce_gym.diagnostics.scene_text import scene_report
+    from ce_gym.diagnostics.scene import scene_report
     from ce_gym.model import RobotError
 
     module, _, name = args.name.rpartition(":")
     try:
         if module:
             importlib.import_module(module)  # registers it, as in `gymnasium.make`
-        print(scene_report(name, timing=not args.no_timing, **dict(args.env_args)))
+        print(scene_report(name, **dict(args.env_args)))
     except ImportError as error:
         raise RobotError(f"environment {args.name!r}: {error}") from error
     except ValueError as error:  # names what is wrong
