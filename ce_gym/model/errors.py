@@ -30,6 +30,11 @@ class LossyImportWarning(UserWarning):
     """A file says things that a `Robot` cannot; the message is a short list, `Robot.notes` has all of them."""
 
 
+def file_error(file: object, problem: str, expected: str, kind: type[RobotError] = RobotError) -> RobotError:
+    """Return the error of a problem in a file, as one line: file, problem, and what was expected."""
+    return kind(f"{file}: {problem}: expected {expected}")
+
+
 def bad(file: str, key: str, value: object, expected: str) -> RobotError:
     """Return the error for one bad value: file, key, value, and what was expected.
 
@@ -39,7 +44,7 @@ def bad(file: str, key: str, value: object, expected: str) -> RobotError:
         value: What was found there.
         expected: What should be there instead.
     """
-    return RobotError(f"{file}: {key} is {shown(value)}: expected {expected}")
+    return file_error(file, f"{key} is {shown(value)}", expected)
 
 
 def unknown(file: str, key: str, value: object, known: Iterable[str], what: str) -> RobotError:
