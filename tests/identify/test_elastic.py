@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Robot, RobotError, Simulator, load_robot
-from ce_gym.identify import Identified, Log, identify, overlay, simulate_log
+from ce_gym.identify import Identified, Log, identify, simulate_log, to_yaml
 from ce_gym.model import Gains, Joint
 
 pytest.importorskip("scipy")
@@ -134,11 +134,11 @@ def found(arm: Robot, log: Log) -> Identified:
 
 
 def test_what_is_found_is_what_the_other_arm_has(found: Identified):
-    names = [figure.name for figure in found.figures]
+    names = [parameter.name for parameter in found.parameters]
     for name, value in PLANTED.items():
         assert found[name] == pytest.approx(value, rel=0.02), name
         assert abs(found[name] - value) < 4 * dict(zip(names, found.std, strict=True))[name], name
-    assert found.cannot_tell == ()
+    assert found.warnings == ()
     assert found.held_out.max() < 1.1 * NOISE
     assert found.held_out_before.max() > 50 * NOISE
 
@@ -151,20 +151,18 @@ def only(log: Log, *names: str) -> Log:
 
 def test_encoders_at_rotors_alone_tell_of_what_is_behind_them(arm: Robot, log: Log):
     kinds = tuple(kind for kind in KINDS if kind != "encoder_zero")
-    with pytest.raises(RobotError, match="figure is 'encoder_zero': expected a kind that arm and its log have"):
+    with pytest.raises(RobotError, match="kind is 'encoder_zero': expected a kind that arm and its log have"):
         identify(arm, only(log, "first", "second"), kinds=KINDS, **OPTIONS)
     found = identify(arm, only(log, "first", "second"), kinds=kinds, substep=5e-4, **OPTIONS)
-    for figure, value in zip(found.figures, found.values, strict=True):
-        assert value == pytest.approx(PLANTED[figure.name], rel=0.02), figure.name
-    assert found.cannot_tell == ()
+    for parameter, value in zip(found.parameters, found.values, strict=True):
+        assert value == pytest.approx(PLANTED[parameter.name], rel=0.02), parameter.name
+    assert found.warnings == ()
 
 
 def test_rigid_figures_do_not_fit_and_this_is_said(arm: Robot, log: Log):
     kinds = ("rotor_inertia", "motor_damping", "link_inertia", "delay")
     found = identify(arm, log, control="motor_torque", kinds=kinds)
-    assert re.match(
-        r"what is left of angle:\w+ is \d+ times its noise: .*; intervals do not hold", found.cannot_tell[0]
-    )
+    assert re.match(r"the residual of angle:\w+ is \d+ times its noise: .*; intervals are not valid", found.warnings[0])
 
 
 def test_play_that_is_never_crossed_is_not_told_from_the_zero_of_an_encoder(arm: Robot):
@@ -180,16 +178,16 @@ def test_play_that_is_never_crossed_is_not_told_from_the_zero_of_an_encoder(arm:
     stretch = log.values[:, 2:] - [6, 9] * (log.values[:, :2] - [0.006, 0.0])
     assert (np.abs(stretch[500:]) > 0.01).all(), "on one flank"
     found = identify(pressed, log, kinds=("drive_stiffness", "backlash", "encoder_zero"), **options)
-    held = {which.figure.name: [figure.name for figure, _ in which.taken] for which in found.held}
+    held = {item.parameter.name: item.shifted for item in found.unidentifiable}
     assert held.keys() in ({"backlash:first", "backlash:second"}, {"encoder_zero:upper", "encoder_zero:lower"})
     assert all(held.values())
     assert found["drive_stiffness:first"] == pytest.approx(1.3, rel=0.02)
 
 
 def test_what_is_written_loads_and_is_the_same_robot(arm: Robot, found: Identified, tmp_path: Path):
-    (tmp_path / "found.yaml").write_text(text := overlay(found, arm.source))
+    (tmp_path / "found.yaml").write_text(text := to_yaml(found, arm.source))
     assert "the encoder of upper reads 0.006" in text
-    laid, names = load_robot(tmp_path / "found.yaml"), [f.name for f in found.figures if f.kind in KINDS[:4]]
+    laid, names = load_robot(tmp_path / "found.yaml"), [p.name for p in found.parameters if p.kind in KINDS[:4]]
     sims = [
         Simulator(Model(robot, "elastic"), motors="limited", parameters=p) for robot, p in ((laid, ()), (arm, names))
     ]
@@ -206,7 +204,7 @@ def test_what_is_written_loads_and_is_the_same_robot(arm: Robot, found: Identifi
 def test_figures_that_a_file_does_not_have_are_not_sought(arm: Robot):
     stiff = replace(arm, elastic=tuple(replace(e, backlash=0.0, damping=0.0) for e in arm.elastic))
     log = simulate_log(arm, 4.0, transmission="elastic")
-    with pytest.raises(RobotError, match="figure is 'backlash': expected a kind that arm and its log have"):
+    with pytest.raises(RobotError, match="kind is 'backlash': expected a kind that arm and its log have"):
         identify(stiff, log, kinds=("backlash", "drive_damping"), transmission="elastic")
     with pytest.raises(RobotError, match="elastic is missing"):
         identify(replace(arm, elastic=()), log, transmission="elastic")

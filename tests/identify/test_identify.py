@@ -10,9 +10,9 @@ import pytest
 
 from ce_gym import Model, Robot, RobotError, Simulator, load_robot
 from ce_gym.__main__ import main
-from ce_gym.identify import Identified, Log, LogError, identify, overlay, page, read_log, report, simulate_log
-from ce_gym.identify.held import held
-from ce_gym.identify.separable import correlation_time
+from ce_gym.identify import Identified, Log, LogError, identify, page, read_log, report, simulate_log, to_yaml
+from ce_gym.identify.base_fixed import fix_base
+from ce_gym.identify.identifiability import correlation_time
 
 pytest.importorskip("scipy")
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -30,7 +30,7 @@ KINDS = ("rotor_inertia", "motor_friction", "delay")
 
 @pytest.fixture(scope="module")
 def leg() -> Robot:
-    return held(load_robot("mini_cheetah"), ["HR_knee_link"])
+    return fix_base(load_robot("mini_cheetah"), ["HR_knee_link"])
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +46,10 @@ def found(leg: Robot, log: Log) -> Identified:
 def test_planted_figures_are_found(found: Identified):
     for name, value in PLANTED.items():
         assert found[name] == pytest.approx(value, rel=0.02), name
-        low, high = found.intervals[[figure.name for figure in found.figures].index(name)]
+        low, high = found.intervals[[parameter.name for parameter in found.parameters].index(name)]
         assert abs(found[name] - value) < high - low, name  # 3.9 standard deviations
     assert (found.std / np.abs(found.values)).max() < 0.02
-    assert found.cannot_tell == ()
+    assert found.warnings == ()
 
 
 def test_held_out_error_is_that_of_the_encoders(found: Identified):
@@ -63,21 +63,22 @@ def test_friction_and_mass_of_joints_without_motors():
     links = [b.name for b in load_robot("planar_leg_linkage").bodies if b.kind == "link"]
     fixed = [f"added_mass:{name}" for name in links if name != "foot"]
     found = identify("planar_leg_linkage", log, kinds=("joint_friction", "joint_damping", "added_mass"), fixed=fixed)
-    for figure, value, std in zip(found.figures, found.values, found.std, strict=True):
-        assert abs(value - planted.get(figure.name, 0.0)) < 4 * std + 1e-4 * figure.scale, figure.name
-        assert std < 0.1 * planted.get(figure.name, np.inf), figure.name
+    for parameter, value, std in zip(found.parameters, found.values, found.std, strict=True):
+        name = parameter.name
+        assert abs(value - planted.get(name, 0.0)) < 4 * std + 1e-4 * parameter.scale, name
+        assert std < 0.1 * planted.get(name, np.inf), name
 
 
 def test_what_is_written_loads_and_is_the_same_robot(found: Identified, tmp_path: Path):
     """The overlay, as a robot of its own, moves as the simulator does with the figures as parameters."""
     path = tmp_path / "found.yaml"
-    path.write_text(overlay(found, "mini_cheetah"))
-    laid, plain = Model(held(load_robot(path), ["HR_knee_link"])), Model(found.robot)
-    written = [f for f in found.figures if f.kind != "delay"]
-    names = tuple(dict.fromkeys(figure.parameter for figure in written))
+    path.write_text(to_yaml(found, "mini_cheetah"))
+    laid, plain = Model(fix_base(load_robot(path), ["HR_knee_link"])), Model(found.robot)
+    written = [p for p in found.parameters if p.kind != "delay"]
+    names = tuple(dict.fromkeys(p.simulator_parameter for p in written))
     ours = Simulator(plain, 1, 0.001, motors="limited", parameters=names)
     for name in names:
-        mine = [(f.entry, found[f.name]) for f in written if f.parameter == name]
+        mine = [(p.entry, found[p.name]) for p in written if p.simulator_parameter == name]
         ours.set_parameter(name, [value for _, value in sorted(mine)])
     theirs = Simulator(laid, 1, 0.001, motors="limited")
     bare = Simulator(plain, 1, 0.001, motors="limited")
@@ -109,7 +110,7 @@ GOOD = "time,command:a,angle:a\n" + "".join(f"{k / 100},0,0\n" for k in range(12
     ("text", "message"),
     [
         (GOOD.replace("angle:a", "angel:a"), r"column 3 is 'angel:a': expected time, or command:"),
-        (GOOD.replace("angle:a", "command:a"), r"column 3 is command:a again"),
+        (GOOD.replace("angle:a", "command:a"), r"column 3 is command:a again: expected each column once"),
         (GOOD.replace("angle:a", "torque:a"), r"no column angle:NAME"),
         (GOOD.replace("0.5,0,0", "0.5,0,x"), r"row 52, column angle:a is 'x': expected a finite number"),
         (GOOD.replace("0.5,0,0", "0.5,nan,0"), r"row 52, column command:a is 'nan'"),
@@ -131,19 +132,19 @@ def test_bad_logs_are_one_line(text: str, message: str, tmp_path: Path):
 def test_logs_that_do_not_fit_the_robot(leg: Robot, log: Log):
     with pytest.raises(LogError, match="no column command:HR_knee_link: expected one for each of"):
         identify(leg, replace(log, commanded=log.commanded[:2], commands=log.commands[:, :2]))
-    with pytest.raises(LogError, match="no column tells where HR_knee_link is"):
+    with pytest.raises(LogError, match="no column determines the position of HR_knee_link"):
         identify(leg, replace(log, measured=log.measured[:2], values=log.values[:, :2]))
     with pytest.raises(RobotError, match=r"column is 'HR_kneelink': .*did you mean 'HR_knee_link'"):
         identify(leg, replace(log, commanded=("HR_kneelink", *log.commanded[1:])))
     with pytest.raises(LogError, match="expected radians"):
         identify(leg, replace(log, values=np.degrees(log.values)))
-    with pytest.raises(LogError, match="nothing that was measured ever changes"):
+    with pytest.raises(LogError, match="all measurements are constant: expected a robot that moves"):
         identify(leg, replace(log, values=0 * log.values))
     with pytest.raises(LogError, match="rows: expected at least"):
         identify(leg, log, window=4.0)
     with pytest.raises(RobotError, match=r"transmission is 'elastik': expected .*did you mean 'elastic'"):
         identify(leg, log, transmission="elastik")
-    with pytest.raises(RobotError, match="figure is 'colour': expected a kind of figure"):
+    with pytest.raises(RobotError, match="kind is 'colour': expected a kind of parameter"):
         identify(leg, log, kinds=("colour",))
 
 
@@ -153,7 +154,7 @@ def test_nothing_that_is_read_is_replaced(log: Log, tmp_path: Path, capsys: pyte
     robot, file = str(tmp_path / "leg.yaml"), str(tmp_path / "leg.csv")
     for words in ([robot, file], ["mini_cheetah", file, "--html", file], [robot, robot, "--simulate", "2"]):
         assert main(["identify", *words]) == 2
-        assert "would replace what is read" in capsys.readouterr().err
+        assert "would replace an input file" in capsys.readouterr().err
     assert (tmp_path / "leg.yaml").read_text().startswith("robot: mini_cheetah")
 
 

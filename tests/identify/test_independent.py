@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Robot, Simulator, load_robot
-from ce_gym.identify import Identified, Log, identify, overlay
+from ce_gym.identify import Identified, Log, identify, to_yaml
 
 pytest.importorskip("scipy")
 
@@ -92,7 +92,7 @@ def found(run: tuple[Log, np.ndarray], plain: Robot) -> Identified:
 
 
 def test_what_is_found_is_what_the_other_robot_has(found: Identified):
-    std = dict(zip([figure.name for figure in found.figures], found.std, strict=True))
+    std = dict(zip([parameter.name for parameter in found.parameters], found.std, strict=True))
     for name, value in PLANTED.items():
         assert found[name] == pytest.approx(value, rel=0.02), name
         assert abs(found[name] - value) < 4 * std[name], name
@@ -100,9 +100,9 @@ def test_what_is_found_is_what_the_other_robot_has(found: Identified):
 
 
 def test_of_figures_that_cannot_be_separated_one_is_held_and_their_sum_is_found(found: Identified):
-    assert [which.figure.name for which in found.held] == ["rotor_inertia:first"]
+    assert [item.parameter.name for item in found.unidentifiable] == ["rotor_inertia:first"]
     assert found["rotor_inertia:first"] == 1.0
-    line, text = found.cannot_tell[0], overlay(found, "arm.yaml")
+    line, text = found.warnings[0], to_yaml(found, "arm.yaml")
     assert line.startswith(
         "rotor_inertia:first is held at 1, as in the robot's file: the data cannot separate it from "
     )
@@ -118,7 +118,7 @@ def test_standard_errors_are_those_of_dense_least_squares(found: Identified, run
     log, states = run
     first, length = np.arange(9, 1100 - 125, 125)[:-2], 125  # 30 ms and a row, then half a second each, two held out
     assert found.curves[0][0, 0] == pytest.approx((first[-1] + length) * DT)
-    names = [found.figures[i].name for i in found.sought]
+    names = [found.parameters[i].name for i in found.estimated]
     factors = ("rotor_inertia:second", "link_inertia:upper", "link_inertia:lower")
     options = {"control": "torque", "motors": "limited", "method": "extrapolated", "contacts": (), "outputs": ()}
     sim = Simulator(Model(plain), len(first), DT / 4, parameters=(*factors, "motor_friction"), **options)
@@ -152,4 +152,4 @@ def test_standard_errors_are_those_of_dense_least_squares(found: Identified, run
     J = np.column_stack(columns)
     std = NOISE * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))[: len(names)]
     np.testing.assert_allclose(found.noise, NOISE, rtol=0.05)
-    np.testing.assert_allclose(found.std[found.sought], std, rtol=0.05)
+    np.testing.assert_allclose(found.std[found.estimated], std, rtol=0.05)

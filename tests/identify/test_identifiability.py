@@ -3,18 +3,24 @@
 import numpy as np
 import pytest
 
-from ce_gym.identify.figures import Figure
-from ce_gym.identify.separable import Held, covariance_of, held_of, hold, lines_of
+from ce_gym.identify.identifiability import (
+    Unidentifiable,
+    covariance_of,
+    find_unidentifiable,
+    select_identifiable,
+    unidentifiable_warnings,
+)
+from ce_gym.identify.parameters import Parameter
 
-FIGURES = [
-    Figure("rotor_inertia", "a", 1.0, 1.0, 0.02, 50.0, 1.0, 0),
-    Figure("link_inertia", "b", 1.0, 1.0, 0.02, 50.0, 1.0, 0),
-    Figure("motor_friction", "c", 0.0, 0.1, 0.0, 50.0, 0.2, 0),
-    Figure("delay", "", 0.0, 0.003, 0.0, 0.03, 0.01, -1),
+PARAMETERS = [
+    Parameter("rotor_inertia", "a", 1.0, 1.0, 0.02, 50.0, 1.0, 0),
+    Parameter("link_inertia", "b", 1.0, 1.0, 0.02, 50.0, 1.0, 0),
+    Parameter("motor_friction", "c", 0.0, 0.1, 0.0, 50.0, 0.2, 0),
+    Parameter("delay", "", 0.0, 0.003, 0.0, 0.03, 0.01, -1),
 ]
-A, B, C, D = FIGURES
-SCALE = np.array([figure.scale for figure in FIGURES])
-NOMINAL = np.array([figure.nominal for figure in FIGURES])
+A, B, C, D = PARAMETERS
+SCALE = np.array([parameter.scale for parameter in PARAMETERS])
+NOMINAL = np.array([parameter.nominal for parameter in PARAMETERS])
 PLANTED = {A.name: 1.3, B.name: 0.8, C.name: 0.15, D.name: 0.007}
 
 
@@ -24,10 +30,10 @@ def columns(apart: float) -> np.ndarray:
     return np.stack([*(one + apart * other for other in others), last], axis=1) * [100, 110, 200, 100]
 
 
-def found_in(J: np.ndarray) -> tuple[list[Held], np.ndarray, np.ndarray, dict[str, tuple[float, float]]]:
+def found_in(J: np.ndarray) -> tuple[list[Unidentifiable], np.ndarray, np.ndarray, dict[str, tuple[float, float]]]:
     """What is held, places of the rest, estimates of all by least squares without noise, and intervals of the rest."""
-    planted = np.array([PLANTED[figure.name] for figure in FIGURES]) / SCALE
-    left, x = hold(J, planted, FIGURES, 1.0)
+    planted = np.array([PLANTED[parameter.name] for parameter in PARAMETERS]) / SCALE
+    left, x = select_identifiable(J, planted, PARAMETERS, 1.0)
     values = NOMINAL / SCALE
     held = np.setdiff1d(np.arange(4), left)
     seen = J @ planted - J[:, held] @ values[held]
@@ -36,17 +42,17 @@ def found_in(J: np.ndarray) -> tuple[list[Held], np.ndarray, np.ndarray, dict[st
     std = np.zeros(4)
     std[left] = np.sqrt(np.diag(np.linalg.inv(J[:, left].T @ J[:, left])))
     ends = zip(values * SCALE, 1.96 * std * SCALE, strict=True)
-    intervals = {f.name: (v - s, v + s) for f, (v, s) in zip(FIGURES, ends, strict=True)}
-    return held_of(J, values, left, FIGURES, 1.0), left, values * SCALE, intervals
+    intervals = {f.name: (v - s, v + s) for f, (v, s) in zip(PARAMETERS, ends, strict=True)}
+    return find_unidentifiable(J, values, left, PARAMETERS, 1.0), left, values * SCALE, intervals
 
 
 def test_of_three_figures_that_act_alike_two_are_held_and_the_third_stands_for_both():
     held, left, values, intervals = found_in(columns(1e-4))
-    assert [which.figure for which in held] == [A, B]
+    assert [item.parameter for item in held] == [A, B]
     assert left.tolist() == [2, 3]
-    for which, much in zip(held, (0.1, 0.11), strict=True):  # of felt 1, 1.1 and 2, and scales 1, 1 and 0.2
-        assert which.taken == ((C, pytest.approx(much, rel=1e-3)),)
-    lines, low_high = lines_of(held, intervals), "{:.5g} to {:.5g}".format(*intervals[C.name])
+    for item, slope in zip(held, (0.1, 0.11), strict=True):  # of felt 1, 1.1 and 2, and scales 1, 1 and 0.2
+        assert item.shifted == ((C, pytest.approx(slope, rel=1e-3)),)
+    lines, low_high = unidentifiable_warnings(held, intervals), "{:.5g} to {:.5g}".format(*intervals[C.name])
     for line in lines:
         assert f"{C.name} + 0.1 ({A.name} - 1) + 0.11 ({B.name} - 1) is {values[2]:.5g}, {low_high}" in line
         assert "the data cannot separate it from motor_friction:c;" in line
@@ -59,5 +65,5 @@ def test_a_figure_that_is_felt_by_nothing_else_is_known_badly_and_shifts_nothing
     J[:, 0] -= J[:, 1:] @ np.linalg.lstsq(J[:, 1:], J[:, 0], rcond=None)[0]
     held, _, _, intervals = found_in(J)
     share = np.sqrt(covariance_of(J, 1.0)[0, 0])
-    assert [(which.figure, which.taken) for which in held] == [(A, ())]
-    assert lines_of(held, intervals)[0].endswith(f"the data know it to {100 * share:.3g} % only")
+    assert [(item.parameter, item.shifted) for item in held] == [(A, ())]
+    assert unidentifiable_warnings(held, intervals)[0].endswith(f"the data know it to {100 * share:.3g} % only")
