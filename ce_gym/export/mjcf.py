@@ -115,11 +115,7 @@ def _add_world(root: ET.Element, robot: Robot, ground: bool) -> ET.Element:
 
 
 def _add_body(
-    parent: ET.Element,
-    moving: MovingBody,
-    robot: Robot,
-    reference: Mapping[str, float],
-    armature: Mapping[str, float],
+    parent: ET.Element, moving: MovingBody, robot: Robot, reference: Mapping[str, float], armature: Mapping[str, float]
 ) -> ET.Element:
     """Add a body in its pose at joint position `ref`."""
     body, ref = robot.body(moving.name), reference.get(moving.name, 0.0)

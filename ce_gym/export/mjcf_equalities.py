@@ -37,6 +37,8 @@ from ce_gym.model.frames import Placement
 from ce_gym.model.mechanism import Mechanism, MovingBody, Spin
 
 Array = NDArray[np.float64]
+Elements = Mapping[str | None, ET.Element]
+Attributes = Mapping[str, str]
 
 MJCF_JOINTS = {"revolute": "hinge", "prismatic": "slide", "ball": "ball"}
 """Types of joints in MJCF."""
@@ -135,11 +137,11 @@ def _spins(mechanism: Mechanism) -> Iterator[Spin]:
 
 def add_ties(
     root: ET.Element,
-    elements: Mapping[str | None, ET.Element],
+    elements: Elements,
     mechanism: Mechanism,
     ties: Mapping[str, Tie],
     reference: Mapping[str, float],
-    solver: Mapping[str, str],
+    solver: Attributes,
 ) -> None:
     """Add equalities of dependent joints, loops and rods, and tendons for the armature of rotors with several joints.
 
@@ -157,7 +159,8 @@ def add_ties(
     for name in (*mechanism.bodies, *massless):
         if name in ties and name not in ties[name].ratios:
             tie = ties[name].scaled(1.0 / largest_ratio(ties[name])) if name in massless else ties[name]
-            _add_linear(tendons, equalities, name, tie, reference, solver)
+            constant = tie.at({joint: reference.get(joint, 0.0) for joint in tie.ratios}) - reference.get(name, 0.0)
+            _add_linear(tendons, equalities, name, tie, constant, solver)
     for constraint in mechanism.robot.constraints:
         if not constraint.linear:
             EXPORTS[type(constraint)](elements, tendons, equalities, constraint, solver)
@@ -170,15 +173,8 @@ def add_ties(
 
 
 def _add_linear(
-    tendons: ET.Element,
-    equalities: ET.Element,
-    name: str,
-    tie: Tie,
-    reference: Mapping[str, float],
-    solver: Mapping[str, str],
+    tendons: ET.Element, equalities: ET.Element, name: str, tie: Tie, constant: float, solver: Attributes
 ) -> None:
-    at_reference = {joint: reference.get(joint, 0.0) for joint in tie.ratios}
-    constant = tie.at(at_reference) - reference.get(name, 0.0)
     if len(tie.ratios) == 1:
         ((other, ratio),) = tie.ratios.items()
         pair = {"joint1": name, "joint2": other, "polycoef": text((constant, ratio, 0, 0, 0))}
@@ -196,11 +192,7 @@ def _fixed_tendon(tendons: ET.Element, name: str, ratios: Mapping[str, float]) -
 
 
 def _add_loop(
-    elements: Mapping[str | None, ET.Element],
-    tendons: ET.Element,
-    equalities: ET.Element,
-    loop: LoopConstraint,
-    solver: Mapping[str, str],
+    elements: Elements, tendons: ET.Element, equalities: ET.Element, loop: LoopConstraint, solver: Attributes
 ) -> None:
     """Connect two bodies at a point, or at two points along the axis of a hinge."""
     ends = ((loop.first, loop.first_placement), (loop.second, loop.second_placement))
@@ -215,11 +207,7 @@ def _add_loop(
 
 
 def _add_rod(
-    elements: Mapping[str | None, ET.Element],
-    tendons: ET.Element,
-    equalities: ET.Element,
-    rod: RodConstraint,
-    solver: Mapping[str, str],
+    elements: Elements, tendons: ET.Element, equalities: ET.Element, rod: RodConstraint, solver: Attributes
 ) -> None:
     """Keep the distance of two points in the initial configuration, which is the rod's length."""
     tendon = ET.SubElement(tendons, "spatial", name=rod.name)

@@ -46,7 +46,7 @@ def found_in(J: np.ndarray) -> tuple[list[Unidentifiable], np.ndarray, np.ndarra
     return find_unidentifiable(J, values, left, PARAMETERS, 1.0), left, values * SCALE, intervals
 
 
-def test_of_three_figures_that_act_alike_two_are_held_and_the_third_stands_for_both():
+def test_of_three_similar_parameters_only_one_is_estimated():
     held, left, values, intervals = found_in(columns(1e-4))
     assert [item.parameter for item in held] == [A, B]
     assert left.tolist() == [2, 3]
@@ -60,7 +60,7 @@ def test_of_three_figures_that_act_alike_two_are_held_and_the_third_stands_for_b
     assert lines[0].startswith("rotor_inertia:a is held at 1, as in the robot's file: ")
 
 
-def test_a_figure_that_is_felt_by_nothing_else_is_known_badly_and_shifts_nothing():
+def test_an_independent_unidentifiable_parameter_shifts_nothing():
     J = columns(1.0) * [0.01, 1, 1, 1]
     J[:, 0] -= J[:, 1:] @ np.linalg.lstsq(J[:, 1:], J[:, 0], rcond=None)[0]
     held, _, _, intervals = found_in(J)

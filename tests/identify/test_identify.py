@@ -1,4 +1,4 @@
-"""Identification finds what was planted, knows how well, says what it cannot tell, and refuses bad logs in one line."""
+"""Identification finds planted parameters within its intervals, and refuses bad logs in one line."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ def log(leg: Robot) -> Log:
 
 
 @pytest.fixture(scope="module")
-def found(leg: Robot, log: Log) -> Identified:
+def result(leg: Robot, log: Log) -> Identified:
     return identify(leg, log, kinds=KINDS)
 
 
-def test_planted_figures_are_found(found: Identified):
+def test_planted_parameters_are_found(result: Identified):
     for name, value in PLANTED.items():
-        assert found[name] == pytest.approx(value, rel=0.02), name
-        low, high = found.intervals[[parameter.name for parameter in found.parameters].index(name)]
-        assert abs(found[name] - value) < high - low, name  # 3.9 standard deviations
-    assert (found.std / np.abs(found.values)).max() < 0.02
-    assert found.warnings == ()
+        assert result[name] == pytest.approx(value, rel=0.02), name
+        low, high = result.intervals[[parameter.name for parameter in result.parameters].index(name)]
+        assert abs(result[name] - value) < high - low, name  # 3.9 standard deviations
+    assert (result.std / np.abs(result.values)).max() < 0.02
+    assert result.warnings == ()
 
 
-def test_held_out_error_is_that_of_the_encoders(found: Identified):
-    assert found.held_out.max() < 1.3 * 2e-4
-    assert found.held_out_before.min() > 5 * found.held_out.max()
+def test_held_out_error_is_that_of_the_encoders(result: Identified):
+    assert result.held_out.max() < 1.3 * 2e-4
+    assert result.held_out_before.min() > 5 * result.held_out.max()
 
 
 def test_friction_and_mass_of_joints_without_motors():
@@ -62,23 +62,23 @@ def test_friction_and_mass_of_joints_without_motors():
     log = simulate_log("planar_leg_linkage", 4.0, planted=planted, noise=1e-4, substep=1e-3)
     links = [b.name for b in load_robot("planar_leg_linkage").bodies if b.kind == "link"]
     fixed = [f"added_mass:{name}" for name in links if name != "foot"]
-    found = identify("planar_leg_linkage", log, kinds=("joint_friction", "joint_damping", "added_mass"), fixed=fixed)
-    for parameter, value, std in zip(found.parameters, found.values, found.std, strict=True):
+    result = identify("planar_leg_linkage", log, kinds=("joint_friction", "joint_damping", "added_mass"), fixed=fixed)
+    for parameter, value, std in zip(result.parameters, result.values, result.std, strict=True):
         name = parameter.name
         assert abs(value - planted.get(name, 0.0)) < 4 * std + 1e-4 * parameter.scale, name
         assert std < 0.1 * planted.get(name, np.inf), name
 
 
-def test_what_is_written_loads_and_is_the_same_robot(found: Identified, tmp_path: Path):
-    """The overlay, as a robot of its own, moves as the simulator does with the figures as parameters."""
-    path = tmp_path / "found.yaml"
-    path.write_text(to_yaml(found, "mini_cheetah"))
-    laid, plain = Model(fix_base(load_robot(path), ["HR_knee_link"])), Model(found.robot)
-    written = [p for p in found.parameters if p.kind != "delay"]
+def test_the_written_file_loads_and_is_the_same_robot(result: Identified, tmp_path: Path):
+    """The robot of the written file moves as the original robot with the estimates as simulator parameters."""
+    path = tmp_path / "result.yaml"
+    path.write_text(to_yaml(result, "mini_cheetah"))
+    laid, plain = Model(fix_base(load_robot(path), ["HR_knee_link"])), Model(result.robot)
+    written = [p for p in result.parameters if p.kind != "delay"]
     names = tuple(dict.fromkeys(p.simulator_parameter for p in written))
     ours = Simulator(plain, 1, 0.001, motors="limited", parameters=names)
     for name in names:
-        mine = [(p.entry, found[p.name]) for p in written if p.simulator_parameter == name]
+        mine = [(p.entry, result[p.name]) for p in written if p.simulator_parameter == name]
         ours.set_parameter(name, [value for _, value in sorted(mine)])
     theirs = Simulator(laid, 1, 0.001, motors="limited")
     bare = Simulator(plain, 1, 0.001, motors="limited")
@@ -88,12 +88,12 @@ def test_what_is_written_loads_and_is_the_same_robot(found: Identified, tmp_path
     assert np.abs(bare.q - ours.q).max() > 1e-3
 
 
-def test_report_and_page_name_every_figure(found: Identified):
-    text, shown = report(found), page(found)
+def test_report_and_page_name_every_parameter(result: Identified):
+    text, shown = report(result), page(result)
     for name in PLANTED:
         assert name in text
         assert name in shown
-    assert shown.count("<svg") == 6  # of each angle what was measured, and errors
+    assert shown.count("<svg") == 6  # two plots for each angle
 
 
 def test_a_log_is_read_as_it_was_saved(log: Log, tmp_path: Path):
@@ -148,7 +148,7 @@ def test_logs_that_do_not_fit_the_robot(leg: Robot, log: Log):
         identify(leg, log, kinds=("colour",))
 
 
-def test_nothing_that_is_read_is_replaced(log: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_inputs_are_not_overwritten(log: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "leg.yaml").write_text("robot: mini_cheetah\nidentified: {}\n")
     log.save(tmp_path / "leg.csv")
     robot, file = str(tmp_path / "leg.yaml"), str(tmp_path / "leg.csv")
@@ -158,7 +158,7 @@ def test_nothing_that_is_read_is_replaced(log: Log, tmp_path: Path, capsys: pyte
     assert (tmp_path / "leg.yaml").read_text().startswith("robot: mini_cheetah")
 
 
-def test_what_nothing_can_be_laid_over_is_refused_before_the_search(
+def test_robots_without_a_plain_yaml_file_are_refused_before_the_search(
     log: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     (tmp_path / "over.yaml").write_text("robot: mini_cheetah\nidentified: {}\n")
@@ -174,7 +174,7 @@ def test_what_nothing_can_be_laid_over_is_refused_before_the_search(
         assert said.count("\n") == 1
 
 
-def test_factors_are_those_of_the_parameters_in_any_order(tmp_path: Path):
+def test_identified_factors_act_in_any_order(tmp_path: Path):
     """A link's factor is one on what its file has, whatever its rotor's does to it."""
     parts = "rotor_inertia: {HR_knee_rotor: 1.3}", "link_inertia: {HR_hip_link: 2}"
     inertias = []
@@ -201,7 +201,7 @@ def test_correlation_in_time():
     assert correlation_time(colored[:, 20:]) == pytest.approx((1 + a) / (1 - a), rel=0.1)
 
 
-def test_bad_overlays_are_one_line(tmp_path: Path):
+def test_bad_identified_sections_are_one_line(tmp_path: Path):
     path = tmp_path / "over.yaml"
     for text, message in (
         ("{rotor_inertia: {knee: 1.1}}", "identified.rotor_inertia is 'knee'"),

@@ -1,4 +1,4 @@
-"""Initial states of a leg whose transmissions rattle: found at wrong figures, they have to be left at right ones."""
+"""Restarts of initial states of a leg whose transmissions rattle: the search leaves local minima."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ce_gym.model import load_robot
 from ce_gym.model.mechanism import without_stretches
 
 NOISE, SEED = 2e-4, 17
-"""Of encoders [rad]; of a trial whose log begins with flanks that hit each other."""
+"""Noise of encoders [rad]; seed of a log that begins with flanks that hit each other."""
 
 
 def planted_at_random(parameters: list[Parameter]) -> dict[str, float]:
@@ -29,12 +29,12 @@ def planted_at_random(parameters: list[Parameter]) -> dict[str, float]:
 
 
 def squares(problem: Problem, values: np.ndarray) -> float:
-    """Return the mean square of what is left over the noise, of the worst window."""
+    """Return the mean square of the residual over noise, of the worst window."""
     shown = problem.shooting(values[None], problem.states[None], problem.windows.first, problem.windows.length)[0]
     return float((((shown - problem.measured) / problem.noise) ** 2).mean(axis=(1, 2)).max())
 
 
-def test_states_that_were_found_at_wrong_figures_are_left_at_right_ones():
+def test_restarts_leave_states_that_fit_wrong_parameters():
     model = base_fixed_model(load_robot("mini_cheetah"), ["HR_knee_link"], "elastic")
     measured = encoders_at(model, "both")
     parameters = select_parameters(model.robot, default_kinds(model.robot, measured), measured=measured)
@@ -48,6 +48,6 @@ def test_states_that_were_found_at_wrong_figures_are_left_at_right_ones():
     problem.improve_states(start / problem.scale, 20)
     x = truth / problem.scale
     problem.improve_states(x, 20)
-    assert squares(problem, truth) > 10, "no step leads back: if one does, this trial tests nothing"
+    assert squares(problem, truth) > 10, "no step leads back, else this test is void"
     assert problem.restart_states(x, guess_states(shooting, parts, truth)) > 0.1
     assert squares(problem, truth) < 1.5
