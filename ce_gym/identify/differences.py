@@ -94,7 +94,7 @@ class Differences:
         for k, i in enumerate(common):
             perturbed[1 + n_states + n_single + k, i] += STEP * self._scale[i]
         length = self.windows.length
-        readings, last = self.shooting.run(perturbed, perturbed_states, self.windows.first, length + self._extra_rows)
+        readings, last = self.shooting(perturbed, perturbed_states, self.windows.first, length + self._extra_rows)
         readings, self.last = readings[:, :, :length], last[0]
         by_state, by_parameter = {}, {}
         for c in numbers:

@@ -175,7 +175,8 @@ def _validate(
             problem = Problem(shooting, pieces, states, noise)
             problem.improve_states(candidate / problem.scale, 4)
             states = problem.states[::PARTS]
-        curves.append(shooting(candidate[None], problem.states[None], windows.first, windows.length)[0])
+        readings, _ = shooting(candidate[None], problem.states[None], windows.first, windows.length)
+        curves.append(readings[0])
         errors.append(np.sqrt(((curves[-1] - measured) ** 2).mean(axis=(0, 1))))
     return (windows.rows * shooting.log.dt, measured, *curves), errors  # type: ignore[return-value]
 

@@ -92,7 +92,7 @@ def simulate_log(
     parameters = _planted_parameters(model.robot, planted or {}, measured)
     shooting = Shooting(model, log, parameters, substep, control=control)
     values, state = np.array([[p.start for p in parameters]]), np.r_[model.standing_q, np.zeros(model.nv)]
-    exact = shooting(values, state[None, None], np.array([0]), len(commands))[0, 0]
+    exact = shooting(values, state[None, None], np.array([0]), len(commands))[0][0, 0]
     readings = exact + np.random.default_rng(seed).normal(0.0, noise, exact.shape)
     if resolution:
         readings = np.round(readings / resolution) * resolution

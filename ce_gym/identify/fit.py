@@ -157,7 +157,7 @@ class Problem:
             Relative decrease of the sum of squares from the first states to the best.
         """
         values = np.tile(self.values(x), (len(states), 1))
-        readings = self.shooting(values, states, self.windows.first, self.windows.length)
+        readings, _ = self.shooting(values, states, self.windows.first, self.windows.length)
         windows, first_cost, best_cost = np.arange(len(self.states)), 0.0, 0.0
         for c in self.limbs.numbers:
             costs = (((readings - self.measured) / self.noise)[..., self.limbs.channels[c]] ** 2).sum((2, 3))

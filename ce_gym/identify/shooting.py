@@ -129,8 +129,8 @@ class Shooting:
             self._sims[n] = Simulator(self.model, n, dt, parameters=self.simulator_parameters, **self._options)
         return self._sims[n]
 
-    def __call__(self, values: Array, states: Array, first: Indices, length: int) -> Array:
-        """Return simulated encoder readings.
+    def __call__(self, values: Array, states: Array, first: Indices, length: int) -> tuple[Array, Array]:
+        """Return simulated encoder readings, and the states at the last row.
 
         Args:
             values: Parameters of each candidate, shape (C, P).
@@ -139,12 +139,8 @@ class Shooting:
             length: Number of rows of a window.
 
         Returns:
-            Shape (C, W, length, n_measured).
+            Shapes (C, W, length, n_measured) and (C, W, nq + nv).
         """
-        return self.run(values, states, first, length)[0]
-
-    def run(self, values: Array, states: Array, first: Indices, length: int) -> tuple[Array, Array]:
-        """Return simulated encoder readings, and states at the last row, shape (C, W, nq + nv); arguments as above."""
         n = max(1, LARGEST_BATCH // len(values))
         batches = [self._batch(values, states[:, i : i + n], first[i : i + n], length) for i in range(0, len(first), n)]
         readings, last = zip(*batches, strict=True)

@@ -111,7 +111,7 @@ def settle_stretches(shooting: Shooting, windows: Windows, states: Array, values
     lead = int(min(windows.first.min(), round(SETTLING / shooting.log.dt)))
     earlier = Windows(windows.first - lead, lead + 1)
     start = smoothed_states(shooting, earlier)
-    _, last = shooting.run(values[None], start[None], earlier.first, earlier.length)
+    _, last = shooting(values[None], start[None], earlier.first, earlier.length)
     settled = states.copy()
     settled[:, n:nq], settled[:, nq + n :] = last[0, :, n:nq], last[0, :, nq + n :]
     return settled

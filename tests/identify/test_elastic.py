@@ -67,7 +67,7 @@ def slope(z: list[float], torque: list[float]) -> list[float]:
     q1, q2, theta1, theta2, v1, v2, w1, w2 = z
     J1, J2 = SPIN * PLANTED["rotor_inertia:first"], SPIN * PLANTED["rotor_inertia:second"]
     upper, lower, length, c1, c2, g = 0.8, 0.3, 0.25, 0.1, 0.08, 9.81
-    I1 = 0.005 - (J2 - SPIN)  # as a load the rotor stays what it is
+    I1 = 0.005 - (J2 - SPIN)  # the load on the upper link is unchanged
     I2 = 0.002 + lower * c2**2
     elbow = I2 + lower * length * c2 * cos(q2)
     M11 = I1 + upper * c1**2 + 0.1 * length**2 + J2 + lower * length**2 + 2 * elbow - I2
@@ -90,7 +90,7 @@ def mesh(rotor: str, i: int, stretch: float, rate: float) -> float:
 
 
 def log_of(seconds: float, amplitude: float, about: tuple[float, float] = (0.0, 0.0), fast: float = 15.0) -> Log:
-    """What a controller of motors, and encoders of joints and rotors, make of the arm; torques reach motors late."""
+    """Log of the arm under a controller of its motors, with encoders at joints and rotors and delayed torques."""
     rows, late = round(seconds / DT), round(PLANTED["delay"] / DT)
     z = [*about, 6 * about[0], 9 * about[1], 0.0, 0.0, 0.0, 0.0]
     seen, torques = np.zeros((rows, 4)), np.zeros((rows, 2))

@@ -53,7 +53,7 @@ DT, LATE, NOISE = 0.004, 2, 3e-4
 
 
 def written(folder: Path, first=1.0, second=1.0, lower=1.0, frictions=(0.01, 0.01)) -> Robot:
-    """Return the arm with numbers of its own; what it carries does not become heavier with a rotor's spin."""
+    """Return the arm with other numbers; a factor on a rotor's spin inertia does not change its load on the carrier."""
     spins = {"first": first * SPIN, "second": second * SPIN}
     links = {"upper": UPPER - (second - 1) * SPIN, "lower": lower * LOWER}
     (folder / "arm.urdf").write_text(URDF.format(**links))
@@ -116,7 +116,7 @@ def test_of_inseparable_parameters_the_sum_is_estimated(result: Identified):
 def test_standard_errors_are_those_of_dense_least_squares(
     result: Identified, run: tuple[Log, np.ndarray], plain: Robot
 ):
-    """Parameters and the initial states of all windows at once, Jacobian by central differences at what was planted."""
+    """Parameters and all initial states at once, with the Jacobian by central differences at planted parameters."""
     log, states = run
     first, length = np.arange(9, 1100 - 125, 125)[:-2], 125  # 30 ms and a row, then half a second each, two held out
     assert result.curves[0][0, 0] == pytest.approx((first[-1] + length) * DT)
@@ -131,7 +131,7 @@ def test_standard_errors_are_those_of_dense_least_squares(
             sim.set_parameter(name, parameters[name])
         sim.set_parameter("motor_friction", [parameters["motor_friction:first"], parameters["motor_friction:second"]])
         start = states[first] + moved
-        late, rest = divmod(4 * parameters["delay"] / DT, 1)  # in sub-steps; each has the mean of what is due in it
+        late, rest = divmod(4 * parameters["delay"] / DT, 1)  # in sub-steps; each has the mean of its commands
         sim.set_state(start[:, :2], start[:, 2:])
         read = [sim.q.copy()]
         for k in range(4 * (length - 1)):

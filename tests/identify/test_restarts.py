@@ -30,7 +30,7 @@ def planted_at_random(parameters: list[Parameter]) -> dict[str, float]:
 
 def squares(problem: Problem, values: np.ndarray) -> float:
     """Return the mean square of the residual over noise, of the worst window."""
-    shown = problem.shooting(values[None], problem.states[None], problem.windows.first, problem.windows.length)[0]
+    shown = problem.shooting(values[None], problem.states[None], problem.windows.first, problem.windows.length)[0][0]
     return float((((shown - problem.measured) / problem.noise) ** 2).mean(axis=(1, 2)).max())
 
 
