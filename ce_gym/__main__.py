@@ -27,8 +27,8 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
 
   python -m ce_gym list                  robots, environments and trained policies
   python -m ce_gym new my_robot.urdf     write the YAML file that a robot of one's own needs, guesses marked
-  python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
-  python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
+  python -m ce_gym inspect mini_cheetah  clusters and gears of a robot, errors of each transmission level
+  python -m ce_gym inspect ENVIRONMENT   scalar operations of an environment's step, feature by feature
   python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
   python -m ce_gym live POLICY           drive, push and throw it in a browser
   python -m ce_gym watch RUN             see how training goes: curves, and the present policy

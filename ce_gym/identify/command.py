@@ -37,7 +37,9 @@ def add_identify_command(subparsers: Any) -> None:
     parser.add_argument(
         "--simulate", type=float, metavar="SECONDS", help="do not estimate: write a simulated LOG of this duration"
     )
-    parser.add_argument("--control", choices=CONTROLS, default="position", help="of commands (default position)")
+    parser.add_argument(
+        "--control", choices=CONTROLS, default="position", help="meaning of commands (default position)"
+    )
     levels = (*LEVELS, ELASTIC)
     parser.add_argument("--transmission", default="exact", choices=levels, help=f"{', '.join(levels)} (default exact)")
     parser.add_argument("--parameters", nargs="+", metavar="KIND", help="kinds such as rotor_inertia delay")
