@@ -8,7 +8,7 @@
 """
 
 from ce_gym.compile.system import usable_cores
-from ce_gym.diagnostics.scene_text import scene_report
+from ce_gym.diagnostics.scene import scene_report
 from ce_gym.dynamics.forces.scene import SceneOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.custom import register_robot

@@ -25,8 +25,8 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
 
   python -m ce_gym list                  robots, environments and trained policies
   python -m ce_gym new my_robot.urdf     write the YAML file that a robot of one's own needs, guesses marked
-  python -m ce_gym inspect mini_cheetah  what a robot is made of: clusters, gears, what each level drops
-  python -m ce_gym inspect ENVIRONMENT   what an environment's step costs, feature by feature
+  python -m ce_gym inspect mini_cheetah  clusters and gears of a robot, errors of each transmission level
+  python -m ce_gym inspect ENVIRONMENT   scalar operations of an environment's step, feature by feature
   python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
   python -m ce_gym live POLICY           drive, push and throw it in a browser
   python -m ce_gym watch RUN             see how training goes: curves, and the present policy
@@ -85,14 +85,14 @@ def _parser() -> argparse.ArgumentParser:
     list_.set_defaults(run=_list)
     inspect = commands.add_parser(
         "inspect",
-        help="what a robot is made of, or what an environment costs",
-        description="Say what a robot is made of and what each transmission level drops, or what a step of an "
-        "environment\ncosts, feature by feature.",
+        help="print the structure of a robot, or the operations of an environment's step",
+        description="Print the clusters and gears of a robot and the errors of each transmission level, or the "
+        "scalar operations\nof an environment's step, feature by feature.",
         epilog=examples(
             "inspect mini_cheetah",
             "inspect my_robot.yaml --levels",
-            "inspect ce_gym/TelloVelocity-v0 --no-timing",
-            "inspect ce_gym/TelloVelocity-v0 --no-timing --env-arg terrain=stairs",
+            "inspect ce_gym/TelloVelocity-v0",
+            "inspect ce_gym/TelloVelocity-v0 --env-arg terrain=stairs",
         ),
     )
     inspect.add_argument("name", metavar="NAME", help="name of a robot, path of its file, or id of an environment")
@@ -101,9 +101,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_env_arg(inspect)
     inspect.add_argument("--no-errors", action="store_true", help="robot: do not compare the levels in random states")
-    inspect.add_argument("--levels", action="store_true", help="robot: only what simplified levels get wrong of it")
+    inspect.add_argument("--levels", action="store_true", help="robot: print only the errors of the simplified levels")
     inspect.add_argument(
-        "--no-timing", action="store_true", help="compile nothing: do not time an environment, nor let a robot stand"
+        "--no-standing", action="store_true", help="robot: do not simulate whether it stands without a policy"
     )
     inspect.set_defaults(run=_inspect)
     new = commands.add_parser(
@@ -163,10 +163,9 @@ def _new(args: argparse.Namespace) -> int:
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    from ce_gym.diagnostics.levels_text import levels_report
-    from ce_gym.diagnostics.standing import seconds_to_compile
-    from ce_gym.diagnostics.standing_text import standing_report
-    from ce_gym.diagnostics.transmission_text import transmission_report
+    from ce_gym.diagnostics.levels import levels_report
+    from ce_gym.diagnostics.standing import seconds_to_compile, standing_report
+    from ce_gym.diagnostics.transmission import transmission_report
     from ce_gym.dynamics import Model
     from ce_gym.envs.custom import missing, zero_limits
 
@@ -185,24 +184,24 @@ def _inspect(args: argparse.Namespace) -> int:
     print("".join(f"Joints have {line}\n" for line in zero_limits(model.robot)), flush=True)
     print("Environments: it has what every task needs\n" if not problems else "Environments lack:")
     print("".join(f"  {problem}\n" for problem in problems), flush=True)
-    if model.robot.gains.kp and not (problems or args.no_timing):
+    if model.robot.gains.kp and not (problems or args.no_standing):
         if (seconds := seconds_to_compile(model)) > 5:
             told = f"letting it stand compiles a kernel of about {seconds:.0f} s once"
-            print(f"ce_gym: {told}; --no-timing leaves that out", file=sys.stderr, flush=True)
+            print(f"ce_gym: {told}; --no-standing omits that", file=sys.stderr, flush=True)
         print(f"{standing_report(model)}\n", flush=True)
     print(transmission_report(model, states=0) if args.no_errors else transmission_report(model))
     return 0
 
 
 def _inspect_environment(args: argparse.Namespace) -> int:
-    from ce_gym.diagnostics.scene_text import scene_report
+    from ce_gym.diagnostics.scene import scene_report
     from ce_gym.model import RobotError
 
     module, _, name = args.name.rpartition(":")
     try:
         if module:
             importlib.import_module(module)  # registers it, as in `gymnasium.make`
-        print(scene_report(name, timing=not args.no_timing, **dict(args.env_args)))
+        print(scene_report(name, **dict(args.env_args)))
     except ImportError as error:
         raise RobotError(f"environment {args.name!r}: {error}") from error
     except ValueError as error:  # names what is wrong

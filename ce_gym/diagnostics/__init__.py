@@ -1,1 +1,1 @@
-"""What a robot's transmissions are and what a scene costs, in figures and in words."""
+"""Reports on robots and environments: transmissions, levels, standing, and instructions of a step."""

@@ -1,16 +1,15 @@
-"""What a scene costs, feature by feature: what is compiled into an environment, and what has been left out.
+"""Scalar operations of an environment's step, feature by feature: `inspect ENVIRONMENT`.
 
-Everything is a difference of traced functions. A sub-step is built up in layers, each with one feature more; a layer
-costs what its function takes beyond the one before, so that the layers add up to the whole. A feature that is left out
-would cost what the whole takes with it beyond what it takes without. An instruction is one scalar operation of a CasADi
+A sub-step is traced repeatedly, each time with one more feature. A feature costs the instructions that its function
+adds to the one before, so all features sum to the sub-step. An instruction is one scalar operation of a CasADi
 function for one robot.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import textwrap
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
@@ -21,12 +20,10 @@ import gymnasium
 from ce_gym.compile import Call, Repeat, calls_of
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
-from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.dynamics.forces.friction import FRICTION
-from ce_gym.dynamics.forces.normal import KelvinVoigt, normal_law
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.methods import METHODS
-from ce_gym.dynamics.laws.scene_laws import OUTPUTS, PARAMETERS, symbolic_state
+from ce_gym.dynamics.laws.scene_laws import symbolic_state
 from ce_gym.dynamics.laws.scene_parameters import make_scene
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.step import first_iterate, solve
@@ -36,6 +33,7 @@ from ce_gym.envs.task.tasks import Task
 from ce_gym.envs.terms.registry import OWN
 from ce_gym.model.description import Robot
 from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.table import table_text
 from ce_gym.sim.kernels import select_contacts
 from ce_gym.sim.substeps import substeps
 
@@ -46,27 +44,46 @@ TERMS = {
     "observations": "observation",
     "critic": "observation",
 }
-"""Fields of a `Task` that name terms, in the order in which they are added, and the kind of each."""
-
-AGAIN = {"iteration": "another iteration of a sub-step", "subdivide": "a sub-step in parts"}
-"""What is done in a sub-step only if some robot of a tile needs it, by name of the function."""
-
+"""Fields of a `Task` that list terms, in the order in which they are added, and the kind of each."""
 NO_TERMS: dict[str, Any] = {"rewards": {}, "noise": {}, "history": 1} | {f: () for f in TERMS if f != "rewards"}
-"""What makes a task one without terms."""
-
-
-WITHOUT_COST = ("autoreset_mode", "dtype", "max_episode_steps", "num_threads", "obs_mode", "width", "height")
-"""Arguments of environments that a task's program does not depend on."""
+"""Fields of a `Task` without terms."""
+BARE: dict[str, Any] = {
+    "control": "torque",
+    "contacts": (),
+    "seldom": (),
+    "self_collisions": (),
+    "ground": "flat",
+    "motors": "ideal",
+    "method": "euler",
+    "parameters": (),
+    "control_period": 0.0,
+}
+"""Options of the smallest scene."""
+OPTION_NAMES = {
+    "contacts": "contact",
+    "seldom": "contacts seldom near, where they are",
+    "self_collisions": "pairs of links, where they are near",
+    "ground": "ground field",
+    "motors": "limited motors",
+    "method": "method",
+    "parameters": "parameters",
+    "control_period": "sampled control",
+}
+"""Options of a scene in the order in which they are added, and their names in the report."""
+CONDITIONAL = {"iteration": "another iteration of a sub-step", "subdivide": "a sub-step in parts"}
+"""Functions of a sub-step that run only if some robot of a tile needs them, and their names in the report."""
+NOT_TRACED = ("autoreset_mode", "dtype", "max_episode_steps", "num_threads", "obs_mode", "width", "height")
+"""Arguments of environments that do not change a task's program."""
 
 
 @dataclass(frozen=True)
 class SubStep:
-    """A sub-step that could be compiled.
+    """A traced sub-step.
 
     Attributes:
         model: The robot at a transmission level.
         options: The scene.
-        outputs: What is computed besides the state.
+        outputs: Computed values other than the state.
     """
 
     model: Model
@@ -81,7 +98,7 @@ class SubStep:
 
     @property
     def instructions(self) -> int:
-        """Instructions that are always carried out."""
+        """Instructions that always run."""
         return sum(call.function.n_instructions() for call in self.calls if not call.only_if)
 
 
@@ -90,31 +107,27 @@ class Item:
     """One line of a report.
 
     Attributes:
-        group: What it is part of.
-        name: For people.
-        instructions: That it adds, for one robot.
-        compiled: The sub-step or function with it, and with all before it in a sequence; None if it is not timed.
+        group: Part of the step to which the item belongs.
+        name: Name of the feature or term.
+        instructions: Instructions that the item adds, for one robot.
     """
 
     group: str
     name: str
     instructions: int
-    compiled: SubStep | ca.Function | None
 
 
 @dataclass(frozen=True)
 class SceneReport:
-    """What an environment costs.
+    """Instructions of an environment's step.
 
     Attributes:
         name: Id of the environment.
         program: The task on the robot.
-        layers: Of a sub-step, in the order in which they are added; they sum to the sub-step.
-        once: What is done once in each environment step: the action; then, in the order in which they are added,
-            bookkeeping and the terms of the task.
-        sometimes: What is done only if some robot of a tile needs it: another iteration, a reset.
-        left_out: What each feature would add to a sub-step; less than 0 if it would save.
-        terms_left_out: What each term would add to an environment step.
+        layers: Features of a sub-step, in the order in which they are added; they sum to the sub-step.
+        once: Action, bookkeeping and terms, which run once in each environment step, in the order of addition.
+        sometimes: Functions that run only if some robot of a tile needs them: another iteration, a reset.
+        unused: Names of options and terms that the environment does not use, by field.
     """
 
     name: str
@@ -122,17 +135,15 @@ class SceneReport:
     layers: tuple[Item, ...]
     once: tuple[Item, ...]
     sometimes: tuple[Item, ...]
-    left_out: tuple[Item, ...]
-    terms_left_out: tuple[Item, ...]
+    unused: Mapping[str, list[str]]
 
     @property
-    def groups(self) -> tuple[Item, ...]:
-        """What is done once in each environment step, terms of a kind taken together."""
-        together = itertools.groupby(self.once, lambda item: item.group)
-        return tuple(
-            Item(group, group, sum(item.instructions for item in items), items[-1].compiled)
-            for group, items in ((group, list(items)) for group, items in together)
-        )
+    def groups(self) -> dict[str, int]:
+        """Instructions of each group of `once`."""
+        sums: dict[str, int] = {}
+        for item in self.once:
+            sums[item.group] = sums.get(item.group, 0) + item.instructions
+        return sums
 
     @property
     def sub_step(self) -> int:
@@ -145,160 +156,177 @@ class SceneReport:
         return self.program.task.n_substeps * self.sub_step + sum(item.instructions for item in self.once)
 
 
-def report_scene(env_id: str, **arguments: Any) -> SceneReport:
-    """Count what a registered environment costs.
+def scene_report(env_id: str, **arguments: Any) -> str:
+    """Return the scalar operations of an environment's step, feature by feature, as plain text.
 
     Args:
-        env_id: Its id.
-        **arguments: What `gymnasium.make` would be given besides, see `ce_gym.envs.runtime.setup.make_program`.
+        env_id: Id of a registered environment.
+        **arguments: Further arguments of `gymnasium.make`, such as `motors="limited"`.
 
     Raises:
-        ValueError: If the id is no registered environment of robots of ours, or an argument is wrong.
+        ValueError: If the id is not one of this package's, or an argument is wrong.
     """
+    return as_text(count_instructions(env_id, **arguments))
+
+
+def count_instructions(env_id: str, **arguments: Any) -> SceneReport:
+    """Count the instructions of a registered environment; see `scene_report`."""
     spec = gymnasium.registry.get(env_id)
     if spec is None:
-        raise ValueError(f"environment {env_id!r} is not registered; `python -m ce_gym list` shows those that are")
-    given = {**spec.kwargs, **arguments}
-    if not {"robot", "task"} <= given.keys():
-        raise ValueError(f"environment {env_id!r}: made with {', '.join(given) or 'nothing'}; expected robot and task")
-    program = make_program(**{name: value for name, value in given.items() if name not in WITHOUT_COST})
+        raise ValueError(f"environment {env_id!r} is not registered; `python -m ce_gym list` shows the known ids")
+    kwargs = {**spec.kwargs, **arguments}
+    if not {"robot", "task"} <= kwargs.keys():
+        raise ValueError(f"environment {env_id!r}: made with {', '.join(kwargs) or 'nothing'}; expected robot and task")
+    program = make_program(**{name: value for name, value in kwargs.items() if name not in NOT_TRACED})
     outputs = ("torque", "contact_forces") if program.contact_forces else ("torque",)
-    whole = SubStep(program.model, program.options, outputs)
-    again = dict.fromkeys(call.function for call in whole.calls if call.only_if and call.inputs)
-    sometimes = [(AGAIN[f.name()], f) for f in again] + [("reset", program.function("reset"))]
+    sub_step = SubStep(program.model, program.options, outputs)
+    conditional = dict.fromkeys(call.function for call in sub_step.calls if call.only_if and call.inputs)
+    sometimes = [(CONDITIONAL[f.name()], f) for f in conditional] + [("reset", program.function("reset"))]
     return SceneReport(
         name=env_id,
         program=program,
-        layers=tuple(_differences("sub-step", layers(whole))),
+        layers=tuple(_layer_items(sub_step)),
         once=tuple(_once(program)),
-        sometimes=tuple(Item("where needed", name, f.n_instructions(), f) for name, f in sometimes),
-        left_out=tuple(
-            Item("left out", name, step.instructions - whole.instructions, step) for name, step in left_out(whole)
-        ),
-        terms_left_out=tuple(_terms_left_out(program)),
+        sometimes=tuple(Item("where needed", name, f.n_instructions()) for name, f in sometimes),
+        unused=unused(program),
     )
 
 
-def layers(whole: SubStep) -> Iterator[tuple[str, int, SubStep | ca.Function]]:
-    """Build a sub-step up, one feature after the other.
+def layers(whole: SubStep) -> Iterator[tuple[str, int]]:
+    """Build up a sub-step, one feature after the other.
 
     Yields:
-        Name of the feature, instructions with it and with all before it, and what to compile.
+        Name of the feature, and instructions with the feature and all before.
     """
-    options, robot = whole.options, whole.model.robot
-    loose = _with_joints(robot, position=(-math.inf, math.inf))
-    nothing: dict[str, Any] = {"contacts": (), "seldom": (), "self_collisions": (), "parameters": ()}
-    bare = replace(
-        options, control="torque", control_period=0.0, motors="ideal", ground="flat", method="euler", **nothing
+    robot = whole.model.robot
+    no_stops = _with_joints(robot, position=(-math.inf, math.inf))
+    no_losses = _with_joints(no_stops, torque=math.inf, damping=0.0, friction=0.0)
+    step = SubStep(Model(no_losses, "none"), replace(whole.options, **BARE), ())
+    kinematics, acceleration = _dynamics_functions(step)
+    # the results of the kinematics are no results of the whole sub-step, so storing them does not count
+    yield "kinematics", kinematics.n_instructions() - kinematics.nnz_out()
+    yield "inertias and accelerations", acceleration.n_instructions()
+    yield "integration and checks", step.instructions
+    step = replace(step, options=replace(step.options, control=whole.options.control))
+    if whole.options.control != "torque":
+        yield f"{whole.options.control} control", step.instructions
+    yield "joint friction and torque limits", replace(step, model=Model(no_stops, "none")).instructions
+    yield "joint stops", replace(step, model=Model(robot, "none")).instructions
+    step = replace(step, model=whole.model)
+    if whole.model.transmission != "none":
+        yield "rotors", step.instructions
+    for field, name in OPTION_NAMES.items():
+        value = getattr(whole.options, field)
+        if value != BARE[field]:
+            step = replace(step, options=replace(step.options, **{field: value}))
+            yield name, step.instructions
+    if whole.outputs:
+        yield "outputs", whole.instructions
+
+
+def unused(program: TaskProgram) -> dict[str, list[str]]:
+    """Return the names of options and terms that an environment does not use, by field."""
+    options, robot, task = program.options, program.model.robot, program.task
+    groups = dict.fromkeys(contact.group for contact in robot.contacts)
+    limited = robot.motors and options.motors != "limited"
+    names = {
+        "transmission": [level for level in LEVELS if level != program.model.transmission],
+        "contacts": [group for group in groups if not {*select_contacts(robot, group)} <= {*options.contacts}],
+        "friction": [law for law in FRICTION if law != options.friction],
+        "method": [method for method in METHODS if method != options.method],
+        "motors": ["limited"] if limited else [],
+        "terrain": [] if options.ground == "field" else ["field"],
+    }
+    terms = {field: OWN[kind] for field, kind in TERMS.items() if field != "critic"}
+    names |= {field: [term for term in known if term not in getattr(task, field)] for field, known in terms.items()}
+    return {field: listed for field, listed in names.items() if listed}
+
+
+def as_text(report: SceneReport) -> str:
+    """Return a report as plain text."""
+    task, model = report.program.task, report.program.model
+    n, layer_rows = task.n_substeps, [(item.name, item.instructions) for item in report.layers]
+    step_rows = [("action", report.groups["action"]), (f"{n} sub-steps", n * report.sub_step)]
+    for group, instructions in list(report.groups.items())[1:]:
+        terms = [item for item in report.once if item.group == group != item.name]
+        step_rows += [(group, instructions), *((f"  {item.name}", item.instructions) for item in terms)]
+    columns = ("", "instructions")
+    return "\n".join(
+        [
+            f"{report.name}: {model.robot.name}, transmission {model.transmission}, "
+            f"{n} sub-steps of {1e3 * task.dt:g} ms in a step",
+            "Instructions are scalar operations of the traced functions, for one robot.",
+            "A line has the instructions that it adds to the lines above.",
+            "",
+            "A sub-step",
+            table_text(columns, [*layer_rows, ("sub-step", report.sub_step)]),
+            "",
+            "An environment step",
+            table_text(columns, [*step_rows, ("environment step", report.env_step)]),
+            "",
+            "Only for tiles with a robot that needs it",
+            table_text(columns, [(item.name, item.instructions) for item in report.sometimes]),
+            "",
+            "Not used",
+            *(
+                textwrap.fill(f"  {field}: {', '.join(names)}", 120, subsequent_indent="    ")
+                for field, names in report.unused.items()
+            ),
+        ]
     )
-    step = SubStep(Model(_with_joints(loose, torque=math.inf, damping=0.0, friction=0.0), "none"), bare, ())
-    kinematics, acceleration = _parts_of_dynamics(step)
-    # the results of the first are not results of the whole, so that writing them does not count
-    yield "kinematics", kinematics.n_instructions() - kinematics.nnz_out(), kinematics
-    yield "inertias and accelerations", acceleration.n_instructions(), acceleration
-    yield "integration and checks", step.instructions, step
-    present = replace(step, options=replace(step.options, control=options.control))
-    steps = [(f"{options.control} control", present, options.control != "torque")]
-    steps += [("joint friction and torque limits", replace(present, model=Model(loose, "none")), True)]
-    steps += [("joint stops", replace(present, model=Model(robot, "none")), True)]
-    present = replace(present, model=whole.model)
-    steps += [("rotors", present, whole.model.transmission != "none")]
-    for name, field in (
-        ("contact", "contacts"),
-        ("contacts seldom near, where they are", "seldom"),
-        ("pairs of links, where they are near", "self_collisions"),
-        ("ground field", "ground"),
-        ("limited motors", "motors"),
-        ("method", "method"),
-        ("parameters", "parameters"),
-        ("control at a rate of its own", "control_period"),
-    ):
-        chosen = getattr(options, field)
-        before, present = present, replace(present, options=replace(present.options, **{field: chosen}))
-        steps += [(name, present, present.options != before.options)]
-    steps += [("outputs", whole, bool(whole.outputs))]
-    yield from ((name, step.instructions, step) for name, step, is_there in steps if is_there)
 
 
-def left_out(whole: SubStep) -> Iterator[tuple[str, SubStep]]:
-    """Yield what could be asked for and is not, each with the sub-step that has it."""
-    options, robot = whole.options, whole.model.robot
-    changes: dict[str, dict] = {}
-    for group in dict.fromkeys(contact.group for contact in robot.contacts):
-        wanted = tuple(dict.fromkeys((*options.contacts, *select_contacts(robot, group))))
-        changes[f"contacts of group {group!r}"] = {"contacts": select_contacts(robot, wanted)}
-    changes |= {f"friction={friction!r} instead": {"friction": friction} for friction in FRICTION}
-    changes |= {f"method={method!r} instead": {"method": method} for method in METHODS}
-    changes |= {"motors='limited'": {"motors": "limited"}} if robot.motors else {}
-    changes |= {"ground='field'": {"ground": "field"}}
-    if options.material.dissipation is None:
-        changes["dissipation of the material"] = {"material": replace(options.material, dissipation=1.0)}
-    damped = isinstance(normal_law(options.normal_law, options.material), KelvinVoigt)
-    known = [name for name in PARAMETERS if "ROTOR" not in name and (name != "damping" or damped)]
-    for name in (name.replace("BODY", robot.bodies[0].name) for name in known):
-        changes[f"parameter {name!r}"] = {"parameters": tuple(dict.fromkeys((*options.parameters, name)))}
-    for name, change in changes.items():
-        if any(getattr(options, key) != value for key, value in change.items()):
-            yield name, replace(whole, options=replace(options, **change))
-    for level in LEVELS:
-        if level != whole.model.transmission:
-            yield f"transmission={level!r} instead", replace(whole, model=Model(robot, level))
-    missing = set() if METHODS[options.method].estimates else {"error"}
-    missing |= set() if any(closures(whole.model.mechanism)) else {"loop_gap", "nearness"}
-    for name in OUTPUTS:
-        step = replace(whole, outputs=(*whole.outputs, name))
-        if name not in {*whole.outputs, *missing} and any(name in call.outputs for call in step.calls):
-            yield f"output {name!r}", step
+def _layer_items(whole: SubStep) -> Iterator[Item]:
+    previous = 0
+    for name, total in layers(whole):
+        yield Item("sub-step", name, total - previous)
+        previous = total
 
 
-def _differences(group: str, cumulative: Iterable[tuple[str, int, SubStep | ca.Function]]) -> Iterator[Item]:
-    """Turn running totals into items."""
-    before = 0
-    for name, total, compiled in cumulative:
-        yield Item(group, name, total - before, compiled)
-        before = total
-
-
-def _with_joints(robot: Robot, **figures: Any) -> Robot:
-    """Return the robot with some figures of all its joints replaced."""
-    bodies = (replace(b, joint=replace(b.joint, **figures)) if b.joint.type != "free" else b for b in robot.bodies)
+def _with_joints(robot: Robot, **changes: Any) -> Robot:
+    """Return the robot with the same changes to all joints."""
+    bodies = (replace(b, joint=replace(b.joint, **changes)) if b.joint.type != "free" else b for b in robot.bodies)
     return replace(robot, bodies=tuple(bodies))
 
 
-def _parts_of_dynamics(step: SubStep) -> tuple[ca.Function, ca.Function]:
-    """Trace what the kinematics leave for the recursions, and the accelerations."""
+def _dynamics_functions(step: SubStep) -> tuple[ca.Function, ca.Function]:
+    """Trace the kinematics, with all results that the recursions use, and the accelerations."""
     mechanism, options = step.model.mechanism, step.options
     state, dt = symbolic_state(mechanism, options), cast(Any, SX.sym("dt"))
     target = SX.sym("target", len(mechanism.robot.commanded))
     scene = make_scene(mechanism, options, SX(0, 1), SX(3, 0))
     solved = solve(scene, state, target, dt, first_iterate(scene))
-    found = [x for body in solved.kinematics.bodies.values() for x in (body.X.E, body.X.p, body.c, body.v[:3])]
-    found += [x for c in solved.kinematics.coordinates if c is not None for x in (c.G, c.g)]
-    results = {f"x{i}": ca.vec(x) for i, x in enumerate(found)}
+    values = [x for body in solved.kinematics.bodies.values() for x in (body.X.E, body.X.p, body.c, body.v[:3])]
+    values += [x for c in solved.kinematics.coordinates if c is not None for x in (c.G, c.g)]
+    results = {f"x{i}": ca.vec(x) for i, x in enumerate(values)}
     inputs = dict(state.items()) | {"dt": dt} | ({"target": target} if target.numel() else {})
     return traced("kinematics", inputs, results), traced("acceleration", inputs, {"vdot": solved.vdot})
 
 
 def _once(program: TaskProgram) -> Iterator[Item]:
-    """Build up what an environment step does around its sub-steps, one term after the other."""
-    act = program.function("act")
-    yield Item("action", "action", act.n_instructions(), act)
+    """Build up the calls of an environment step around its sub-steps, one term after the other."""
+    yield Item("action", "action", program.function("act").n_instructions())
     if late := _late_actions(program):
-        yield Item("late actions", "late actions", late, None)
+        yield Item("late actions", "late actions", late)
     task = replace(program.task, **NO_TERMS)
-    assess = TaskProgram(program.model, task).function("evaluate")
-    yield Item("commands and clocks", "commands and clocks", assess.n_instructions(), assess)
-    steps = [(field, term) for field in TERMS for term in getattr(program.task, field)]
-    for field, term in (*steps, ("noise and history", "noise and history")):
-        known = field in TERMS
-        before, task = assess, with_term(task, field, term, program.task) if known else program.task
-        assess = TaskProgram(program.model, task).function("evaluate")
-        if known or assess.n_instructions() != before.n_instructions():
-            yield Item(field, term, assess.n_instructions() - before.n_instructions(), assess)
+    total = _evaluate_instructions(program, task)
+    yield Item("commands and clocks", "commands and clocks", total)
+    for field in TERMS:
+        for term in getattr(program.task, field):
+            task = _with_term(task, field, term, program.task)
+            previous, total = total, _evaluate_instructions(program, task)
+            yield Item(field, term, total - previous)
+    whole = program.function("evaluate").n_instructions()
+    if whole != total:
+        yield Item("noise and history", "noise and history", whole - total)
+
+
+def _evaluate_instructions(program: TaskProgram, task: Task) -> int:
+    return TaskProgram(program.model, task).function("evaluate").n_instructions()
 
 
 def _late_actions(program: TaskProgram) -> int:
-    """Instructions that choose, in each sub-step of an environment step, between the last action and the new one."""
+    """Return the instructions that choose, in each sub-step, between the last action and the new one."""
     if "delay" not in program.schema:
         return 0
     each, last = (
@@ -308,32 +336,10 @@ def _late_actions(program: TaskProgram) -> int:
     return program.task.n_substeps * each + last
 
 
-def with_term(task: Task, field: str, term: str, like: Task | None = None) -> Task:
-    """Return the task with one term more, its weight and parameters as in `like`; else with weight 1 and defaults."""
-    given, default = getattr(like, field, ()), 1.0 if field == "rewards" else {}
-    own = given.get(term, default) if isinstance(given, Mapping) else default
-    terms = getattr(task, field)
-    old = terms if isinstance(terms, Mapping) else {name: {} for name in terms}
-    return replace(task, **{field: {**old, term: own}})
-
-
-def _terms_left_out(program: TaskProgram) -> Iterator[Item]:
-    """What each term and feature that the task does not have would add to what is done once in its step."""
-    task, whole = program.task, program.function("evaluate").n_instructions()
-    changes = [
-        (field, term, with_term(task, field, term))
-        for field, kind in TERMS.items()
-        for term in OWN[kind]
-        if field != "critic" and term not in getattr(task, field)
-    ]
-    for name, change in {
-        "noise of every observation": {} if task.noise else {"noise": dict.fromkeys(task.observations, 0.1)},
-        "history of 2 observations": {} if task.history > 1 else {"history": 2},
-        "heading commands": {} if task.heading else {"heading": True},
-        "pushes": {} if task.push_period else {"push_period": 1.0},
-    }.items():
-        if change:
-            changes.append(("task", name, replace(task, **change)))
-    for group, name, other in changes:
-        function = TaskProgram(program.model, other).function("evaluate")
-        yield Item(group, name, function.n_instructions() - whole, function)
+def _with_term(task: Task, field: str, term: str, source: Task) -> Task:
+    """Return the task with one more term, with weight and parameters of the source."""
+    terms, all_terms = getattr(task, field), getattr(source, field)
+    parameters = all_terms[term] if isinstance(all_terms, Mapping) else {}
+    if not isinstance(terms, Mapping):
+        terms = {name: {} for name in terms}
+    return replace(task, **{field: {**terms, term: parameters}})

@@ -1,1 +1,1 @@
-"""Robots for other simulators: written as MJCF, and stepped by MuJoCo."""
+"""Robots for other simulators: written as MJCF and stepped by MuJoCo."""

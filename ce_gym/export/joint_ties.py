@@ -1,4 +1,4 @@
-"""What linear constraints say about joints: every coordinate as a linear function of a few."""
+"""Joint coordinates as linear functions of the independent ones, from the linear constraints."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ class Tie:
     """A joint coordinate as a linear function of others, `q = sum(ratio * y) + offset`.
 
     Attributes:
-        ratios: Ratio for each of the other joints that matters, by name.
-        offset: Value when all of those are zero [rad or m].
+        ratios: Ratio of each other joint with an influence, by name.
+        offset: Coordinate if all other joints are at zero [rad or m].
     """
 
     ratios: dict[str, float]
     offset: float = 0.0
 
     def at(self, coordinates: Mapping[str, float]) -> float:
-        """Return the coordinate [rad or m] for given ones of the other joints."""
+        """Return the coordinate [rad or m] for coordinates of the other joints, by name."""
         return self.offset + sum(ratio * coordinates[name] for name, ratio in self.ratios.items())
 
     def scaled(self, factor: float) -> Tie:
-        """Return the tie of a coordinate that is larger by a factor."""
+        """Return the tie of the coordinate times a factor."""
         return Tie({name: factor * ratio for name, ratio in self.ratios.items()}, factor * self.offset)
 
 
 def joint_ties(mechanism: Mechanism) -> dict[str, Tie]:
-    """Return every joint coordinate as a function of the independent ones, by joint name.
+    """Return every joint coordinate as a linear function of others, by joint name.
 
-    With closed loops, the linear constraints alone leave more joints free: functions are then of the independent joints
-    and of those that only the loops determine.
+    Without closed loops, the others are the independent joints. With closed loops, they include the joints that only
+    the loops determine.
 
     Raises:
         RobotError: If the independent joints do not determine the others, or loops do not close.
@@ -46,7 +46,7 @@ def joint_ties(mechanism: Mechanism) -> dict[str, Tie]:
             continue
         B, q0 = linear_solution(cluster) if closure is None else (closure.assembly.B, closure.assembly.q0)
         unknown = () if closure is None else closure.assembly.unknown
-        kept = [*cluster.independent, *(cluster.bodies[i] for i in unknown)]
+        arguments = [*cluster.independent, *(cluster.bodies[i] for i in unknown)]
         for name, row, offset in zip(cluster.bodies, B, q0, strict=True):
-            ties[name] = Tie({y: float(x) for y, x in zip(kept, row, strict=True) if x != 0.0}, float(offset))
+            ties[name] = Tie({y: float(x) for y, x in zip(arguments, row, strict=True) if x != 0.0}, float(offset))
     return {body.name: ties[body.name] for body in mechanism.robot.bodies if body.name in ties}

@@ -1,6 +1,6 @@
-"""A robot as MJCF text, so that MuJoCo simulates the same machine at the same transmission level.
+"""A robot as MJCF text for MuJoCo, at a transmission level.
 
-What MJCF cannot say is said in `to_mjcf`. Source: https://mujoco.readthedocs.io/en/stable/XMLreference.html.
+Source: https://mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ce_gym.dynamics.standing import standing_pose, turned
 from ce_gym.export.joint_ties import joint_ties
-from ce_gym.export.mjcf_equalities import MJCF_JOINTS, add_ties, check_expressible, held_rotors, joint_armature
+from ce_gym.export.mjcf_equalities import MJCF_JOINTS, add_ties, check_expressible, joint_armature, massless_rotors
 from ce_gym.export.mjcf_mechanism import SMALLEST_INERTIA, largest_ratio, mjcf_mechanism
 from ce_gym.export.mjcf_text import quaternion, text
 from ce_gym.model.description import ContactSphere, Robot, Shape
@@ -24,13 +24,13 @@ from ce_gym.model.mechanism import ELASTIC, MovingBody
 Array = NDArray[np.float64]
 
 SMALLEST_MASS = 1e-12
-"""Mass given to a massless body [kg]; MuJoCo refuses moving bodies without mass."""
+"""Mass of a massless body [kg]; MuJoCo refuses moving bodies without mass."""
 
 SMALLEST_RADIUS = 1e-6
-"""Radius given to a contact point [m]; MuJoCo refuses spheres without extent."""
+"""Radius of a contact point [m]; MuJoCo refuses spheres without extent."""
 
 NO_LIMIT = 1e6
-"""Stands for the missing end of a one-sided joint range [rad or m]."""
+"""Replaces the missing end of a one-sided joint range [rad or m]."""
 
 
 def to_mjcf(
@@ -43,34 +43,27 @@ def to_mjcf(
     solref: Sequence[float] | None = None,
     solimp: Sequence[float] | None = None,
 ) -> str:
-    """Write a robot as MJCF.
+    """Return a robot as MJCF.
 
-    - `exact`: every rotor is a body with a hinge; gears are joint equalities, belts and differentials are fixed tendons
-      with a tendon equality (soft constraints: MuJoCo has no exact ones). Rotors too light for a body of MuJoCo's,
-      such as those that stand for an armature of unknown ratio, are written as at `coupled`, see mjcf_mechanism.py.
-    - `coupled`: no rotors; joint armature for gears, tendon armature for what spans several joints of a chain; for
-      other chains a massless body with armature, tied by a tendon.
-    - `armature`: no rotor bodies; the diagonal of the reflected inertia as joint armature.
-    - `none`: no rotor bodies, no armature.
+    - `exact`: rotors are bodies with hinges. Gears are joint equalities, belts and differentials are fixed tendons
+      with tendon equalities. Very light rotors are written as at `coupled`.
+    - `coupled`: rotors are armature of joints and tendons, see mjcf_equalities.py.
+    - `armature`: rotors are joint armature, the diagonal of the reflected inertia.
+    - `none`: no rotors, no armature.
 
-    Loops are closed by connects and rods by spatial tendons at every level, see mjcf_equalities.py. So armature of
-    a joint inside a loop is reflected to the independent ones as the pose demands, velocity terms included: `coupled`
-    is exact there too. At `armature` a diagonal that varies with the pose would be needed, which MJCF does not have.
+    Loops are closed by connects and rods by spatial tendons at every level. All of MuJoCo's equalities are soft, and as
+    stiff as the lightest body that they hold. Use `coupled` for robots with a massless link between rotors and a loop.
 
-    A joint is called after the body it moves, and so are its actuator (position control with the robot's gains and
-    torque limits) and its tendon. The keyframe "stand" is the standing pose; joints of clusters with loops have it as
-    their `ref` too, so that the file is drawn, and starts, assembled. Coordinates are the robot's own either way. Only
-    contact spheres collide, only with the ground. Limits of a motor's speed have no counterpart and are left out.
+    Joints, their position actuators and their tendons have the names of the moved bodies. The keyframe "stand" is the
+    standing pose, and joints of clusters with loops have it as `ref`. Contact spheres collide with the ground only.
 
-    MuJoCo makes an equality as stiff as the lightest thing it holds: a massless link between rotors that are bodies and
-    a loop gives way. Simulate such robots at `coupled`.
+    MJCF has no counterpart of these data:
 
-    MuJoCo's contacts are stated by time constant and impedance relative to an effective mass, not by stiffness and
-    damping: of the robot's material only friction is exported, the rest is MuJoCo's default.
-
-    MuJoCo refuses inertias that violate the triangle inequality, and its own `balanceinertia` would replace all three
-    moments by their mean. Such an inertia is written with its two smaller principal moments raised equally until the
-    inequality holds; `ce_gym.export.mujoco_model.load` puts the published inertia back after compilation.
+    - Motor speed limits are omitted.
+    - Contact stiffness and damping are MuJoCo's default, as MuJoCo uses a time constant and an impedance instead. Only
+      the friction coefficient is exported.
+    - MuJoCo refuses inertias that violate the triangle inequality. The two smaller principal moments of such an
+      inertia are raised equally; `ce_gym.export.mujoco_model.load` restores the published inertia after compilation.
 
     Args:
         robot: The robot.
@@ -78,14 +71,13 @@ def to_mjcf(
         timestep: MuJoCo's step [s].
         integrator: "Euler", "implicitfast", "implicit" or "RK4".
         ground: Whether to add the plane z = 0.
-        solref: Reference of the equality constraints, gears and loops alike (time constant [s], damping ratio); None
-            is MuJoCo's default, with which they give way visibly.
-        solimp: Impedance of the equality constraints; None is MuJoCo's default.
+        solref: Time constant [s] and damping ratio of all equalities; MuJoCo's default is visibly soft.
+        solimp: Impedance of all equalities; MuJoCo's default if omitted.
 
     Raises:
-        RobotError: If the level does not exist, the independent joints do not determine the others, loops do not close
-            at the standing pose, or MJCF has no way to say something: a constraint that is a function, a rotor that is
-            left out but independent or part of a loop, or the varying diagonal of `armature`.
+        RobotError: If the level does not exist, the independent joints do not determine the others, or loops do not
+            close at the standing pose. MJCF has no function constraints, no omitted rotors that are independent joints
+            or ends of loops, and no armature that varies with the pose.
     """
     if transmission == ELASTIC:
         expected = "another level: MJCF has no such drives"
@@ -93,9 +85,9 @@ def to_mjcf(
     mechanism = mjcf_mechanism(robot, transmission)
     ties = joint_ties(mechanism)
     check_expressible(mechanism, ties)
-    held = held_rotors(mechanism, ties)
+    massless = massless_rotors(mechanism, ties)
     standing = dict(standing_pose(mechanism).q)
-    standing |= {name: standing[name] / largest_ratio(ties[name]) for name in held}
+    standing |= {name: standing[name] / largest_ratio(ties[name]) for name in massless}
     in_loops = [name for cluster in mechanism.tree.clusters if not cluster.linear for name in cluster.bodies]
     reference = {name: standing[name] for name in in_loops}
     solver = {key: text(value) for key, value in (("solref", solref), ("solimp", solimp)) if value is not None}
@@ -104,7 +96,7 @@ def to_mjcf(
     ET.SubElement(root, "option", timestep=text(timestep), integrator=integrator, gravity=text(robot.gravity))
     elements: dict[str | None, ET.Element] = {None: _add_world(root, robot, ground)}
     armature = joint_armature(mechanism, ties)
-    for moving in (*mechanism.bodies.values(), *(moving for moving, _ in held.values())):
+    for moving in (*mechanism.bodies.values(), *(moving for moving, _ in massless.values())):
         elements[moving.name] = _add_body(elements[moving.parent], moving, robot, reference, armature)
     add_ties(root, elements, mechanism, ties, reference, solver)
     _add_actuators(root, robot)
@@ -124,13 +116,9 @@ def _add_world(root: ET.Element, robot: Robot, ground: bool) -> ET.Element:
 
 
 def _add_body(
-    parent: ET.Element,
-    moving: MovingBody,
-    robot: Robot,
-    reference: Mapping[str, float],
-    armature: Mapping[str, float],
+    parent: ET.Element, moving: MovingBody, robot: Robot, reference: Mapping[str, float], armature: Mapping[str, float]
 ) -> ET.Element:
-    """Add a body where it is when its joint is at `ref`."""
+    """Add a body in its pose at joint position `ref`."""
     body, ref = robot.body(moving.name), reference.get(moving.name, 0.0)
     position, rotation = moving.position, moving.rotation
     if ref:
@@ -171,7 +159,7 @@ def _add_body(
 
 
 def _solid(contact: ContactSphere) -> dict[str, str]:
-    """Return what a contact is: a sphere, or a disc as thick as the sphere that moves around its rim."""
+    """Return the attributes of a contact: a sphere, or a disc as thick as the sphere on its rim."""
     radius = max(contact.radius, SMALLEST_RADIUS)
     if not contact.rim:
         return {"type": "sphere", "size": text(radius)}
@@ -203,7 +191,7 @@ def valid_inertia(inertia: Array) -> Array:
     lacking = moments[2] - moments[0] - moments[1]
     if lacking <= 0.0:
         return inertia
-    margin = 1e-9 * moments[2]  # MuJoCo checks without a tolerance, after a diagonalisation of its own
+    margin = 1e-9 * moments[2]  # MuJoCo diagonalises again and checks without a tolerance
     return inertia + 0.5 * (lacking + margin) * (np.eye(3) - np.outer(axes[:, 2], axes[:, 2]))
 
 
@@ -214,10 +202,10 @@ def _add_shape(element: ET.Element, shape: Shape) -> None:
         "cylinder": (shape.size[0], 0.5 * shape.size[-1]),
         "capsule": (shape.size[0], 0.5 * shape.size[-1]),
     }
-    look = {"rgba": text(shape.color), "group": "2", "contype": "0", "conaffinity": "0"}
+    visual = {"rgba": text(shape.color), "group": "2", "contype": "0", "conaffinity": "0"}
     quat = text(quaternion(np.array(shape.placement.rotation)))
     place = {"pos": text(shape.placement.position), "quat": quat}
-    ET.SubElement(element, "geom", {"type": shape.type, "size": text(sizes[shape.type]), **place, **look})
+    ET.SubElement(element, "geom", {"type": shape.type, "size": text(sizes[shape.type]), **place, **visual})
 
 
 def _add_actuators(root: ET.Element, robot: Robot) -> None:
@@ -232,13 +220,13 @@ def _add_actuators(root: ET.Element, robot: Robot) -> None:
 
 
 def _add_standing_pose(root: ET.Element, robot: Robot, standing: Mapping[str, float]) -> None:
-    """Write the standing pose as a keyframe; MuJoCo orders coordinates depth first."""
+    """Add the standing pose as a keyframe; MuJoCo orders coordinates depth first."""
     qpos: list[float] = []
-    turned = {name: robot.standing_q[rows.start : rows.stop] for name, (rows, _) in robot.rows.items()}
+    standing_q = {name: robot.standing_q[rows.start : rows.stop] for name, (rows, _) in robot.rows.items()}
     for element in root.iter("body"):
         name = element.get("name", "")
         if robot.body(name).joint.nv > 1:
-            qpos += turned[name]
+            qpos += standing_q[name]
         else:
             qpos.append(standing[name])
     key = ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="stand", qpos=text(qpos))

@@ -1,4 +1,4 @@
-"""The constraints of a robot as MJCF: equalities, the tendons they need, and the armature that stands for rotors.
+"""The constraints of a robot as MJCF: equalities, tendons, and the armature that replaces rotors.
 
 | constraint              | in MJCF                                                                                 |
 |-------------------------|-----------------------------------------------------------------------------------------|
@@ -7,16 +7,16 @@
 | loop with a ball joint  | one connect between two sites                                                           |
 | loop with a hinge       | two connects, at points along its axis                                                  |
 | rod                     | spatial tendon between two sites with a tendon equality: MuJoCo has no other distance   |
-| function                | nothing: an error                                                                       |
+| function                | an error                                                                                |
 
-Where rotors are left out and `coupled` keeps what they reflect, that is
+Level `coupled` replaces rotors by their reflected inertia:
 
 | rotor driven by              | in MJCF                                                                            |
 |------------------------------|------------------------------------------------------------------------------------|
-| one joint                    | joint armature; the joint may be a dependent one of a loop, which then reflects it |
+| one joint                    | joint armature, also of a dependent joint of a loop                                |
 | several joints of one chain  | a fixed tendon with armature                                                       |
-| joints of several chains     | a massless body whose joint has the armature, tied by a tendon equality: of tendon |
-|                              | armature MuJoCo keeps only what its sparse mass matrix has room for (tested, 4.0)  |
+| joints of several chains     | a massless body whose joint has the armature, tied by a tendon equality: MuJoCo    |
+|                              | drops tendon armature between chains                                               |
 """
 
 from __future__ import annotations
@@ -32,60 +32,62 @@ from ce_gym.export.joint_ties import Tie
 from ce_gym.export.mjcf_mechanism import largest_ratio
 from ce_gym.export.mjcf_text import quaternion, text
 from ce_gym.model.constraints import Constraint, LoopConstraint, RodConstraint
-from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError
+from ce_gym.model.errors import file_error
 from ce_gym.model.frames import Placement
 from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody
 
 Array = NDArray[np.float64]
+Elements = Mapping[str | None, ET.Element]
+Attributes = Mapping[str, str]
 
 MJCF_JOINTS = {"revolute": "hinge", "prismatic": "slide", "ball": "ball"}
 """Types of joints in MJCF."""
 HINGE_SPAN = 0.1
-"""Distance between the two points at which a hinge that closes a loop is held [m]: about the width of a bearing."""
+"""Distance between the two connects of a hinge that closes a loop [m]: about the width of a bearing."""
 
 
 def check_expressible(mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:
-    """Check that MJCF can say what is left of a robot at a transmission level.
+    """Check that MJCF can express a robot at a transmission level.
 
     Raises:
-        RobotError: A constraint is a function; what a left-out rotor moves cannot move without it; its joint has dry
-            friction; or its reflected inertia varies with the pose and only its diagonal is wanted.
+        RobotError: A constraint is a function; an omitted rotor is an independent joint, an end of a loop or has dry
+            friction; or `armature` needs a reflected inertia that varies with the pose.
     """
     robot, level = mechanism.robot, mechanism.level
+    file = robot.source or robot.name
     for body in robot.bodies:
         if body.joint.type not in MJCF_JOINTS and body.joint.type != "free":
-            raise _error(
-                robot, f"joint {body.name!r} is {body.joint.type}", f"one of {', '.join(MJCF_JOINTS)} for MJCF"
+            raise file_error(
+                file, f"joint {body.name!r} is {body.joint.type}", f"one of {', '.join(MJCF_JOINTS)} for MJCF"
             )
     for constraint in robot.constraints:
         if type(constraint) not in EXPORTS and not constraint.linear:
-            what = f"constraint {constraint.name!r} is of a kind that MJCF cannot say"
-            raise _error(robot, what, "type linear, loop or rod")
+            what = f"constraint {constraint.name!r} is of a kind that MJCF does not have"
+            raise file_error(file, what, "type linear, loop or rod")
         for body in constraint.bodies if not constraint.linear else ():
             if body not in mechanism.bodies:
-                what = f"constraint {constraint.name!r} ends on rotor {body!r}, which {level!r} leaves out"
-                raise _error(robot, what, "transmission 'exact' for MJCF")
+                what = f"constraint {constraint.name!r} ends on rotor {body!r}, which {level!r} omits"
+                raise file_error(file, what, "transmission 'exact' for MJCF")
     for name in ties:
         if name not in mechanism.bodies and robot.body(name).joint.friction:
-            what = f"the joint of rotor {name!r}, which {level!r} leaves out, has dry friction"
-            raise _error(robot, what, "transmission 'exact', or friction of links' joints, for MJCF")
+            what = f"the joint of rotor {name!r}, which {level!r} omits, has dry friction"
+            raise file_error(file, what, "transmission 'exact', or friction of links' joints, for MJCF")
         if name not in mechanism.bodies and name in ties[name].ratios:
-            what = f"rotor {name!r}, which {level!r} leaves out, is an independent joint"
-            raise _error(robot, what, "transmission 'exact', or independent links, for MJCF")
+            what = f"rotor {name!r}, which {level!r} omits, is an independent joint"
+            raise file_error(file, what, "transmission 'exact', or independent links, for MJCF")
     for rotor in _eliminated_rotors(mechanism):
-        by_loops = [name for name in ties[rotor.name].ratios if name not in robot.independent]
-        if level == "armature" and by_loops:
-            what = f"the inertia that {level!r} reflects from rotor {rotor.name!r} through {by_loops[0]!r} varies"
-            raise _error(robot, what, "transmission 'exact', 'coupled' or 'none' for MJCF")
+        dependent = [name for name in ties[rotor.name].ratios if name not in robot.independent]
+        if level == "armature" and dependent:
+            what = f"the inertia that {level!r} reflects from rotor {rotor.name!r} through {dependent[0]!r} varies"
+            raise file_error(file, what, "transmission 'exact', 'coupled' or 'none' for MJCF")
 
 
 def joint_armature(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, float]:
-    """Return the armature of joints [kg m^2], by name, as the table at the top of this file says; tendons come later.
+    """Return the armature of joints [kg m^2], by name, see the table at the top of this file.
 
-    At "armature" that is the diagonal of the reflected inertia.
+    At level `armature`, the diagonal of the reflected inertia.
     """
-    armature = {name: rotor.inertia for name, (_, rotor) in held_rotors(mechanism, ties).items()}
+    armature = {name: rotor.inertia for name, (_, rotor) in massless_rotors(mechanism, ties).items()}
     for rotor in _eliminated_rotors(mechanism):
         ratios = ties[rotor.name].ratios
         if mechanism.level == "armature" or (_reflects_all(mechanism) and len(ratios) == 1):
@@ -94,26 +96,26 @@ def joint_armature(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, f
     return armature
 
 
-def held_rotors(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, tuple[MovingBody, EliminatedRotor]]:
-    """Return the left-out rotors that need a body, without mass, to carry their reflected inertia; by name.
+def massless_rotors(mechanism: Mechanism, ties: Mapping[str, Tie]) -> dict[str, tuple[MovingBody, EliminatedRotor]]:
+    """Return the omitted rotors that need a massless body for their reflected inertia, by name.
 
-    The coordinate of that body is the rotor's angle over its largest ratio, since MuJoCo's smallest inertia times the
-    square of a ratio is no longer small.
+    The coordinate of the body is the rotor's angle over its largest ratio: MuJoCo's smallest inertia times a squared
+    ratio is not negligible.
     """
-    held: dict[str, tuple[MovingBody, EliminatedRotor]] = {}
+    massless: dict[str, tuple[MovingBody, EliminatedRotor]] = {}
     for rotor in _eliminated_rotors(mechanism) if _reflects_all(mechanism) else ():
         if len(ties[rotor.name].ratios) > 1 and not _one_chain(mechanism, ties[rotor.name].ratios):
             body = mechanism.robot.body(rotor.name)
             rotation, position = np.array(body.placement.rotation), np.array(body.placement.position)
-            axis, nothing = np.array(body.joint.axis), np.zeros((6, 6))
-            moving = MovingBody(body.name, body.parent, rotation, position, body.joint, axis, nothing)
+            axis, no_inertia = np.array(body.joint.axis), np.zeros((6, 6))
+            moving = MovingBody(body.name, body.parent, rotation, position, body.joint, axis, no_inertia)
             inertia = rotor.inertia * largest_ratio(ties[rotor.name]) ** 2
-            held[body.name] = moving, replace(rotor, inertia=inertia)
-    return held
+            massless[body.name] = moving, replace(rotor, inertia=inertia)
+    return massless
 
 
 def _one_chain(mechanism: Mechanism, joints: Mapping[str, float]) -> bool:
-    """Whether each of some joints carries the next, or the other way round."""
+    """Whether all joints lie on one path from the base to a leaf."""
     chains = []
     for joint in joints:
         body, chain = mechanism.bodies[joint], {joint}
@@ -125,7 +127,7 @@ def _one_chain(mechanism: Mechanism, joints: Mapping[str, float]) -> bool:
 
 
 def _reflects_all(mechanism: Mechanism) -> bool:
-    """Whether rotors that are left out keep all of their reflected inertia, off-diagonal terms included."""
+    """Whether omitted rotors keep all of their reflected inertia, including off-diagonal terms."""
     return mechanism.level in ("exact", "coupled")
 
 
@@ -135,50 +137,44 @@ def _eliminated_rotors(mechanism: Mechanism) -> Iterator[EliminatedRotor]:
 
 def add_ties(
     root: ET.Element,
-    elements: Mapping[str | None, ET.Element],
+    elements: Elements,
     mechanism: Mechanism,
     ties: Mapping[str, Tie],
     reference: Mapping[str, float],
-    solver: Mapping[str, str],
+    solver: Attributes,
 ) -> None:
-    """Tie dependent joints to independent ones, close loops, add the armature of rotors that several joints drive.
+    """Add equalities of dependent joints, loops and rods, and tendons for the armature of rotors with several joints.
 
     Args:
         root: The <mujoco> element.
-        elements: The element of each body; None is the world.
+        elements: The element of each body; the world has the key None.
         mechanism: The robot at a transmission level.
         ties: From `joint_ties`.
-        reference: Joint coordinates in the initial configuration, `ref` [rad or m], where they are not zero: MuJoCo's
-            polynomials and tendon lengths are counted from there.
+        reference: Non-zero joint coordinates in the initial configuration, `ref` [rad or m]. MuJoCo's polynomials and
+            tendon lengths are relative to them.
         solver: Attributes `solref` and `solimp` of equalities.
     """
     tendons, equalities = ET.Element("tendon"), ET.Element("equality")
-    held = held_rotors(mechanism, ties)
-    for name in (*mechanism.bodies, *held):
+    massless = massless_rotors(mechanism, ties)
+    for name in (*mechanism.bodies, *massless):
         if name in ties and name not in ties[name].ratios:
-            tie = ties[name].scaled(1.0 / largest_ratio(ties[name])) if name in held else ties[name]
-            _add_linear(tendons, equalities, name, tie, reference, solver)
+            tie = ties[name].scaled(1.0 / largest_ratio(ties[name])) if name in massless else ties[name]
+            constant = tie.at({joint: reference.get(joint, 0.0) for joint in tie.ratios}) - reference.get(name, 0.0)
+            _add_linear(tendons, equalities, name, tie, constant, solver)
     for constraint in mechanism.robot.constraints:
         if not constraint.linear:
             EXPORTS[type(constraint)](elements, tendons, equalities, constraint, solver)
     if _reflects_all(mechanism):
         for rotor in _eliminated_rotors(mechanism):
-            if len(ties[rotor.name].ratios) > 1 and rotor.name not in held:
+            if len(ties[rotor.name].ratios) > 1 and rotor.name not in massless:
                 tendon = _fixed_tendon(tendons, rotor.name, ties[rotor.name].ratios)
                 tendon.set("armature", text(rotor.inertia))
     root.extend(element for element in (tendons, equalities) if len(element))
 
 
 def _add_linear(
-    tendons: ET.Element,
-    equalities: ET.Element,
-    name: str,
-    tie: Tie,
-    reference: Mapping[str, float],
-    solver: Mapping[str, str],
+    tendons: ET.Element, equalities: ET.Element, name: str, tie: Tie, constant: float, solver: Attributes
 ) -> None:
-    at_reference = {joint: reference.get(joint, 0.0) for joint in tie.ratios}
-    constant = tie.at(at_reference) - reference.get(name, 0.0)
     if len(tie.ratios) == 1:
         ((other, ratio),) = tie.ratios.items()
         pair = {"joint1": name, "joint2": other, "polycoef": text((constant, ratio, 0, 0, 0))}
@@ -196,13 +192,9 @@ def _fixed_tendon(tendons: ET.Element, name: str, ratios: Mapping[str, float]) -
 
 
 def _add_loop(
-    elements: Mapping[str | None, ET.Element],
-    tendons: ET.Element,
-    equalities: ET.Element,
-    loop: LoopConstraint,
-    solver: Mapping[str, str],
+    elements: Elements, tendons: ET.Element, equalities: ET.Element, loop: LoopConstraint, solver: Attributes
 ) -> None:
-    """Hold two bodies together at a point, or at two points along the axis of a hinge."""
+    """Connect two bodies at a point, or at two points along the axis of a hinge."""
     ends = ((loop.first, loop.first_placement), (loop.second, loop.second_placement))
     shifts = {loop.name: 0.0}
     if loop.joint == "revolute":
@@ -215,13 +207,9 @@ def _add_loop(
 
 
 def _add_rod(
-    elements: Mapping[str | None, ET.Element],
-    tendons: ET.Element,
-    equalities: ET.Element,
-    rod: RodConstraint,
-    solver: Mapping[str, str],
+    elements: Elements, tendons: ET.Element, equalities: ET.Element, rod: RodConstraint, solver: Attributes
 ) -> None:
-    """Keep two points at the distance they have in the initial configuration, which is the rod's length."""
+    """Keep the distance of two points in the initial configuration, which is the rod's length."""
     tendon = ET.SubElement(tendons, "spatial", name=rod.name)
     for end, body, point in (("first", rod.first, rod.first_point), ("second", rod.second, rod.second_point)):
         _add_site(elements[body], f"{rod.name}_{end}", Placement(point))
@@ -232,10 +220,9 @@ def _add_rod(
 def _add_site(
     element: ET.Element, name: str, place: Placement, axis: Sequence[float] = (0.0, 0.0, 1.0), shift: float = 0.0
 ) -> None:
-    """Add a site at a point on an axis of a frame of a body, its z along that axis.
+    """Add a site at a point on an axis of a body's frame, with z along the axis.
 
-    MJCF's connect has no axis, but a reader of the file finds it there: equations written along and across it are
-    shorter.
+    MJCF's connect has no axis. A reader of the file takes the axis from the site.
     """
     rotation, along = np.array(place.rotation), np.array(axis)
     position = np.array(place.position) + rotation @ along * shift
@@ -250,9 +237,5 @@ def _from_z(axis: Array) -> Array:
     return np.column_stack([across, np.cross(axis, across), axis])
 
 
-def _error(robot: Robot, problem: str, expected: str) -> RobotError:
-    return RobotError(f"{robot.source or robot.name}: {problem}: expected {expected}")
-
-
 EXPORTS: dict[type[Constraint], Callable[..., None]] = {LoopConstraint: _add_loop, RodConstraint: _add_rod}
-"""Functions (elements, tendons, equalities, constraint, solver) that add a kind of constraint that is not linear."""
+"""Function (elements, tendons, equalities, constraint, solver) that adds each non-linear kind of constraint."""

@@ -1,9 +1,9 @@
-"""A robot at a transmission level as MJCF can say it: rotors that MuJoCo cannot hold as bodies become armature.
+"""The mechanism of a robot for MJCF: rotors that are too light to be bodies of MuJoCo become armature.
 
-MuJoCo refuses bodies of less than 1e-15 kg m^2, and a gear multiplies whatever is added to a rotor's inertia by the
-square of its ratio. A rotor below that, or behind a ratio as large as the one that stands for an unknown ratio (see
-`model/formats/mjcf/rotors.py`), is written at `exact` as what it reflects. What armature leaves out of a rotor is its
-own inertia over the ratio, so that is exact to 1 / LARGEST_RATIO of the reflected inertia.
+MuJoCo refuses bodies below 1e-15 kg m^2, and a gear multiplies any added rotor inertia by its squared ratio. A lighter
+rotor, or one with a ratio as large as the placeholder of an unknown ratio (see `model/formats/mjcf/rotors.py`), becomes
+armature at `exact`, too. Armature neglects the rotor's own inertia over the ratio: an error below 1 / LARGEST_RATIO of
+the reflected inertia.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ SMALLEST_INERTIA = 1e-13
 """Moment of inertia given to a body without any [kg m^2]; MuJoCo refuses moving bodies without inertia."""
 
 LARGEST_RATIO = 1e5
-"""Gear ratio from which on a rotor is written as armature; those of real gears are far below."""
+"""Rotors with at least this gear ratio become armature; real gears have far smaller ratios."""
 
 
 def mjcf_mechanism(robot: Robot, level: str) -> Mechanism:
-    """Prepare a robot for MJCF at a transmission level; arguments and errors as of `build_mechanism`."""
+    """Return the mechanism to write as MJCF; arguments and errors as in `build_mechanism`."""
     mechanism = build_mechanism(robot, level, eliminate=False)
     if level != "exact":
         return mechanism
@@ -49,11 +49,11 @@ def largest_ratio(tie: Tie) -> float:
 
 
 def _is_light(robot: Robot, rotor: Body, ties: Mapping[str, Tie]) -> bool:
-    """Whether a rotor is written as armature; one that does more than to spin behind a gear stays a body."""
-    tie, joint, others = ties[rotor.name], rotor.joint, {body.parent for body in robot.bodies}
-    others |= {contact.body for contact in robot.contacts}
-    others |= {body for constraint in robot.constraints if not constraint.linear for body in constraint.bodies}
-    if rotor.name in others or rotor.name in tie.ratios or joint.friction or joint.damping or joint.stiffness:
+    """Whether a rotor becomes armature; a rotor with other functions than to spin behind a gear stays a body."""
+    tie, joint, used = ties[rotor.name], rotor.joint, {body.parent for body in robot.bodies}
+    used |= {contact.body for contact in robot.contacts}
+    used |= {body for constraint in robot.constraints if not constraint.linear for body in constraint.bodies}
+    if rotor.name in used or rotor.name in tie.ratios or joint.friction or joint.damping or joint.stiffness:
         return False
     axis = np.array(joint.axis)
     moment = float(axis @ np.array(rotor.inertial.inertia) @ axis)

@@ -18,7 +18,7 @@ def text(x: float | Iterable[float]) -> str:
 def quaternion(rotation: Array) -> Array:
     """Return the unit quaternion (w, x, y, z) of a rotation matrix, shape (4,), with w >= 0.
 
-    It is the eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric matrix (2000), sound at every angle.
+    The eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric matrix (2000), accurate at every angle.
     """
     r = rotation
     upper = np.array(

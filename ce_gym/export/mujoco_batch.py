@@ -1,8 +1,6 @@
 # pyright: reportAttributeAccessIssue=false
-"""Copies of a MuJoCo model, rolled out together.
-
-(MuJoCo's compiled modules carry no types, hence the line above.)
-"""
+# MuJoCo's compiled modules have no types
+"""Copies of a MuJoCo model that are rolled out together."""
 
 from __future__ import annotations
 
@@ -19,12 +17,12 @@ STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 @dataclass
 class Batch:
-    """Robots that MuJoCo rolls out with `mujoco.rollout`, one after another on each thread.
+    """Copies of a robot that `mujoco.rollout` steps, one after another on each thread.
 
     Attributes:
         model: Compiled model.
-        num_envs: Robots.
-        num_threads: Threads; 1 is the calling one.
+        num_envs: Number of copies.
+        num_threads: Number of threads; 1 uses the calling thread.
         states: Full physics states, shape (num_envs, n_state).
     """
 
@@ -41,7 +39,7 @@ class Batch:
         self.reset()
 
     def reset(self) -> None:
-        """Put every robot into the standing keyframe."""
+        """Put every copy into the standing keyframe."""
         mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         state = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.data, state, STATE)
@@ -49,11 +47,11 @@ class Batch:
         self.data.warning.number[:] = 0
 
     def trajectory(self, control: Array, out: Array | None = None) -> Array:
-        """Roll out from the current states, which stay as they are.
+        """Roll out from the current states, without changing them.
 
         Args:
             control: Position targets of the actuators [rad] at every step, shape (num_envs, n_steps, nu).
-            out: Where to write; None allocates.
+            out: Array for the result; None allocates one.
 
         Returns:
             States after every step, shape (num_envs, n_steps, n_state).
@@ -63,7 +61,7 @@ class Batch:
         return np.asarray(states)
 
     def split(self, states: Array) -> tuple[Array, Array]:
-        """Return positions (..., nq) and velocities (..., nv), MuJoCo's coordinates, of full physics states."""
+        """Return MuJoCo's positions (..., nq) and velocities (..., nv) of full physics states."""
         nq, nv = self.model.nq, self.model.nv
         return states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + nv]
 
@@ -78,6 +76,6 @@ class Batch:
 
     @property
     def diverged(self) -> bool:
-        """Whether MuJoCo has met a bad state since the last reset (it then resets that robot silently)."""
+        """Whether MuJoCo met a bad state since the last reset (MuJoCo then resets that copy silently)."""
         bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
         return any(self.data.warning[int(kind)].number > 0 for kind in bad)

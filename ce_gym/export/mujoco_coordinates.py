@@ -1,9 +1,9 @@
 # pyright: reportAttributeAccessIssue=false
+# MuJoCo's compiled modules have no types
 """The change from our coordinates to MuJoCo's.
 
-MuJoCo's velocities are [base linear in the world, base angular in the base, joints depth first]; ours are [base
-angular, base linear, ball joints, independent joints], base velocities in the base frame. (MuJoCo's
-compiled modules carry no types, hence the line above.)
+MuJoCo's velocities are [base linear in the world, base angular in the base, joints depth first]. Ours are [base
+angular, base linear, ball joints, independent joints], with base velocities in the base frame.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ce_gym.export.mjcf_mechanism import largest_ratio
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.coordinates import Layout
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError
+from ce_gym.model.errors import file_error
 from ce_gym.model.frames import rotation_matrix
 from ce_gym.model.mechanism import build_mechanism
 
@@ -27,9 +27,14 @@ Array = NDArray[np.float64]
 
 
 def rotor_scale(model: mujoco.MjModel, robot: Robot, name: str, tie: Tie) -> float:
-    """Return a rotor's angle over the coordinate that stands for it in MJCF: 1 but for those of `held_rotors`."""
-    written = [j for j in range(model.njnt) if model.joint(j).name == name and robot.body(name).kind == "rotor"]
-    return largest_ratio(tie) if any(model.dof_armature[model.jnt_dofadr[j]] for j in written) else 1.0
+    """Return a rotor's angle over its coordinate in MJCF: the largest ratio for `massless_rotors`, else 1."""
+    joints = [j for j in range(model.njnt) if model.joint(j).name == name and robot.body(name).kind == "rotor"]
+    return largest_ratio(tie) if any(model.dof_armature[model.jnt_dofadr[j]] for j in joints) else 1.0
+
+
+def joint_rows(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
+    """Return the first rows of each joint in `qpos` and in `qvel`, by name."""
+    return {model.joint(i).name: (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])) for i in range(model.njnt)}
 
 
 @dataclass(frozen=True)
@@ -37,11 +42,12 @@ class Coordinates:
     """The change from our coordinates to MuJoCo's, for one compiled model.
 
     Attributes:
-        layout: Which rows of our coordinates are what.
-        to_positions: MuJoCo's positions of joints with one coordinate for ours, shape (n, n_independent).
-        offset: Its constant part [rad or m], shape (n,).
-        scalars: Rows of these in `qpos` and in `qvel`, shape (n,) each.
-        balls: First rows of ball joints in `qpos` and in `qvel`, in our order.
+        layout: Layout of our coordinates.
+        to_positions: Linear map from our joint positions to MuJoCo's, for joints with one coordinate, shape
+            (n, n_independent).
+        offset: Constant part of this map [rad or m], shape (n,).
+        scalars: Rows of these joints in `qpos` and in `qvel`, shape (n,) each.
+        balls: First rows of each ball joint in `qpos` and in `qvel`, in our order.
     """
 
     layout: Layout
@@ -55,37 +61,36 @@ class Coordinates:
         """Read the order of joints from a compiled model.
 
         Raises:
-            RobotError: The robot has closed loops, whose coordinates are no linear map of the independent ones.
+            RobotError: The robot has closed loops, whose coordinates are not linear in the independent ones.
         """
         loops = [tie.name for tie in robot.constraints if not isinstance(tie, LinearConstraint)]
         if loops:
-            raise RobotError(f"{robot.name}: constraint {loops[0]!r}: expected only linear ones for this comparison")
+            raise file_error(robot.name, f"constraint {loops[0]!r}", "only linear ones for this comparison")
         ties = joint_ties(build_mechanism(robot))
         ties = {name: tie.scaled(1.0 / rotor_scale(model, robot, name, tie)) for name, tie in ties.items()}
-        at = {model.joint(i).name: (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])) for i in range(model.njnt)}
-        names = [name for name in at if name in ties]
+        rows = joint_rows(model)
+        names = [name for name in rows if name in ties]
         matrix = np.array([[ties[name].ratios.get(y, 0.0) for y in robot.independent] for name in names])
-        scalars = [at[name][0] for name in names], [at[name][1] for name in names]
+        scalars = [rows[name][0] for name in names], [rows[name][1] for name in names]
         return cls(
             layout=robot.layout,
             to_positions=matrix.reshape(len(names), len(robot.independent)),
             offset=np.array([ties[name].offset for name in names]),
             scalars=scalars,
-            balls=tuple(at[name] for name in robot.balls),
+            balls=tuple(rows[name] for name in robot.balls),
         )
 
     @property
     def sizes(self) -> tuple[int, int]:
         """Sizes of `qpos` and `qvel`."""
-        first = self.layout
-        return first.joints_q + len(self.offset), first.joints_v + len(self.offset)
+        return self.layout.joints_q + len(self.offset), self.layout.joints_v + len(self.offset)
 
     def positions(self, q: Array) -> Array:
-        """Return MuJoCo's qpos for one configuration of ours, shape (nq,)."""
+        """Return MuJoCo's `qpos` for our configuration q, shape (nq,)."""
         qpos, base = np.zeros(self.sizes[0]), self.layout.base_nq
         qpos[:base] = q[:base]
-        for (theirs, _), (ours, _) in zip(self.balls, self.layout.ball_turns, strict=True):
-            qpos[theirs : theirs + 4] = q[ours : ours + 4]
+        for (qpos_row, _), (row, _) in zip(self.balls, self.layout.ball_turns, strict=True):
+            qpos[qpos_row : qpos_row + 4] = q[row : row + 4]
         qpos[self.scalars[0]] = self.to_positions @ q[self.layout.joints_q :] + self.offset
         return qpos
 
@@ -95,8 +100,8 @@ class Coordinates:
         if self.layout.floating:
             matrix[0:3, 3:6] = rotation_matrix(q[3:7])
             matrix[3:6, 0:3] = np.eye(3)
-        for (_, theirs), (_, ours) in zip(self.balls, self.layout.ball_turns, strict=True):
-            matrix[theirs : theirs + 3, ours : ours + 3] = np.eye(3)
+        for (_, qvel_row), (_, row) in zip(self.balls, self.layout.ball_turns, strict=True):
+            matrix[qvel_row : qvel_row + 3, row : row + 3] = np.eye(3)
         matrix[self.scalars[1], self.layout.joints_v :] = self.to_positions
         return matrix
 

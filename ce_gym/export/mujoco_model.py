@@ -1,13 +1,12 @@
 # pyright: reportAttributeAccessIssue=false
-"""A robot as a compiled MuJoCo model: its MJCF with published inertias, and how MuJoCo is to solve it.
-
-(MuJoCo's compiled modules carry no types, hence the line above.)
-"""
+# MuJoCo's compiled modules have no types
+"""A robot as a compiled MuJoCo model, with published inertias and settings of the solver."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,20 +17,20 @@ from ce_gym.export.mjcf_text import quaternion
 from ce_gym.model.description import Robot
 
 STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Impedance of equalities held as stiffly as MuJoCo allows, with a time constant of two steps."""
+"""Impedance of the stiffest equalities that MuJoCo allows, with a time constant of two steps."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How MuJoCo is set up.
+    """Options of MuJoCo.
 
     Attributes:
-        timestep: [s].
+        timestep: Step [s].
         integrator: Name in MJCF.
         solver: "Newton", "CG" or "PGS".
-        iterations: Most iterations of the solver.
-        line_search: Most iterations of its line search.
-        solimp: Impedance of equalities, with the smallest time constant MuJoCo allows; None is its default for both.
+        iterations: Maximum number of iterations of the solver.
+        line_search: Maximum number of iterations of its line search.
+        solimp: Impedance of equalities, with the smallest time constant MuJoCo allows; by default MuJoCo's defaults.
     """
 
     timestep: float
@@ -47,31 +46,20 @@ class Settings:
 
 
 def load(
-    robot: Robot,
-    transmission: str,
-    *,
-    timestep: float = 0.005,
-    integrator: str = "implicitfast",
-    solref: Sequence[float] | None = None,
-    solimp: Sequence[float] | None = None,
-    also: Callable[[mujoco.MjSpec], None] | None = None,
+    robot: Robot, transmission: str, extend: Callable[[mujoco.MjSpec], None] | None = None, **options: Any
 ) -> mujoco.MjModel:
-    """Compile a robot's MJCF and put back inertias that MuJoCo's compiler refuses; arguments as in `to_mjcf`.
+    """Compile the MJCF of a robot and put back inertias that MuJoCo's compiler refuses.
 
-    What `also` adds to the description is compiled with it.
+    Args:
+        robot: The robot.
+        transmission: Transmission level.
+        extend: Adds elements to the description before compilation.
+        **options: Options of `to_mjcf`.
     """
-    text = to_mjcf(
-        robot,
-        transmission,
-        timestep=timestep,
-        integrator=integrator,
-        ground=robot.floating,
-        solref=solref,
-        solimp=solimp,
-    )
+    text = to_mjcf(robot, transmission, ground=robot.floating, **options)
     spec = mujoco.MjSpec.from_string(text)
-    if also:
-        also(spec)
+    if extend:
+        extend(spec)
     model = spec.compile()
     for moving in mjcf_mechanism(robot, transmission).bodies.values():
         _, _, inertia = mass_properties(moving.inertia)
@@ -83,20 +71,13 @@ def load(
     return model
 
 
-def compiled(
-    robot: Robot, level: str, settings: Settings, also: Callable[[mujoco.MjSpec], None] | None = None
+def compile_model(
+    robot: Robot, level: str, settings: Settings, extend: Callable[[mujoco.MjSpec], None] | None = None
 ) -> mujoco.MjModel:
-    """Compile a robot with settings, with what is added to it, and without whatever the scene does not need."""
+    """Compile a robot with settings, without MuJoCo's islands; `extend` as in `load`."""
     solref = None if settings.solimp is None else (2.0 * settings.timestep, 1.0)
-    model = load(
-        robot,
-        level,
-        timestep=settings.timestep,
-        integrator=settings.integrator,
-        solref=solref,
-        solimp=settings.solimp,
-        also=also,
-    )
+    options = {"timestep": settings.timestep, "integrator": settings.integrator}
+    model = load(robot, level, extend, solref=solref, solimp=settings.solimp, **options)
     model.opt.solver = getattr(mujoco.mjtSolver, f"mjSOL_{settings.solver.upper()}")
     model.opt.iterations, model.opt.ls_iterations = settings.iterations, settings.line_search
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE

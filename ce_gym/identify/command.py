@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from ce_gym.console import examples
+from ce_gym.model.errors import file_error
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 CONTROLS = ("position", "torque", "motor_position", "motor_torque")
 ENCODERS = ("joints", "rotors", "both")
 OSCILLATING = {"dt": 1e-3, "high": 20.0}
-"""Rows [s] and highest frequency [Hz] of simulated logs of transmissions that stretch."""
+"""Time between rows [s] and highest frequency [Hz] of simulated logs of elastic transmissions."""
 
 
 def add_identify_command(subparsers: Any) -> None:
@@ -21,9 +22,9 @@ def add_identify_command(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "identify",
         help="estimate rotor inertia, friction and delay from a log of commands and encoders",
-        description="Estimate figures of a robot that hangs in the air, its base held, from a log: a CSV file with "
-        "columns time,\ncommand:NAME and angle:NAME. Write a robot file with them, and a page of measured and "
-        "simulated curves.",
+        description="Estimate parameters of a robot with a fixed base and its feet in the air from a log, a CSV file "
+        "with columns\ntime, command:NAME and angle:NAME. Write a robot file with the estimates, and a page with "
+        "measured and simulated curves.",
         epilog=examples(
             "identify mini_cheetah chirps.csv --simulate 60",
             "identify mini_cheetah chirps.csv",
@@ -34,17 +35,19 @@ def add_identify_command(subparsers: Any) -> None:
     parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or path of its YAML file")
     parser.add_argument("log", type=Path, metavar="LOG", help="a CSV file")
     parser.add_argument(
-        "--simulate", type=float, metavar="SECONDS", help="write LOG instead, of the robot under chirps"
+        "--simulate", type=float, metavar="SECONDS", help="do not estimate: write a simulated LOG of this duration"
     )
-    parser.add_argument("--control", choices=CONTROLS, default="position", help="what commands mean (default position)")
+    parser.add_argument(
+        "--control", choices=CONTROLS, default="position", help="meaning of commands (default position)"
+    )
     levels = (*LEVELS, ELASTIC)
     parser.add_argument("--transmission", default="exact", choices=levels, help=f"{', '.join(levels)} (default exact)")
-    parser.add_argument("--figures", nargs="+", metavar="KIND", help="what to seek, such as rotor_inertia delay")
-    parser.add_argument("--fix", nargs="+", default=[], metavar="NAME", help="figures that are known")
-    parser.add_argument("--window", type=float, default=0.5, metavar="SECONDS", help="pieces of the log (default 0.5)")
+    parser.add_argument("--parameters", nargs="+", metavar="KIND", help="kinds such as rotor_inertia delay")
+    parser.add_argument("--fix", nargs="+", default=[], metavar="NAME", help="known parameters")
+    parser.add_argument("--window", type=float, default=0.5, metavar="SECONDS", help="length of windows (default 0.5)")
     parser.add_argument("--substep", type=float, default=1e-3, metavar="SECONDS", help="longest step (default 0.001)")
     parser.add_argument(
-        "--encoders", choices=ENCODERS, default="joints", help="with --simulate, where they are (default joints)"
+        "--encoders", choices=ENCODERS, default="joints", help="with --simulate, place of encoders (default joints)"
     )
     parser.add_argument("--out", type=Path, metavar="YAML", help="default: beside LOG")
     parser.add_argument("--html", type=Path, metavar="FILE", help="default: beside LOG")
@@ -56,52 +59,48 @@ def run(args: argparse.Namespace) -> int:
     from ce_gym.identify.estimate import identify
     from ce_gym.identify.excite import simulate_log
     from ce_gym.identify.log import read_log
-    from ce_gym.identify.overlay import check_base, overlay, report
     from ce_gym.identify.page import page
+    from ce_gym.identify.yaml_output import check_base, report, to_yaml
 
     if args.simulate is not None:
         _check_new("LOG", args.log, [Path(args.robot)])
         _check_range("--simulate", args.simulate, 1.0, 3600.0)
-        known = {"control": args.control, "transmission": args.transmission, "encoders": args.encoders}
-        known |= OSCILLATING if args.transmission == ELASTIC else {}
-        print(simulate_log(args.robot, args.simulate, **known).save(args.log))
+        options = {"control": args.control, "transmission": args.transmission, "encoders": args.encoders}
+        options |= OSCILLATING if args.transmission == ELASTIC else {}
+        print(simulate_log(args.robot, args.simulate, **options).save(args.log))
         return 0
     _check_range("--window", args.window, 0.01, 60.0)
     _check_range("--substep", args.substep, 1e-6, 0.1)
-    out, shown = args.out or args.log.with_suffix(".yaml"), args.html or args.log.with_suffix(".html")
-    for option, file in (("--out", out), ("--html", shown)):
+    out, html = args.out or args.log.with_suffix(".yaml"), args.html or args.log.with_suffix(".html")
+    for option, file in (("--out", out), ("--html", html)):
         _check_new(option, file, [Path(args.robot), args.log])
     check_base(args.robot)
-    found = identify(
+    result = identify(
         args.robot,
         read_log(args.log),
         control=args.control,
         transmission=args.transmission,
-        kinds=args.figures,
+        kinds=args.parameters,
         fixed=args.fix,
         window=args.window,
         substep=args.substep,
     )
-    print(report(found))
+    print(report(result))
     base = args.robot
     if base.endswith((".yaml", ".yml")):
         base = os.path.relpath(base, out.resolve().parent)
-    out.write_text(overlay(found, base), encoding="utf-8")
-    shown.write_text(page(found), encoding="utf-8")
-    print(f"{out}\n{shown}")
+    out.write_text(to_yaml(result, base), encoding="utf-8")
+    html.write_text(page(result), encoding="utf-8")
+    print(f"{out}\n{html}")
     return 0
 
 
-def _check_new(option: str, file: Path, read: list[Path]) -> None:
-    """Refuse to write over what is read."""
-    from ce_gym.model import RobotError
-
-    if any(file.resolve() == other.resolve() for other in read):
-        raise RobotError(f"identify: {option} {file}: would replace what is read; expected another name")
+def _check_new(option: str, file: Path, inputs: list[Path]) -> None:
+    """Check that no input file is overwritten."""
+    if any(file.resolve() == other.resolve() for other in inputs):
+        raise file_error("identify", f"{option} {file} would replace an input file", "another name")
 
 
 def _check_range(option: str, value: float, low: float, high: float) -> None:
-    from ce_gym.model import RobotError
-
     if not low <= value <= high:
-        raise RobotError(f"identify: {option} {value:g}: expected {low:g} to {high:g} s")
+        raise file_error("identify", f"{option} {value:g}", f"{low:g} to {high:g} s")

@@ -1,6 +1,6 @@
-"""Derivatives of what encoders read, by figures and by initial states: differences over one batch.
+"""Derivatives of encoder readings by parameters and initial states: finite differences in one batch.
 
-Limbs do not feel each other, so that a figure, or a coordinate, of each can be changed in the same candidate.
+Limbs of a robot with a fixed base are independent, so one candidate perturbs a parameter or state of every limb.
 """
 
 from __future__ import annotations
@@ -8,90 +8,100 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.identify.held import limbs_of
-from ce_gym.identify.shots import Shots
+from ce_gym.identify.base_fixed import limbs_of
+from ce_gym.identify.shooting import Shooting
 from ce_gym.identify.windows import Windows
 
 Array = NDArray[np.float64]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 STEP = 1e-4
-"""Of differences in figures, relative to their scale."""
+"""Step of a parameter, relative to its scale."""
 STATE_STEPS = 1e-5, 1e-3
-"""Of differences in initial positions [rad or m] and velocities."""
+"""Steps of initial positions [rad or m] and velocities."""
+NONE = np.array([], dtype=np.int64)
 
 
 class Limbs:
-    """What belongs to each limb.
+    """Measurements, states and parameters of each limb.
 
     Args:
-        shots: What is simulated.
+        shooting: Log, model and parameters.
 
     Attributes:
-        numbers: Of limbs that are measured.
-        channels: Places of its measurements, for each limb.
-        states: Places of its coordinates in [q; v], for each limb.
+        numbers: Numbers of the measured limbs.
+        channels: Indices of the measurements of each limb.
+        states: Indices of the coordinates of each limb in [q; v].
     """
 
-    def __init__(self, shots: Shots) -> None:
-        limb = limbs_of(shots.model.robot)
-        of_channels = np.array([limb[name] for _, name in shots.log.measured])
-        of_states = np.array([limb[name] for name in shots.model.robot.independent] * 2)
-        self._of_figures = np.array([figure.limb for figure in shots.figures])
+    def __init__(self, shooting: Shooting) -> None:
+        limb = limbs_of(shooting.model.robot)
+        of_channels = np.array([limb[name] for _, name in shooting.log.measured])
+        of_states = np.array([limb[name] for name in shooting.model.robot.independent] * 2)
+        self._of_parameters = np.array([parameter.limb for parameter in shooting.parameters])
         self.numbers = sorted(set(of_channels.tolist()))
         self.channels = {c: np.flatnonzero(of_channels == c) for c in self.numbers}
         self.states = {c: np.flatnonzero(of_states == c) for c in self.numbers}
 
-    def own(self, c: int, free: Places) -> Places:
-        """Return which of the figures that are free act on a limb alone; those of limb -1 act on all."""
-        return free[self._of_figures[free] == c]
+    def parameters(self, c: int, free: Indices) -> Indices:
+        """Return the free parameters that act on limb c alone; with c = -1, those that act on all limbs."""
+        return free[self._of_parameters[free] == c]
 
 
 class Differences:
-    """Takes differences.
+    """Readings of windows and their finite differences.
 
     Args:
-        shots: Simulates windows.
-        windows: Which.
+        shooting: Simulates windows.
+        windows: The windows.
 
     Attributes:
-        last: Where transmissions stretch, states a row after the windows that were simulated last, (W, nq + nv).
+        last: With elastic transmissions, states one row after each window of the last call, shape (W, nq + nv).
     """
 
-    def __init__(self, shots: Shots, windows: Windows) -> None:
-        self.shots, self.windows, self.limbs = shots, windows, Limbs(shots)
-        self._more = int(shots.encoders.joints < shots.model.nq)
-        self.last = np.zeros((0, shots.model.nq + shots.model.nv))
-        self._scale = np.array([figure.scale for figure in shots.figures])
-        self._steps = np.repeat(STATE_STEPS, (shots.model.nq, shots.model.nv))
+    def __init__(self, shooting: Shooting, windows: Windows) -> None:
+        self.shooting, self.windows, self.limbs = shooting, windows, Limbs(shooting)
+        self._extra_rows = int(shooting.encoders.joints < shooting.model.nq)
+        self.last = np.zeros((0, shooting.model.nq + shooting.model.nv))
+        self._scale = np.array([parameter.scale for parameter in shooting.parameters])
+        self._steps = np.repeat(STATE_STEPS, (shooting.model.nq, shooting.model.nv))
 
-    def by_states(self, values: Array, states: Array) -> tuple[Array, dict[int, Array]]:
-        """Return readings (W, L, n) at figures (P,), and their derivatives by states of each limb (W, L n, k)."""
-        read, by_state, _ = self.by_all(values, states, np.array([], dtype=np.int64))
-        return read, by_state
+    def __call__(
+        self, values: Array, states: Array, free: Indices = NONE
+    ) -> tuple[Array, dict[int, Array], dict[int, Array]]:
+        """Return readings and their derivatives by states and by parameters of each limb.
 
-    def by_all(self, values: Array, states: Array, free: Places) -> tuple[Array, dict[int, Array], dict[int, Array]]:
-        """Return them by free figures, over their scales, too; each limb's own ones before those of all limbs."""
-        numbers, common = self.limbs.numbers, self.limbs.own(-1, free)
-        own = {c: self.limbs.own(c, free) for c in numbers}
+        Args:
+            values: Parameters, shape (P,).
+            states: Initial states, shape (W, nq + nv).
+            free: Indices of the parameters for derivatives.
+
+        Returns:
+            Readings, shape (W, L, n), and for each limb with its n_limb measurements: derivatives by its states, shape
+            (W, L n_limb, k), and derivatives by parameters over their scales. Parameters of the limb alone come first,
+            then parameters of all limbs.
+        """
+        numbers, common = self.limbs.numbers, self.limbs.parameters(-1, free)
+        single = {c: self.limbs.parameters(c, free) for c in numbers}
         n_states = max(len(rows) for rows in self.limbs.states.values())
-        n_own = max(len(mine) for mine in own.values())
-        changed = np.tile(values, (1 + n_states + n_own + len(common), 1))
-        moved = np.tile(states, (len(changed), 1, 1))
+        n_single = max(len(places) for places in single.values())
+        perturbed = np.tile(values, (1 + n_states + n_single + len(common), 1))
+        perturbed_states = np.tile(states, (len(perturbed), 1, 1))
         for c in numbers:
             for k, row in enumerate(self.limbs.states[c]):
-                moved[1 + k, :, row] += self._steps[row]
-            for k, figure in enumerate(own[c]):
-                changed[1 + n_states + k, figure] += STEP * self._scale[figure]
-        for k, figure in enumerate(common):
-            changed[1 + n_states + n_own + k, figure] += STEP * self._scale[figure]
-        read, last = self.shots.run(changed, moved, self.windows.first, self.windows.length + self._more)
-        read, self.last = read[:, :, : self.windows.length], last[0]
-        by_state, by_figure = {}, {}
+                perturbed_states[1 + k, :, row] += self._steps[row]
+            for k, i in enumerate(single[c]):
+                perturbed[1 + n_states + k, i] += STEP * self._scale[i]
+        for k, i in enumerate(common):
+            perturbed[1 + n_states + n_single + k, i] += STEP * self._scale[i]
+        length = self.windows.length
+        readings, last = self.shooting(perturbed, perturbed_states, self.windows.first, length + self._extra_rows)
+        readings, self.last = readings[:, :, :length], last[0]
+        by_state, by_parameter = {}, {}
         for c in numbers:
-            change = (read[1:] - read[0])[..., self.limbs.channels[c]]
+            change = (readings[1:] - readings[0])[..., self.limbs.channels[c]]
             change = np.moveaxis(change.reshape(len(change), len(states), -1), 0, -1)
             rows = self.limbs.states[c]
             by_state[c] = change[..., : len(rows)] / self._steps[rows]
-            mine = change[..., n_states : n_states + len(own[c])]
-            by_figure[c] = np.concatenate([mine, change[..., n_states + n_own :]], axis=2) / STEP
-        return read[0], by_state, by_figure
+            of_limb = change[..., n_states : n_states + len(single[c])]
+            by_parameter[c] = np.concatenate([of_limb, change[..., n_states + n_single :]], axis=2) / STEP
+        return readings[0], by_state, by_parameter

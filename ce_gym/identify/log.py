@@ -1,10 +1,9 @@
-"""Logs: what was commanded and what encoders read, from CSV files whose columns say what they are.
+"""Logs of commands and encoder readings, from CSV files.
 
     time, command:HR_hip_rotor, angle:HR_hip_rotor, speed:HR_hip_rotor, ...
 
-`time` [s] is evenly spaced. `command:NAME` holds from its row to the next; NAME is a joint (the link that it moves) or,
-for control at the motors, a rotor. `angle:NAME` [rad or m] and `speed:NAME` are measured at the time of the row, of any
-joint or rotor. Columns `torque:NAME` are passed over.
+`time` [s] is evenly spaced. `command:NAME` holds until the next row. `angle:NAME` [rad or m] and `speed:NAME` are
+readings at the time of the row. `torque:NAME` is ignored. NAME is a joint, by the link that it moves, or a rotor.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.model.errors import RobotError, printable
+from ce_gym.model.errors import RobotError, file_error, printable
 from ce_gym.model.formats.text_file import read_text
 
 Array = NDArray[np.float64]
@@ -26,11 +25,11 @@ KINDS = ("command", "angle", "speed", "torque")
 LARGEST_LOG = 2**30
 """Largest log [bytes]."""
 JITTER = 0.1
-"""How far the time from row to row may be from the mean, relative to it."""
+"""Largest deviation of the time between rows from its median, relative to the median."""
 
 
 class LogError(RobotError):
-    """A log that cannot be used; the message is one line: file, column, row."""
+    """An unusable log; the message is one line with file, column and row."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,11 @@ class Log:
 
     Attributes:
         dt: Time from row to row [s].
-        commanded: What each command is for, by joint or rotor.
-        commands: Shape (T, n_commands) [rad, m, N m or N].
-        measured: Pairs ("angle" or "speed", joint or rotor).
-        values: What was measured, shape (T, n_measured) [rad, m, rad/s or m/s].
-        source: The file, for messages.
+        commanded: Joint or rotor of each command.
+        commands: Commands, shape (T, n_commands) [rad, m, N m or N].
+        measured: Pairs ("angle" or "speed", joint or rotor), one for each measurement.
+        values: Measurements, shape (T, n_measured) [rad, m, rad/s or m/s].
+        source: Name of the file, for messages.
     """
 
     dt: float
@@ -54,7 +53,7 @@ class Log:
     source: str = "log"
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write it as a CSV file; return its path."""
+        """Write the log to a CSV file; return its path."""
         names = [f"command:{name}" for name in self.commanded] + [f"{kind}:{name}" for kind, name in self.measured]
         rows = np.column_stack([np.arange(len(self.values)) * self.dt, self.commands, self.values])
         header = ",".join(["time", *names])
@@ -66,10 +65,10 @@ def read_log(path: str | os.PathLike[str]) -> Log:
     """Read a log.
 
     Args:
-        path: A CSV file, see above.
+        path: A CSV file.
 
     Raises:
-        LogError: It is missing, or a column or a row of it is wrong; one line that says where.
+        LogError: The file is missing, or a column or a row is wrong.
     """
     file = str(path)
     try:
@@ -94,14 +93,15 @@ def _kinds(file: str, header: list[str]) -> list[tuple[str, str]]:
         kind, colon, name = column.partition(":")
         if column != "time" and not (colon and name and kind in KINDS):
             expected = "time, or command:, angle:, speed: or torque: and the name of a joint or rotor"
-            raise LogError(f"{file}: column {i + 1} is {column[:60]!r}: expected {expected}")
+            raise file_error(file, f"column {i + 1} is {column[:60]!r}", expected, LogError)
         if column in header[:i]:
-            raise LogError(f"{file}: column {i + 1} is {printable(column)} again: expected each once")
+            raise file_error(file, f"column {i + 1} is {printable(column)} again", "each column once", LogError)
         kinds.append((kind, name))
-    there = {kind for kind, _ in kinds}
-    for kind, what in (("time", "time"), ("command", "command:NAME"), ("angle", "angle:NAME")):
-        if kind not in there:
-            raise LogError(f"{file}: no column {what}: expected a header such as time,command:NAME,angle:NAME")
+    present = {kind for kind, _ in kinds}
+    for kind, column in (("time", "time"), ("command", "command:NAME"), ("angle", "angle:NAME")):
+        if kind not in present:
+            expected = "a header such as time,command:NAME,angle:NAME"
+            raise file_error(file, f"no column {column}", expected, LogError)
     return kinds
 
 
@@ -109,21 +109,15 @@ def _numbers(file: str, header: list[str], rows: csv.reader) -> Array:  # type: 
     """Return the rows below the header as numbers."""
     table = []
     try:
-        for row in rows:
-            if not row:
-                continue
+        for row in filter(None, rows):
             if len(row) != len(header):
-                raise LogError(f"{file}: row {rows.line_num} has {len(row)} cells: expected {len(header)}")
-            try:
-                table.append([float(cell) for cell in row])
-            except ValueError:
-                table.append([_number(file, rows.line_num, *pair) for pair in zip(header, row, strict=True)])
-            if not all(map(math.isfinite, table[-1])):
-                table[-1] = [_number(file, rows.line_num, *pair) for pair in zip(header, row, strict=True)]
+                raise file_error(file, f"row {rows.line_num} has {len(row)} cells", f"{len(header)}", LogError)
+            table.append([_number(file, rows.line_num, *pair) for pair in zip(header, row, strict=True)])
     except csv.Error as error:
-        raise LogError(f"{file}: row {rows.line_num}: {error}: expected commas between numbers") from None
+        problem = f"row {rows.line_num}: {error}"
+        raise file_error(file, problem, "commas between numbers", LogError) from None
     if len(table) < 100:
-        raise LogError(f"{file}: {len(table)} rows: expected at least 100")
+        raise file_error(file, f"{len(table)} rows", "at least 100", LogError)
     return np.array(table)
 
 
@@ -133,7 +127,8 @@ def _number(file: str, row: int, column: str, cell: str) -> float:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise LogError(f"{file}: row {row}, column {printable(column)} is {cell[:40]!r}: expected a finite number")
+        problem = f"row {row}, column {printable(column)} is {cell[:40]!r}"
+        raise file_error(file, problem, "a finite number", LogError)
     return number
 
 
@@ -143,6 +138,6 @@ def _spacing(file: str, time: Array) -> float:
     wrong = np.flatnonzero(np.abs(steps - dt) > JITTER * abs(dt)) if dt > 0 else np.flatnonzero(steps <= 0)
     if wrong.size:
         k = int(wrong[0])
-        expected = f"evenly spaced rows, {dt:.6g} s apart" if dt > 0 else "times that grow"
-        raise LogError(f"{file}: row {k + 3}, column time is {time[k + 1]:.9g}: expected {expected}")
+        expected = f"evenly spaced rows, {dt:.6g} s apart" if dt > 0 else "increasing times"
+        raise file_error(file, f"row {k + 3}, column time is {time[k + 1]:.9g}", expected, LogError)
     return float((time[-1] - time[0]) / len(steps))

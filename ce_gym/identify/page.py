@@ -1,4 +1,4 @@
-"""A page without scripts: the figures, and what was measured and simulated in windows that were not fitted."""
+"""The result of an identification as an HTML page: estimates, and measured and simulated curves of the validation."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.identify.found import Identified
-from ce_gym.identify.overlay import COLUMNS, remarks, rows_of
+from ce_gym.identify.result import Identified
+from ce_gym.identify.yaml_output import COLUMNS, remarks, table_rows
 
 Array = NDArray[np.float64]
 WIDTH, HEIGHT = 900, 150
@@ -24,17 +24,17 @@ svg{width:100%;height:120px;background:#f6f8f9;display:block}small{color:#555}
 polyline{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}"""
 
 
-def page(found: Identified, shown: int = 4) -> str:
-    """Return an HTML page.
+def page(result: Identified, shown: int = 4) -> str:
+    """Return an HTML page without scripts.
 
     Args:
-        found: What was identified.
-        shown: How many windows of each measurement are drawn.
+        result: The result of the identification.
+        shown: Number of windows to draw for each measurement.
     """
-    plots = [_measurement(found, k, shown) for k in range(len(found.log.measured))]
-    title = html.escape(f"{found.robot.name}: identified from {found.log.source}")
-    table = "".join(_row("td", row) for row in rows_of(found))
-    lines = "".join(f"<p>{html.escape(line)}</p>" for line in remarks(found))
+    plots = [_measurement(result, k, shown) for k in range(len(result.log.measured))]
+    title = html.escape(f"{result.robot.name}: identified from {result.log.source}")
+    table = "".join(_row("td", row) for row in table_rows(result))
+    lines = "".join(f"<p>{html.escape(line)}</p>" for line in remarks(result))
     keys = ", ".join(
         f'<b style="color:{color}">{name}</b>'
         for color, name in ((MEASURED, "measured"), (BEFORE, "errors before"), (AFTER, "errors as identified"))
@@ -43,7 +43,7 @@ def page(found: Identified, shown: int = 4) -> str:
         '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
         f"<table>{_row('th', COLUMNS)}{table}</table>{lines}"
-        f"<p>Windows that were not fitted, each from an initial state of its own: {keys}, simulated less measured.</p>"
+        f"<p>Windows that were not fitted, each from its own initial state: {keys}, simulated minus measured.</p>"
         + "".join(plots)
         + "</html>\n"
     )
@@ -53,11 +53,11 @@ def _row(cell: str, texts: Sequence[str]) -> str:
     return "<tr>" + "".join(f"<{cell}>{html.escape(text)}</{cell}>" for text in texts) + "</tr>"
 
 
-def _measurement(found: Identified, k: int, shown: int) -> str:
-    """Return what was measured, and below it the errors, which the same axis would not show."""
-    times, measured, before, after = (curve[:shown] for curve in found.curves)
-    kind, name = found.log.measured[k]
-    rms = f"error {1e3 * found.held_out[k]:.3g}, before {1e3 * found.held_out_before[k]:.3g} thousandths"
+def _measurement(result: Identified, k: int, shown: int) -> str:
+    """Return two plots of a measurement: the curve, and the errors on their own scale."""
+    times, measured, before, after = (curve[:shown] for curve in result.curves)
+    kind, name = result.log.measured[k]
+    rms = f"error {1e3 * result.held_out[k]:.3g}, before {1e3 * result.held_out_before[k]:.3g} thousandths"
     errors = {BEFORE: (before - measured)[..., k], AFTER: (after - measured)[..., k]}
     return (
         f"<h2>{html.escape(f'{kind} of {name}')}: {rms}</h2>"
@@ -67,7 +67,7 @@ def _measurement(found: Identified, k: int, shown: int) -> str:
 
 
 def _plot(times: Array, curves: dict[str, Array]) -> str:
-    """Return curves over time by their colours, shapes (W, L), windows apart from each other, and a line of ranges."""
+    """Return a plot of curves over time, by colour, shapes (W, L), with gaps between windows, and a line of ranges."""
     low, high = float(min(c.min() for c in curves.values())), float(max(c.max() for c in curves.values()))
     span, first, last = max(high - low, 1e-9), float(times.min()), float(times.max())
     lines = []

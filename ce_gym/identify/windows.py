@@ -1,4 +1,4 @@
-"""Windows of a log, and what can be said of them without a model's figures: states where they start, and noise."""
+"""Windows of a log, and model-free guesses of their initial states and of the encoder noise."""
 
 from __future__ import annotations
 
@@ -8,108 +8,115 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.identify.log import Log, LogError
-from ce_gym.identify.shots import Shots
+from ce_gym.identify.shooting import Shooting
+from ce_gym.model.errors import file_error
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 SETTLING = 0.03
-"""How long transmissions are given until they stretch as their load has them [s]."""
+"""Simulated time until elastic transmissions have settled under their load [s]."""
 SPANS = 0.02, 0.01, 0.005
-"""Half of what a first guess looks at [s]: a smooth motion is known best from long ones, one that rattles by short."""
+"""Half widths of the fits of initial states [s]: long ones for smooth motion, short ones for rattling transmissions."""
 PARTS = 5
-"""Windows of the first search are so many times shorter."""
+"""Number of short windows in a window."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows of a log.
+    """Disjoint windows of a log.
 
     Attributes:
-        first: Rows where they start, shape (W,).
-        length: [rows], a multiple of `PARTS`; no row is in two windows, or its noise would count twice.
+        first: First row of each window, shape (W,).
+        length: Number of rows of a window, a multiple of `PARTS`.
     """
 
-    first: NDArray[np.int64]
+    first: Indices
     length: int
 
     def parts(self) -> Windows:
-        """Return the windows cut into shorter ones, `PARTS` each."""
+        """Return the windows cut into `PARTS` short windows each."""
         length = self.length // PARTS
         return Windows((self.first[:, None] + length * np.arange(PARTS)).ravel(), length)
 
     @property
-    def rows(self) -> NDArray[np.int64]:
+    def rows(self) -> Indices:
         """Rows of each window, shape (W, length)."""
         return self.first[:, None] + np.arange(self.length)
 
 
-def cut(log: Log, window: float, longest_delay: float, held_out: float) -> tuple[Windows, Windows]:
-    """Return windows to fit and windows to judge by, at the end of the log.
+def split_log(log: Log, window: float, longest_delay: float, held_out: float) -> tuple[Windows, Windows]:
+    """Return windows to fit, and windows for validation at the end of the log.
 
     Args:
         log: The log.
-        window: How long they are [s], about.
-        longest_delay: No window starts earlier [s].
-        held_out: Share to judge by.
+        window: Approximate length of a window [s].
+        longest_delay: Earliest start of a window [s].
+        held_out: Share of windows for validation.
 
     Raises:
-        LogError: It is too short for that.
+        LogError: The log is too short.
     """
     length = PARTS * max(4, round(window / log.dt / PARTS))
     first = int(np.ceil(longest_delay / log.dt)) + 1
     starts = np.arange(first, len(log.values) - length, length)
-    kept = max(1, round(held_out * len(starts)))
-    if len(starts) - kept < 4:
-        raise LogError(f"{log.source}: {len(log.values)} rows: expected at least {first + 7 * length} for such windows")
-    return Windows(starts[:-kept], length), Windows(starts[-kept:], length)
+    n = max(1, round(held_out * len(starts)))
+    if len(starts) - n < 4:
+        expected = f"at least {first + 7 * length} for windows of {window:g} s"
+        raise file_error(log.source, f"{len(log.values)} rows", expected, LogError)
+    return Windows(starts[:-n], length), Windows(starts[-n:], length)
 
 
-def first_states(shots: Shots, windows: Windows, span: float = SPANS[0], zeros: Array | float = 0.0) -> Array:
-    """Return a first guess of states, shape (W, nq + nv): cubics through the angles about the start of each window.
-
-    Near an end of the log they go through what there is on the other side.
+def smoothed_states(
+    shooting: Shooting, windows: Windows, span: float = SPANS[0], offsets: Array | float = 0.0
+) -> Array:
+    """Return guesses of initial states from cubic fits through the angles around the start of each window.
 
     Args:
-        shots: What is simulated.
-        windows: Which.
-        span: How long before and after the start they look [s].
-        zeros: What encoders read too much, shape (n_measured,).
+        shooting: The log and its encoders.
+        windows: The windows.
+        span: Half width of the fit [s]; shifted at the ends of the log.
+        offsets: Offsets of the encoders, shape (n_measured,).
+
+    Returns:
+        Shape (W, nq + nv).
     """
-    log, last = shots.log, len(shots.log.values) - 1
+    log, last = shooting.log, len(shooting.log.values) - 1
     n = min(max(3, round(span / log.dt)), last // 2)
     rows = np.clip(windows.first, n, last - n)[:, None] + np.arange(-n, n + 1)
     powers = ((rows - windows.first[:, None]) * log.dt)[..., None] ** np.arange(4)
-    fit = np.linalg.pinv(powers) @ (log.values[rows] - zeros)
-    q = shots.encoders.positions(fit[:, 0])
-    ahead = shots.encoders.positions(fit[:, 0] + 1e-3 * fit[:, 1])
-    return np.hstack([q, (ahead - q) / 1e-3])
+    coefficients = np.linalg.pinv(powers) @ (log.values[rows] - offsets)
+    q = shooting.encoders.positions(coefficients[:, 0])
+    q_later = shooting.encoders.positions(coefficients[:, 0] + 1e-3 * coefficients[:, 1])
+    return np.hstack([q, (q_later - q) / 1e-3])
 
 
-def guesses(shots: Shots, windows: Windows, values: Array) -> Array:
-    """Return first guesses of states at figures (P,), shape (G, W, nq + nv): several where transmissions stretch.
+def guess_states(shooting: Shooting, windows: Windows, values: Array) -> Array:
+    """Return guesses of initial states at parameters (P,), shape (G, W, nq + nv); several for elastic transmissions.
 
-    What rattles on its flanks turns back within milliseconds: a cubic over 40 ms has its mean and not its speed, and
-    a search from there ends between other flanks. With 5 ms rows all spans are three rows, and one guess is enough.
+    A transmission that rattles in its backlash reverses within milliseconds. A cubic over 40 ms misses its speed, and
+    the search then ends in a local minimum. With rows of 5 ms all spans are equal, so one guess is enough.
     """
-    rattles = shots.encoders.joints < shots.model.nq
-    spans = SPANS if rattles and SPANS[1] > 3 * shots.log.dt else SPANS[:1]
-    zeros = shots.zeros(values)
-    each = [first_states(shots, windows, span, zeros) for span in spans]
-    return np.stack([with_stretches(shots, windows, states, values) for states in each])
+    elastic = shooting.encoders.joints < shooting.model.nq
+    spans = SPANS if elastic and SPANS[1] > 3 * shooting.log.dt else SPANS[:1]
+    offsets = shooting.encoder_offsets(values)
+    guesses = [smoothed_states(shooting, windows, span, offsets) for span in spans]
+    return np.stack([settle_stretches(shooting, windows, states, values) for states in guesses])
 
 
-def with_stretches(shots: Shots, windows: Windows, states: Array, values: Array) -> Array:
-    """Return states with stretches that encoders do not tell as they are at figures (P,) once they have settled."""
-    n = shots.encoders.joints
-    if shots.encoders.tell_stretches:
+def settle_stretches(shooting: Shooting, windows: Windows, states: Array, values: Array) -> Array:
+    """Return initial states whose stretches come from a short simulation, unless the encoders determine them."""
+    n, nq = shooting.encoders.joints, shooting.model.nq
+    if shooting.encoders.observe_stretches:
         return states
-    lead = int(min(windows.first.min(), round(SETTLING / shots.log.dt)))
+    lead = int(min(windows.first.min(), round(SETTLING / shooting.log.dt)))
     earlier = Windows(windows.first - lead, lead + 1)
-    _, last = shots.run(values[None], first_states(shots, earlier)[None], earlier.first, earlier.length)
-    settled, nq = states.copy(), shots.model.nq
+    start = smoothed_states(shooting, earlier)
+    _, last = shooting(values[None], start[None], earlier.first, earlier.length)
+    settled = states.copy()
     settled[:, n:nq], settled[:, nq + n :] = last[0, :, n:nq], last[0, :, nq + n :]
     return settled
 
 
-def noise_of_encoders(log: Log) -> Array:
-    """Return a first guess of noise: what third differences have, of which smooth motion has little."""
+def encoder_noise(log: Log) -> Array:
+    """Return a guess of the noise from third differences, which are small for smooth motion, shape (n_measured,)."""
     return np.maximum(np.diff(log.values, 3, axis=0).std(axis=0) / np.sqrt(20.0), 1e-9)

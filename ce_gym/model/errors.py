@@ -30,6 +30,11 @@ class LossyImportWarning(UserWarning):
     """Parts of a file have no counterpart in `Robot`; the message is a short list, `Robot.notes` the full one."""
 
 
+def file_error(file: object, problem: str, expected: str, kind: type[RobotError] = RobotError) -> RobotError:
+    """Return the error of a problem in a file, as one line: file, problem, and what was expected."""
+    return kind(f"{file}: {problem}: expected {expected}")
+
+
 def invalid_value(file: str, key: str, value: object, expected: str) -> RobotError:
     """Return the error for an invalid value: file, key, value and allowed values.
 
@@ -39,7 +44,7 @@ def invalid_value(file: str, key: str, value: object, expected: str) -> RobotErr
         value: The invalid value; None if it is missing.
         expected: The allowed values.
     """
-    return RobotError(f"{file}: {key} is {shown(value)}: expected {expected}")
+    return file_error(file, f"{key} is {shown(value)}", expected)
 
 
 def unknown_name(file: str, key: str, value: object, known: Iterable[str], what: str) -> RobotError:

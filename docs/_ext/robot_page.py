@@ -17,8 +17,7 @@ from environment_page import percent, table, title
 from numpy.typing import NDArray
 
 from ce_gym import InertiaWarning, Model, Robot, load_robot
-from ce_gym.diagnostics.transmission import TransmissionReport, report_levels
-from ce_gym.diagnostics.transmission_text import DROPPED
+from ce_gym.diagnostics.transmission import DROPPED, TransmissionReport, analyse_models
 from ce_gym.envs.registration import ROBOTS, tasks_of
 from ce_gym.model.formats.reading import read_yaml
 from ce_gym.model.mechanism import LEVELS
@@ -45,7 +44,7 @@ def models_of(name: str) -> dict[str, Model]:
 @cache
 def report_of(name: str) -> TransmissionReport:
     """Return the transmission report of a robot that ships with the package, as `python -m ce_gym inspect` has it."""
-    return report_levels(models_of(name))
+    return analyse_models(models_of(name))
 
 
 def robot_page(name: str, folder: Path) -> str:

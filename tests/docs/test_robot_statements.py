@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 import ce_gym
-from ce_gym.diagnostics.levels import report_levels
-from ce_gym.diagnostics.levels_text import as_text
+from ce_gym.diagnostics.levels import levels_report
 from ce_gym.diagnostics.standing import joints_at_feet, pitch_stiffness, toppling
 from ce_gym.dynamics import Model
 from ce_gym.model import Robot
@@ -73,7 +72,7 @@ def belts(name: str) -> bool:
 
 def level_row(name: str) -> str:
     """Return the figures of `armature` as the report prints them, cells of a row of a page."""
-    line = next(line for line in as_text(report_levels(model(name))).splitlines() if line.startswith("  armature"))
+    line = next(line for line in levels_report(model(name)).splitlines() if line.startswith("  armature"))
     return " | ".join(re.split(r"\s{2,}", line.strip())[1:])
 
 

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from ce_gym.__main__ import main
-from ce_gym.diagnostics.levels import foot_rows, frequencies, in_flight, level_row, masses, report_levels
-from ce_gym.diagnostics.levels_text import levels_report, verdict
+from ce_gym.diagnostics.levels import (
+    compare_levels,
+    flight_inertia,
+    foot_jacobian,
+    foot_masses,
+    level_row,
+    levels_report,
+    natural_frequencies,
+    verdict,
+)
 from ce_gym.dynamics import Model
 from ce_gym.model.mechanism import LEVELS
 
@@ -29,40 +37,40 @@ def test_no_motion_of_the_leg_is_worse_than_the_worst_case():
     chol = np.linalg.cholesky(np.linalg.inv(M["exact"][0]))
     size = {"exact": torque["exact"] @ chol, "error": (torque["armature"] - torque["exact"]) @ chol}
     share = np.linalg.norm(size["error"], axis=1) / np.linalg.norm(size["exact"], axis=1)
-    assert share.max() == pytest.approx(row.torque.middle, rel=1e-9)
+    assert share.max() == pytest.approx(row.torque.median, rel=1e-9)
     assert 0.5 * share.max() < share[:-5].max() <= share.max() * (1 + 1e-9)
-    assert row.turn is None
-    assert row.mass is None
+    assert row.base_turn is None
+    assert row.foot_mass is None
 
 
 def test_inertia_in_flight_and_mass_of_a_foot_are_those_of_forward_dynamics():
     model = CHEETAH["exact"]
     q, v = model.standing_q, np.zeros(18)
     M = model.mass_matrix(q)[None]
-    H, turn = in_flight(M, 6)
+    H, turn = flight_inertia(M, 6)
     bias = model.bias_force(q, v)
     push = np.random.default_rng(1).normal(size=12)
     vdot = model.forward_dynamics(q, v, bias + np.concatenate([np.zeros(6), push]))
     np.testing.assert_allclose(H[0] @ vdot[6:], push, atol=1e-9)
     np.testing.assert_allclose(turn[0] @ vdot[6:], vdot[:6], atol=1e-9)
-    feet = foot_rows(model, q[None])
+    feet = foot_jacobian(model, q[None])
     assert feet.shape == (1, 4, 18)
     struck = model.forward_dynamics(q, v, bias + feet[0, 2])  # by 1 N upwards on the third foot
-    assert masses(M, feet)[0, 2] == pytest.approx(1.0 / (feet[0, 2] @ struck), rel=1e-9)
+    assert foot_masses(M, feet)[0, 2] == pytest.approx(1.0 / (feet[0, 2] @ struck), rel=1e-9)
 
 
 def test_frequencies_of_pendulums_on_springs():
     H = np.array([[[2.0, 0.0], [0.0, 0.5]]])
-    np.testing.assert_allclose(frequencies(H, np.array([8.0, 32.0])), [[2.0, 8.0]])
+    np.testing.assert_allclose(natural_frequencies(H, np.array([8.0, 32.0])), [[2.0, 8.0]])
 
 
 def test_levels_of_the_cheetah():
     """Only reaction on the carriers is lost: small in torques, twice as small in frequencies."""
-    report = report_levels(CHEETAH["armature"], poses=10)
+    report = compare_levels(CHEETAH["armature"], poses=10)
     coupled, armature, none = report.rows
     assert coupled.torque == armature.torque
-    assert report.shared.high == 0.0
-    assert armature.frequency.middle == pytest.approx(armature.torque.middle / 2, rel=0.2)
+    assert report.joint_coupling.high == 0.0
+    assert armature.frequency.median == pytest.approx(armature.torque.median / 2, rel=0.2)
     assert none.torque.low > 0.5 > armature.torque.high > 0.05
     assert verdict(report) == "No."
 

@@ -12,7 +12,7 @@ from tripod import TRIPOD
 
 import ce_gym
 from ce_gym.dynamics import Model
-from ce_gym.export.mujoco_twin import lay_ground
+from ce_gym.export.mujoco_twin import set_contact_material
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
 from ce_gym.model.description import Shape
 
@@ -96,7 +96,7 @@ def test_the_twin_in_mujoco_is_damped_by_the_dissipation():
     grounds = []
     for material in (ContactMaterial(dissipation=0.5, damping=7.0), ContactMaterial(damping=0.5 * load)):
         changed = replace(robot, material=material)
-        model = mujoco_model.compiled(changed, "exact", mujoco_model.Settings(0.001))
-        lay_ground(model, changed)
+        model = mujoco_model.compile_model(changed, "exact", mujoco_model.Settings(0.001))
+        set_contact_material(model, changed)
         grounds.append(np.hstack([model.geom_solref, model.geom_solimp]))
     np.testing.assert_allclose(*grounds, rtol=1e-12)

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from ce_gym.bench.chains import rod_parallel_chain
-from ce_gym.diagnostics.transmission import LEAST_NEARNESS, random_states, report_transmissions
-from ce_gym.diagnostics.transmission_text import transmission_report
+from ce_gym.diagnostics.transmission import (
+    LEAST_NEARNESS,
+    analyse_transmissions,
+    random_states,
+    transmission_report,
+)
 from ce_gym.dynamics import Model
 from ce_gym.model import Body, Inertial, Joint, LinearConstraint, Placement, Pose, Robot, load_robot
 
@@ -17,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
 
 def test_gears_of_mini_cheetah():
-    report = report_transmissions(Model("mini_cheetah"), states=0)
+    report = analyse_transmissions(Model("mini_cheetah"), states=0)
     figures = {c.joints[0]: c for c in report.clusters}
     assert len(figures) == 12
     assert report.without_rotors == ()
@@ -33,7 +37,7 @@ def test_gears_of_mini_cheetah():
 
 
 def test_belt_of_the_leg():
-    cluster = report_transmissions(Model("mit_humanoid_leg"), states=0).clusters[-1]
+    cluster = analyse_transmissions(Model("mit_humanoid_leg"), states=0).clusters[-1]
     assert cluster.joints == ("knee_link", "ankle_link")
     expected = [[0.1041422, 0.0242510], [0.0242510, 0.0242510]]  # of the paper's library
     np.testing.assert_allclose(cluster.reflected, expected, atol=5e-8)
@@ -48,14 +52,14 @@ def test_reflected_inertia_is_what_the_coupled_level_adds(robot: Robot):
     added = coupled.mass_matrix(coupled.standing_q) - none.mass_matrix(none.standing_q)
     reflected = np.zeros_like(added)
     first = coupled.nv - len(coupled.joint_links)
-    for cluster in report_transmissions(coupled, states=0).clusters:
+    for cluster in analyse_transmissions(coupled, states=0).clusters:
         rows = [first + coupled.joint_links.index(joint) for joint in cluster.joints]
         reflected[np.ix_(rows, rows)] = cluster.reflected
     np.testing.assert_allclose(added, reflected, atol=1e-12)
 
 
 def test_errors_grow_with_what_is_dropped():
-    errors = {e.level: e for e in report_transmissions(Model("mit_humanoid_leg"), states=100).errors}
+    errors = {e.level: e for e in analyse_transmissions(Model("mit_humanoid_leg"), states=100).errors}
     assert list(errors) == ["coupled", "armature", "none"]
     assert errors["coupled"].base is None
     medians = [error.joints.median for error in errors.values()]
@@ -65,7 +69,7 @@ def test_errors_grow_with_what_is_dropped():
 
 def test_errors_are_of_accelerations():
     """One geared joint on the world: exact = coupled = armature, and `none` is wrong by the reflected share."""
-    report = report_transmissions(Model(geared_joint()), states=50)
+    report = analyse_transmissions(Model(geared_joint()), states=50)
     errors = {error.level: error for error in report.errors}
     assert errors["coupled"].joints.max < 1e-12
     assert errors["armature"].joints.max < 1e-12
@@ -75,7 +79,7 @@ def test_errors_are_of_accelerations():
 
 
 def test_base_is_apart_from_joints():
-    errors = report_transmissions(Model("mini_cheetah"), states=50).errors
+    errors = analyse_transmissions(Model("mini_cheetah"), states=50).errors
     assert all(error.base is not None and 0.0 < error.base.median <= error.base.max for error in errors)
 
 

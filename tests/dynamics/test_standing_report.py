@@ -11,16 +11,17 @@ import pytest
 from ce_gym.__main__ import main
 from ce_gym.diagnostics.standing import (
     StandingReport,
-    carrying_contacts,
+    as_text,
     contact_heights,
-    fallen_after,
+    fall_times,
     has_fallen,
     joints_at_feet,
     pitch_stiffness,
-    report_standing,
     seconds_to_compile,
+    simulate_standing,
+    standing_contacts,
+    standing_report,
 )
-from ce_gym.diagnostics.standing_text import as_text, standing_report
 from ce_gym.dynamics import Model
 
 MASS, HEIGHT, FOOT = 10.0, 0.8, 1.0  # [kg], of the trunk above the ankle [m], of the foot [kg]
@@ -56,23 +57,23 @@ def pole(folder: Path, kp: float) -> str:
 def test_pendulum_falls_below_its_weight_times_height_and_stands_above(tmp_path: Path) -> None:
     model = Model(pole(tmp_path, TOPPLING))
     factors = np.array([0.8, 0.95, 1.05, 1.2])[:, None]
-    np.testing.assert_array_equal(np.isinf(fallen_after(model, factors)), [False, False, True, True])
+    np.testing.assert_array_equal(np.isinf(fall_times(model, factors)), [False, False, True, True])
 
 
 def test_what_would_carry_it(tmp_path: Path) -> None:
     """With 0.45 of the necessary stiffness the first factor above 2 suffices; else the pole falls as a pendulum."""
-    report = report_standing(Model(pole(tmp_path, 0.45 * TOPPLING)))
+    report = simulate_standing(Model(pole(tmp_path, 0.45 * TOPPLING)))
     assert report.ankles == ("foot",)
     assert report.toppling == pytest.approx(TOPPLING, rel=1e-9)
     assert report.stiffness == pytest.approx(0.45 * TOPPLING, rel=1e-9)
     assert report.factor == report.ankle_factor == 2.8
     rate = np.sqrt(0.55 * TOPPLING / (MASS * HEIGHT**2 + 0.1))  # of growth, but for damping
     undamped = np.arccosh(0.5 / (0.02 / HEIGHT / rate)) / rate  # until it has tilted by 0.5 rad
-    assert report.after is not None
-    assert undamped < report.after < 2.5 * undamped
+    assert report.fall_time is not None
+    assert undamped < report.fall_time < 2.5 * undamped
     words = as_text(report)
-    assert "All position gains times 2.8 would carry it." in words
-    assert "Those of foot" in words
+    assert "All position gains times 2.8 would hold the robot." in words
+    assert "Gains of foot alone" in words
 
 
 def boxes(feet: int, torso: int, shanks: int) -> str:
@@ -86,42 +87,42 @@ def boxes(feet: int, torso: int, shanks: int) -> str:
 
 
 @pytest.mark.parametrize(
-    ("counts", "chosen", "which"),
+    ("counts", "chosen", "choice"),
     [
         ((1, 1, 1), 24, "all"),
-        ((1, 1, 28), 16, "those of the groups foot and torso"),
-        ((2, 10, 0), 16, "those of the group foot"),
-        ((6, 1, 20), 24, "the lowest of the group foot"),
+        ((1, 1, 28), 16, "groups foot and torso"),
+        ((2, 10, 0), 16, "group foot"),
+        ((6, 1, 20), 24, "the lowest of group foot"),
     ],
 )
-def test_of_many_contacts_those_that_carry_are_compiled(tmp_path: Path, counts: tuple, chosen: int, which: str) -> None:
+def test_of_many_contacts_some_are_compiled(tmp_path: Path, counts: tuple, chosen: int, choice: str) -> None:
     file = Path(pole(tmp_path, 2 * TOPPLING))
     before, after = YAML.index("  a: {body"), YAML.index("material:")
     file.write_text(f"{YAML[:before]}{boxes(*counts)}\n{YAML[after:]}".replace("KP", f"{2 * TOPPLING}"))
     model = Model(file)
     assert len(model.robot.contacts) == 8 * sum(counts)
-    names, words = carrying_contacts(model)
-    assert (len(names), words) == (chosen, which)
-    if which.startswith("the lowest"):
+    names, words = standing_contacts(model)
+    assert (len(names), words) == (chosen, choice)
+    if choice.startswith("the lowest"):
         lowest = {f"foot{i}" for i in range(3)}  # boxes of 8 contacts, some as low as the next box's
         assert lowest <= {name.split("_")[0] for name in names}
     assert seconds_to_compile(model) < 60
     if sum(counts) == 30:
         words = standing_report(model)
         assert "stands 30 s" in words
-        assert "Simulated with 16 of its 240 contacts: those of the groups foot and torso." in words
+        assert "Simulated with 16 of its 240 contacts: groups foot and torso." in words
 
 
 def report(**figures: Any) -> StandingReport:
     """Return a report of a robot that falls, with some figures changed."""
-    usual = {"after": 0.3, "ankles": ("knee",), "ankle_factor": None, "factor": 4.0, "toppling": 30.0}
-    usual |= {"stiffness": 20.0, "gap": 0.0, "contacts": 8, "which": "all", "of_contacts": 8}
+    usual = {"fall_time": 0.3, "ankles": ("knee",), "ankle_factor": None, "factor": 4.0, "toppling": 30.0}
+    usual |= {"stiffness": 20.0, "gap": 0.0, "contacts": 8, "choice": "all", "all_contacts": 8}
     return StandingReport(**(usual | figures))
 
 
 def test_figures_that_mean_nothing_are_not_printed() -> None:
     assert "times height above these joints is 30 N m/rad; their gains hold 20" in as_text(report())
-    assert "Those of knee alone would not carry it, not even times 64." in as_text(report())
+    assert "Gains of knee alone would not hold the robot, not even times 64." in as_text(report())
     below = as_text(report(toppling=-822.0))
     assert "-822" not in below
     assert "centre of mass is below these joints" in below
@@ -129,7 +130,7 @@ def test_figures_that_mean_nothing_are_not_printed() -> None:
     assert "None of these joints turns about the lateral axis" in sideways
     assert "hold 0" not in sideways
     assert "lowest contact is 0.054 m below the ground" in as_text(report(gap=-0.054))
-    assert "lowest contact is 0.120 m above the ground" in as_text(report(gap=0.12, after=None))
+    assert "lowest contact is 0.120 m above the ground" in as_text(report(gap=0.12, fall_time=None))
     assert "lowest contact" not in as_text(report(gap=0.009))
 
 
@@ -151,7 +152,7 @@ def test_the_gap_below_a_robot_is_that_of_its_lowest_contact(tmp_path: Path) -> 
 
 def test_a_quadruped_stands(capsys: pytest.CaptureFixture[str]) -> None:
     assert "stands 30 s" in standing_report(Model("mini_cheetah"))
-    assert main(["inspect", "mini_cheetah", "--no-errors", "--no-timing"]) == 0
+    assert main(["inspect", "mini_cheetah", "--no-errors", "--no-standing"]) == 0
     assert "Without a policy" not in capsys.readouterr().out
     assert main(["inspect", "mini_cheetah", "--no-errors"]) == 0
     assert "Without a policy: stands" in capsys.readouterr().out

@@ -10,7 +10,7 @@ import yaml
 
 import ce_gym
 from ce_gym.envs.runtime.setup import make_program
-from ce_gym.identify.figures import sought
+from ce_gym.identify.parameters import select_parameters
 from ce_gym.model.errors import RobotError, check_names, listed_names
 
 CHEETAH = ce_gym.Model("mini_cheetah")
@@ -110,16 +110,16 @@ def test_models_refuse_names_that_match_nothing():
 @pytest.mark.parametrize(
     ("kinds", "fixed", "message"),
     [
-        (["delay", "delay"], [], "figure is 'delay': expected each name once"),
-        (["delay", "backlash"], [], "figure is 'backlash': expected a kind that mini_cheetah and its log have"),
-        (["delay", "rotor_inertai"], [], "figure is 'rotor_inertai': .* mean 'rotor_inertia'"),
-        (["rotor_inertia"], ["rotor_inertia:FL_hip"], "fixed figure is 'rotor_inertia:FL_hip': .* mean 'rotor_in"),
-        (["rotor_inertia", "delay"], ["delay", "delay"], "fixed figure is 'delay': expected each name once"),
+        (["delay", "delay"], [], "kind is 'delay': expected each name once"),
+        (["delay", "backlash"], [], "kind is 'backlash': expected a kind that mini_cheetah and its log have"),
+        (["delay", "rotor_inertai"], [], "kind is 'rotor_inertai': .* mean 'rotor_inertia'"),
+        (["rotor_inertia"], ["rotor_inertia:FL_hip"], "fixed is 'rotor_inertia:FL_hip': .* mean 'rotor_in"),
+        (["rotor_inertia", "delay"], ["delay", "delay"], "fixed is 'delay': expected each name once"),
     ],
 )
 def test_identify_refuses_names_that_match_nothing(kinds: list[str], fixed: list[str], message: str):
     with pytest.raises(RobotError, match=message):
-        sought(CHEETAH.robot, kinds, fixed)
+        select_parameters(CHEETAH.robot, kinds, fixed)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
-"""Transmissions that stretch: figures of logs that an integration of the test's own makes, and what logs cannot tell.
+"""Identification of elastic transmissions from logs of an independent simulation, and unidentifiable parameters.
 
-Two links and two rotors in a plane, by Lagrange's equations, in steps of 50 us; no code of the package is in it.
+The simulation has two links and two rotors in a plane: Lagrange's equations in steps of 50 us, without the package.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Robot, RobotError, Simulator, load_robot
-from ce_gym.identify import Identified, Log, identify, overlay, simulate_log
+from ce_gym.identify import Identified, Log, identify, simulate_log, to_yaml
 from ce_gym.model import Gains, Joint
 
 pytest.importorskip("scipy")
@@ -67,7 +67,7 @@ def slope(z: list[float], torque: list[float]) -> list[float]:
     q1, q2, theta1, theta2, v1, v2, w1, w2 = z
     J1, J2 = SPIN * PLANTED["rotor_inertia:first"], SPIN * PLANTED["rotor_inertia:second"]
     upper, lower, length, c1, c2, g = 0.8, 0.3, 0.25, 0.1, 0.08, 9.81
-    I1 = 0.005 - (J2 - SPIN)  # as a load the rotor stays what it is
+    I1 = 0.005 - (J2 - SPIN)  # the load on the upper link is unchanged
     I2 = 0.002 + lower * c2**2
     elbow = I2 + lower * length * c2 * cos(q2)
     M11 = I1 + upper * c1**2 + 0.1 * length**2 + J2 + lower * length**2 + 2 * elbow - I2
@@ -90,7 +90,7 @@ def mesh(rotor: str, i: int, stretch: float, rate: float) -> float:
 
 
 def log_of(seconds: float, amplitude: float, about: tuple[float, float] = (0.0, 0.0), fast: float = 15.0) -> Log:
-    """What a controller of motors, and encoders of joints and rotors, make of the arm; torques reach motors late."""
+    """Log of the arm under a controller of its motors, with encoders at joints and rotors and delayed torques."""
     rows, late = round(seconds / DT), round(PLANTED["delay"] / DT)
     z = [*about, 6 * about[0], 9 * about[1], 0.0, 0.0, 0.0, 0.0]
     seen, torques = np.zeros((rows, 4)), np.zeros((rows, 2))
@@ -129,18 +129,18 @@ def log() -> Log:
 
 
 @pytest.fixture(scope="module")
-def found(arm: Robot, log: Log) -> Identified:
+def result(arm: Robot, log: Log) -> Identified:
     return identify(arm, log, kinds=KINDS, substep=2.5e-4, **OPTIONS)
 
 
-def test_what_is_found_is_what_the_other_arm_has(found: Identified):
-    names = [figure.name for figure in found.figures]
+def test_estimates_are_the_parameters_of_the_other_arm(result: Identified):
+    names = [parameter.name for parameter in result.parameters]
     for name, value in PLANTED.items():
-        assert found[name] == pytest.approx(value, rel=0.02), name
-        assert abs(found[name] - value) < 4 * dict(zip(names, found.std, strict=True))[name], name
-    assert found.cannot_tell == ()
-    assert found.held_out.max() < 1.1 * NOISE
-    assert found.held_out_before.max() > 50 * NOISE
+        assert result[name] == pytest.approx(value, rel=0.02), name
+        assert abs(result[name] - value) < 4 * dict(zip(names, result.std, strict=True))[name], name
+    assert result.warnings == ()
+    assert result.held_out.max() < 1.1 * NOISE
+    assert result.held_out_before.max() > 50 * NOISE
 
 
 def only(log: Log, *names: str) -> Log:
@@ -149,25 +149,25 @@ def only(log: Log, *names: str) -> Log:
     return replace(log, measured=tuple(log.measured[k] for k in kept), values=log.values[:, kept])
 
 
-def test_encoders_at_rotors_alone_tell_of_what_is_behind_them(arm: Robot, log: Log):
+def test_encoders_at_rotors_alone_are_enough(arm: Robot, log: Log):
     kinds = tuple(kind for kind in KINDS if kind != "encoder_zero")
-    with pytest.raises(RobotError, match="figure is 'encoder_zero': expected a kind that arm and its log have"):
+    with pytest.raises(RobotError, match="kind is 'encoder_zero': expected a kind that arm and its log have"):
         identify(arm, only(log, "first", "second"), kinds=KINDS, **OPTIONS)
-    found = identify(arm, only(log, "first", "second"), kinds=kinds, substep=5e-4, **OPTIONS)
-    for figure, value in zip(found.figures, found.values, strict=True):
-        assert value == pytest.approx(PLANTED[figure.name], rel=0.02), figure.name
-    assert found.cannot_tell == ()
+    result = identify(arm, only(log, "first", "second"), kinds=kinds, substep=5e-4, **OPTIONS)
+    for parameter, value in zip(result.parameters, result.values, strict=True):
+        assert value == pytest.approx(PLANTED[parameter.name], rel=0.02), parameter.name
+    assert result.warnings == ()
 
 
-def test_rigid_figures_do_not_fit_and_this_is_said(arm: Robot, log: Log):
+def test_rigid_parameters_do_not_fit_and_cause_a_warning(arm: Robot, log: Log):
     kinds = ("rotor_inertia", "motor_damping", "link_inertia", "delay")
-    found = identify(arm, log, control="motor_torque", kinds=kinds)
+    result = identify(arm, log, control="motor_torque", kinds=kinds)
     assert re.match(
-        r"what is left of angle:\w+ is \d+ times its noise: .*; intervals do not hold", found.cannot_tell[0]
+        r"the residual of angle:\w+ is \d+ times its noise: .*; intervals are not valid", result.warnings[0]
     )
 
 
-def test_play_that_is_never_crossed_is_not_told_from_the_zero_of_an_encoder(arm: Robot):
+def test_uncrossed_backlash_is_not_separable_from_an_encoder_offset(arm: Robot):
     """Without gravity, a long soft spring pressing flanks on each other, nothing else tells one from the other."""
     soft = 1e-4
     pulled = {name: Joint("revolute", (0, 1, 0), stiffness=soft, springref=2.0 / soft) for name in ("upper", "lower")}
@@ -179,22 +179,22 @@ def test_play_that_is_never_crossed_is_not_told_from_the_zero_of_an_encoder(arm:
     log = simulate_log(pressed, 4.0, 1e-3, amplitude=0.05, planted=planted, noise=NOISE, encoders="both", **options)
     stretch = log.values[:, 2:] - [6, 9] * (log.values[:, :2] - [0.006, 0.0])
     assert (np.abs(stretch[500:]) > 0.01).all(), "on one flank"
-    found = identify(pressed, log, kinds=("drive_stiffness", "backlash", "encoder_zero"), **options)
-    held = {which.figure.name: [figure.name for figure, _ in which.taken] for which in found.held}
+    result = identify(pressed, log, kinds=("drive_stiffness", "backlash", "encoder_zero"), **options)
+    held = {item.parameter.name: item.shifted for item in result.unidentifiable}
     assert held.keys() in ({"backlash:first", "backlash:second"}, {"encoder_zero:upper", "encoder_zero:lower"})
     assert all(held.values())
-    assert found["drive_stiffness:first"] == pytest.approx(1.3, rel=0.02)
+    assert result["drive_stiffness:first"] == pytest.approx(1.3, rel=0.02)
 
 
-def test_what_is_written_loads_and_is_the_same_robot(arm: Robot, found: Identified, tmp_path: Path):
-    (tmp_path / "found.yaml").write_text(text := overlay(found, arm.source))
+def test_the_written_file_loads_and_is_the_same_robot(arm: Robot, result: Identified, tmp_path: Path):
+    (tmp_path / "result.yaml").write_text(text := to_yaml(result, arm.source))
     assert "the encoder of upper reads 0.006" in text
-    laid, names = load_robot(tmp_path / "found.yaml"), [f.name for f in found.figures if f.kind in KINDS[:4]]
+    laid, names = load_robot(tmp_path / "result.yaml"), [p.name for p in result.parameters if p.kind in KINDS[:4]]
     sims = [
         Simulator(Model(robot, "elastic"), motors="limited", parameters=p) for robot, p in ((laid, ()), (arm, names))
     ]
     for name in names:
-        sims[1].set_parameter(name, found[name])
+        sims[1].set_parameter(name, result[name])
     bare = Simulator(Model(arm, "elastic"), motors="limited")
     for sim in (*sims, bare):
         sim.set_state(np.array([[0.3, -0.2, 0.03, -0.02]]), np.zeros((1, 4)))
@@ -203,10 +203,10 @@ def test_what_is_written_loads_and_is_the_same_robot(arm: Robot, found: Identifi
     assert np.abs(bare.q - sims[1].q).max() > 1e-4
 
 
-def test_figures_that_a_file_does_not_have_are_not_sought(arm: Robot):
+def test_parameters_without_a_value_in_the_file_are_refused(arm: Robot):
     stiff = replace(arm, elastic=tuple(replace(e, backlash=0.0, damping=0.0) for e in arm.elastic))
     log = simulate_log(arm, 4.0, transmission="elastic")
-    with pytest.raises(RobotError, match="figure is 'backlash': expected a kind that arm and its log have"):
+    with pytest.raises(RobotError, match="kind is 'backlash': expected a kind that arm and its log have"):
         identify(stiff, log, kinds=("backlash", "drive_damping"), transmission="elastic")
     with pytest.raises(RobotError, match="elastic is missing"):
         identify(replace(arm, elastic=()), log, transmission="elastic")

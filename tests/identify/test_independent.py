@@ -1,7 +1,7 @@
-"""Identification against logs that none of its code had a hand in, and its standard errors against dense least squares.
+"""Identification from logs of an independent controller, and its standard errors against dense least squares.
 
-The robot is text with other numbers in it, stepped by a bare `Simulator`; a controller of the test's own asks for
-torques row by row, which reach the motors whole rows later.
+The robot is text with other numbers, stepped by a bare `Simulator`. A controller of this test commands torques row by
+row, which reach the motors whole rows later.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ce_gym import Model, Robot, Simulator, load_robot
-from ce_gym.identify import Identified, Log, identify, overlay
+from ce_gym.identify import Identified, Log, identify, to_yaml
 
 pytest.importorskip("scipy")
 
@@ -53,7 +53,7 @@ DT, LATE, NOISE = 0.004, 2, 3e-4
 
 
 def written(folder: Path, first=1.0, second=1.0, lower=1.0, frictions=(0.01, 0.01)) -> Robot:
-    """Return the arm with numbers of its own; what it carries does not become heavier with a rotor's spin."""
+    """Return the arm with other numbers; a factor on a rotor's spin inertia does not change its load on the carrier."""
     spins = {"first": first * SPIN, "second": second * SPIN}
     links = {"upper": UPPER - (second - 1) * SPIN, "lower": lower * LOWER}
     (folder / "arm.urdf").write_text(URDF.format(**links))
@@ -65,7 +65,7 @@ def written(folder: Path, first=1.0, second=1.0, lower=1.0, frictions=(0.01, 0.0
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, np.ndarray]:
-    """A log of the arm with planted figures, and its states, shape (T, 4)."""
+    """A log of the arm with planted parameters, and its states, shape (T, 4)."""
     robot = written(tmp_path_factory.mktemp("real"), 1.25, 0.8, 1.3, (0.03, 0.02))
     sim = Simulator(Model(robot), 1, DT / 4, control="torque", motors="limited", method="extrapolated")
     states, torques = np.zeros((1100, 4)), np.zeros((1100, 2))
@@ -86,50 +86,52 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Robot:
 
 
 @pytest.fixture(scope="module")
-def found(run: tuple[Log, np.ndarray], plain: Robot) -> Identified:
+def result(run: tuple[Log, np.ndarray], plain: Robot) -> Identified:
     kinds = ("rotor_inertia", "motor_friction", "link_inertia", "delay")
     return identify(plain, run[0], control="torque", kinds=kinds)
 
 
-def test_what_is_found_is_what_the_other_robot_has(found: Identified):
-    std = dict(zip([figure.name for figure in found.figures], found.std, strict=True))
+def test_estimates_are_the_parameters_of_the_other_robot(result: Identified):
+    std = dict(zip([parameter.name for parameter in result.parameters], result.std, strict=True))
     for name, value in PLANTED.items():
-        assert found[name] == pytest.approx(value, rel=0.02), name
-        assert abs(found[name] - value) < 4 * std[name], name
-    assert found.held_out.max() < 1.1 * NOISE
+        assert result[name] == pytest.approx(value, rel=0.02), name
+        assert abs(result[name] - value) < 4 * std[name], name
+    assert result.held_out.max() < 1.1 * NOISE
 
 
-def test_of_figures_that_cannot_be_separated_one_is_held_and_their_sum_is_found(found: Identified):
-    assert [which.figure.name for which in found.held] == ["rotor_inertia:first"]
-    assert found["rotor_inertia:first"] == 1.0
-    line, text = found.cannot_tell[0], overlay(found, "arm.yaml")
+def test_of_inseparable_parameters_the_sum_is_estimated(result: Identified):
+    assert [item.parameter.name for item in result.unidentifiable] == ["rotor_inertia:first"]
+    assert result["rotor_inertia:first"] == 1.0
+    line, text = result.warnings[0], to_yaml(result, "arm.yaml")
     assert line.startswith(
         "rotor_inertia:first is held at 1, as in the robot's file: the data cannot separate it from "
     )
     assert f"link_inertia:upper + {SHARE:.3g}" in line
-    assert f"is {found['link_inertia:upper']:.5g}, " in line
+    assert f"is {result['link_inertia:upper']:.5g}, " in line
     assert '"upper"' in text
     assert line in text
     assert '"first"' not in text.split("  rotor_inertia:")[1].split("  motor")[0]
 
 
-def test_standard_errors_are_those_of_dense_least_squares(found: Identified, run: tuple[Log, np.ndarray], plain: Robot):
-    """Figures and the initial states of all windows at once, Jacobian by central differences at what was planted."""
+def test_standard_errors_are_those_of_dense_least_squares(
+    result: Identified, run: tuple[Log, np.ndarray], plain: Robot
+):
+    """Parameters and all initial states at once, with the Jacobian by central differences at planted parameters."""
     log, states = run
     first, length = np.arange(9, 1100 - 125, 125)[:-2], 125  # 30 ms and a row, then half a second each, two held out
-    assert found.curves[0][0, 0] == pytest.approx((first[-1] + length) * DT)
-    names = [found.figures[i].name for i in found.sought]
+    assert result.curves[0][0, 0] == pytest.approx((first[-1] + length) * DT)
+    names = [result.parameters[i].name for i in result.estimated]
     factors = ("rotor_inertia:second", "link_inertia:upper", "link_inertia:lower")
     options = {"control": "torque", "motors": "limited", "method": "extrapolated", "contacts": (), "outputs": ()}
     sim = Simulator(Model(plain), len(first), DT / 4, parameters=(*factors, "motor_friction"), **options)
 
-    def angles(figures: dict[str, float], moved: np.ndarray) -> np.ndarray:
+    def angles(parameters: dict[str, float], moved: np.ndarray) -> np.ndarray:
         """Windows after each other, each its two angles row by row."""
         for name in factors:
-            sim.set_parameter(name, figures[name])
-        sim.set_parameter("motor_friction", [figures["motor_friction:first"], figures["motor_friction:second"]])
+            sim.set_parameter(name, parameters[name])
+        sim.set_parameter("motor_friction", [parameters["motor_friction:first"], parameters["motor_friction:second"]])
         start = states[first] + moved
-        late, rest = divmod(4 * figures["delay"] / DT, 1)  # in sub-steps; each has the mean of what is due in it
+        late, rest = divmod(4 * parameters["delay"] / DT, 1)  # in sub-steps; each has the mean of its commands
         sim.set_state(start[:, :2], start[:, 2:])
         read = [sim.q.copy()]
         for k in range(4 * (length - 1)):
@@ -151,5 +153,5 @@ def test_standard_errors_are_those_of_dense_least_squares(found: Identified, run
         columns.append((angles(PLANTED, moved) - angles(PLANTED, -moved)) / 2e-5)
     J = np.column_stack(columns)
     std = NOISE * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))[: len(names)]
-    np.testing.assert_allclose(found.noise, NOISE, rtol=0.05)
-    np.testing.assert_allclose(found.std[found.sought], std, rtol=0.05)
+    np.testing.assert_allclose(result.noise, NOISE, rtol=0.05)
+    np.testing.assert_allclose(result.std[result.estimated], std, rtol=0.05)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ce_gym.identify.log import Log
-from ce_gym.identify.windows import cut, first_states
+from ce_gym.identify.windows import smoothed_states, split_log
 
 
 @pytest.mark.parametrize("window", [0.01, 0.02, 0.5])
@@ -19,10 +19,10 @@ def test_states_of_cubics_are_exact_in_logs_of_any_length(dt: float, window: flo
         angles = np.stack([np.polyval(c[::-1], t) for c in cubics], axis=1)
         speeds = np.stack([np.polyval(np.polyder(c[::-1]), t) for c in cubics], axis=1) / ((rows + more) * dt)
         log = Log(dt, (), angles[:, :0], (("angle", "a"), ("angle", "b")), angles)
-        shots = SimpleNamespace(log=log, encoders=SimpleNamespace(positions=lambda z: z))
-        for windows in cut(log, window, 0.03, 0.2):
+        shooting = SimpleNamespace(log=log, encoders=SimpleNamespace(positions=lambda z: z))
+        for windows in split_log(log, window, 0.03, 0.2):
             assert windows.rows.max() < len(t)
             for each in (windows, windows.parts()):
-                states = first_states(shots, each)  # type: ignore[arg-type]
+                states = smoothed_states(shooting, each)  # type: ignore[arg-type]
                 np.testing.assert_allclose(states[:, :2], angles[each.first], atol=1e-10)
                 np.testing.assert_allclose(states[:, 2:], speeds[each.first], atol=1e-6)

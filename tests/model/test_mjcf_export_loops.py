@@ -387,14 +387,14 @@ CAM = FunctionConstraint("cam", "export_cam", ("crank",), ("slider",))
         (
             {"constraints": (CAM, *slider_crank().constraints[1:])},
             "exact",
-            "'cam' is of a kind that MJCF cannot say",
+            "'cam' is of a kind that MJCF does not have",
         ),
         (
             {"independent": ("swing", "wheel")},
             "coupled",
-            "rotor 'wheel', which 'coupled' leaves out, is an independent",
+            "rotor 'wheel', which 'coupled' omits, is an independent",
         ),
-        (changed(0, first="wheel"), "none", "constraint 'push' ends on rotor 'wheel', which 'none' leaves out"),
+        (changed(0, first="wheel"), "none", "constraint 'push' ends on rotor 'wheel', which 'none' omits"),
         (changed(1, length=9.0), "exact", "tied by .*link.*, does not close at the standing pose, "),
         ({"constraints": slider_crank().constraints[:3]}, "exact", "do not determine"),
     ],

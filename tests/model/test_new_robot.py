@@ -71,7 +71,7 @@ def test_an_mjcf_file_keeps_what_it_says(tmp_path):
 
 def test_what_it_refuses(pup, tmp_path):
     write_new_robot(pup)
-    with pytest.raises(RobotError, match=r"pup\.yaml: is there already"):
+    with pytest.raises(RobotError, match=r"pup\.yaml: exists already"):
         write_new_robot(pup)
     with pytest.raises(RobotError, match=r"file type '\.yaml': expected a file that ends in \.urdf or \.xml"):
         write_new_robot(pup.with_suffix(".yaml"), tmp_path / "x.yaml")

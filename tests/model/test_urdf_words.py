@@ -268,7 +268,7 @@ def test_a_new_file_gives_no_gains_to_joints_without_effort(tmp_path: Path):
 
 def test_inspect_prints_what_the_file_says_beyond_the_robot(load, tmp_path: Path, capsys):
     load(arm("<gazebo reference='upper'><mu1>0.3</mu1></gazebo>"))
-    assert main(["inspect", str(tmp_path / "arm.urdf"), "--no-errors", "--no-timing"]) == 0
+    assert main(["inspect", str(tmp_path / "arm.urdf"), "--no-errors", "--no-standing"]) == 0
     assert "left out: <gazebo>: mu1\n" in capsys.readouterr().out
 
 

@@ -71,7 +71,7 @@ def test_everything_takes_it(write, name, seen, tmp_path: Path, monkeypatch: pyt
         assert sim2sim.main([*judged, "--seconds", "1", "--json", "sim2sim.json"]) in (0, 1)  # it has hardly learned
         assert Path("sim2sim.json").exists()
         assert main(["inspect", str(file), "--no-errors"]) == 0
-        assert main(["inspect", env, "--no-timing"]) == 0
+        assert main(["inspect", env]) == 0
         assert main(["play", "run", "--env", env, "--command", "0.1", "0", "0", "0"]) == 0
         assert Path("run.html").exists()
         with serving(Runner(named("run", env), tmp_path)):

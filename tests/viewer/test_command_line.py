@@ -166,8 +166,8 @@ def test_environments_of_other_modules_are_inspected_and_play(
         assert "not registered" in capsys.readouterr().err
         named = "my_dogs:ce_gym/MyDogVelocity-v0"
         with monkeypatch.context() as quick:  # the report itself takes a minute
-            quick.setattr("ce_gym.diagnostics.scene_text.scene_report", lambda name, **_: str(gymnasium.spec(name).id))
-            assert main(["inspect", named, "--no-timing"]) == 0
+            quick.setattr("ce_gym.diagnostics.scene.scene_report", lambda name, **_: str(gymnasium.spec(name).id))
+            assert main(["inspect", named]) == 0
         assert capsys.readouterr().out == "ce_gym/MyDogVelocity-v0\n"
         assert main(["play", "dog", "--env", named, "--command", "0.1", "0", "0", "0"]) == 0
         assert Path("dog.html").exists()

@@ -27,7 +27,7 @@ mujoco.set_mju_user_warning(lambda _: None)  # it would write to a file; `Peer.d
 def compiled(scene: Scene, level: str, stiff: bool = False) -> mujoco.MjModel:
     """Compile a scene for MuJoCo at a transmission level; torques act on the joints directly, without actuators."""
     robot, level, also = stated(scene, level)
-    model = mujoco_model.compiled(robot, level, Settings(1e-3, solimp=STIFF if stiff else None), also)
+    model = mujoco_model.compile_model(robot, level, Settings(1e-3, solimp=STIFF if stiff else None), also)
     if scene.control == "torque":
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     return model

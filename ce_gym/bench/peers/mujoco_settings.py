@@ -11,7 +11,7 @@ from ce_gym.bench.measure.timing import Competitor, interleaved
 from ce_gym.bench.peers import stand
 from ce_gym.export.mujoco_batch import Batch
 from ce_gym.export.mujoco_coordinates import Coordinates
-from ce_gym.export.mujoco_model import STIFF, Settings, compiled
+from ce_gym.export.mujoco_model import STIFF, Settings, compile_model
 from ce_gym.model import Robot
 
 SOLVERS = (("Newton", 100, 50), ("Newton", 4, 4), ("Newton", 3, 4), ("Newton", 2, 4), ("CG", 5, 4), ("PGS", 5, 4))
@@ -32,7 +32,7 @@ def candidates(timestep: float, level: str) -> list[Settings]:
 
 def watched(robot: Robot, level: str, settings: Settings, num_envs: int = NUM_ENVS) -> tuple[Batch, stand.Behaviour]:
     """Return a batch that has stood for a while, and how it stood."""
-    model = compiled(robot, level, settings)
+    model = compile_model(robot, level, settings)
     batch = Batch(model, num_envs)
     return batch, stand.watch_mujoco(batch, robot, Coordinates.of(model, robot))
 

@@ -102,7 +102,7 @@ def mujoco_batch(robot: Robot, level: str, num_envs: int, num_threads: int, dt: 
         ValueError: If MuJoCo refuses it.
     """
     settings = Settings(dt, "Euler", "Newton", 4, 4, STIFF if level == "exact" else None)
-    return Batch(mujoco_model.compiled(robot, level, settings), num_envs, num_threads)
+    return Batch(mujoco_model.compile_model(robot, level, settings), num_envs, num_threads)
 
 
 def mujoco_steps(batch: Batch, robot: Robot) -> Competitor:

@@ -1,4 +1,4 @@
-"""A robot as a log has it: its base held still, only those limbs that the log knows."""
+"""The robot of a log: with a fixed base, and only the limbs in the log."""
 
 from __future__ import annotations
 
@@ -7,42 +7,42 @@ from dataclasses import replace
 
 from ce_gym.dynamics.model import Model
 from ce_gym.model.description import Body, Pose, Robot
-from ce_gym.model.errors import RobotError, unknown_name
+from ce_gym.model.errors import file_error, unknown_name
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.frames import Placement
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 
-def held_model(robot: Robot, names: Collection[str], transmission: str) -> Model:
-    """Return the model of a robot that hangs in the air.
+def base_fixed_model(robot: Robot, names: Collection[str], transmission: str) -> Model:
+    """Return the model of some limbs of a robot with a fixed base.
 
     Args:
         robot: The robot.
-        names: As for `held`.
-        transmission: Level of the simulation.
+        names: Bodies of the limbs, see `fix_base`.
+        transmission: Transmission level.
 
     Raises:
-        RobotError: There is no such level, or a joint turns about all axes.
+        RobotError: There is no such level, or the limbs have ball joints.
     """
     if transmission not in (levels := (*LEVELS, ELASTIC)):
         raise unknown_name("identify", "transmission", transmission, levels, "a transmission level")
-    model = Model(held(robot, names), transmission)
+    model = Model(fix_base(robot, names), transmission)
     if model.nq != model.nv:
-        raise RobotError(f"{robot.name}: identify: expected joints about or along one axis, no ball joints")
+        raise file_error(robot.name, "identify: the robot has ball joints", "joints about or along one axis")
     return model
 
 
-def held(robot: Robot, names: Collection[str]) -> Robot:
-    """Return a robot that hangs in the air, its base held upright: no contact, and those limbs that are named.
+def fix_base(robot: Robot, names: Collection[str]) -> Robot:
+    """Return some limbs of a robot with a fixed, upright base and without contacts.
 
     Args:
-        robot: The robot, with a floating base or a fixed one.
-        names: Bodies of limbs; a limb is all that moves together once the base is held.
+        robot: The robot, with a floating or a fixed base.
+        names: Bodies of the limbs; a limb is a set of bodies that move together if the base is fixed.
     """
-    bodies = _on_the_world(robot.bodies) if robot.floating else robot.bodies
+    bodies = _without_base(robot.bodies) if robot.floating else robot.bodies
     limbs = limbs_of(replace(robot, bodies=bodies))
-    there = {limbs[name] for name in names if name in limbs}
-    kept = {body.name for body in bodies if limbs[body.name] in there}
+    chosen = {limbs[name] for name in names if name in limbs}
+    kept = {body.name for body in bodies if limbs[body.name] in chosen}
     gains = {key: tuple(pair for pair in getattr(robot.gains, key) if pair[0] in kept) for key in ("kp", "kd")}
     return replace(
         robot,
@@ -62,24 +62,21 @@ def held(robot: Robot, names: Collection[str]) -> Robot:
 
 
 def limbs_of(robot: Robot) -> dict[str, int]:
-    """Return a number for each body, the same for those that move together: by their parents or by what ties them."""
+    """Return the number of each body's limb, by body; bodies with a common ancestor or constraint share a limb."""
     limb = {body.name: i for i, body in enumerate(robot.bodies)}
-    together = [(body.name, body.parent) for body in robot.bodies if body.parent is not None]
-    together += [(tie.bodies[0], name) for tie in robot.constraints for name in tie.bodies[1:]]
-    for a, b in together:
+    connected = [(body.name, body.parent) for body in robot.bodies if body.parent is not None]
+    connected += [(tie.bodies[0], name) for tie in robot.constraints for name in tie.bodies[1:]]
+    for a, b in connected:
         old, new = limb[a], limb[b]
         limb = {name: new if i == old else i for name, i in limb.items()}
     return limb
 
 
-def _on_the_world(bodies: tuple[Body, ...]) -> tuple[Body, ...]:
-    """Leave out a floating base; what it carried is on the world, as if the base were upright at the origin."""
+def _without_base(bodies: tuple[Body, ...]) -> tuple[Body, ...]:
+    """Remove the floating base, the first body; attach its children to the world, as to a base at the origin."""
     base = bodies[0]
+    upright = Placement((0.0, 0.0, 0.0), base.placement.rotation)
     return tuple(
-        replace(
-            body, parent=None, placement=compose(Placement((0.0, 0.0, 0.0), base.placement.rotation), body.placement)
-        )
-        if body.parent == base.name
-        else body
+        replace(body, parent=None, placement=compose(upright, body.placement)) if body.parent == base.name else body
         for body in bodies[1:]
     )
