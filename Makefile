@@ -35,10 +35,10 @@ demo: .venv/installed
 	@$(BIN)/python train/demo.py
 
 test: .venv/installed
-	$(BIN)/python -m pytest -n auto --dist loadgroup
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 quick: .venv/installed
-	$(BIN)/python -m pytest -n auto --dist loadgroup -m "not slow and not stress"
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow and not stress"
 
 arm: .venv/installed
 	tests/arm.sh
