@@ -25,8 +25,6 @@ from ce_gym import __main__ as command_line
 from ce_gym.bench import __main__ as benchmarks
 
 WITH_CODE = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
-GROUPED = [pytest.param(page, marks=pytest.mark.xdist_group(name_of(page)), id=name_of(page)) for page in WITH_CODE]
-"""Each page by itself, so that workers share them."""
 ELSEWHERE = ("ray start", "python3 -m venv", "pip install torch onnx", "python -c", "source ")
 """Beginnings of commands that are not ours to check."""
 RUN = """
@@ -39,7 +37,7 @@ runpy.run_path("page.py", run_name="__main__")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", GROUPED)
+@pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
 def test_python_blocks_run(page: Path, tmp_path: Path):
     for command in commands(page):
         if command.startswith("cp "):

@@ -104,9 +104,10 @@ def test_slopes_of_a_step():
     """On the ground, beyond a stop, with damping: against central differences, all at once and in reverse."""
     robot = with_balls(True, damping=0.2, position=(-np.inf, 0.3))
     contacts = (ContactSphere("foot", "e", (0.1, 0.0, -0.1), 0.05), ContactSphere("belly", "base", (0.0,) * 3, 0.2))
-    robot, h = replace(robot, contacts=contacts), 1e-6
+    bodies = tuple(body for body in robot.bodies if body.name not in ("c", "d"))
+    robot, h = replace(robot, bodies=bodies, independent=("b",), contacts=contacts), 1e-6
     sim = simulator(robot, "euler", 0.001, contacts=("foot", "belly"), outputs=("contact_forces",))
-    nv, target, derivatives = sim.model.nv, np.array([0.3, -0.2]), ce_gym.StepDerivatives(sim)
+    nv, target, derivatives = sim.model.nv, np.array([0.3]), ce_gym.StepDerivatives(sim)
     q, v = moved(robot, sim.model.standing_q, random_state(robot, 2)[1] * 0.5), random_state(robot, 3)[1]
     q[2] = 0.1
 

@@ -112,7 +112,7 @@ def test_state_is_a_copy(model: Model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("dt", "stiffness", "dtype"), itertools.product((0.0005, 0.01), (1e4, 1e6), DTYPES))
+@pytest.mark.parametrize(("dt", "stiffness", "dtype"), [*itertools.product((0.0005, 0.01), (1e4, 1e6), DTYPES)])
 def test_dropped_robots_come_to_rest(model: Model, dt: float, stiffness: float, dtype: str):
     sim = Simulator(model, 8, dt=dt, dtype=dtype, material=ContactMaterial(stiffness, 500.0, 0.8))
     q = np.tile(model.standing_q, (8, 1))
