@@ -37,6 +37,7 @@ class Stages:
     """Traces the stages of a task on a robot.
 
     The constructor traces every term once, in `evaluate`. This trace also yields the state that terms need.
+    `evaluate`, `spawn` and `reset` return a call and the number of random numbers that it reads.
 
     Args:
         spec: The task on the robot.
@@ -64,7 +65,7 @@ class Stages:
         self._inputs = self.state | self.ground_values | {"clipped": action, "draws": sampler.symbols}
 
     def evaluate(self) -> tuple[Call, int]:
-        """Return the call that follows the sub-steps and how many random numbers it takes."""
+        """Return the stage that follows the sub-steps."""
         return _call("evaluate", self._inputs, self._evaluation), self._inputs["draws"].numel()
 
     def _evaluate(self, action: SX, sampler: Sampler) -> dict[str, SX]:
@@ -111,11 +112,7 @@ class Stages:
         return after | {"outcome": outcome, "ended": ca.vertcat(ca.if_else(done, after["elapsed"], 0), sums)}
 
     def spawn(self) -> tuple[Call, int]:
-        """Trace the pose of `chosen` robots on a tile of the field as if the ground were at height 0.
-
-        Returns:
-            The call and how many random numbers it takes.
-        """
+        """Trace the pose of `chosen` robots on a tile of the field, for ground at height 0."""
         state, sampler = self.state, Sampler()
         level = self.spec.curriculum.next_level(state, sampler, self.spec.control_dt)
         place = starting_place(self.task, level, sampler)
@@ -126,11 +123,7 @@ class Stages:
         return _call("spawn", state | {"spawn_draws": sampler.symbols}, after), sampler.symbols.numel()
 
     def reset(self) -> tuple[Call, int]:
-        """Trace the start of an episode of `chosen` robots, which `spawn` has placed if the ground is a field.
-
-        Returns:
-            The call and how many random numbers it takes.
-        """
+        """Trace the start of an episode of `chosen` robots, which `spawn` has placed if the ground is a field."""
         sampler, chosen = Sampler(), self.state["chosen"] > 0.5
         written = {name for name, row in self.rows.items() if row.writer in ("physics", "task", "term", "drift")}
         written -= {"chosen", "retries"}  # `retries` goes on counting, so that a reader after a reset sees all
