@@ -86,7 +86,8 @@ class DifferentiableEnv:
         gradient = ControlStepGradient(self.batch.program)
         self._kernel = load_kernel(f"control step gradient {kernel_key(self.batch.program)}", gradient.program, dtype)
         self._recorded = [name for name in (*self._kernel.buffers, "clock") if name in self.batch.schema]
-        self._carried = {f"w_{name}": place.tiles(n, size, dtype) for name, size in gradient.carried.items()}
+        self._weights = gradient.weights
+        self._carried = {weight.name: place.tiles(n, weight.size, dtype) for weight in self._weights.values()}
         self._following = np.full(n, -1.0)  # clock of the control step that was differentiated last
         self._records, self._spare = list[Record](), list[dict[str, NDArray]]()
 
@@ -162,7 +163,7 @@ class DifferentiableEnv:
         tangent space of positions.
         """
         read = self.batch.place.read
-        return {name[2:]: read(array, self.batch.num_envs) for name, array in self._carried.items()}
+        return {name: read(self._carried[w.name], self.batch.num_envs) for name, w in self._weights.items()}
 
     def clear(self) -> None:
         """Remove all recorded control steps."""

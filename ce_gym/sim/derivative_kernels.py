@@ -52,7 +52,7 @@ def _key(model: Model, options: StepOptions) -> str:
     return f"{model_key(model)} {options!r} {laws_key(model.mechanism, options)}"
 
 
-class Chain:
+class IterationTape:
     """The iterations of one sub-step with their iterates, and the reverse mode of those that were executed.
 
     Args:
@@ -71,7 +71,7 @@ class Chain:
         self.iterates = [f"iterate{suffix}{k}" for k in range(n + 1)]
         self.active = [f"active{suffix}{k}" for k in range(n + 1)]
 
-    def begun(self) -> Call:
+    def begin(self) -> Call:
         """Return the call that resets the iterate and activates the first iteration only.
 
         A skipped iteration does not write whether the next one is needed, so flags of the previous tile must not stay.
@@ -129,7 +129,7 @@ def gradient_program(model: Model, options: StepOptions) -> Program:
     """Return the program that turns the gradient `w_q`, `w_v`, ... after a sub-step into the gradient before it."""
     mechanism, layout = model.mechanism, model.robot.layout
     primal = primal_function(mechanism, options)
-    chain = Chain(primal, adjoint_function(mechanism, options, leads_on=True), iterations_of(mechanism, options))
+    tape = IterationTape(primal, adjoint_function(mechanism, options, leads_on=True), iterations_of(mechanism, options))
     sizes = {name: primal.numel_in(name) for name in primal.name_in()}
     weights = adjoint_weights(primal, layout)
     others = input_gradients(primal)
@@ -139,19 +139,19 @@ def gradient_program(model: Model, options: StepOptions) -> Program:
     buffers += [Buffer(variable.name, variable.size, "tiles") for variable in weights.values()]
     buffers += [Buffer(variable.name, variable.size, "rows_out", "float64") for variable in others.values()]
     gradients = [*weights.values(), *others.values()]
-    steps = (*_ground_calls(model, options), chain.begun(), *chain.guessed(), _split(chain, gradients))
+    steps = (*_ground_calls(model, options), tape.begin(), *tape.guessed(), _split(tape, gradients))
     name = f"{model.robot.name} {model.transmission} step gradient"
     return _program(name, buffers, steps)
 
 
-def _split(chain: Chain, gradients: list[Variable]) -> Call:
+def _split(tape: IterationTape, gradients: list[Variable]) -> Call:
     """Return the call that splits the sums, or the first sums of robots with one iteration, into gradients."""
     sizes = [variable.size for variable in gradients]
     first, ends = SX.sym("first", sum(sizes)), list(accumulate(sizes, initial=0))
     sums, again = SX.sym("sums", first.numel()), SX.sym("again")
     inputs, total = {"first_sums": first}, first
-    if chain.n > 1:
-        inputs = {chain.active[1]: again, "sums": sums, "first_sums": first}
+    if tape.n > 1:
+        inputs = {tape.active[1]: again, "sums": sums, "first_sums": first}
         total = ca.if_else(again, sums, first)
     parts = ca.vertsplit(total, ends)
     return call(traced("split", inputs, {x.name: part for x, part in zip(gradients, parts, strict=True)}))

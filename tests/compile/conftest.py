@@ -54,7 +54,7 @@ def needs_host_compiler():
 
 @pytest.fixture(params=["llvm", "cuda"])
 def evaluate(request):
-    """`evaluate(function, *inputs, dtype=)`: inputs of shape (n, size) to a list of outputs likewise."""
+    """`evaluate(function, *inputs, dtype=)`: inputs of shape (n, size) to a list of outputs, shape (n, size) each."""
     if request.param == "cuda":
         request.getfixturevalue("needs_host_compiler")
     run_program = {"llvm": run_llvm, "cuda": run_cuda}[request.param]

@@ -33,7 +33,7 @@ def never():
 
 
 def result(build, key="k"):
-    """What the kernel computes, loaded as in a new process."""
+    """Return the result of the kernel, loaded as in a new process."""
     loading._loaded.clear()
     kernel = load_kernel(key, build)
     assert load_kernel(key, build) is kernel
@@ -43,7 +43,7 @@ def result(build, key="k"):
 
 
 def main():
-    """What the processes that `start` starts do: load the kernel, evaluate it, say whether the trace was lowered."""
+    """Load the kernel, print its result and whether the trace was lowered; processes of `start` execute this."""
     print(result(build).hex(), "ce_gym.compile.lowering.function" in sys.modules)
 
 
@@ -82,7 +82,7 @@ def forget(monkeypatch):
 
 @pytest.fixture
 def filled(original, tmp_path, monkeypatch):
-    """A copy of that cache, in use; its one file, and what the kernel computes."""
+    """Return the only file of a copy of the cache, which is in use, and the result of the kernel."""
     folder, computed = original
     shutil.copytree(folder, tmp_path / "cache")
     monkeypatch.setenv("CE_GYM_CACHE_DIR", str(tmp_path / "cache"))

@@ -72,7 +72,7 @@ def test_look_up_of_a_grid(dtype, needs_host_compiler):
 
 
 def stepping():
-    """Counts down where it has not reached zero, by calls that are made only there, as often as it is told."""
+    """Return a program that counts down where the count is above zero, by calls with a flag."""
     x, more, noise = ca.SX.sym("x"), ca.SX.sym("more"), ca.SX.sym("noise", 2)
     start = ca.Function("start", [x], [x, x > 0])
     down = ca.Function("down", [x, more], [x - more, ca.logic_and(more, x > 1)])
@@ -111,7 +111,7 @@ def test_each_thread_leaves_out_what_it_does_not_need(dtype, needs_host_compiler
 
 @DTYPES
 def test_each_thread_takes_the_short_way_by_itself(dtype, needs_host_compiler):
-    """What is left of a function where its choice is zero, to the same bits."""
+    """Threads whose flag is zero execute the short variant of a function, with the same bits."""
     x, z = ca.SX.sym("x"), ca.SX.sym("z")
     flag = z > 0.5
     function = ca.Function("choosing", [x, z], [x * x + x + ca.if_else(flag, ca.sin(x * x), 0), flag])
@@ -126,7 +126,7 @@ def test_each_thread_takes_the_short_way_by_itself(dtype, needs_host_compiler):
 
 
 def doubling():
-    """Doubles numbers until they are 100 or more, those of other lanes untouched."""
+    """Return a program that doubles numbers until they are 100 or more and leaves other lanes unchanged."""
     x = ca.SX.sym("x")
     start = ca.Function("start", [x], [x, x < 100])
     double = ca.Function("double", [x], [ca.if_else(x < 100, 2 * x, x), ca.if_else(x < 100, 2 * x, x) < 100])
@@ -155,7 +155,7 @@ def test_a_loop_needs_a_flag():
 
 
 def test_stages_of_one_launch(needs_host_compiler):
-    """The second stage sees what the first has done, draws at the next counter, and is left out where it is not due."""
+    """The second stage sees results of the first, draws at the next counter, and is skipped where its flag is zero."""
     x, noise = ca.SX.sym("x"), ca.SX.sym("noise")
     add = ca.Function("add", [x, noise], [x + noise, x > 2])
     clear = ca.Function("clear", [noise], [-noise])
@@ -304,7 +304,7 @@ def ptx_of(text):
 
 
 def test_the_compiler_fuses_nothing_by_itself(needs_compiler):
-    """The only fused multiply-adds are those in the text, and what is not fused says how it is rounded."""
+    """Only multiply-adds of the text are fused, and every other operation states its rounding."""
     x, y, z = ca.SX.sym("x"), ca.SX.sym("y"), ca.SX.sym("z")
     product = x * y
     function = ca.Function("f", [x, y, z], [ca.vertcat(product + z, product - z, y * z + x)])

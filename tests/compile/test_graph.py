@@ -1,4 +1,4 @@
-"""What is done to a trace before compilers see it: every rewriting by its operations and by its values."""
+"""Rewritings of a trace before compilation: each is checked by its operations and by its values."""
 
 from dataclasses import replace
 from functools import partial
@@ -28,7 +28,7 @@ X, Y, Z = (ca.SX.sym(name) for name in "xyz")
 
 
 def rewritten(*values):
-    """Function of x, y and z, and the operations that are left of it, sorted."""
+    """Return a function of x, y and z, and its operations after rewriting, sorted."""
     function = ca.Function("f", [X, Y, Z], [ca.vertcat(*values)])
     return function, sorted(op for op in graph_of(function).ops if op not in NO_OPERATION)
 
@@ -136,7 +136,7 @@ CHOICE = 2
 
 
 def test_what_is_left_where_a_choice_is_zero():
-    """Choices are made, what was not chosen is gone, and what was not fused in the whole is not fused now."""
+    """Choices are made, dead code is removed, and operations that the full function does not fuse stay unfused."""
     says, whole, left = variants_of(choosing(), CHOICE)
     assert sorted(operations(says.graph)) == sorted([ca.OP_ADD, ca.OP_LT])
     assert operations(whole.graph) == operations(graph_of(choosing()))
@@ -151,7 +151,7 @@ def operations(graph):
 
 
 def test_a_tile_takes_the_short_way_to_the_same_bits():
-    """Robots with zero among zeros alone, and beside others: the same bits, those of the whole function."""
+    """Robots with a zero flag have the bits of the full function, in tiles of zeros only and beside other robots."""
     function, results = choosing(), []
 
     def program(short):
@@ -210,7 +210,7 @@ def growing_program(again, short=""):
     return Program("growing", (*buffers, Buffer("z", 1, "scratch"), Buffer("flag", 1, "scratch")), tuple(calls))
 
 
-def test_what_does_not_follow_from_an_iterate_is_in_the_first_part():
+def test_what_does_not_depend_on_an_iterate_is_in_the_prologue():
     parts = split_function(growing(), frozenset({2}))
     (none, second), first = *parts.variants, parts.prologue.graph
     assert none.is_empty
@@ -220,8 +220,8 @@ def test_what_does_not_follow_from_an_iterate_is_in_the_first_part():
     assert parts.prologue.keeps == {k for k, op in enumerate(second.graph.ops) if op == KEPT} != set()
 
 
-def test_what_only_a_choice_asks_for_is_in_parts_of_its_own():
-    """The root is, and of what the choice takes what is short is made again; the sine is needed in any case."""
+def test_what_only_a_flag_needs_is_in_a_variant():
+    """The root is in the full variant only, cheap values of the flag are recomputed, and the sine is always needed."""
     parts = split_function(growing(), frozenset({2}), LEFT.index("choice"))
     (before, last), (none, left) = parts.variants
     assert {ca.OP_SIN, ca.OP_EXP, ca.OP_LT} <= set(operations(parts.prologue.graph))
@@ -237,7 +237,7 @@ def test_what_only_a_choice_asks_for_is_in_parts_of_its_own():
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("short", ["", "choice"])
 def test_a_call_again_goes_by_what_the_first_one_left_to_the_same_bits(short, dtype):
-    """Where the loop ends at once, late or never, and for what is left of the function where its choice is zero."""
+    """For loops that end at once, late or never, and for the short variant of the function."""
     results = []
     for again in ((), ("z",)):
         kernel = load_kernel(f"growing {again} {short}", partial(growing_program, again, short), dtype)
@@ -256,7 +256,7 @@ def test_a_call_again_goes_by_what_the_first_one_left_to_the_same_bits(short, dt
 
 
 def test_a_second_iteration_of_a_step_takes_kinematics_from_the_first():
-    """No joint's sine is in what is iterated, only that of the step's turn, and a fifth of the instructions less."""
+    """Repeated iterations have no sine of a joint angle, only that of the step, and 20 % fewer operations."""
     model = Model("mini_cheetah")
     options = StepOptions(contacts=tuple(c.name for c in model.robot.contacts if c.group == "foot"))
     function = iteration_function(model.mechanism, options)

@@ -107,7 +107,7 @@ def test_values_and_slopes_are_continuous(kernel):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, -1e300])
 def test_a_place_that_is_none_harms_nobody(kernel, bad):
-    """Other lanes get what they would have got; nothing outside the table is read, which would end the process."""
+    """Results of other lanes do not change, and nothing outside the table is read, which would end the process."""
     rng = np.random.default_rng(4)
     table, points = rng.normal(0, 1, (3, 3)), rng.uniform(0, 2, (40, N, 2))
     clean = look_up(kernel, table, points)
@@ -118,7 +118,7 @@ def test_a_place_that_is_none_harms_nobody(kernel, bad):
     others[11, 2] = others[12, 3] = False
     np.testing.assert_array_equal(found[others], clean[others])
     if np.isnan(bad):
-        assert np.isnan(found[~others][:, 0]).all()  # and is seen as what it is
+        assert np.isnan(found[~others][:, 0]).all()  # and the result is NaN, too
 
 
 def test_batch_and_threads_do_not_matter(kernel):
@@ -184,7 +184,7 @@ def test_wrong_programs(message):
 
 
 def test_values_alone_are_the_same(kernel):
-    """To rounding, inside and outside, more points than fit into one chunk; what is no number reads the table."""
+    """To rounding, inside and outside, more points than fit into one chunk; NaN reads the table, too."""
     n = 21
     buffers = (Buffer("table", 0, "table"), Buffer("frame", 3, "rows_in"), Buffer("points", 2 * n, "rows_in"))
     program = Program("values", (*buffers, Buffer("found", n, "rows_out")), (

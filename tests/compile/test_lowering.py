@@ -1,4 +1,4 @@
-"""Every operation, and graphs of them, against CasADi's own evaluation."""
+"""Every operation, and graphs of operations, against CasADi's own evaluation."""
 
 import casadi as ca
 import numpy as np

@@ -55,7 +55,7 @@ def test_every_cpu_gives_the_same_bits(dtype, monkeypatch):
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_kernels_without_optimisation_give_the_same_bits(dtype, monkeypatch, tmp_path):
-    """Compiled as tests/conftest.py asks for: an environment's steps, randomisation and resets."""
+    """Steps, randomisation and resets of an environment, compiled with the settings of tests/conftest.py."""
     episodes = []
     for optimised in (True, False):
         if not optimised:

@@ -10,23 +10,24 @@ The gradient with respect to positions `q` is in their tangent space.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 import casadi as ca
 
-from ce_gym.compile import Buffer, Call, Program, Step, calls_of
+from ce_gym.compile import Buffer, Call, Program, Step, calls_of, scratch_buffers
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
+from ce_gym.dynamics.stepping.variables import Variables
 from ce_gym.envs.runtime.program import TaskProgram
-from ce_gym.sim.derivative_kernels import Chain
+from ce_gym.sim.derivative_kernels import IterationTape
 
 FLAGS = 2
 """Columns of the rows `control`: whether the gradient of the following control step is used, and its largest norm."""
 
-SUMS = "substep_sums"
-"""Buffer for `sums` of the adjoint of a sub-step; environments use the name `sums` for sums over an episode."""
+SUMS, TORQUE = "substep_sums", "substep_torque"
+"""Buffers for `sums` of the adjoint of a sub-step and for its torque; environments have `sums` and `torque`, too."""
 
 
 class ControlStepGradient:
@@ -37,6 +38,8 @@ class ControlStepGradient:
 
     Attributes:
         carried: Sizes of the gradients that pass from control step to control step, by name of the state.
+        weights: Variables of these gradients.
+        states: Variables of the state before each sub-step, and after the last.
 
     Raises:
         ValueError: The control step of the task cannot be differentiated.
@@ -61,6 +64,9 @@ class ControlStepGradient:
         names += ["command"] if "heading" in program.schema else []
         sizes = self.parts | {name: program.schema[name].size for name in names}
         self.carried = sizes | {"q": sizes["q"] - 1}
+        self.weights = Variables("w", self.carried)
+        prefixes = ["", *(f"substep{k}" for k in range(1, self.substeps + 1))]
+        self.states = [Variables(prefix, self.parts | {"diverged": 1}) for prefix in prefixes]
         self.evaluate, self.n_draws = program.stages.evaluate()
 
     def program(self) -> Program:
@@ -73,56 +79,43 @@ class ControlStepGradient:
             Buffer("w_reward", 1, "rows_in"),
             Buffer("control", FLAGS, "rows_in"),
             *([Buffer("draws", self.n_draws, "random")] if "draws" in used else []),
-            *(Buffer(f"w_{name}", size, "tiles") for name, size in self.carried.items()),
+            *(Buffer(weight.name, weight.size, "tiles") for weight in self.weights.values()),
             Buffer("by_action", task.n_actions, "rows_out"),
         ]
         state = [Buffer(row.name, row.size, "tiles") for row in task.schema.values() if row.name in used]
         known = {buffer.name for buffer in buffers} | task.schema.keys()
-        scratch = [Buffer(name, size, "scratch") for name, size in self._sizes(steps).items() if name not in known]
+        scratch = scratch_buffers(steps, known)
         name = f"{task.model.robot.name} {task.model.transmission} control step gradient"
         return Program(name, tuple(state + buffers + scratch), tuple(steps), compact=True)
 
-    def _sizes(self, steps: list[Step]) -> dict[str, int]:
-        sizes: dict[str, int] = {}
-        for call in steps:
-            assert isinstance(call, Call)
-            f = call.function
-            sizes |= {name: f.numel_in(i) for i, name in enumerate(call.inputs)}
-            sizes |= {name: f.numel_out(i) for i, name in enumerate(call.outputs)}
-        return sizes
-
-    def _chain(self, k: int) -> Chain:
+    def _tape(self, k: int) -> IterationTape:
         """Return the iterations of sub-step k."""
-        return Chain(self.primal, self.adjoint, self.iterations, f"@{k}.")
-
-    def _state_before(self, k: int) -> dict[str, str]:
-        """Return the buffer of each part of the state before sub-step k."""
-        return {name: f"{name}@{k}" if k else name for name in (*self.parts, "diverged")}
+        return IterationTape(self.primal, self.adjoint, self.iterations, f"@{k}.")
 
     def _forwards(self) -> list[Step]:
         steps: list[Step] = [Call(self.task.function("act"), ("action_in",), ("clipped", "target"))]
-        for k in range(self.substeps):
-            chain, after = self._chain(k), self._state_before(k + 1) | {"torque": "torque@"}
-            steps += [chain.begun(), *chain.forwards(self.iterations, self._state_before(k), after)]
+        for k, (before, after) in enumerate(pairwise(self.states)):
+            tape, results = self._tape(k), after.names | {"torque": TORQUE}
+            steps += [tape.begin(), *tape.forwards(self.iterations, before.names, results)]
         return steps
 
     def _backwards(self) -> list[Step]:
-        weights = tuple(f"w_{name}" for name in self.carried)
-        parts = tuple(f"w_{name}" for name in self.parts)
+        weights = tuple(self.weights.names.values())
+        parts = tuple(self.weights[name].name for name in self.parts)
         steps: list[Step] = [Call(self._start(), ("control", *weights), (*weights, "by_target"))]
         steps.append(self._evaluate_adjoint())
         for k in reversed(range(self.substeps)):
-            steps += self._chain(k).backwards(self._state_before(k) | {"sums": SUMS})
+            steps += self._tape(k).backwards(self.states[k].names | {"sums": SUMS})
             steps.append(Call(self._split_sums(), (SUMS, "by_target"), (*parts, "w_torque", "by_target")))
         return [*steps, Call(self._act_adjoint(), ("action_in", "by_clipped", "by_target"), ("by_action",))]
 
     def _start(self) -> ca.Function:
         """Trace (control, *carried gradients) -> these, cut off or shortened, and a gradient of 0 to the target."""
         control = SX.sym("control", FLAGS)
-        weights = {f"w_{name}": SX.sym(name, size) for name, size in self.carried.items()}
+        weights = self.weights.named(self.weights.symbols())
         length = ca.norm_2(ca.vertcat(*weights.values()))
         scale = ca.if_else(length > control[1], control[1] / length, 1)
-        results = {f"{name}_next": ca.if_else(control[0] > 0.5, scale * w, 0) for name, w in weights.items()}
+        results = {name: ca.if_else(control[0] > 0.5, scale * w, 0) for name, w in weights.items()}
         results["by_target"] = SX(ca.DM.zeros(len(self.task.actions.targets)))
         return traced("start", {"control": control} | weights, results)
 
@@ -137,7 +130,7 @@ class ControlStepGradient:
         outputs = dict(zip(self.evaluate.outputs, f.call(list(inputs.values())), strict=True))
         inputs.setdefault("q", SX.sym("q", self.parts["q"]))
         diverged = inputs.setdefault("diverged", SX.sym("diverged"))
-        weights = {name: SX.sym(f"w_{name}", size) for name, size in self.carried.items()}
+        weights = self.weights.symbols()
         w_observation, w_reward = SX.sym("w_observation", outputs["observation"].numel()), SX.sym("w_reward")
 
         changed = [name for name in self.carried if name in outputs]
@@ -153,14 +146,14 @@ class ControlStepGradient:
                 gradient = gradient + weights[name]
             after[f"{name}_after"] = ca.if_else(diverged > 0.5, 0, gradient)
 
-        inputs |= {f"w_{name}": w for name, w in weights.items()}
+        inputs |= self.weights.named(weights)
         inputs |= {"w_observation": w_observation, "w_reward": w_reward}
         everything = ca.vertcat(*after.values())
         inputs = {name: x for name, x in inputs.items() if ca.depends_on(everything, x)}
-        buffers = self._state_before(self.substeps) | {"torque": "torque@"}
-        written = ("by_clipped" if name == "clipped" else f"w_{name}" for name in sizes)
+        buffers = self.states[-1].names | {"torque": TORQUE}
+        written = (*self.weights.names.values(), "w_torque", "by_clipped")
         function = traced("evaluate_adjoint", inputs, after)
-        return Call(function, tuple(buffers.get(name, name) for name in inputs), tuple(written))
+        return Call(function, tuple(buffers.get(name, name) for name in inputs), written)
 
     def _split_sums(self) -> ca.Function:
         """Trace (sums, by_target) -> gradients to the parts of the state, 0 to the torque, and to the target so far."""
@@ -169,9 +162,9 @@ class ControlStepGradient:
         sizes = [*(self.carried[name] for name in self.parts), by_target.numel()]
         ends = list(accumulate(sizes, initial=0))
         *parts, target = ca.vertsplit(sums[: ends[-1]], ends)
-        results = {f"w_{name}": part for name, part in zip(self.parts, parts, strict=True)}
+        results = {self.weights[name].name: part for name, part in zip(self.parts, parts, strict=True)}
         results["w_torque"] = SX(ca.DM.zeros(self.primal.numel_out("torque")))
-        results["by_target_next"] = by_target + target
+        results["by_target"] = by_target + target
         return traced("split_sums", {"sums": sums, "by_target": by_target}, results)
 
     def _act_adjoint(self) -> ca.Function:
