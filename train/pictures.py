@@ -1,17 +1,13 @@
-"""Figures: errors and falls by transmission level, the learning curve, and the runs of a study."""
+"""Figures: errors and falls by transmission level, and the learning curve."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bootstrap import interquartile_mean
 
 INK, MUTED, LINE = "#22262b", "#6b7280", "#2a6f97"
-COLORS = (LINE, "#d1832b", "#6b7280", "#3f8f5b")
-"""Of ways of judging."""
 
 
 def _plotting() -> Any:
@@ -91,34 +87,4 @@ def draw_curve(rows: list[dict[str, float]], title: str, file: Path) -> None:
         ax.spines[["top", "right"]].set_visible(False)
     figure.suptitle(title, fontsize=10)
     figure.savefig(file, dpi=80)
-    plt.close(figure)
-
-
-def draw_study(panels: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], file: Path) -> None:
-    """Draw every run of a study as a point, and a line through the interquartile mean of each group.
-
-    Args:
-        panels: Values by title of the panel, arm, and way of judging.
-        file: PNG to write.
-    """
-    plt = _plotting()
-    figure, axes = plt.subplots(1, len(panels), figsize=(3.4 * len(panels), 3.0), layout="constrained", squeeze=False)
-    for ax, (title, arms) in zip(axes[0], panels.items(), strict=True):
-        for i, ways in enumerate(arms.values()):
-            for j, (way, values) in enumerate(ways.items()):
-                x, x_mean = np.array(values), i + 0.25 * (j - (len(ways) - 1) / 2)
-                if len(x):
-                    ax.plot(np.full(len(x), x_mean), x, "o", color=COLORS[j], alpha=0.5, markersize=4, linewidth=0)
-                    mean = interquartile_mean(x)
-                    ax.plot([x_mean - 0.1, x_mean + 0.1], [mean, mean], color=COLORS[j], linewidth=2, label=way)
-        ax.set_xticks(range(len(arms)), [arm.replace(", ", ",\n") for arm in arms], fontsize=8)
-        ax.set_title(title)
-        ax.grid(axis="y", color="#e5e7eb", linewidth=0.8)
-        ax.spines[["top", "right"]].set_visible(False)
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    shown = dict(zip(labels, handles, strict=True))
-    figure.legend(
-        shown.values(), [f"judged on {way}" for way in shown], loc="outside lower center", ncols=3, fontsize=8
-    )
-    figure.savefig(file, dpi=100)
     plt.close(figure)
