@@ -75,8 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in BENCHMARKS:
         print(f"ce_gym.bench: no benchmark {name!r}; expected one of {listed_names(name, BENCHMARKS)}", file=sys.stderr)
         return 2
-    parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
-    parser.add_argument("--json", metavar="FILE", help="also write the report to a JSON file")
+    json_option = Parser(add_help=False)
+    json_option.add_argument("--json", metavar="FILE", help="also write the report to a JSON file")
+    parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name), parents=[json_option])
     try:
         benchmark = load(name)
         benchmark.add_arguments(parser)
@@ -92,8 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         missing = f"{name} needs {error.name}, which is not installed"
         print(f'ce_gym.bench: {missing}: pip install "ce_gym[bench]"', file=sys.stderr)
         return 2
-    words = [word for word in argv if word not in ("--json", arguments.json)]
-    report.command = f"python -m ce_gym.bench {shlex.join(words)}"
+    words = json_option.parse_known_args(rest)[1]
+    report.command = shlex.join(["python", "-m", "ce_gym.bench", name, *words])
     print(report.as_text())
     if arguments.json:
         Path(arguments.json).write_text(report.as_json(), encoding="utf-8")
