@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from progress import (
     Curve,
+    Log,
     ProgressBar,
     StopInOrder,
     adapted_rate,
@@ -22,7 +23,7 @@ from progress import (
 )
 from run_folder import going_on
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter
+from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
 from stable_baselines3.common.utils import FloatSchedule
 from training_page import Present
 
@@ -168,13 +169,17 @@ class KeepPresent(_Quiet):
 
 
 class Lenient(KVWriter):
-    """A log writer that lets training go on when its disk is full."""
+    """A log writer that lets training continue when its disk is full.
+
+    Args:
+        writer: Writer of Stable-Baselines3.
+    """
 
     def __init__(self, writer: KVWriter) -> None:
         self.writer = writer
 
     def write(self, *args: Any) -> None:
-        """Write figures, see `KVWriter`."""
+        """Write one row, see `KVWriter`."""
         with going_on():
             self.writer.write(*args)
 
@@ -182,6 +187,24 @@ class Lenient(KVWriter):
         """Close the file."""
         with going_on():
             self.writer.close()
+
+
+class WriteLog(KVWriter):
+    """Writes the log of Stable-Baselines3 as `progress.csv`.
+
+    Args:
+        log: File to write.
+    """
+
+    def __init__(self, log: Log) -> None:
+        self.log = log
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Write one row, see `KVWriter`."""
+        self.log.add(filter_excluded_keys(key_values, key_excluded, "csv"))
+
+    def close(self) -> None:
+        """Do nothing: the file is closed after every row."""
 
 
 class Stop(BaseCallback):

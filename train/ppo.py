@@ -37,11 +37,12 @@ from callbacks import (
     SpreadEpisodes,
     Stop,
     WriteCurve,
+    WriteLog,
 )
 from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record, resumed_record
 from job import main as run_jobs
 from learner import ThreadedPPO
-from progress import StopInOrder, read_curve
+from progress import CURVE, LOG, Log, StopInOrder, earlier_rows
 from run_folder import going_on, make_folder, save_somewhere, write_whole
 from settings import Settings
 from stable_baselines3 import PPO
@@ -76,10 +77,11 @@ def train(job: Job) -> Trained:
 
 def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
-    logger = configure(str(job.out), ["csv", "tensorboard"] if job.tensorboard else ["csv"])
-    model.set_logger(Logger(str(job.out), [Lenient(writer) for writer in logger.output_formats]))
     settings, before = job.settings, model.num_timesteps
-    earlier = read_curve(job.resume.parent / "curve.csv") if job.resume else []
+    log = Log(job.out / "progress.csv", earlier_rows(job.resume, "progress.csv", LOG), before)
+    board = configure(str(job.out), ["tensorboard"]).output_formats if job.tensorboard else []
+    model.set_logger(Logger(str(job.out), [WriteLog(log), *map(Lenient, board)]))
+    earlier = earlier_rows(job.resume, "curve.csv", CURVE)
     progress = ShowProgress(settings.steps)
     native, clock = acting_environment(job, envs.envs.unwrapped), Clock()
 

@@ -6,7 +6,7 @@ import csv
 import signal
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -16,8 +16,16 @@ from numpy.typing import NDArray
 from run_folder import going_on
 from tqdm import tqdm
 
-CURVE: tuple[str, ...] = ("steps", "seconds", "reward", "length")
-"""Columns of a learning curve."""
+from ce_gym.policies import locate_policy
+
+Row = Mapping[str, Any]
+"""Cells of a row of a CSV file by column."""
+
+CURVE = ("steps", "seconds", "reward", "length")
+"""Columns of `curve.csv`."""
+
+STEPS, SECONDS = LOG = "time/total_timesteps", "time/time_elapsed"
+"""Columns of `progress.csv` that every row has."""
 
 
 def episode_means(episodes: Iterable[Mapping[str, float]] | None) -> dict[str, float]:
@@ -72,77 +80,115 @@ class RecentEpisodes:
         self.names, self._rows = names, rows
 
 
-class Curve:
-    """Writes how learning goes into a small CSV file: steps, seconds, mean reward and length of recent episodes.
-
-    A learner's own log begins anew when training goes on from a policy; this one keeps what came before.
+class RowFile:
+    """A CSV file to which rows are added during training.
 
     Args:
-        file: To write, a row after every rollout.
-        before: Rows of the training that led to the policy gone on from, see `read_curve`.
-        steps: Steps done so far; rows beyond them are dropped.
+        file: File to write.
+        earlier: Rows of the training before this run; they are kept.
     """
 
-    def __init__(self, file: Path, before: list[dict[str, float]], steps: int = 0) -> None:
-        rows = [row for row in before if row["steps"] <= steps]
-        self.file, self.started = file, time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
-        self._write(rows, "w")
+    def __init__(self, file: Path, earlier: Sequence[Row]) -> None:
+        self.file, self.rows = file, list(earlier)
+        self.columns = list(dict.fromkeys(name for row in self.rows for name in row))
+        self._write(self.rows, "w")
 
-    def add(self, steps: int, means: Mapping[str, float]) -> None:
-        """Write one row; none before the first episode ends."""
-        if means:
-            seconds = round(time.perf_counter() - self.started, 2)
-            values = (steps, seconds, round(means["r"], 4), round(means["l"], 2))
-            self._write([dict(zip(CURVE, values, strict=True))], "a")
+    def append(self, row: Row) -> None:
+        """Write one row. If the row has new columns, write the whole file again."""
+        self.rows.append(row)
+        new = [name for name in row if name not in self.columns]
+        self.columns += new
+        self._write(self.rows if new else [row], "w" if new else "a")
 
-    def _write(self, rows: list[dict[str, float]], mode: str) -> None:
+    def _write(self, rows: Sequence[Row], mode: str) -> None:
         with going_on(), self.file.open(mode, newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, CURVE)
-            if mode == "w":
+            writer = csv.DictWriter(file, self.columns)
+            if mode == "w" and self.columns:
                 writer.writeheader()
             writer.writerows(rows)
 
 
-def read_curve(file: Path) -> list[dict[str, float]]:
-    """Return the rows of a learning curve; none if there is no such file.
+class Curve:
+    """Writes the learning curve as a small CSV file: steps, seconds, mean reward and length of recent episodes.
+
+    Args:
+        file: File to write, one row after every rollout.
+        earlier: Rows of the training before this run, see `earlier_rows`.
+        steps: Steps done so far; earlier rows beyond them are dropped.
+    """
+
+    def __init__(self, file: Path, earlier: Sequence[Row], steps: int = 0) -> None:
+        rows = [row for row in earlier if row["steps"] <= steps]
+        self.started = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
+        self.file = RowFile(file, rows)
+
+    def add(self, steps: int, means: Mapping[str, float]) -> None:
+        """Write one row, or nothing before the first episode ends."""
+        if means:
+            seconds = round(time.perf_counter() - self.started, 2)
+            values = (steps, seconds, round(means["r"], 4), round(means["l"], 2))
+            self.file.append(dict(zip(CURVE, values, strict=True)))
+
+
+class Log:
+    """Writes the statistics of each iteration as a CSV file.
+
+    Args:
+        file: File to write.
+        earlier: Rows of the training before this run, see `earlier_rows`.
+        steps: Steps done so far; earlier rows beyond them are dropped.
+    """
+
+    def __init__(self, file: Path, earlier: Sequence[Row], steps: int = 0) -> None:
+        rows = [row for row in earlier if row[STEPS] <= steps]
+        self.earlier_seconds = rows[-1][SECONDS] if rows else 0
+        self.file = RowFile(file, rows)
+
+    def add(self, row: Row) -> None:
+        """Write one row; its time counts from the start of this run [s]."""
+        self.file.append({**row, SECONDS: round(self.earlier_seconds + row[SECONDS], 3)})
+
+
+def log_row(steps: int, seconds: float, means: Row, figures: Row) -> dict[str, float]:
+    """Return a row of `progress.csv`, with the names that Stable-Baselines3 uses.
+
+    Args:
+        steps: Environment steps done.
+        seconds: Time since this run began [s].
+        means: Means of recent episodes, see `RecentEpisodes`.
+        figures: Statistics of the update.
+    """
+    row = {STEPS: steps, SECONDS: seconds, "rollout/ep_rew_mean": means["r"], "rollout/ep_len_mean": means["l"]}
+    return row | {key: mean for key, mean in means.items() if key not in ("r", "l")} | dict(figures)
+
+
+def read_rows(file: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the rows of a CSV file, `columns` as numbers and others as text; no rows if there is no such file.
 
     Raises:
-        ValueError: If it is something else.
+        ValueError: If a column is missing, or a number in it.
     """
     if not file.exists():
         return []
     try:
         with file.open(newline="", encoding="utf-8") as lines:
-            return [{key: float(row[key]) for key in CURVE} for row in csv.DictReader(lines)]
+            whole = [row for row in csv.DictReader(lines) if None not in row.values()]  # a killed run cuts its last row
+        return [{**row, **{key: float(row[key]) for key in columns}} for row in whole]
     except (KeyError, TypeError, ValueError, csv.Error):
-        raise ValueError(f"{file}: expected the columns {', '.join(CURVE)}, numbers in each row") from None
+        raise ValueError(f"{file}: expected the columns {', '.join(columns)}, numbers in each row") from None
 
 
-class Log:
-    """Writes what happens in each iteration into a CSV file.
+def read_curve(file: Path) -> list[dict[str, float]]:
+    """Return the rows of a learning curve; see `read_rows`."""
+    return read_rows(file, CURVE)
 
-    Args:
-        file: To write; begun anew.
-    """
 
-    def __init__(self, file: Path) -> None:
-        self.file, self.columns = file, []
-        with going_on():
-            file.write_text("", encoding="utf-8")
-
-    def add(self, steps: int, seconds: float, means: dict[str, float], figures: dict[str, float]) -> None:
-        """Write one row, from the first episode that ends on."""
-        if not means:
-            return
-        rollout = {"rollout/ep_rew_mean": means["r"], "rollout/ep_len_mean": means["l"]}
-        times = {"time/total_timesteps": steps, "time/time_elapsed": round(seconds, 3)}
-        row = times | rollout | {key: mean for key, mean in means.items() if key not in ("r", "l")} | figures
-        with going_on(), self.file.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            if not self.columns:
-                self.columns = list(row)
-                writer.writerow(self.columns)
-            writer.writerow([row[key] for key in self.columns])
+def earlier_rows(resume: Path | None, name: str, columns: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the rows of the CSV file `name` of the run whose policy is resumed; see `read_rows`."""
+    if resume is None:
+        return []
+    folder = locate_policy(resume).parent
+    return read_rows((folder.parent if folder.name == "checkpoints" else folder) / name, columns)
 
 
 def adapted_rate(rate: float, kl: float, target: float, limits: tuple[float, float] = (1e-5, 1e-2)) -> float:

@@ -19,7 +19,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
-from progress import Curve, Log, ProgressBar, StopInOrder, read_curve
+from progress import CURVE, LOG, Curve, Log, ProgressBar, StopInOrder, earlier_rows, log_row
 from run_folder import going_on, make_folder, save_somewhere, write_whole
 from training_page import Present
 
@@ -62,8 +62,9 @@ def _learn(learner: Any, job: Job, name: str) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
     s, native = job.settings, acting_environment(job, learner.envs.unwrapped)
     start, clock = time.perf_counter(), Clock()
-    curve = Curve(job.out / "curve.csv", _earlier(job.resume), learner.steps)
-    bar, log = ProgressBar(s.steps, learner.steps), Log(job.out / "progress.csv")
+    curve = Curve(job.out / "curve.csv", earlier_rows(job.resume, "curve.csv", CURVE), learner.steps)
+    log = Log(job.out / "progress.csv", earlier_rows(job.resume, "progress.csv", LOG), learner.steps)
+    bar = ProgressBar(s.steps, learner.steps)
 
     def record(finished: bool = False) -> dict[str, Any]:
         written = make_record(job, native, learner.steps, clock, ("numba",))
@@ -77,7 +78,8 @@ def _learn(learner: Any, job: Job, name: str) -> Trained:
             before = learner.steps // every
             figures, means = learner.iterate(), learner.episodes.means()
             curve.add(learner.steps, means)
-            log.add(learner.steps, time.perf_counter() - start, means, figures)
+            if means:
+                log.add(log_row(learner.steps, time.perf_counter() - start, means, figures))
             bar.advance(learner.steps)
             bar.describe(means, learner.step_seconds, learner.collect_seconds)
             present.keep()
@@ -134,8 +136,3 @@ def resume(learner: Any, policy: Path) -> None:
 
 def _learner_file(policy: Path) -> Path:
     return locate_policy(policy).with_suffix(".learner.npz")
-
-
-def _earlier(policy: Path | None) -> list[dict[str, float]]:
-    """The learning curve of the policy gone on from."""
-    return read_curve(locate_policy(policy).parent / "curve.csv") if policy else []
