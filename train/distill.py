@@ -26,7 +26,7 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from console import say_missing
+from console import report_missing
 from gymnasium.vector import VectorEnv
 from job import Job, Trained
 from job import main as run_jobs
@@ -40,7 +40,7 @@ try:
     from networks import KINDS, layers_of, make_work, outputs, parameter_count, start_layers
     from regression import squared_error_gradient
 except ModuleNotFoundError as error:
-    raise SystemExit(say_missing("distill.py", error)) from None
+    raise SystemExit(report_missing("distill.py", error)) from None
 
 from ce_gym.policies import Actor, Policy, PolicyError, load_policy
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from console import say_missing
+from console import report_missing
 from gymnasium.vector import VectorEnv
 from job import Job, Trained
 from job import main as run_jobs
@@ -33,11 +33,11 @@ from run_learner import run_learner
 from settings import CONFIG_FOLDER, CommonSettings
 
 try:
-    from loops import adam, advantages_of
+    from loops import adam, estimate_advantages
     from networks import KINDS, critic_gradient, layers_of, make_work, outputs, padded, parameter_count, start_layers
     from pathwise import back_through
 except ModuleNotFoundError as error:
-    raise SystemExit(say_missing("shac.py", error)) from None
+    raise SystemExit(report_missing("shac.py", error)) from None
 
 from ce_gym.policies import Actor
 
@@ -182,7 +182,7 @@ class SHAC:
         if late.any():
             rewards[late] += F(s.gamma) * self._run(self.target, self.critic_sizes, self.after[late])[:, 0]
         last = self._run(self.target, self.critic_sizes, self.after[-1])[:, 0]
-        advantages_of(rewards, self.values, last, self.dones, F(s.gamma), F(s.gae_lambda), self.advantages)
+        estimate_advantages(rewards, self.values, last, self.dones, F(s.gamma), F(s.gae_lambda), self.advantages)
         returns, size = (self.advantages + self.values).reshape(n), -(-n // s.minibatches)
         figures, (first, second) = np.zeros(4, F), self.moments[:, self.n_actor :]
         for _ in range(s.epochs):

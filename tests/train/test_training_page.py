@@ -41,7 +41,7 @@ def test_a_full_disk_does_not_end_training(tmp_path, capsys):
         raise OSError(28, "No space left on device")
 
     Present(fail, tmp_path, wanted=True).keep()
-    assert "No space left on device; training goes on" in capsys.readouterr().err
+    assert "No space left on device; training continues" in capsys.readouterr().err
 
 
 def test_the_page_ends_with_training_and_leaves_nothing(tmp_path, capfd):
