@@ -53,7 +53,7 @@ class AveragedPPO(FastPPO):
         return values
 
     def learned(self) -> dict[str, NDArray]:
-        """Return the state of the learner, with the steps of all processes, for `FastPPO` or any number of processes."""
+        """Return the state of the learner with the steps of all processes; any number of processes can continue."""
         state = super().learned()
         facts = json.loads(str(state["facts"]))
         return state | {"facts": np.array(json.dumps(facts | {"steps": facts["steps"] * self.count}))}

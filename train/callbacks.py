@@ -47,12 +47,12 @@ class EpisodeLog(_Quiet):
 class WriteCurve(_Quiet):
     """Writes the learning curve; see `Curve` for the arguments."""
 
-    def __init__(self, file: Path, before: list[dict[str, float]]) -> None:
+    def __init__(self, file: Path, earlier: list[dict[str, float]]) -> None:
         super().__init__()
-        self.file, self.before = file, before
+        self.file, self.earlier = file, earlier
 
     def _on_training_start(self) -> None:
-        self.curve = Curve(self.file, self.before, self.num_timesteps)
+        self.curve = Curve(self.file, self.earlier, self.num_timesteps)
 
     def _on_rollout_end(self) -> None:
         self.curve.add(self.num_timesteps, episode_means(self.model.ep_info_buffer))

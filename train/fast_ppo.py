@@ -261,10 +261,10 @@ class FastPPO:
         """Return the state of learner and environments as arrays; see `restore`."""
         native: Any = self.envs.unwrapped
         views = {f"observed_{i}": view for i, view in enumerate(self.observed)}
-        found = self.learned() | views | {"episodes": self.episodes.rows()}
+        state = self.learned() | views | {"episodes": self.episodes.rows()}
         if hasattr(native, "snapshot"):
-            found |= {f"env/{name}": array for name, array in native.snapshot().items()}
-        return found
+            state |= {f"env/{name}": array for name, array in native.snapshot().items()}
+        return state
 
     def restore(self, state: dict[str, NDArray]) -> None:
         """Continue from a state; environments are reset if they have no snapshots or their number differs.

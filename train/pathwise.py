@@ -53,8 +53,8 @@ def back_through(theta, sizes, kind, observations, by_output, gradient, by_obser
         rows = np.arange(start, min(start + CHUNK, len(observations)))
         n = len(rows)
         _gather(observations, rows, values)
-        found = _forwards(theta, sizes, kind, values, n)
-        width = found.shape[1]
+        last_layer = _forwards(theta, sizes, kind, values, n)
+        width = last_layer.shape[1]
         for i in range(n):
             for j in range(width):
                 d[i * width + j] = by_output[start + i, j] if j < sizes[-1] else ZERO

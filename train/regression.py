@@ -35,11 +35,11 @@ def squared_error_gradient(theta, sizes, kind, observations, labels, rows, gradi
         chosen = rows[start : start + CHUNK]
         n = len(chosen)
         _gather(observations, chosen, values)
-        found = _forwards(theta, sizes, kind, values, n)
-        by_output = d[: found.size].reshape(found.shape)
+        last_layer = _forwards(theta, sizes, kind, values, n)
+        by_output = d[: last_layer.size].reshape(last_layer.shape)
         for i in range(n):
             for j in range(n_out):
-                error = found[i, j] - labels[chosen[i], j]
+                error = last_layer[i, j] - labels[chosen[i], j]
                 total += error * error
                 by_output[i, j] = np.float32(2) * weight * error
             for j in range(n_out, by_output.shape[1]):

@@ -1,8 +1,8 @@
 """Train a policy with rsl_rl's PPO: any registered environment, with the settings files of train/ppo.py.
 
 Writes rsl_rl's checkpoints and TensorBoard logs to the output folder, and the policy as `policy.onnx` with its
-specification. evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read this file. Needs the extra `rsl-rl`.
-Uses public names of ce_gym only, and no name of a robot or task.
+specification. evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read this file. Needs the extra
+`rsl-rl`. Uses public names of ce_gym only, and no name of a robot or task.
 
     python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --steps 6e6
     python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --critic contact_forces base_height
@@ -39,8 +39,8 @@ DIVERGENCE = 0.01
 def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str, Any]:
     """Return settings in the form of rsl_rl's runner; `groups` are the observation groups.
 
-    rsl_rl has no schedules for the entropy bonus, the noise and the cost of falls. So the weight of the entropy bonus is
-    constant, the noise is learned, and falls have no cost. The learning rate follows the KL divergence.
+    rsl_rl has no schedules for the entropy bonus, the noise and the cost of falls. So the weight of the entropy bonus
+    is constant, the noise is learned, and falls have no cost. The learning rate follows the KL divergence.
     """
     network = {"class_name": "MLPModel", "hidden_dims": list(s.hidden), "activation": s.activation.lower()}
     spread = {"class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log"}

@@ -229,27 +229,27 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 def _convert(source: str, key: str, value: Any, kind: str) -> Any:
     """Return one value with the type of its setting; numbers may be quoted."""
-    wanted = f"one of {', '.join(ACTIVATIONS)}" if kind == "Activation" else "a list of layer sizes"
+    expected = f"one of {', '.join(ACTIVATIONS)}" if kind == "Activation" else "a list of layer sizes"
     try:
         if kind == "int":
             high: Any = LIMITS[key]
-            wanted = f"a positive whole number, at most {high:g}"
+            expected = f"a positive whole number, at most {high:g}"
             number = float(value)
             if isinstance(value, bool) or number != int(number) or not 1 <= number <= high:
                 raise ValueError
             return int(number)
         if kind == "float":
             low, high = LIMITS[key]  # type: ignore[misc]
-            wanted = f"a number from {low:g} to {high:g}"
+            expected = f"a number from {low:g} to {high:g}"
             number = float(value)
             if isinstance(value, bool) or not low <= number <= high:
                 raise ValueError
             return number
         if kind.startswith("Mapping"):
-            wanted = "arguments of the environment by name, as plain data"
+            expected = "arguments of the environment by name, as plain data"
             return checked_arguments(value)
         if kind == "str":
-            wanted = "a name or a path"
+            expected = "a name or a path"
             if not isinstance(value, str) or not value:
                 raise ValueError
             return value
@@ -261,7 +261,7 @@ def _convert(source: str, key: str, value: Any, kind: str) -> Any:
     except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, SettingsError):
             raise
-        raise SettingsError(f"{source}: {key}: {repr(value)[:200]}; expected {wanted}") from None
+        raise SettingsError(f"{source}: {key}: {repr(value)[:200]}; expected {expected}") from None
 
 
 def _snake(name: str) -> str:

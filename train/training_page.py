@@ -67,12 +67,12 @@ class Present:
     Args:
         save: Function that writes the policy to a path without suffix.
         out: Folder of the run.
-        wanted: Whether there is a page; otherwise nothing is written.
+        enabled: Whether there is a page; otherwise nothing is written.
     """
 
-    def __init__(self, save: Callable[[Path], Any], out: Path, wanted: bool) -> None:
+    def __init__(self, save: Callable[[Path], Any], out: Path, enabled: bool) -> None:
         self._save, self._path = save, out / PRESENT / "policy"
-        self._due = 0.0 if wanted else float("inf")
+        self._due = 0.0 if enabled else float("inf")
 
     def keep(self) -> None:
         """Write the policy if the last one is older than `PERIOD`."""
