@@ -1,7 +1,7 @@
 """Plan a jump by iterative LQR at several transmission levels, and simulate each plan at the first level.
 
 A robot with a floating base stands, jumps to a height, and stands again at the same place. A plan has joint targets and
-feedback of the state. Each plan is simulated with its feedback and without. Uses public names of ce_gym only, and no
+state feedback. Each plan is simulated with its feedback and without. Uses public names of ce_gym only, and no
 name of a robot.
 
     python train/jump.py mini_cheetah --height 0.25 --level exact armature
