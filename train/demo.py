@@ -76,7 +76,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps (default: as in the settings file)")
     parser.add_argument(
-        "--minutes", type=above_zero, default=4.0, metavar="M", help="longest time to train (default 4)"
+        "--minutes", type=above_zero, default=4.0, metavar="M", help="longest training time [min] (default 4)"
     )
     parser.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all CPUs")
     parser.add_argument(

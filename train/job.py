@@ -269,7 +269,9 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change, such as gamma=0.98")
     how.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
     how.add_argument("--num-envs", metavar="N", help="environments stepped in parallel")
-    how.add_argument("--minutes", type=above_zero, default=float("inf"), metavar="M", help="longest training time")
+    how.add_argument(
+        "--minutes", type=above_zero, default=float("inf"), metavar="M", help="longest training time [min]"
+    )
     how.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all CPUs")
     where = result.add_argument_group("output")
     where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")

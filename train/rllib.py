@@ -155,7 +155,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--address", metavar="HOST:PORT", help="cluster to connect to; 'auto' for this node's own")
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
-    parser.add_argument("--minutes", type=above_zero, default=float("inf"), metavar="M", help="longest training time")
+    parser.add_argument(
+        "--minutes", type=above_zero, default=float("inf"), metavar="M", help="longest training time [min]"
+    )
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
     args = parser.parse_args(argv)
