@@ -123,6 +123,22 @@ def acting_environment(job: Job, native: Any) -> Any:
     return acting
 
 
+def basic_record(native: Any, env_id: str, env_kwargs: dict[str, Any], settings: Any) -> dict[str, Any]:
+    """Return the part of a policy's record that all learners write; `native` is the environment of evaluations."""
+    space, action = native.single_observation_space, native.single_action_space.shape
+    observation = space["policy"].shape if isinstance(space, gymnasium.spaces.Dict) else space.shape
+    return {
+        "env": env_id,
+        "transmission": native.model.transmission,
+        "env_kwargs": env_kwargs,
+        "observation_size": observation[0] if observation else 0,
+        "action_size": action[0] if action else 0,
+        "activation": settings.activation,
+        "policy_spec": native.policy_spec(),
+        "settings": asdict(settings),
+    }
+
+
 def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple[str, ...]) -> dict[str, Any]:
     """Return the record of a policy: the data to use it and to repeat its training.
 
@@ -133,21 +149,11 @@ def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple
         clock: Clock created at the start of training.
         packages: Packages whose versions are recorded, in addition to ce_gym, gymnasium, numpy and Python.
     """
-    space, action = native.single_observation_space, native.single_action_space.shape
-    observation = space["policy"].shape if isinstance(space, gymnasium.spaces.Dict) else space.shape
-    return {
-        "env": job.env_id,
-        "transmission": native.model.transmission,
-        "env_kwargs": job.env_kwargs,
-        "observation_size": observation[0] if observation else 0,
-        "action_size": action[0] if action else 0,
-        "activation": job.settings.activation,
-        "policy_spec": native.policy_spec(),
+    return basic_record(native, job.env_id, job.env_kwargs, job.settings) | {
         "steps": steps,
         "seed": job.seed,
         "resumed_from": str(job.resume) if job.resume else None,
         **clock.spent(),
-        "settings": asdict(job.settings),
         "date": time.strftime("%Y-%m-%d"),
         "versions": {name: _version(name) for name in ("ce_gym", "gymnasium", *packages, "numpy")}
         | {"python": platform.python_version()},

@@ -25,6 +25,7 @@ import numpy as np
 import ray
 from console import SEED, THREADS, Parser, above_zero, run, whole
 from export import to_onnx, write
+from job import basic_record
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
@@ -180,26 +181,12 @@ def _work(args: argparse.Namespace) -> int:
     make_folder(out)
     keep_map(kwargs, out)
     algo.save_to_path(str((out / "checkpoint").resolve()))
-    record = _record(env.unwrapped, args.env, kwargs, s, steps)
+    kept = {key: value for key, value in kwargs.items() if key != "num_threads"}
+    record = basic_record(env.unwrapped, args.env, kept, s) | {"steps": steps}
     write(to_onnx(actor_of(algo, s.activation), record), record, out / "policy.onnx")
     algo.stop()
     print(out / "policy.onnx")
     return 0
-
-
-def _record(native: Any, env_id: str, kwargs: dict[str, Any], s: Settings, steps: int) -> dict[str, Any]:
-    """Return the record of the policy."""
-    return {
-        "env": env_id,
-        "env_kwargs": {key: value for key, value in kwargs.items() if key != "num_threads"},
-        "transmission": native.model.transmission,
-        "observation_size": native.single_observation_space.shape[0],
-        "action_size": native.single_action_space.shape[0],
-        "activation": s.activation,
-        "policy_spec": native.policy_spec(),
-        "settings": s.as_dict(),
-        "steps": steps,
-    }
 
 
 if __name__ == "__main__":

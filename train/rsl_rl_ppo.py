@@ -24,7 +24,7 @@ import torch
 from console import EPISODES, SEED, Parser, run
 from evaluate import evaluate, report
 from export import to_onnx, write
-from job import Job, acting_environment, env_kwargs_of
+from job import Job, acting_environment, basic_record, env_kwargs_of
 from rsl_rl.runners import OnPolicyRunner
 from run_folder import make_folder
 from settings import Settings, config_file, load_env_args, load_settings, with_named
@@ -86,21 +86,6 @@ def actor_of(runner: OnPolicyRunner, activation: str) -> Actor:
     return Actor(tuple((x.weight.detach().cpu().numpy(), x.bias.detach().cpu().numpy()) for x in linear), activation)
 
 
-def record_of(envs: RslRlVecEnv, env_id: str, env_kwargs: dict[str, Any], settings: Settings) -> dict[str, Any]:
-    """Return the record of the policy."""
-    native: Any = envs.envs.unwrapped
-    return {
-        "env": env_id,
-        "env_kwargs": env_kwargs,
-        "transmission": native.model.transmission,
-        "observation_size": envs.get_observations()["policy"].shape[-1],
-        "action_size": envs.num_actions,
-        "activation": settings.activation,
-        "policy_spec": native.policy_spec(),
-        "settings": settings.as_dict(),
-    }
-
-
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(description="Train a policy with rsl_rl's PPO.")
@@ -133,9 +118,8 @@ def _work(args: argparse.Namespace) -> int:
     training = {**kwargs, **settings.training}
     envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **training)
     runner = train(envs, settings, args.seed, out)
-    record = record_of(envs, args.env, kwargs, settings)
     acting = acting_environment(Job(args.env, settings, out, kwargs), envs.envs.unwrapped)
-    record["policy_spec"] = acting.policy_spec()
+    record = basic_record(acting, args.env, kwargs, settings)
     write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
     policy = load_policy(out / "policy.onnx")
     print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))
