@@ -237,7 +237,7 @@ class HeldActions:
         self.policy, self.hold, self.history = policy, hold, history
         self.step = 0
 
-    def predict(self, frame: Array, /, *, deterministic: bool = True) -> tuple[Array, None]:
+    def predict(self, frame: NDArray, /, *, deterministic: bool = True) -> tuple[NDArray, None]:
         """Return the action of the current control step; `frame` (n, size) is the newest part of the observation."""
         if self.step == 0:
             self.observation = np.tile(frame, self.history)

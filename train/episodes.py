@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 EVALUATION_SEED = 1_000_000
 """Seed for policies whose weights cannot be read; training uses small seeds."""
 
-UNDISTURBED: Mapping[str, Any] = {"push_period": 0.0, "command_period": 1e6, "heading": False}
+UNDISTURBED: dict[str, Any] = {"push_period": 0.0, "command_period": 1e6, "heading": False}
 """Arguments of an environment without pushes and new commands of its own."""
 
 LEVEL = "metrics/terrain_level"
@@ -125,7 +125,7 @@ def play(policy: Predicts, envs: SB3VecEnv, before_step: Callable[[int], None] |
         continuing = running & ~dones  # an environment that is done has the state of its next episode
         sums[continuing] += magnitudes((planar_velocity(state["v"]) - command)[continuing])
         counts += continuing
-        last_infos |= {i: infos[i] for i in np.flatnonzero(running & dones)}
+        last_infos |= {i: infos[i] for i in np.flatnonzero(running & dones).tolist()}
         running &= ~dones
         if not running.any():
             break
