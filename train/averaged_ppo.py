@@ -1,8 +1,8 @@
-"""PPO of train/fast_ppo.py by several processes: each has environments of its own, and gradients are averaged.
+"""PPO of train/fast_ppo.py in several processes, each with its own environments; gradients are averaged.
 
-Every process draws minibatches from its own rollout; the mean of their gradients is what one process would have for
-all samples, but that advantages are scaled to unit variance in each. All parameters stay the same, bit for bit. This is
-decentralised PPO (Wijmans et al. 2020, arXiv:1911.00357) without its stragglers: robots of a batch take the same time.
+Each process draws minibatches from its own rollout. The mean of the gradients equals the gradient over all samples,
+except that each process scales its advantages to unit variance. All processes have the same parameters, bit for bit.
+This is decentralised PPO (Wijmans et al. 2020, arXiv:1911.00357) without early ends of slow rollouts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import distributed
 
 
 def share(job: Job, rank: int, count: int) -> Job:
-    """Return one process's part of a training run: its environments, its steps, a seed of its own.
+    """Return one process's part of a training run, with its share of environments and steps and its own seed.
 
     Raises:
         SettingsError: If the environments cannot be divided among `count` processes.
@@ -34,11 +34,11 @@ def share(job: Job, rank: int, count: int) -> Job:
 
 
 class AveragedPPO(FastPPO):
-    """One of the processes; the others are those of torch's default process group, which has begun.
+    """One of the processes in torch's default process group, which must be initialised.
 
     Args:
         envs: A vector environment in SAME_STEP autoreset mode.
-        job: Its part of the training run, see `share`.
+        job: This process's part of the training run, see `share`.
     """
 
     def __init__(self, envs: VectorEnv, job: Job) -> None:
@@ -47,19 +47,19 @@ class AveragedPPO(FastPPO):
         distributed.broadcast(torch.from_numpy(self.theta), 0)
 
     def average(self, values: NDArray) -> NDArray:
-        """Average over all processes, in place."""
+        """Average over all processes in place, and return the array."""
         distributed.all_reduce(torch.from_numpy(values))
         values /= self.count
         return values
 
     def learned(self) -> dict[str, NDArray]:
-        """What `FastPPO` can go on from, and any number of processes; steps are those of all."""
-        found = super().learned()
-        facts = json.loads(str(found["facts"]))
-        return found | {"facts": np.array(json.dumps(facts | {"steps": facts["steps"] * self.count}))}
+        """Return the state of the learner with the steps of all processes; any number of processes can continue."""
+        state = super().learned()
+        facts = json.loads(str(state["facts"]))
+        return state | {"facts": np.array(json.dumps(facts | {"steps": facts["steps"] * self.count}))}
 
     def restore(self, state: dict[str, NDArray]) -> None:
-        """Go on from what was learnt; environments begin anew, and each process explores in its own way."""
+        """Continue from a state; environments are reset, and each process draws its own random numbers."""
         super().restore({name: state[name] for name in ("facts", "theta", "moments")})
         self.rng = np.random.default_rng([self.seed, self.steps])
         self.steps //= self.count

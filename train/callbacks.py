@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from progress import (
     Curve,
+    Log,
     ProgressBar,
     StopInOrder,
     adapted_rate,
@@ -20,45 +21,45 @@ from progress import (
     linear,
     spread_episodes,
 )
-from run_folder import going_on
+from run_folder import continue_if_full
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter
+from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
 from stable_baselines3.common.utils import FloatSchedule
 from training_page import Present
 
 
 class _Quiet(BaseCallback):
-    """A callback that does nothing at each step unless it says so."""
+    """A callback that does nothing after a step."""
 
     def _on_step(self) -> bool:
         return True
 
 
 class EpisodeLog(_Quiet):
-    """Writes the mean of every reward term and metric of recent episodes to the log."""
+    """Logs the mean of every reward term and metric of recent episodes."""
 
     def _on_rollout_end(self) -> None:
         for key, value in episode_means(self.model.ep_info_buffer).items():
-            if key not in ("r", "l"):  # the learner logs these two itself
+            if key not in ("r", "l"):  # Stable-Baselines3 logs these two itself
                 self.logger.record(key, value)
 
 
 class WriteCurve(_Quiet):
-    """Writes the learning curve; arguments as of `Curve`."""
+    """Writes the learning curve; see `Curve` for the arguments."""
 
-    def __init__(self, file: Path, before: list[dict[str, float]]) -> None:
+    def __init__(self, file: Path, earlier: list[dict[str, float]]) -> None:
         super().__init__()
-        self.file, self.before = file, before
+        self.file, self.earlier = file, earlier
 
     def _on_training_start(self) -> None:
-        self.curve = Curve(self.file, self.before, self.num_timesteps)
+        self.curve = Curve(self.file, self.earlier, self.num_timesteps)
 
     def _on_rollout_end(self) -> None:
         self.curve.add(self.num_timesteps, episode_means(self.model.ep_info_buffer))
 
 
 class SpreadEpisodes(_Quiet):
-    """Lets the first episodes end at different times, see `spread_episodes`."""
+    """Spreads the ends of the first episodes, see `spread_episodes`."""
 
     def _on_training_start(self) -> None:
         spread_episodes(self.training_env.unwrapped.envs.unwrapped, np.random.default_rng(self.model.seed))  # type: ignore[attr-defined]
@@ -72,19 +73,19 @@ class AdaptiveLearningRate(_Quiet):
         self.target = target
 
     def _on_rollout_start(self) -> None:
-        kl = self.logger.name_to_value.get("train/approx_kl")  # of the update that has just ended
+        kl = self.logger.name_to_value.get("train/approx_kl")  # of the last update
         if kl is not None:
             rate = self.model.policy.optimizer.param_groups[0]["lr"]
             self.model.lr_schedule = FloatSchedule(adapted_rate(rate, kl, self.target))
 
 
 class _Schedule(_Quiet):
-    """Changes something between rollouts by the share of the training that is done.
+    """Changes a value between rollouts.
 
     Args:
-        start: Its value before the first step.
-        end: Its value after the last one.
-        steps: Steps in all.
+        start: Value before the first step.
+        end: Value after the last step.
+        steps: Number of steps of the training.
     """
 
     def __init__(self, start: float, end: float, steps: int) -> None:
@@ -114,11 +115,11 @@ class NoiseSchedule(_Schedule):
 
 
 class FallCost(_Schedule):
-    """Takes the cost of a fall from the reward of the step that ends an episode as a failure.
+    """Subtracts the cost of a fall from the reward of a step that ends an episode as a failure.
 
     Args:
-        most: What a fall costs in the end, see `fall_cost`.
-        steps: Steps in all.
+        most: Final cost of a fall, see `fall_cost`.
+        steps: Number of steps of the training.
     """
 
     def __init__(self, most: float, steps: int) -> None:
@@ -128,7 +129,7 @@ class FallCost(_Schedule):
         self.cost = fall_cost(self.end, done)
 
     def _on_step(self) -> bool:
-        infos, rewards = self.locals["infos"], self.locals["rewards"]  # of the step just made, not in the buffer yet
+        infos, rewards = self.locals["infos"], self.locals["rewards"]  # of the last step; not in the buffer yet
         for i in np.flatnonzero(self.locals["dones"]):
             if not (infos[i]["TimeLimit.truncated"] or infos[i]["diverged"]):
                 rewards[i] -= self.cost
@@ -136,10 +137,10 @@ class FallCost(_Schedule):
 
 
 class Checkpoints(_Quiet):
-    """Saves the policy between updates, every so many steps.
+    """Saves the policy between updates.
 
     Args:
-        save: Writes a checkpoint.
+        save: Function that writes a checkpoint.
         every: Steps between two checkpoints.
     """
 
@@ -157,7 +158,7 @@ class Checkpoints(_Quiet):
 
 
 class KeepPresent(_Quiet):
-    """Writes the policy for a page between updates."""
+    """Writes the policy for the page between updates."""
 
     def __init__(self, present: Present) -> None:
         super().__init__()
@@ -168,24 +169,46 @@ class KeepPresent(_Quiet):
 
 
 class Lenient(KVWriter):
-    """A log writer that lets training go on when its disk is full."""
+    """A log writer that lets training continue when its disk is full.
+
+    Args:
+        writer: Writer of Stable-Baselines3.
+    """
 
     def __init__(self, writer: KVWriter) -> None:
         self.writer = writer
 
     def write(self, *args: Any) -> None:
-        """Write figures, see `KVWriter`."""
-        with going_on():
+        """Write one row, see `KVWriter`."""
+        with continue_if_full():
             self.writer.write(*args)
 
     def close(self) -> None:
         """Close the file."""
-        with going_on():
+        with continue_if_full():
             self.writer.close()
 
 
+class WriteLog(KVWriter):
+    """Writes the log of Stable-Baselines3 as `progress.csv`.
+
+    Args:
+        log: File to write.
+    """
+
+    def __init__(self, log: Log) -> None:
+        self.log = log
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Write one row, see `KVWriter`."""
+        self.log.add(filter_excluded_keys(key_values, key_excluded, "csv"))
+
+    def close(self) -> None:
+        """Do nothing: the file is closed after every row."""
+
+
 class Stop(BaseCallback):
-    """Ends training between two steps when that is due."""
+    """Ends training between two steps, see `StopInOrder`."""
 
     def __init__(self, stop: StopInOrder) -> None:
         super().__init__()
@@ -196,7 +219,7 @@ class Stop(BaseCallback):
 
 
 class ShowProgress(_Quiet):
-    """Moves the progress bar; "learning" is the time of the updates.
+    """Updates the progress bar.
 
     Args:
         total: Steps at which training ends.
@@ -231,5 +254,5 @@ class ShowProgress(_Quiet):
         self.bar.close()
 
     def _physics(self) -> float:
-        """Time spent inside the environment so far [s]."""
+        """Return the time inside the environment so far [s]."""
         return getattr(self.training_env, "step_seconds", 0.0)

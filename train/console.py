@@ -1,4 +1,4 @@
-"""Command lines of the programs that judge policies: results as text and JSON, errors in one line."""
+"""Command lines of the training programs: results as text and JSON, errors in one line."""
 
 from __future__ import annotations
 
@@ -13,31 +13,28 @@ from typing import Any, NoReturn
 import gymnasium
 
 EXTRAS = {"mujoco": "mjcf", "meshcat": "viewer", "onnx": "export", "numba": "fast"}
-"""What brings packages that a program needs for a part of its work."""
+"""Extra of ce_gym that installs an optional package."""
 
 UNKNOWN_ARGUMENT = "unexpected keyword argument"
-"""What Python says of a mistake in `--env-arg` that an environment does not check itself."""
+"""Message of Python about a wrong name in `--env-arg`, if an environment does not check names."""
 
 Table = list[list[str]]
-"""Rows of cells, the heading first."""
+"""Rows of cells; the first row is the heading."""
 
 
 def run(program: str, work: Callable[[], int]) -> int:
-    """Do the work of a program and return its exit code: 2 after an error of the user, which is reported in one line.
-
-    130 after Ctrl-C.
-    """
+    """Run a program and return its exit code: 2 after a wrong input, which prints one line, and 130 after Ctrl-C."""
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: print(f"{program}: warning: {message}", file=sys.stderr)
             return work()
     except ModuleNotFoundError as error:
-        return say_missing(program, error)
+        return report_missing(program, error)
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130
     except OSError as error:
-        print(f"{program}: {said(error)}", file=sys.stderr)
+        print(f"{program}: {file_error(error)}", file=sys.stderr)
         return 2
     except MemoryError as error:
         print(f"{program}: not enough memory: {' '.join(str(error).split())}", file=sys.stderr)
@@ -49,13 +46,13 @@ def run(program: str, work: Callable[[], int]) -> int:
         return 2
 
 
-def say_missing(program: str, error: ModuleNotFoundError) -> int:
-    """Say in one line which package a program needs and what brings it; return the exit code.
+def report_missing(program: str, error: ModuleNotFoundError) -> int:
+    """Print in one line which package a program needs and how to install it; return the exit code.
 
     Raises:
-        ModuleNotFoundError: If it is a part of ce_gym itself.
+        ModuleNotFoundError: If the missing module belongs to ce_gym.
     """
-    if error.name is None:  # Gymnasium's, of a module that an id names
+    if error.name is None:  # Gymnasium's error about the module of an id
         print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     package = error.name.split(".")[0]
@@ -66,8 +63,8 @@ def say_missing(program: str, error: ModuleNotFoundError) -> int:
     return 2
 
 
-def said(error: OSError) -> str:
-    """Return what went wrong with a file."""
+def file_error(error: OSError) -> str:
+    """Return file and reason of an error."""
     return f"{error.filename}: {error.strerror}" if error.filename else error.strerror or str(error)
 
 
@@ -80,7 +77,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
-    """Return what reads an argument that is a whole number within limits."""
+    """Return a function that reads a whole number within limits from the command line."""
 
     def read(text: str) -> int:
         try:
@@ -95,7 +92,7 @@ def whole(low: int, high: int) -> Callable[[str], int]:
 
 
 def above_zero(text: str) -> float:
-    """Read an argument that is a number above 0, which may be inf."""
+    """Read a number above 0, or inf, from the command line."""
     try:
         number = float(text)
     except ValueError:
@@ -106,23 +103,28 @@ def above_zero(text: str) -> float:
 
 
 SEED = whole(0, 2**31 - 1)
-"""Reads `--seed`."""
+"""Type of `--seed`."""
 
 THREADS = whole(1, 1024)
-"""Reads `--threads`."""
+"""Type of `--threads`."""
 
 EPISODES = whole(1, 1_000_000)
-"""Reads `--episodes`."""
+"""Type of `--episodes`."""
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
-    """Add `--json`, which `print_result` understands."""
+    """Add `--json`, the argument of `print_result`."""
     text = "write the result to FILE as JSON as well; without FILE, print JSON and nothing else"
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help=text)
 
 
 def print_result(result: Any, text: str, json_file: str | None) -> None:
-    """Print a result as `text`, and write it as JSON where `--json` says.
+    """Print a result as text or JSON, and write it to the file of `--json`.
+
+    Args:
+        result: Plain data.
+        text: The result as text.
+        json_file: Value of `--json`: None, a file, or "-" for JSON instead of text.
 
     Raises:
         OSError: If the file cannot be written.
@@ -134,7 +136,7 @@ def print_result(result: Any, text: str, json_file: str | None) -> None:
 
 
 def markdown(table: Table) -> str:
-    """Return a table as Markdown whose columns are aligned, so that it reads well as it is."""
+    """Return a table as Markdown with aligned columns."""
     widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
     heading, *rows = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in table

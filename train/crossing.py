@@ -1,19 +1,21 @@
-"""How many robots cross a stretch of ground: all walk straight at one speed, and those that get there are counted.
+"""Count the robots that walk straight across a stretch of ground without a fall.
 
-They are steered as by hand: the yaw rate is commanded towards a point ahead on a line along the world's y-axis, which
-on ground of tiles stays on one level. Uses public names of ce_gym only, and no name of a robot or task.
+All robots walk at one speed along the world's y-axis, a line that stays on one level if the ground has tiles. The
+commanded yaw rate steers each robot towards a point ahead on its line. Uses public names of ce_gym only, and no name of
+a robot or task.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 from console import Table, markdown
+from episodes import UNDISTURBED, run_policy, without_curricula
 from numpy.typing import NDArray
-from suites import everywhere
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.policies import Policy, PolicyError
@@ -21,32 +23,33 @@ from ce_gym.policies import Policy, PolicyError
 Array = NDArray[np.float64]
 
 GAIN = 2.0
-"""Commanded yaw rate over the error of the heading [1/s]."""
+"""Commanded yaw rate divided by the heading error [1/s]."""
 AHEAD = 1.0
-"""Robots head for a point of their line that is so far ahead [m]."""
+"""Distance of the target point ahead on the line [m]."""
 PATIENCE = 2.0
-"""Robots have so many times as long as they would need at the commanded speed."""
+"""Time limit, as a multiple of the time at the commanded speed."""
 
 
 def cross(
     policy: Policy, episodes: int, seed: int, *, distance: float = 8.0, speed: float = 0.5, **kwargs: Any
 ) -> dict[str, Any]:
-    """Let robots walk straight, each once, and count those that come so far without a fall.
+    """Let each robot walk straight once, and count the robots that cover a distance without a fall.
 
-    Curricula are left out. On tiles robots walk towards the middle of the field; from the middle of a tile 8 m away
-    is the middle of the next, on stairs the bottom of a pit from the top of a pyramid or the other way round.
+    Curricula are disabled. On tiles, robots walk towards the middle of the field. The default distance is that between
+    the middles of neighbouring tiles; on stairs robots walk from the top of a pyramid to the bottom of a pit, or up.
 
     Args:
-        policy: With its record.
-        episodes: Robots.
-        seed: Of the first environment.
-        distance: How far along the line they have to come [m].
-        speed: Commanded forward [m/s].
-        **kwargs: Given to the environment, such as `transmission`.
+        policy: Policy with its record.
+        episodes: Number of robots.
+        seed: Seed of the first environment.
+        distance: Distance along the line [m].
+        speed: Commanded forward speed [m/s].
+        **kwargs: Arguments of the environment, such as `transmission`.
 
     Returns:
-        crossed, fell: shares of the robots, those that do neither run out of time; episodes, distance, speed; levels,
-        where the ground has some: the same of each.
+        - crossed, fell: Fractions of the robots; all others reached the time limit.
+        - episodes, distance, speed: The arguments.
+        - levels: crossed, fell and episodes for each terrain level, if the ground has levels.
 
     Raises:
         PolicyError: If the task of the policy has no commands.
@@ -54,50 +57,49 @@ def cross(
     record = policy.record
     if "command" not in record["policy_spec"]:
         raise PolicyError(f"crossing: {record['env']} has no commanded velocities; expected a task with them")
-    arguments = everywhere(record["env"], kwargs)
     steps = math.ceil(PATIENCE * distance / speed / record["policy_spec"]["control_dt"])
-    arguments |= {"push_period": 0.0, "command_period": 1e6, "heading": False, "max_episode_steps": steps + 1}
-    envs = make_sb3_vec_env(record["env"], episodes, seed, **arguments)
-    try:
+    arguments = without_curricula(record["env"], kwargs) | UNDISTURBED | {"max_episode_steps": steps + 1}
+    with closing(make_sb3_vec_env(record["env"], episodes, seed, **arguments)) as envs:
         crossed, fell, level = _walk(policy, envs, steps, distance, speed, _middle(arguments.get("terrain")))
-    finally:
-        envs.close()
     result = {**_shares(crossed, fell), "distance": distance, "speed": speed}
     if level.size:
-        found = [(number, level == number) for number in np.unique(level).tolist()]
-        result["levels"] = [{"level": number, **_shares(crossed[on], fell[on])} for number, on in found]
+        groups = [(number, level == number) for number in np.unique(level).tolist()]
+        result["levels"] = [{"level": number, **_shares(crossed[on], fell[on])} for number, on in groups]
     return result
 
 
 def _walk(policy: Policy, envs: Any, steps: int, distance: float, speed: float, middle: float) -> tuple[NDArray, ...]:
-    """Return who crossed, who fell, and the level of each, from 0; none where the ground has no levels."""
+    """Return which robots crossed, which fell, and the level of each from 0, or no levels if the ground has none."""
     native: Any = envs.envs.unwrapped
-    observation: Any = envs.reset()
+    obs: Any = envs.reset()
     start = native.batch.rows("q")[:, :2].astype(float)
     side = np.where(start[:, 1] > middle, -1.0, 1.0)
     level = np.empty(0, int)
     if "level" in native.batch.schema:
         level = np.rint(native.batch.rows("level")[:, 0]).astype(int)
     crossed, fell = np.zeros(envs.num_envs, bool), np.zeros(envs.num_envs, bool)
-    for _ in range(steps):
+
+    def steer(_step: int) -> None:
+        nonlocal crossed
         q = native.batch.rows("q").astype(float)
         crossed |= ~fell & (side * (q[:, 1] - start[:, 1]) >= distance)
+        native.set_command(steering_command(q, start[:, 0], side, speed))
+
+    for dones, _ in run_policy(policy, envs, obs, steer, steps):
+        fell |= dones & ~crossed
         if (crossed | fell).all():
             break
-        native.set_command(steered(q, start[:, 0], side, speed))
-        observation, _, dones, _ = envs.step(policy.predict(observation)[0])
-        fell |= dones & ~crossed
     return crossed, fell, level
 
 
-def steered(q: Array, line: Array, side: Array, speed: float) -> Array:
+def steering_command(q: Array, line: Array, side: Array, speed: float) -> Array:
     """Return commands that keep robots on lines along y, shape (n, 3).
 
     Args:
-        q: Positions, a quaternion (w, x, y, z) from column 3 on, shape (n, nq).
+        q: Positions with the quaternion (w, x, y, z) from column 3, shape (n, nq).
         line: x of each robot's line [m], shape (n,).
-        side: 1 for those that walk along y, -1 for those that walk against it, shape (n,).
-        speed: [m/s]
+        side: Direction of each robot, 1 along y and -1 against y, shape (n,).
+        speed: Forward speed [m/s].
     """
     w, x, y, z = q[:, 3:7].T
     heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -107,7 +109,7 @@ def steered(q: Array, line: Array, side: Array, speed: float) -> Array:
 
 
 def _middle(terrain: Any) -> float:
-    """Middle of a field of tiles along y [m]; of other ground the origin."""
+    """Return y of the middle of a field of tiles [m]; 0 for other ground."""
     terrain = terrain if isinstance(terrain, Mapping) else {}
     return terrain.get("size", 8.0) * terrain.get("columns", 4) / 2 if terrain.get("kind") not in (None, "map") else 0.0
 
@@ -117,7 +119,7 @@ def _shares(crossed: NDArray, fell: NDArray) -> dict[str, Any]:
 
 
 def crossing_table(result: Mapping[str, Any]) -> str:
-    """One line per level of the ground and one for all of them, as Markdown."""
+    """Return a Markdown table with one line per terrain level and one line for all levels."""
     rows: Table = [["level", f"crossed {result['distance']:g} m at {result['speed']:g} m/s", "fell", "robots"]]
     for row in [*result.get("levels", ()), {"level": "all", **result}]:
         rows.append([str(row["level"]), f"{row['crossed']:.1%}", f"{row['fell']:.1%}", str(row["episodes"])])

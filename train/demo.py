@@ -1,7 +1,7 @@
-"""The whole chain in one command: train a robot, judge it, and show it in a browser.
+"""Train a robot, evaluate it, and show it in a browser, in one command.
 
-A policy that an earlier run finished is used again, one that was interrupted is trained on; `--fresh` starts anew.
-Uses public names of ce_gym only.
+A second call uses the finished policy, or continues an interrupted training; `--fresh` starts again. Uses public names
+of ce_gym only.
 
     python train/demo.py
 """
@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 from console import EPISODES, SEED, THREADS, Parser, above_zero, run
+from episodes import EVALUATION_SEED
 from evaluate import report
 from job import Job, Trained
 from settings import config_file, load_env_args, load_settings
-from suites import EVALUATION_SEED
 from transfer import summary, table, transfer
 
 from ce_gym import usable_cores
@@ -32,14 +32,14 @@ ENV = "ce_gym/MiniCheetahVelocity-v0"
 
 
 def obtain_policy(args: argparse.Namespace) -> Path:
-    """Train a policy, or take the one in the output folder, and say which."""
-    from fast_ppo import train  # says what is missing where its extra is not installed
+    """Return the policy in the output folder, trained now if necessary, and print which."""
+    from fast_ppo import train  # prints the missing extra if it is not installed
 
     policy, path = args.out / "policy.npz", config_file(args.env)
-    resume, asked = None, (args.env, {**load_env_args(path), **dict(args.env_args)})
+    env_kwargs, resume = {**load_env_args(path), **dict(args.env_args)}, None
     if policy.exists() and not args.fresh:
         record = load_policy(policy).record
-        same = (record["env"], record["env_kwargs"]) == (args.env, with_map(asked[1], policy))
+        same = (record["env"], record["env_kwargs"]) == (args.env, with_map(env_kwargs, policy))
         if record.get("finished") and same:
             print(f"Using the policy trained earlier: {policy}, {record['steps']:,} steps. --fresh trains a new one.")
             return policy
@@ -47,10 +47,10 @@ def obtain_policy(args: argparse.Namespace) -> Path:
     overrides = [f"steps={args.steps}"] if args.steps else []
     settings = load_settings(path, overrides)
     job = Job(
-        args.env, settings, args.out, env_kwargs=asked[1], seed=args.seed, threads=args.threads, resume=resume,
+        args.env, settings, args.out, env_kwargs=env_kwargs, seed=args.seed, threads=args.threads, resume=resume,
         seconds=60.0 * args.minutes,
     )  # fmt: skip
-    begin = f"Going on with {policy}" if resume else "Training from nothing"
+    begin = f"Continuing {policy}" if resume else "Training a new policy"
     print(
         f"{begin}: {args.env}, {settings.steps:,} steps or {args.minutes:g} minutes. Ctrl-C stops and keeps the policy."
     )
@@ -60,7 +60,7 @@ def obtain_policy(args: argparse.Namespace) -> Path:
 
 
 def _announce(trained: Trained) -> Path:
-    """Say how training went."""
+    """Print steps and time of training, and return the policy."""
     seconds, steps = trained.record["training_seconds"], trained.record["steps"]
     how = "Interrupted" if trained.interrupted else "Trained"
     print(f"{how}: {steps:,} steps, {seconds:.0f} s. Policy: {trained.policy}")
@@ -69,18 +69,18 @@ def _announce(trained: Trained) -> Path:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
-    parser = Parser(description="Train a robot on exact transmissions, judge it, and show it.")
+    parser = Parser(description="Train a robot on exact transmissions, evaluate it, and show it.")
     parser.add_argument("--env", default=ENV, metavar="ID", help=f"environment id (default {ENV})")
     add_env_arg(parser)
-    parser.add_argument("--fresh", action="store_true", help="train anew even if there is a policy from an earlier run")
+    parser.add_argument("--fresh", action="store_true", help="train a new policy even if an earlier run left one")
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps (default: as in the settings file)")
     parser.add_argument(
-        "--minutes", type=above_zero, default=4.0, metavar="M", help="longest time to train (default 4)"
+        "--minutes", type=above_zero, default=4.0, metavar="M", help="longest training time [min] (default 4)"
     )
     parser.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all CPUs")
     parser.add_argument(
-        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes to judge it by (default 256)"
+        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation (default 256)"
     )
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     args = parser.parse_args(argv)
@@ -88,18 +88,21 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def show(policy: Path, episodes: int, out: Path, env: str | None = None) -> int:
-    """Print how good a policy is, on every transmission level, and write its rollout; the last line is the page.
+    """Print the results of a policy at every transmission level, and write a rollout and its page.
 
-    `env` is what the user named: an id `module:id` is not imported because the policy's record has it.
+    The page also shows a ghost: the policy at level `none`, or at `exact` if it was trained at a simplified level.
 
-    The page also shows, as a ghost, what becomes of the policy without rotors, or of one that was trained on a
-    simplified level when nothing is left out.
+    Args:
+        policy: File of the policy.
+        episodes: Episodes of the evaluation.
+        out: Folder to write to.
+        env: Environment id from the command line; see `ce_gym.policies.environment_of`.
     """
     model = load_policy(policy)
     level = model.record["transmission"]
     results = transfer(model, model.record, episodes=episodes)
     entry = {"transmission": level, "results": results}
-    print(f"\nJudged on {level} transmissions:\n{report(results[level])}")
+    print(f"\nEvaluated on {level} transmissions:\n{report(results[level])}")
     print(f"\nThe same policy on every transmission level:\n{table(summary([entry]))}")
     (rollout,), (ghost,) = (
         walk(policy, env=env, seed=EVALUATION_SEED, transmission=shown, label=f"{shown} transmissions, {what}")
@@ -114,7 +117,7 @@ def show(policy: Path, episodes: int, out: Path, env: str | None = None) -> int:
 
 
 def parting(rollout: Rollout, ghost: Rollout) -> str:
-    """Return a sentence that says what the ghost is, and how far it is away when either of the two ends."""
+    """Return a sentence about the ghost and its distance from the robot when the shorter rollout ends."""
     last = min(len(rollout), len(ghost)) - 1
     distance = np.linalg.norm(rollout.q[last, :2] - ghost.q[last, :2])
     what = f"The ghost is the same policy from the same seed on {ghost.transmission} transmissions"

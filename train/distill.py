@@ -1,10 +1,10 @@
-"""Train a student that sees what a real robot senses to do what a teacher does that sees more.
+"""Train a student, whose observations a real robot can measure, to imitate a teacher with more observations.
 
-DAgger (Ross et al. 2011, arXiv:1011.0686) without memory: the student acts, the teacher says in each of the student's
-states what it would have done, and the student is fitted to that by least squares. The environment is the student's;
-the teacher sees its blocks among those of the critic, which have neither noise, nor delay, nor history. Same command
-line, files and settings machinery as train/fast_ppo.py; settings are in train/config/distill. Uses public names of
-ce_gym only, and no name of a robot or task.
+DAgger (Ross et al. 2011, arXiv:1011.0686) without memory: the student acts, the teacher labels each state with its own
+action, and least squares fit the student to the labels. The environment belongs to the student. The teacher uses
+observation blocks of the critic, which have no noise, delay or history. Command line and files are the same as in
+train/fast_ppo.py; settings are in train/config/distill. Uses public names of ce_gym only, and no name of a robot or
+task.
 
     python train/distill.py --env ce_gym/MiniCheetahVelocity-v0
     python train/distill.py --env ce_gym/MiniCheetahVelocity-v0 --set teacher=runs/mini_cheetah_velocity-fast
@@ -26,7 +26,7 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from console import say_missing
+from console import report_missing
 from gymnasium.vector import VectorEnv
 from job import Job, Trained
 from job import main as run_jobs
@@ -40,7 +40,7 @@ try:
     from networks import KINDS, layers_of, make_work, outputs, parameter_count, start_layers
     from regression import squared_error_gradient
 except ModuleNotFoundError as error:
-    raise SystemExit(say_missing("distill.py", error)) from None
+    raise SystemExit(report_missing("distill.py", error)) from None
 
 from ce_gym.policies import Actor, Policy, PolicyError, load_policy
 
@@ -49,13 +49,13 @@ F = np.float32
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that shapes a student, apart from the environment's id and the seed.
+    """Settings of distillation.
 
     Attributes:
-        teacher: A policy: a file, the folder of a run, or the name of one that comes along.
-        initial_std: Standard deviation of what is added to the student's actions while it collects, at the start.
-        final_std: At the end, geometric in between.
-        learning_rate: Of Adam, at the start; it falls linearly to 0.
+        teacher: A policy: a file, the folder of a run, or the name of a shipped policy.
+        initial_std: Standard deviation of the noise on the student's actions during collection, at the start.
+        final_std: Standard deviation at the end, geometric in between.
+        learning_rate: Learning rate of Adam at the start; it falls linearly to 0.
     """
 
     folder: ClassVar[Path] = CONFIG_FOLDER / "distill"
@@ -76,59 +76,60 @@ class Settings:
 
 
 SENSOR_ERRORS = ("drift", "shift", "dropout", "delay")
-"""Parameters of observation blocks that the critic does not see."""
+"""Parameters of observation blocks that have no effect on the critic's observation."""
 
 
 def teacher_columns(teacher: Policy, name: str, native: Any, kwargs: Mapping[str, Any]) -> NDArray[np.intp]:
-    """Return where the teacher finds its observation in the critic's, shape (n_obs,).
+    """Return the columns of the teacher's observation in the critic's observation, shape (n_obs,).
 
     Args:
-        teacher: With its record.
-        name: What the user calls it.
+        teacher: Teacher with its record.
+        name: Name of the teacher in errors.
         native: The student's environments, unwrapped.
-        kwargs: What they were made with.
+        kwargs: Arguments of these environments.
 
     Raises:
-        PolicyError: If the teacher has a history, or a block is not shown to the critic, or is another one there.
+        PolicyError: If the teacher has a history, or the critic lacks a block or has it with other parameters.
     """
-    seen, known = teacher.record["policy_spec"]["observation"], native.critic_structure
-    if seen["history"] != 1:
-        raise PolicyError(f"{name}: history={seen['history']}; expected a teacher that sees the present alone")
-    starts = dict(zip(known, np.cumsum([0, *known.values()]).tolist(), strict=False))
-    here, there, found = _parameters(kwargs), _parameters(teacher.record["env_kwargs"]), []
-    for key, size in ((block["name"], block["size"]) for block in seen["blocks"]):
-        if key not in known:
-            raise PolicyError(f"{name}: sees {key}; expected it among what the critic sees: {', '.join(known)}")
-        wanted, given = there.get(key, {}), here.get(key, {})
-        named = {*wanted, *given} - {*SENSOR_ERRORS}
-        if known[key] != size or any(given.get(one) != wanted.get(one) for one in named):
+    observation, blocks = teacher.record["policy_spec"]["observation"], native.critic_structure
+    if observation["history"] != 1:
+        raise PolicyError(f"{name}: history={observation['history']}; expected a teacher without history")
+    starts = dict(zip(blocks, np.cumsum([0, *blocks.values()]).tolist(), strict=False))
+    of_critic, of_teacher = _parameters(kwargs), _parameters(teacher.record["env_kwargs"])
+    columns = []
+    for key, size in ((block["name"], block["size"]) for block in observation["blocks"]):
+        if key not in blocks:
+            raise PolicyError(f"{name}: observes {key}; expected one of the critic's blocks: {', '.join(blocks)}")
+        trained, present = of_teacher.get(key, {}), of_critic.get(key, {})
+        parameters = {*trained, *present} - {*SENSOR_ERRORS}
+        if blocks[key] != size or any(present.get(p) != trained.get(p) for p in parameters):
             raise PolicyError(
-                f"{name}: sees {key} of {wanted}, {size} numbers; here it has {given}, {known[key]} numbers"
+                f"{name}: observes {key} with {trained}, size {size}; here it has {present}, size {blocks[key]}"
             )
-        found.append(np.arange(starts[key], starts[key] + size))
-    return np.concatenate(found)
+        columns.append(np.arange(starts[key], starts[key] + size))
+    return np.concatenate(columns)
 
 
 def _parameters(kwargs: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Parameters of observation blocks, by name, as arguments of an environment have them."""
-    given = (kwargs.get(key, {}) for key in ("critic", "observations"))
-    return {name: parameters for group in given if isinstance(group, Mapping) for name, parameters in group.items()}
+    """Return the parameters of observation blocks in the arguments of an environment, by name of the block."""
+    groups = (kwargs.get(key, {}) for key in ("critic", "observations"))
+    return {name: parameters for group in groups if isinstance(group, Mapping) for name, parameters in group.items()}
 
 
 class Distiller:
-    """A student that learns from a teacher.
+    """Learner of a student that imitates a teacher.
 
     Args:
-        envs: A vector environment of ours in SAME_STEP autoreset mode, whose critic sees what the teacher sees.
+        envs: A vector environment of ce_gym in SAME_STEP autoreset mode, with the teacher's blocks in the critic.
         job: The training run.
 
     Attributes:
         theta: Parameters of the student.
         steps: Environment steps done.
-        step_seconds, collect_seconds: Time spent inside the environment, and in collection as a whole [s].
+        step_seconds, collect_seconds: Time inside the environment, and in collection including it [s].
 
     Raises:
-        PolicyError: If the teacher cannot be read, or cannot see or do here what it was trained with.
+        PolicyError: If the teacher cannot be read, or its observations or actions do not fit the environment.
     """
 
     def __init__(self, envs: VectorEnv, job: Job) -> None:
@@ -136,12 +137,12 @@ class Distiller:
         native: Any = envs.unwrapped
         spaces: Any = envs.single_observation_space, envs.single_action_space
         if not isinstance(spaces[0], gymnasium.spaces.Dict):
-            raise PolicyError(f"{job.env_id}: obs_mode: expected dict, so that the teacher sees what the critic does")
+            raise PolicyError(f"{job.env_id}: obs_mode: expected dict, for the observation of the teacher")
         self.teacher, size, self.n_actions = load_policy(s.teacher), spaces[0]["policy"].shape[0], spaces[1].shape[0]
         self.columns = teacher_columns(self.teacher, s.teacher, native, {**job.env_kwargs, **s.training})
         if self.teacher.record["action_size"] != self.n_actions:
-            found = self.teacher.record["action_size"]
-            raise PolicyError(f"{s.teacher}: has {found} actions; expected {self.n_actions}, as the student")
+            n_teacher = self.teacher.record["action_size"]
+            raise PolicyError(f"{s.teacher}: has {n_teacher} actions; expected {self.n_actions}, as the student")
         self.sizes = np.array([size, *s.hidden, self.n_actions])
         self.kind, self.rng = KINDS.index(s.activation), np.random.default_rng(job.seed)
         self.theta = np.zeros(parameter_count(self.sizes), F)
@@ -155,7 +156,7 @@ class Distiller:
         spread_episodes(native, self.rng)
 
     def iterate(self) -> dict[str, float]:
-        """Act for a rollout and learn what the teacher would have done; return what the log shows."""
+        """Collect a rollout and fit the student to the teacher's actions; return statistics for the log."""
         s, done, start = self.settings, min(self.steps / self.settings.steps, 1.0), time.perf_counter()
         self.collect(F(geometric(s.initial_std, s.final_std, done)))
         self.collect_seconds += time.perf_counter() - start
@@ -165,7 +166,7 @@ class Distiller:
         return {"train/error": error**0.5, "train/learning_rate": rate}
 
     def collect(self, std: np.float32) -> None:
-        """Act for a rollout by the student, with noise, and ask the teacher."""
+        """Collect a rollout with the student's actions plus noise, and store the teacher's actions as labels."""
         actions = np.empty((self.settings.num_envs, self.n_actions), F)
         for t in range(self.settings.rollout):
             self.seen[t] = self.observed["policy"]
@@ -180,7 +181,7 @@ class Distiller:
                 self.episodes.add(ended, infos)
 
     def learn(self, rate: float) -> float:
-        """Go over the rollout in minibatches drawn anew; return the mean squared error the last time."""
+        """Update the student with random minibatches of the rollout; return the last epoch's squared error."""
         s, n = self.settings, self.settings.rollout * self.settings.num_envs
         seen, labels, size = self.seen.reshape(n, -1), self.labels.reshape(n, -1), -(-n // s.minibatches)
         errors: list[float] = []
@@ -195,26 +196,26 @@ class Distiller:
         return float(np.mean(errors))
 
     def actor(self) -> Actor:
-        """The layers that turn observations into mean actions, copies."""
+        """Return copies of the layers from observations to mean actions."""
         layers = layers_of(self.theta, self.sizes)
         return Actor(tuple((weight.T.copy(), bias.copy()) for weight, bias in layers), self.settings.activation)
 
     def state(self) -> dict[str, NDArray]:
-        """All that going on needs, as arrays: see `restore`."""
+        """Return the state of learner and environments as arrays; see `restore`."""
         native: Any = self.envs.unwrapped
         facts = {
             "steps": self.steps, "updates": self.updates, "rng": self.rng.bit_generator.state,
             "sizes": self.sizes.tolist(), "activation": self.settings.activation, "episodes": self.episodes.names,
         }  # fmt: skip
-        found = {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
-        found |= {f"observed_{name}": rows for name, rows in self.observed.items()} | {"episodes": self.episodes.rows()}
-        return found | {f"env/{name}": array for name, array in native.snapshot().items()}
+        state = {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
+        state |= {f"observed_{name}": rows for name, rows in self.observed.items()} | {"episodes": self.episodes.rows()}
+        return state | {f"env/{name}": array for name, array in native.snapshot().items()}
 
     def restore(self, state: dict[str, NDArray]) -> None:
-        """Go on from a state; environments begin anew if they are more or fewer.
+        """Continue from a state; environments are reset if their number differs.
 
         Raises:
-            ValueError: If it is of another network.
+            ValueError: If the state has another network.
         """
         facts = json.loads(str(state["facts"]))
         mine = [self.sizes.tolist(), self.settings.activation]

@@ -1,19 +1,20 @@
-"""What walking costs: torque, speed and power of the motors, and the cost of transport.
+"""Torque, speed and power of the motors, and the cost of transport.
 
-The policy acts in its own environment, whose control step is cut into sub-steps that hold the action, so that the
-peaks between two actions are seen. Torques at the joints are taken to the motors through the transmission,
-`tau = W^T tau_m`, `omega = W yd` (arXiv:2311.13732), at every level in the same way. Uses public names of ce_gym only,
-and no name of a robot or task.
+The policy acts in its own environment, which returns after each sub-step, so that peaks between two actions are
+measured. The transmission relates joints and motors: `tau = W^T tau_m`, `omega = W yd` (arXiv:2311.13732), in the same
+way at every level. Uses public names of ce_gym only, and no name of a robot or task.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from episodes import run_policy
 from numpy.typing import NDArray
 
 import ce_gym
@@ -23,10 +24,10 @@ from ce_gym.policies import Policy
 Array = NDArray[np.float64]
 
 GRAVITY = 9.81
-"""For the weight in the cost of transport [m/s^2]."""
+"""Gravity in the cost of transport [m/s^2]."""
 
 TOLERANCE = 0.01
-"""Share of its largest torque by which a motor may exceed what it can give before that counts."""
+"""Tolerance of the torque limit, as a fraction of the largest torque."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,13 @@ class Drives:
     """The motors of a robot, or its joints where a robot file names no motors.
 
     Attributes:
-        names: Of the motors' rotors, or of the joints.
+        names: Names of the motors' rotors, or of the joints.
         torque: Largest torque [N m], infinite if unknown, shape (n,).
-        stall, velocity: Where the torque-speed line begins [N m] and ends [rad/s], infinite if unknown, shape (n,).
-        power: Largest mechanical power that torque limit and torque-speed line allow [W], shape (n,).
-        speeds: Takes positions (nq, n) to `W`, column by column of the matrix (n_motors, n_joints) below each other.
-        constant: `W` if it is the same in every position.
+        stall, velocity: Stall torque [N m] and no-load speed [rad/s] of the torque-speed line, infinite if unknown,
+            shape (n,).
+        power: Largest mechanical power within torque limit and torque-speed line [W], shape (n,).
+        speeds: Function from positions (nq, n) to `W` (n_motors, n_joints), stacked column by column.
+        constant: `W` if it does not depend on positions, otherwise None.
     """
 
     names: tuple[str, ...]
@@ -52,7 +54,7 @@ class Drives:
 
     @classmethod
     def of(cls, model: ce_gym.Model) -> Drives:
-        """The motors of the robot of `model`, whatever the level of that: all have them on the same rotors."""
+        """Return the motors of a model's robot; they are the same at all levels."""
         robot, exact = model.robot, ce_gym.Model(model.robot, "exact")
         limits = [(motor.rotor, motor.torque, motor.stall, motor.velocity) for motor in robot.motors]
         if not limits:
@@ -79,10 +81,10 @@ class Drives:
         """Return torques [N m] and speeds [rad/s] of the motors, each shape (n, n_motors).
 
         Args:
-            model: The robot.
+            model: Model of the robot.
             q: Positions, shape (n, nq).
-            yd: Velocities of joints, then of what stretches [rad/s], shape (n, n_joints + n_stretches).
-            tau: What the motors do to the joints [N m], shape (n, n_joints).
+            yd: Velocities of joints, then of elastic stretches [rad/s], shape (n, n_joints + n_stretches).
+            tau: Torques of the motors at the joints [N m], shape (n, n_joints).
         """
         (joints, stretched), own = np.split(yd, [tau.shape[1]], axis=1), self.own_speeds(model)
         if self.constant is not None:
@@ -94,32 +96,36 @@ class Drives:
         return np.einsum("nj,njm->nm", tau, np.linalg.pinv(W)), speed
 
     def own_speeds(self, model: ce_gym.Model) -> NDArray[np.bool_]:
-        """Return speeds of motors for unit velocities of what stretches, each its own, (n_stretches, n_motors)."""
+        """Return which motor each elastic stretch belongs to, shape (n_stretches, n_motors)."""
         rotors = {elastic.stretch: elastic.rotor for elastic in model.robot.elastic}
         turned = [rotors[name] for name in model.robot.independent if name in rotors]
         return np.array(turned, object)[:, None] == np.array(self.names, object)
 
-    def beyond(self, tau: Array, speed: Array, before: Array) -> NDArray[np.bool_]:
-        """Return which motors give more than current and voltage allow at any speed of a sub-step, shape (n, n_motors).
+    def beyond(self, tau: Array, speed: Array, last_speed: Array) -> NDArray[np.bool_]:
+        """Return which motors exceed their torque-speed limits in a sub-step, shape (n, n_motors).
 
-        Torques are means over a sub-step, in which an impact may turn a motor round: what it can give at the speed
-        at either end is no violation.
+        Torques are means over a sub-step, in which an impact may reverse a motor. So a torque is allowed if the limit
+        at the start or at the end of the sub-step allows it.
 
         Args:
             tau: Torques [N m], shape (n, n_motors).
-            speed: At the end of the sub-step [rad/s], shape (n, n_motors).
-            before: At its start, likewise.
+            speed: Speeds at the end of the sub-step [rad/s], shape (n, n_motors).
+            last_speed: Speeds at the start of the sub-step [rad/s], shape (n, n_motors).
         """
-        slowest = np.minimum(np.sign(tau) * speed, np.sign(tau) * before)
+        slowest = np.minimum(np.sign(tau) * speed, np.sign(tau) * last_speed)
         allowed = np.clip(self.stall * (1 - slowest / self.velocity), 0, self.torque)
         return np.abs(tau) > allowed + TOLERANCE * self.torque
 
 
 def largest_power(torque: float, stall: float | None, velocity: float) -> float:
-    """Return the largest mechanical power of a motor [W] with `torque * (1 - speed / velocity)` from `stall` as limit.
+    """Return the largest mechanical power of a motor [W] with torque limit and torque-speed line.
 
-    On the line alone that is at half the no-load speed; if the current stops the motor there, where line and limit
-    meet.
+    The maximum is at half the no-load speed, or where the line meets the torque limit if that speed is higher.
+
+    Args:
+        torque: Torque limit [N m].
+        stall: Stall torque of the line [N m]; the torque limit if None.
+        velocity: No-load speed of the line [rad/s].
     """
     stall = torque if stall is None else stall
     if not math.isfinite(stall * velocity):
@@ -130,17 +136,17 @@ def largest_power(torque: float, stall: float | None, velocity: float) -> float:
 
 @dataclass
 class Sums:
-    """What is added up over all sub-steps of all robots that have not fallen.
+    """Sums over all sub-steps of all robots that have not fallen; arrays have one entry per motor.
 
     Attributes:
-        count: Sub-steps.
-        distance: Travelled by the bases over the ground [m].
-        torque: Of each motor, sum of magnitudes [N m].
-        driving: Of each motor, sum of positive powers [W].
-        net: Of each motor, sum of powers, braking negative [W].
-        peak_torque: Of each motor [N m].
-        peak_power: Of each motor, driving [W].
-        beyond: Of each motor, sub-steps in which it gives more than it can.
+        count: Number of sub-steps.
+        distance: Horizontal distance travelled by the bases [m].
+        torque: Sum of torque magnitudes [N m].
+        driving: Sum of positive powers [W].
+        net: Sum of all powers, negative when braking [W].
+        peak_torque: Largest torque magnitude [N m].
+        peak_power: Largest positive power [W].
+        beyond: Number of sub-steps beyond the torque-speed limits.
     """
 
     count: int
@@ -153,7 +159,7 @@ class Sums:
     beyond: Array
 
     def add(self, tau: Array, speed: Array, travelled: Array, beyond: NDArray[np.bool_]) -> None:
-        """Take one sub-step in; torques, speeds and whether a motor gives more than it can (n, n_motors), ways (n,)."""
+        """Add one sub-step: torques, speeds and violations of limits (n, n_motors), and distances (n,)."""
         power = tau * speed
         self.count += len(tau)
         self.distance += float(travelled.sum())
@@ -166,64 +172,85 @@ class Sums:
 
 
 def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: int = 0, **kwargs: Any) -> dict:
-    """Let the policy act on random commands and watch its motors at every sub-step.
+    """Let a policy act on random commands and measure its motors at every sub-step.
 
-    Actions arrive without latency. A robot counts until its first fall.
+    Actions have no latency. A robot counts until its first fall.
 
     Args:
-        policy: With its record.
-        episodes: Robots.
-        seconds: How long they walk.
-        seed: Of the first robot.
-        **kwargs: Given to the environment.
+        policy: Policy with its record.
+        episodes: Number of robots.
+        seconds: Duration [s].
+        seed: Seed of the first robot.
+        **kwargs: Arguments of the environment.
 
     Returns:
-        cost_of_transport: energy of all motors while they drive, over weight times distance travelled, what they take
-        back while braking being lost; cost_of_transport_net: the same with what they take back. seconds: watched, over
-        all robots; speed: mean over the ground [m/s]; power: mean of all motors while they drive [W]. mean_torque,
-        mean_power, peak_torque, peak_power: shares of the motors' limits, means over motors and the worst motor, whose
-        name is in peak_torque_at and peak_power_at; None where limits are unknown, and so is beyond_limits, the share
-        of motors' sub-steps in which they give more than they can, see `Drives.beyond`. motors: the same for each motor
-        in N m and W. An empty dictionary if the environment does not say how its control step is cut.
+        - cost_of_transport: Positive work of all motors divided by weight times distance.
+        - cost_of_transport_net: The same with braking work subtracted.
+        - seconds: Measured time of all robots together [s].
+        - speed: Mean speed over the ground [m/s].
+        - power: Mean positive power of all motors together [W].
+        - mean_torque, mean_power: Fractions of the motors' limits, mean over motors.
+        - peak_torque, peak_power: The largest fraction of a motor, whose name is peak_torque_at or peak_power_at.
+        - beyond_limits: Fraction of sub-steps beyond the limits, see `Drives.beyond`.
+        - motors: Torques [N m] and powers [W] of each motor.
+
+        Fractions are None if limits are unknown. The dictionary is empty if the record has no length of sub-steps.
     """
     spec = policy.record["policy_spec"]
     if "physics_dt" not in spec:
         return {}
-    dt = kwargs.get("dt", spec["physics_dt"])
-    hold, history = round(spec["control_dt"] / dt), spec["observation"]["history"]
+    dt, control_dt = kwargs.get("dt", spec["physics_dt"]), spec["control_dt"]
+    held = HeldActions(policy, round(control_dt / dt), spec["observation"]["history"])
     kwargs = {k: x for k, x in kwargs.items() if k not in ("critic", "obs_mode")}
     kwargs |= {"n_substeps": 1, "latency": (0, 0), "history": 1, "max_episode_steps": 10**9}
-    envs = make_sb3_vec_env(policy.record["env"], episodes, seed, **kwargs)
-    try:
+    with closing(make_sb3_vec_env(policy.record["env"], episodes, seed, **kwargs)) as envs:
         native: Any = envs.envs.unwrapped
-        drives = Drives.of(native.model)
-        n = len(drives.names)
-        sums = Sums(0, 0.0, *(np.zeros(n) for _ in range(6)))
-        frame: Any = envs.reset()
+        model, drives = native.model, Drives.of(native.model)
+        sums = Sums(0, 0.0, *(np.zeros(len(drives.names)) for _ in range(6)))
+        obs: Any = envs.reset()
         q, v, tau = (native.batch.rows(name) for name in ("q", "v", "torque"))
-        _, spun = drives.at_motors(native.model, q, v[:, 6:], tau)
-        seen, running = np.tile(frame, history), np.ones(episodes, bool)
-        for _ in range(round(seconds / spec["control_dt"])):
-            action, _ = policy.predict(seen)
-            for _ in range(hold):
-                before = native.batch.rows("q")[:, :2]
-                frame, _, dones, _ = envs.step(action)
-                running &= ~dones
-                q, v, tau = (native.batch.rows(name)[running] for name in ("q", "v", "torque"))
-                if not len(q):
-                    return _result(sums, drives, native.model.total_mass, dt)
-                travelled = np.hypot(*(q[:, :2] - before[running]).T)
-                torque, speed = drives.at_motors(native.model, q, v[:, 6:], tau)
-                sums.add(torque, speed, travelled, drives.beyond(torque, speed, spun[running]))
-                spun[running] = speed
-            seen = np.hstack([frame, seen[:, : seen.shape[1] - frame.shape[1]]])
-        return _result(sums, drives, native.model.total_mass, dt)
-    finally:
-        envs.close()
+        _, last_speed = drives.at_motors(model, q, v[:, 6:], tau)
+        running = np.ones(episodes, bool)
+        for dones, _ in run_policy(held, envs, obs, steps=round(seconds / control_dt) * held.hold):
+            running &= ~dones
+            if not running.any():
+                break
+            last_q, q = q, native.batch.rows("q")
+            v, tau = (native.batch.rows(name)[running] for name in ("v", "torque"))
+            travelled = np.hypot(*(q[running, :2] - last_q[running, :2]).T)
+            torque, speed = drives.at_motors(model, q[running], v[:, 6:], tau)
+            sums.add(torque, speed, travelled, drives.beyond(torque, speed, last_speed[running]))
+            last_speed[running] = speed
+        return _result(sums, drives, model.total_mass, dt)
+
+
+class HeldActions:
+    """A policy that is called at every sub-step and changes its action at every control step.
+
+    Args:
+        policy: The policy.
+        hold: Sub-steps in a control step.
+        history: Number of frames in an observation of the policy.
+    """
+
+    def __init__(self, policy: Policy, hold: int, history: int) -> None:
+        self.policy, self.hold, self.history = policy, hold, history
+        self.step = 0
+
+    def predict(self, frame: NDArray, /, *, deterministic: bool = True) -> tuple[NDArray, None]:
+        """Return the action of the current control step; `frame` (n, size) is the newest part of the observation."""
+        if self.step == 0:
+            self.observation = np.tile(frame, self.history)
+        elif self.step % self.hold == 0:
+            self.observation = np.hstack([frame, self.observation[:, : -frame.shape[1]]])
+        if self.step % self.hold == 0:
+            self.action, _ = self.policy.predict(self.observation, deterministic=deterministic)
+        self.step += 1
+        return self.action, None
 
 
 def _result(sums: Sums, drives: Drives, mass: float, dt: float) -> dict[str, Any]:
-    """Means and shares of what was added up; see `effort`."""
+    """Return means and fractions of limits from the sums; see `effort`."""
     count, weight_distance = max(sums.count, 1), mass * GRAVITY * sums.distance
     per_motor = {
         "mean_torque": sums.torque / count,

@@ -1,7 +1,7 @@
-"""Judge a trained policy: how well it follows its commands, how often it falls, what it asks of the motors.
+"""Evaluate a trained policy: errors of the commanded velocity, falls, torques and powers of the motors.
 
-By the mean action, from a seed that the weights give. Uses public names of ce_gym only, and no name of a robot or
-task.
+Evaluation uses the mean action, and a seed computed from the weights. Uses public names of ce_gym only, and no name of
+a robot or task.
 
     python train/evaluate.py runs/mini_cheetah_velocity --transmission armature
     python train/evaluate.py policy.onnx --suites --pushes --crossing --json result.json
@@ -16,25 +16,23 @@ import single_blas  # noqa: F401
 
 import argparse
 from collections.abc import Iterable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from console import EPISODES, Parser, add_json_argument, print_result, run, whole
 from crossing import cross, crossing_table
 from effort import effort
-from episodes import play
+from episodes import Predicts, play, weights_seed, without_curricula
 from pushes import push_envelope, push_table
-from suites import everywhere, judge_suites, level_table, suite_table, weights_seed
+from suites import evaluate_suites, level_table, suite_table
 
 from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.policies import WHERE, Policy, add_env_arguments, environment_of, load_policy
 
-if TYPE_CHECKING:
-    from stable_baselines3 import PPO
-
 WEIGHTS_SEED = whole(0, 2**32 - 1)
-"""Reads a seed of judging, which may be as large as 32 bits of a policy's weights."""
+"""Type of `--seed` in evaluations, which may use all 32 bits."""
 
 
 def load(
@@ -43,16 +41,16 @@ def load(
     transmission: str | None = None,
     env_args: Iterable[tuple[str, Any]] = (),
 ) -> Policy:
-    """Read a policy to judge; its record then names the environment to judge it in.
+    """Return a policy whose record has the environment of the evaluation.
 
     Args:
         path: See `ce_gym.load_policy`.
-        env: What the user's command line names; the environment of the record if None.
-        transmission: Level that it will run on.
-        env_args: Arguments of the environment that replace those of the record.
+        env: Environment id from the command line; None keeps the id of the record.
+        transmission: Level at which the policy will run.
+        env_args: Arguments of the environment that replace arguments in the record.
 
     Raises:
-        PolicyError: If it cannot be used, or its environment is one that the user must name: see
+        PolicyError: If the policy cannot be used, or its environment needs `--env`: see
             `ce_gym.policies.environment_of`.
     """
     policy = load_policy(path, transmission)
@@ -64,48 +62,48 @@ def load(
 
 
 def env_kwargs(record: dict[str, Any], transmission: str | None = None) -> dict[str, Any]:
-    """Environment arguments a policy was trained with, on another transmission level if one is named."""
+    """Return the environment arguments in a record, with another transmission level if one is given."""
     kwargs = dict(record["env_kwargs"])
     return kwargs | {"transmission": transmission} if transmission else kwargs
 
 
 def evaluate(
-    model: PPO | Policy, env_id: str, *, episodes: int = 256, seed: int | None = None, **kwargs: Any
+    model: Predicts, env_id: str, *, episodes: int = 256, seed: int | None = None, **kwargs: Any
 ) -> dict[str, Any]:
     """Play one episode in each of `episodes` environments with the policy's mean action.
 
-    Curricula are left out: a robot begins on any level of the ground, and may be given any command.
+    Curricula are disabled: robots start on all terrain levels, and commands have their full range.
 
     Args:
         model: The policy.
         env_id: Registered environment id.
-        episodes: Number of episodes, played side by side.
-        seed: Of the first environment; None takes the one that the policy's weights give, see `suites.weights_seed`.
-        **kwargs: Given to the environment, such as `transmission`.
+        episodes: Number of episodes, played in parallel.
+        seed: Seed of the first environment; None computes it from the weights, see `episodes.weights_seed`.
+        **kwargs: Arguments of the environment, such as `transmission`.
 
     Returns:
-        forward_error, lateral_error [m/s], yaw_rate_error [rad/s]: mean absolute difference between commanded and
-        actual base velocity, in base coordinates, over every step of every episode; velocity_error [m/s]: the same of
-        the length of the horizontal difference. falls, timed_out, diverged: fraction of episodes that ended early,
-        that lasted to the end, and that were stopped because the state was no longer finite. episode_length [s],
-        reward: means over episodes. episodes: their number. seed: what was used. levels, where the ground has some:
-        errors, falls and number of episodes of each. commanded: whether the policy sees commands; errors say nothing of
-        one that does not. Other entries are means of what the task reports itself, `metrics/...` and `reward/...`.
+        - forward_error, lateral_error [m/s], yaw_rate_error [rad/s]: Mean absolute difference between commanded and
+          actual base velocity, in base coordinates, over all steps.
+        - velocity_error [m/s]: Mean length of the horizontal difference.
+        - falls, timed_out, diverged: Fractions of episodes that ended with a failure, reached the time limit, or had a
+          state that was not finite.
+        - episode_length [s], reward: Means over episodes.
+        - episodes, seed: Number of episodes, and seed of the first environment.
+        - levels: Errors, falls and number of episodes for each terrain level, if the ground has levels.
+        - commanded: Whether the policy observes commands; if False, errors have no meaning.
+        - metrics/..., reward/...: Means of the metrics and rewards of the task.
     """
     seed = weights_seed(model) if seed is None else seed
-    envs = make_sb3_vec_env(env_id, episodes, seed, **everywhere(env_id, kwargs))
-    try:
+    with closing(make_sb3_vec_env(env_id, episodes, seed, **without_curricula(env_id, kwargs))) as envs:
         native: Any = envs.envs.unwrapped
-        blocks = getattr(native, "observation_structure", {"command": None})  # environments of others have none
+        blocks = getattr(native, "observation_structure", {"command": None})  # other packages' environments lack it
         commanded = any("command" in block for block in blocks)
         return play(model, envs) | {"seed": seed, "commanded": commanded}
-    finally:
-        envs.close()
 
 
 def report(result: dict[str, Any]) -> str:
-    """The figures that matter, one per line; those of motors and pushes if they are there."""
-    rows = _error_rows(result) if result["commanded"] else _own_rows(result)
+    """Return the main results as text, one per line, and tables of the other results."""
+    rows = _error_rows(result) if result["commanded"] else _metric_rows(result)
     rows += [
         ("falls", f"{result['falls']:.1%}", f"of {result['episodes']} episodes, seed {result['seed']}"),
         ("time-outs", f"{result['timed_out']:.1%}", "on its feet to the end" if result["commanded"] else ""),
@@ -113,18 +111,18 @@ def report(result: dict[str, Any]) -> str:
         ("reward per episode", f"{result['reward']:.2f}", ""),
     ]
     if result["diverged"]:
-        rows.append(("diverged", f"{result['diverged']:.1%}", "stopped because numbers went astray"))
+        rows.append(("diverged", f"{result['diverged']:.1%}", "stopped because the state was not finite"))
     lines = [f"{name:<20} {figure:<12} {note}".rstrip() for name, figure, note in rows + _effort_rows(result)]
     tables = [table(result[key]) for key, table in TABLES.items() if key in result]
     return "\n\n".join(["\n".join(lines), *tables])
 
 
 TABLES = {"levels": level_table, "crossing": crossing_table, "suites": suite_table, "pushes": push_table}
-"""What is shown below the figures, if it was judged."""
+"""Functions that format the other results, by key."""
 
 
 def _error_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """How well commands are followed."""
+    """Return errors of the commanded velocity: name, value, note."""
     return [
         ("forward speed error", f"{result['forward_error']:.3f} m/s", "mean absolute, over every step"),
         ("lateral speed error", f"{result['lateral_error']:.3f} m/s", ""),
@@ -133,37 +131,37 @@ def _error_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _own_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What the task reports itself."""
-    return [(name, f"{figure:.3f}", "mean over episodes") for name, figure in own_figures(result).items()]
+def _metric_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the metrics of the task: name, value, note."""
+    return [(name, f"{figure:.3f}", "mean over episodes") for name, figure in metrics(result).items()]
 
 
-def own_figures(result: dict[str, Any]) -> dict[str, float]:
-    """Return what the task reports itself, by its name in words."""
-    found = {key: x for key, x in result.items() if key.startswith("metrics/")}
-    return {key.removeprefix("metrics/").replace("_", " "): x for key, x in found.items()}
+def metrics(result: dict[str, Any]) -> dict[str, float]:
+    """Return the metrics of the task, by name with spaces."""
+    values = {key: x for key, x in result.items() if key.startswith("metrics/")}
+    return {key.removeprefix("metrics/").replace("_", " "): x for key, x in values.items()}
 
 
 def _effort_rows(result: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What the motors do, or nothing if nobody watched them."""
-    found = result.get("effort")
-    if not found:
+    """Return results of the motors: name, value, note; no rows if they were not measured."""
+    motors = result.get("effort")
+    if not motors:
         return []
-    rows = [("power", f"{found['power']:.0f} W", f"of driving motors, at {found['speed']:.2f} m/s")]
-    if found["cost_of_transport"] is not None:
-        net = f"braking lost; {found['cost_of_transport_net']:.2f} if it is taken back"
-        rows.append(("cost of transport", f"{found['cost_of_transport']:.2f}", net))
+    rows = [("power", f"{motors['power']:.0f} W", f"of driving motors, at {motors['speed']:.2f} m/s")]
+    if motors["cost_of_transport"] is not None:
+        net = f"braking lost; {motors['cost_of_transport_net']:.2f} if braking is recovered"
+        rows.append(("cost of transport", f"{motors['cost_of_transport']:.2f}", net))
     for what in ("torque", "power"):
-        if found[f"mean_{what}"] is not None:
-            figures = f"{found[f'mean_{what}']:.0%}, {found[f'peak_{what}']:.0%}"
-            rows.append((f"motor {what}", figures, f"of its limit, mean and peak ({found[f'peak_{what}_at']})"))
+        if motors[f"mean_{what}"] is not None:
+            figures = f"{motors[f'mean_{what}']:.0%}, {motors[f'peak_{what}']:.0%}"
+            rows.append((f"motor {what}", figures, f"of its limit, mean and peak ({motors[f'peak_{what}_at']})"))
     return rows
 
 
 def add_arguments(parser: argparse.ArgumentParser, episodes: int) -> None:
-    """Arguments shared by the programs that judge policies, apart from the policies and their environment."""
+    """Add the arguments of evaluations: number of episodes, seed, output as JSON."""
     parser.add_argument(
-        "--episodes", type=EPISODES, default=episodes, metavar="N", help=f"episodes, side by side (default {episodes})"
+        "--episodes", type=EPISODES, default=episodes, metavar="N", help=f"episodes, in parallel (default {episodes})"
     )
     text = "seed of the first episode (default: the first 32 bits of the SHA-256 of the policy's weights)"
     parser.add_argument("--seed", type=WEIGHTS_SEED, metavar="N", help=text)
@@ -173,34 +171,35 @@ def add_arguments(parser: argparse.ArgumentParser, episodes: int) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(
-        description="Judge a trained policy: tracking errors, falls, what it asks of the motors, how hard it can be "
-        "pushed. Torques and powers are those of sub-steps, as shares of what the motors can give."
+        description="Evaluate a trained policy: velocity errors, falls, torques and powers of the motors, largest push "
+        "without a fall. Torques and powers are measured at every sub-step, as fractions of the motors' limits."
     )
     parser.add_argument("policy", help=WHERE)
     parser.add_argument(
         "--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic (default: as trained)"
     )
-    parser.add_argument("--pushes", action="store_true", help="also push it, from all sides, harder and harder")
-    text = "also judge it on commands that jump, standing, turning in place, going backwards, and pushed"
+    text = "also push the robots, from all directions and at several speeds"
+    parser.add_argument("--pushes", action="store_true", help=text)
+    text = "also evaluate jumping commands, standing, turning in place, walking backwards, and pushes"
     parser.add_argument("--suites", action="store_true", help=text)
-    text = "also count who walks 8 m straight ahead without a fall, by level of the ground"
+    text = "also count the robots that walk 8 m straight ahead without a fall, by terrain level"
     parser.add_argument("--crossing", action="store_true", help=text)
     add_env_arguments(parser)
     add_arguments(parser, episodes=2048)
     args = parser.parse_args(argv)
-    return run("evaluate.py", lambda: _judge(args))
+    return run("evaluate.py", lambda: _work(args))
 
 
-def _judge(args: argparse.Namespace) -> int:
-    """Do everything that the command line asks for."""
+def _work(args: argparse.Namespace) -> int:
+    """Evaluate and print the results."""
     model = load(args.policy, args.env, args.transmission, args.env_args)
     kwargs = env_kwargs(model.record, args.transmission)
     result: dict[str, Any] = evaluate(model, model.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
     seed = result["seed"]
-    if found := effort(model, episodes=min(args.episodes, 32), seed=seed, **kwargs):
-        result["effort"] = found
+    if motors := effort(model, episodes=min(args.episodes, 32), seed=seed, **kwargs):
+        result["effort"] = motors
     if args.suites:
-        result["suites"] = judge_suites(model, args.episodes, seed, **kwargs)
+        result["suites"] = evaluate_suites(model, args.episodes, seed, **kwargs)
     if args.crossing:
         result["crossing"] = cross(model, args.episodes, seed, **kwargs)
     if args.pushes:

@@ -1,11 +1,11 @@
-"""Write a trained policy as ONNX, with all that is needed to run it elsewhere.
+"""Write a trained policy as ONNX, with the data that other programs need to run it.
 
 The network takes observations `obs` (n, n_obs) and returns clipped mean actions `actions` (n, n_actions). The metadata
-of the file holds the record of the policy with its specification: joint order, default pose, meaning of actions,
+of the file contains the record of the policy with its specification: joint order, default pose, meaning of actions,
 blocks of an observation, gains, time steps, robot, task and transmission level. The specification is also written
 beside the file as JSON. Only weights are read from the policy; no pickled code is run. No robot or task is named here.
 
-    python train/export.py runs/mini_cheetah_velocity/policy.zip policy.onnx
+    python train/export.py runs/mini_cheetah_velocity policy.onnx
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from onnx import TensorProto, helper, numpy_helper
 from ce_gym.policies import RECORD_KEY, Actor, PolicyError, read_actor
 
 OPSET, IR_VERSION = 17, 8
-"""Old enough for the runtimes that robots carry."""
+"""Old versions, for the runtimes on robots."""
 
 
 def to_onnx(actor: Actor, record: dict[str, Any]) -> onnx.ModelProto:
-    """Return an actor as an ONNX model, the record in its metadata."""
-    activation = actor.activation.capitalize()  # ONNX and torch.nn differ in capitals only
+    """Return an actor as an ONNX model with the record in its metadata."""
+    activation = actor.activation.capitalize()  # names in ONNX and torch.nn differ in capital letters only
     nodes, constants, value = [], [], "obs"
     for i, (weight, bias) in enumerate(actor.layers):
         if i:
@@ -54,16 +54,16 @@ def to_onnx(actor: Actor, record: dict[str, Any]) -> onnx.ModelProto:
 
 
 def add_record(model: onnx.ModelProto, record: dict[str, Any]) -> None:
-    """Put the record of a policy into a model's metadata, and its specification once more, entry by entry."""
+    """Add the record of a policy, and each entry of its specification, to a model's metadata."""
     entries = {RECORD_KEY: record, **record["policy_spec"]}
     helper.set_model_props(model, {k: x if isinstance(x, str) else json.dumps(x) for k, x in entries.items()})
 
 
 def write(model: onnx.ModelProto, record: dict[str, Any], out: Path) -> None:
-    """Write `out` and the policy's specification beside it as JSON.
+    """Write a model to `out`, and the policy's specification beside it as JSON.
 
     Raises:
-        PolicyError: If that cannot be done.
+        PolicyError: If a file cannot be written.
     """
     try:
         onnx.save(model, out)
@@ -75,7 +75,8 @@ def write(model: onnx.ModelProto, record: dict[str, Any], out: Path) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(description="Write a trained policy as ONNX with its specification.")
-    parser.add_argument("policy", type=Path, help="policy.zip written by train/ppo.py (its policy.json lies beside it)")
+    text = "a file (policy.npz or policy.zip), the folder of a training run, or the name of a shipped policy"
+    parser.add_argument("policy", type=Path, help=text)
     parser.add_argument(
         "out", type=Path, nargs="?", help="ONNX file to write (default: exported.onnx beside the policy)"
     )

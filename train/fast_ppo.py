@@ -1,10 +1,9 @@
-"""Train a policy with PPO in seconds: collection and learning as compiled loops over plain arrays.
+"""Train a policy with PPO, with collection and learning as compiled loops over plain arrays.
 
-The same algorithm, arguments and settings files as train/ppo.py, which is the reference; about a quarter of its CPU
-time. Writes `policy.npz` (weights and record), `policy.json` (the record), `policy.learner.npz` (what going on
-needs; arrays and JSON, nothing that could run), `progress.csv`, `curve.csv` and `checkpoints/`. On one machine a seed
-gives the same bits on any number of threads, and so does training that was interrupted and resumed. Uses public names
-of ce_gym only, and no name of a robot or task.
+Algorithm, arguments and settings files are the same as in train/ppo.py, which takes four times the CPU time. Writes
+`policy.npz` (weights and record), `policy.json` (the record), `policy.learner.npz` (state of the learner as arrays and
+JSON), `progress.csv`, `curve.csv` and `checkpoints/`. On one machine a seed gives the same bits on any number of
+threads, also if training is interrupted and resumed. Uses public names of ce_gym only, and no name of a robot or task.
 
     python train/fast_ppo.py --env ce_gym/MiniCheetahVelocity-v0
     python train/fast_ppo.py --resume runs/mini_cheetah_velocity-fast --steps 20e6
@@ -24,7 +23,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from console import say_missing
+from console import report_missing
 from gymnasium.vector import VectorEnv
 from job import Job, Trained
 from job import main as run_jobs
@@ -33,7 +32,7 @@ from progress import RecentEpisodes, adapted_rate, fall_cost, geometric, linear,
 from run_learner import run_learner
 
 try:
-    from loops import adam, advantages_of, drawn
+    from loops import adam, estimate_advantages, sample_actions
     from networks import (
         FIGURES,
         KINDS,
@@ -46,13 +45,13 @@ try:
         start_layers,
     )
 except ModuleNotFoundError as error:
-    raise SystemExit(say_missing("fast_ppo.py", error)) from None
+    raise SystemExit(report_missing("fast_ppo.py", error)) from None
 
 import ce_gym  # noqa: F401  (registers the environments)
 from ce_gym.policies import Actor
 
 SHARES = 8
-"""Parts of a minibatch that threads work on. Fixed, so that results do not depend on the number of threads."""
+"""Parts of a minibatch for the threads; fixed, so that results do not depend on the number of threads."""
 
 F = np.float32
 
@@ -101,24 +100,24 @@ class FastPPO:
         spread_episodes(envs.unwrapped, self.rng)
 
     def parts(self, vector: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Actor, logarithms of the standard deviations, and critic in a vector of parameters."""
+        """Return views of actor, logarithms of standard deviations, and critic in a vector of parameters."""
         end = parameter_count(self.actor_sizes)
         return vector[:end], vector[end : end + self.n_actions], vector[end + self.n_actions :]
 
     def _start_parameters(self) -> None:
-        """Orthogonal weights, small ones at the end of the actor, as usual for PPO; biases are zero."""
+        """Set orthogonal weights, small in the last layer of the actor, and zero biases, as usual for PPO."""
         actor, log_std, critic = self.parts(self.theta)
         for vector, sizes, last in ((actor, self.actor_sizes, 0.01), (critic, self.critic_sizes, 1.0)):
             start_layers(vector, sizes, last, self.rng)
         log_std[:] = np.log(self.settings.initial_std)
 
     def _views(self, observations: Any) -> list[NDArray[np.float32]]:
-        """What the actor sees, and what the critic sees if that is something else."""
+        """Return the observations of the actor, and of the critic if it has others."""
         views = [observations["policy"], observations["critic"]] if self.two_views else [observations]
         return [np.ascontiguousarray(view, F) for view in views]
 
     def iterate(self) -> dict[str, float]:
-        """Collect a rollout and learn from it; return what the log shows."""
+        """Collect a rollout and learn from it; return statistics for the log."""
         s, done = self.settings, min(self.steps / self.settings.steps, 1.0)
         if s.final_std:
             self.parts(self.theta)[1][:] = np.log(geometric(s.initial_std, s.final_std, done))
@@ -133,7 +132,7 @@ class FastPPO:
         return figures
 
     def collect(self, cost: float) -> None:
-        """Act for one rollout, each fall of which costs something, and estimate the advantages of its actions."""
+        """Collect one rollout, subtract `cost` from the reward of each fall, and estimate advantages."""
         s = self.settings
         actor, log_std, critic = self.parts(self.theta)
         means, clipped = np.zeros((s.num_envs, self.n_actions), F), np.zeros((s.num_envs, self.n_actions), F)
@@ -143,7 +142,7 @@ class FastPPO:
                 view[t] = rows
             self._run(actor, self.actor_sizes, self.observed[0], means)
             noise = self.rng.standard_normal(means.shape, F)
-            drawn(means, noise, log_std, self.actions[t], clipped, self.log_probs[t])
+            sample_actions(means, noise, log_std, self.actions[t], clipped, self.log_probs[t])
             start = time.perf_counter()
             observations, self.rewards[t], terminated, truncated, infos = self.envs.step(clipped)
             self.step_seconds += time.perf_counter() - start
@@ -158,7 +157,13 @@ class FastPPO:
         self._estimate(critic, timed_out)
 
     def _estimate(self, critic: NDArray, timed_out: list[tuple[int, NDArray, NDArray]]) -> None:
-        """Values and advantages; an episode that was cut off by time is worth what the critic thinks of its end."""
+        """Estimate values and advantages.
+
+        Args:
+            critic: Parameters of the critic.
+            timed_out: For each step with time-outs: the step, the environments, and their last observations. The
+                critic's value of this observation replaces the rewards after the time limit.
+        """
         s, known = self.settings, self.seen[-1]
         self._run(critic, self.critic_sizes, known.reshape(-1, known.shape[2]), self.values.reshape(-1, 1))
         for t, rows, observations in timed_out:
@@ -167,10 +172,12 @@ class FastPPO:
             self.rewards[t, rows] += F(s.gamma) * worth[:, 0]
         last = np.zeros((s.num_envs, 1), F)
         self._run(critic, self.critic_sizes, self.observed[-1], last)
-        advantages_of(self.rewards, self.values, last[:, 0], self.dones, F(s.gamma), F(s.gae_lambda), self.advantages)
+        estimate_advantages(
+            self.rewards, self.values, last[:, 0], self.dones, F(s.gamma), F(s.gae_lambda), self.advantages
+        )
 
     def _run(self, theta: NDArray, sizes: NDArray, observations: NDArray, result: NDArray) -> None:
-        """Run a network, in parts if there is much to do; where parts begin does not change a bit."""
+        """Run a network, on several threads if the batch is large; the number of threads does not change the bits."""
         parts = self.threads if len(observations) * len(theta) > 4e6 else 1
         edges = [len(observations) * i // parts for i in range(parts + 1)]
 
@@ -184,7 +191,7 @@ class FastPPO:
             list(self.pool.map(work, range(min(parts, SHARES))))
 
     def learn(self, entropy: float) -> dict[str, float]:
-        """Go over the rollout several times, in minibatches drawn anew; return means over the last time."""
+        """Update the parameters with random minibatches of the rollout; return statistics of the last epoch."""
         s, n = self.settings, self.dones.size
         returns = (self.advantages + self.values).reshape(n)
         size, figures = -(-n // s.minibatches), []
@@ -203,7 +210,7 @@ class FastPPO:
         }
 
     def _update(self, rows: NDArray, returns: NDArray, entropy: np.float32) -> NDArray:
-        """One step of Adam on a minibatch; return `FIGURES`."""
+        """Make one step of Adam on a minibatch; return `FIGURES`."""
         s, n = self.settings, self.dones.size
         seen, known = self.seen[0].reshape(n, -1), self.seen[-1].reshape(n, -1)
         advantages = self.advantages.reshape(n)
@@ -233,16 +240,16 @@ class FastPPO:
         return figures.sum(axis=0)
 
     def average(self, values: NDArray) -> NDArray:
-        """Average over all processes that learn this policy; there is one."""
+        """Return the mean over all processes that learn this policy; here there is one."""
         return values
 
     def actor(self) -> Actor:
-        """The layers that turn observations into mean actions, copies."""
+        """Return copies of the layers from observations to mean actions."""
         layers = layers_of(self.parts(self.theta)[0], self.actor_sizes)
         return Actor(tuple((weight.T.copy(), bias.copy()) for weight, bias in layers), self.settings.activation)
 
     def learned(self) -> dict[str, NDArray]:
-        """All that going on needs but the state of the environments, as arrays."""
+        """Return the state of the learner as arrays, without the environments."""
         facts = {
             "steps": self.steps, "updates": self.updates, "rate": self.rate, "rng": self.rng.bit_generator.state,
             "sizes": [self.actor_sizes.tolist(), self.critic_sizes.tolist()], "activation": self.settings.activation,
@@ -251,19 +258,19 @@ class FastPPO:
         return {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
 
     def state(self) -> dict[str, NDArray]:
-        """All that going on needs, as arrays: see `restore`."""
+        """Return the state of learner and environments as arrays; see `restore`."""
         native: Any = self.envs.unwrapped
         views = {f"observed_{i}": view for i, view in enumerate(self.observed)}
-        found = self.learned() | views | {"episodes": self.episodes.rows()}
+        state = self.learned() | views | {"episodes": self.episodes.rows()}
         if hasattr(native, "snapshot"):
-            found |= {f"env/{name}": array for name, array in native.snapshot().items()}
-        return found
+            state |= {f"env/{name}": array for name, array in native.snapshot().items()}
+        return state
 
     def restore(self, state: dict[str, NDArray]) -> None:
-        """Go on from a state; environments that cannot be restored, or are more or fewer, begin anew.
+        """Continue from a state; environments are reset if they have no snapshots or their number differs.
 
         Raises:
-            ValueError: If it is of another network.
+            ValueError: If the state has another network.
         """
         facts = json.loads(str(state["facts"]))
         mine = [self.actor_sizes.tolist(), self.critic_sizes.tolist(), self.settings.activation]

@@ -1,6 +1,6 @@
-"""Ctrl-C while a program is still importing what it needs: one line. Programs import this first of all.
+"""Report Ctrl-C during imports in one line. Programs import this file first.
 
-Importing torch takes seconds; `console.run` has not begun then.
+Importing torch takes seconds, and `console.run` has not started by then.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from pathlib import Path
 from types import TracebackType
 
 
-def _say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Print what ended the program: of Ctrl-C one line, as usual of everything else."""
+def _report(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Print one line for Ctrl-C, and the usual traceback for other errors."""
     if issubclass(kind, KeyboardInterrupt):
         print(f"{Path(sys.argv[0]).name}: interrupted", file=sys.stderr)
     else:
         sys.__excepthook__(kind, error, trace)
 
 
-if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # a program of ours, not one that tests it
-    sys.excepthook = _say
+if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # a program of this folder, not a test
+    sys.excepthook = _report

@@ -1,6 +1,6 @@
-"""A training run of any learner: its command line, the record of the policy, its messages.
+"""A training run of any learner: command line, record of the policy, and messages.
 
-A learner is a program that has `train(job) -> Trained`; `main` here does all else.
+A learner is a program with a function `train(job) -> Trained`, which it passes to `main` in this file.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ class Job:
 
     Attributes:
         env_id: Registered environment id.
-        settings: What shapes learning.
+        settings: Settings of the learner.
         out: Folder to write to.
-        env_kwargs: Given to the environment.
-        seed: Of the policy's initial weights, the exploration and the environments.
-        threads: Processor threads for physics and for learning, which take turns.
-        resume: A policy to go on from.
-        seconds: Longest time to train [s]; the steps done by then are kept.
+        env_kwargs: Arguments of the environment.
+        seed: Seed of initial weights, exploration and environments.
+        threads: Processor threads, used by physics and learning alternately.
+        resume: Policy from which training continues.
+        seconds: Longest training time [s].
         tensorboard: Whether to write TensorBoard logs.
-        page: Whether a page shows the present policy.
+        page: Whether a page shows the current policy.
     """
 
     env_id: str
@@ -71,11 +71,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training run leaves.
+    """Result of a training run.
 
     Attributes:
-        model: The policy; its `predict` is that of Stable-Baselines3.
-        record: What is written beside it.
+        model: The policy, with the method `predict` of Stable-Baselines3.
+        record: Record of the policy.
         policy: Path of the policy.
         interrupted: Whether Ctrl-C ended training early.
     """
@@ -87,13 +87,13 @@ class Trained:
 
 
 class Clock:
-    """Time since it was made [s]."""
+    """Measures time since its creation [s]."""
 
     def __init__(self) -> None:
         self._start = self._now()
 
     def spent(self) -> dict[str, float]:
-        """Return the time on the wall, and that of processors in all threads."""
+        """Return wall-clock time, and processor time of all threads."""
         wall, processor = (now - start for now, start in zip(self._now(), self._start, strict=True))
         return {"training_seconds": round(wall, 1), "processor_seconds": round(processor, 1)}
 
@@ -103,14 +103,14 @@ class Clock:
 
 
 def acting_environment(job: Job, native: Any) -> Any:
-    """Return the environment that a policy will act in, which is the one it is trained in but for `training`.
+    """Return the environment of evaluations, which lacks the arguments of the setting `training`.
 
     Args:
         job: The training run.
         native: The environment of training, unwrapped.
 
     Raises:
-        SettingsError: If policies see or do something else there.
+        SettingsError: If its observations or actions have other spaces than in training.
     """
     if not job.settings.training:
         return native
@@ -123,31 +123,37 @@ def acting_environment(job: Job, native: Any) -> Any:
     return acting
 
 
+def basic_record(native: Any, env_id: str, env_kwargs: dict[str, Any], settings: Any) -> dict[str, Any]:
+    """Return the part of a policy's record that all learners write; `native` is the environment of evaluations."""
+    space, action = native.single_observation_space, native.single_action_space.shape
+    observation = space["policy"].shape if isinstance(space, gymnasium.spaces.Dict) else space.shape
+    return {
+        "env": env_id,
+        "transmission": native.model.transmission,
+        "env_kwargs": env_kwargs,
+        "observation_size": observation[0] if observation else 0,
+        "action_size": action[0] if action else 0,
+        "activation": settings.activation,
+        "policy_spec": native.policy_spec(),
+        "settings": asdict(settings),
+    }
+
+
 def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple[str, ...]) -> dict[str, Any]:
-    """Return the record of a policy: what is needed to use it and to repeat its training.
+    """Return the record of a policy: the data to use it and to repeat its training.
 
     Args:
         job: The training run.
-        native: The environment that the policy acts in, unwrapped.
+        native: The environment of evaluations, unwrapped, see `acting_environment`.
         steps: Environment steps done.
-        clock: Made when they began.
-        packages: Whose versions matter, beside those of ce_gym, gymnasium, numpy and Python.
+        clock: Clock created at the start of training.
+        packages: Packages whose versions are recorded, in addition to ce_gym, gymnasium, numpy and Python.
     """
-    seen, action = native.single_observation_space, native.single_action_space.shape
-    observation = seen["policy"].shape if isinstance(seen, gymnasium.spaces.Dict) else seen.shape
-    return {
-        "env": job.env_id,
-        "transmission": native.model.transmission,
-        "env_kwargs": job.env_kwargs,
-        "observation_size": observation[0] if observation else 0,
-        "action_size": action[0] if action else 0,
-        "activation": job.settings.activation,
-        "policy_spec": native.policy_spec(),
+    return basic_record(native, job.env_id, job.env_kwargs, job.settings) | {
         "steps": steps,
         "seed": job.seed,
         "resumed_from": str(job.resume) if job.resume else None,
         **clock.spent(),
-        "settings": asdict(job.settings),
         "date": time.strftime("%Y-%m-%d"),
         "versions": {name: _version(name) for name in ("ce_gym", "gymnasium", *packages, "numpy")}
         | {"python": platform.python_version()},
@@ -155,7 +161,7 @@ def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple
 
 
 def _version(package: str) -> str:
-    """Version of an installed package; a source tree that is only on the path has none."""
+    """Return the version of an installed package, or "not installed" for a source tree on the path."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -163,33 +169,36 @@ def _version(package: str) -> str:
 
 
 def resumed_record(job: Job) -> dict[str, Any]:
-    """Return the record of the policy that a training run goes on from.
+    """Return the record of the policy from which a training run continues.
 
     Raises:
-        PolicyError: If that has another network than the settings ask for, or does not say how long it was trained.
+        PolicyError: If its network differs from the settings, or the record lacks the number of steps.
     """
     file: Any = job.resume
     record = load_policy(file).record
-    wanted, found = json.loads(json.dumps(asdict(job.settings))), _settings_of(record)
+    requested, trained = json.loads(json.dumps(asdict(job.settings))), _settings_of(record)
     for key in NETWORK:
-        if found.get(key) != wanted[key]:
-            both = f"trained with {found.get(key)}, asked for {wanted[key]}"
-            raise PolicyError(f"{file}: {key}: {both}; expected the same to go on")
+        if trained.get(key) != requested[key]:
+            both = f"trained with {trained.get(key)}, requested {requested[key]}"
+            raise PolicyError(f"{file}: {key}: {both}; expected the same to continue")
     if type(record.get("steps")) is not int or record["steps"] < 0:
-        raise PolicyError(f"{file}: steps: {record.get('steps')!r}; expected the steps that it was trained for")
+        raise PolicyError(f"{file}: steps: {record.get('steps')!r}; expected the steps of its training")
     return record
 
 
 def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
-    """The settings in the record of a policy, as plain data; none if there are none."""
-    found = record.get("settings")
-    return found if isinstance(found, dict) else {}
+    """Return the settings in the record of a policy, as plain data; empty if there are none."""
+    settings = record.get("settings")
+    return settings if isinstance(settings, dict) else {}
 
 
 def jobs(args: argparse.Namespace, folder: str = "", settings: type = Settings) -> list[Job]:
-    """The training runs a command line asks for; `folder` ends the names of folders that it does not give.
+    """Return the training runs of a command line.
 
-    `settings` is the learner's dataclass; its attribute `folder` is the folder of its files.
+    Args:
+        args: Values of the command line.
+        folder: Suffix of default folder names.
+        settings: The learner's dataclass of settings; its attribute `folder` is the folder of settings files.
 
     Raises:
         ValueError: If the command line, a settings file or a policy cannot be used.
@@ -204,12 +213,12 @@ def jobs(args: argparse.Namespace, folder: str = "", settings: type = Settings) 
     overrides += [f"num_envs={args.num_envs}"] if args.num_envs else []
     path = args.config or config_file(env_id, settings.folder)
     if record and not args.config:
-        before = {**asdict(load_settings(path, kind=settings)), **_settings_of(record), **parsed(overrides)}
-        chosen = make_settings(before, str(resume), settings)
+        merged = {**asdict(load_settings(path, kind=settings)), **_settings_of(record), **parsed(overrides)}
+        chosen = make_settings(merged, str(resume), settings)
     else:
         chosen = load_settings(path, overrides, settings)
-    own = {} if record and not args.config else load_env_args(path)  # a policy keeps those that it was trained with
-    kwargs = {**record.get("env_kwargs", {}), **own, **env_kwargs_of(args)}
+    from_file = {} if record and not args.config else load_env_args(path)  # the record has them already
+    kwargs = {**record.get("env_kwargs", {}), **from_file, **env_kwargs_of(args)}
     chosen = with_named(chosen, dict(args.env_args))
     out = args.out or Path("runs") / (
         "-".join([path.stem, *([args.transmission] if args.transmission else [])]) + folder
@@ -233,16 +242,16 @@ def jobs(args: argparse.Namespace, folder: str = "", settings: type = Settings) 
 
 
 def env_kwargs_of(args: argparse.Namespace) -> dict[str, Any]:
-    """The arguments of the environment that a command line names."""
+    """Return the arguments of the environment in a command line."""
     kwargs = {"transmission": args.transmission} if args.transmission else {}
     kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
     return kwargs | dict(args.env_args)
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line of every learner."""
+    """Return the command line that all learners share."""
     result = Parser(
-        description="Train a policy. Ctrl-C and SIGTERM stop in good order and save; --resume goes on.",
+        description="Train a policy. Ctrl-C and SIGTERM save the policy and stop; --resume continues.",
         epilog="Settings not named here are in the settings file; --set KEY=VALUE changes any of them.",
     )
     what = result.add_argument_group("what to train")
@@ -256,8 +265,8 @@ def parser() -> argparse.ArgumentParser:
         "--resume",
         type=Path,
         metavar="FILE",
-        help="policy to go on from, with its settings unless --config says otherwise; --steps counts its steps too; "
-        "nothing in it is run",
+        help="policy from which to continue, with its settings unless --config is given; --steps includes its steps; "
+        "no code in the file is run",
     )
     what.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     what.add_argument("--seeds", type=SEED, nargs="+", metavar="N", help="several seeds, one run after the other")
@@ -265,16 +274,16 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the one in train/config)")
     how.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change, such as gamma=0.98")
     how.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
-    how.add_argument("--num-envs", metavar="N", help="environments stepped at once")
+    how.add_argument("--num-envs", metavar="N", help="environments stepped in parallel")
     how.add_argument(
-        "--minutes", type=above_zero, default=float("inf"), metavar="M", help="stop after so long at the latest"
+        "--minutes", type=above_zero, default=float("inf"), metavar="M", help="longest training time [min]"
     )
     how.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all CPUs")
-    where = result.add_argument_group("where to")
+    where = result.add_argument_group("output")
     where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")
     where.add_argument("--no-tensorboard", dest="tensorboard", action="store_false", help="write no TensorBoard logs")
     where.add_argument(
-        "--page", action="store_true", help="show learning curves and the present policy in a browser while it trains"
+        "--page", action="store_true", help="show learning curves and the current policy in a browser during training"
     )
     where.add_argument(
         "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation at the end"
@@ -294,42 +303,42 @@ def main(
 
     Args:
         program: Name of the learner's file, for messages.
-        train: What learns.
+        train: Function that trains.
         argv: Arguments of the command line.
-        folder: Ends the names of folders, so that policies of different learners do not mix.
+        folder: Suffix of default folder names, so that policies of different learners do not mix.
         settings: The learner's dataclass of settings.
-        add_options: Adds the learner's own options to the command line; `train` gets their values by name.
+        add_options: Adds options of the learner to the command line; `train` gets their values by name.
     """
     line = parser()
     common = vars(line.parse_args([]))
     if add_options:
         add_options(line)
     args = line.parse_args(argv)
-    own = partial(train, **{name: value for name, value in vars(args).items() if name not in common})
-    return run(program, lambda: _train_all(program, own, args, folder, settings))
+    with_options = partial(train, **{name: value for name, value in vars(args).items() if name not in common})
+    return run(program, lambda: _train_all(program, with_options, args, folder, settings))
 
 
 def _train_all(
     program: str, train: Callable[[Job], Trained], args: argparse.Namespace, folder: str, settings: type
 ) -> int:
-    """Do what a command line asks for; return the exit code."""
-    wanted = jobs(args, folder, settings)
-    with TrainingPage([job.out for job in wanted], wanted[0].env_id) if args.page else contextlib.nullcontext():
-        return _train_each(program, train, wanted, args.episodes)
+    """Make all training runs of a command line, with a page if requested, and return the exit code."""
+    runs = jobs(args, folder, settings)
+    with TrainingPage([job.out for job in runs], runs[0].env_id) if args.page else contextlib.nullcontext():
+        return _train_each(program, train, runs, args.episodes)
 
 
-def _train_each(program: str, train: Callable[[Job], Trained], wanted: list[Job], episodes: int) -> int:
-    """Do some training runs, one after the other; return the exit code."""
-    from evaluate import evaluate, report  # what judges is not needed before
+def _train_each(program: str, train: Callable[[Job], Trained], runs: list[Job], episodes: int) -> int:
+    """Make training runs one after the other, evaluate each policy, and return the exit code."""
+    from evaluate import evaluate, report  # not needed before training
 
-    for job in wanted:
+    for job in runs:
         make_folder(job.out)
         keep_map(job.env_kwargs, job.out)
         print(f"training {job.env_id}, seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", flush=True)
         trained = train(job)
         print(f"saved {trained.policy} after {trained.record['steps']:,} steps", flush=True)
         if trained.interrupted:
-            print(f"interrupted; go on with: python train/{program} --resume {trained.policy}")
+            print(f"interrupted; continue with: python train/{program} --resume {trained.policy}")
             return 130
         result = evaluate(load_policy(trained.policy), job.env_id, episodes=episodes, **job.env_kwargs)
         print(report(result), flush=True)

@@ -1,8 +1,8 @@
-"""Plan a jump by iterative LQR on the exact model, and on a simplified one, and show both on the exact one.
+"""Plan a jump by iterative LQR at several transmission levels, and simulate each plan at the first level.
 
-A robot with a floating base stands, jumps to a height and is to stand again where it began. The plan, targets of the
-joints and feedback on the state, is made on every level that is named; then each is followed on the first of them,
-with its feedback and without. Uses public names of ce_gym only, and no name of a robot.
+A robot with a floating base stands, jumps to a height, and stands again at the same place. A plan has joint targets and
+state feedback. Each plan is simulated with its feedback and without. Uses public names of ce_gym only, and no
+name of a robot.
 
     python train/jump.py mini_cheetah --height 0.25 --level exact armature
 """
@@ -21,27 +21,27 @@ from pathlib import Path
 
 import numpy as np
 from console import Parser, above_zero, add_json_argument, markdown, print_result, run
-from ilqr import ILQR, Array, Plan, State, chosen
+from ilqr import ILQR, Array, Plan, State, select
 
 import ce_gym
 from ce_gym.viewer import Rollout, write_html
 
 SETTLE, TICK, HOLD = 2.0, 0.005, 2
-"""Time to come to rest before a jump, and sub-step [s]; sub-steps for which a target is held."""
+"""Time to come to rest before a jump [s], sub-step [s], and sub-steps in a control step."""
 TAKE_OFF, APEX, STANDS, END = 0.3, 0.5, 0.95, 1.2
-"""When legs are stretched, when it is highest, when it is to stand again, and the end [s]."""
+"""Times of take-off, of the apex, from which the robot should stand, and of the end [s]."""
 HORIZONS = 0.52, 0.75, 0.85, 1.0, 1.2
-"""Ends of the motions that are planned one after the other, each beginning with the one before [s]."""
+"""Ends of the planned motions [s]; each plan starts with the result of the one before."""
 LEVELS = ("exact", "armature")
 CROUCH, PUSH = 1.375, 0.5
-"""Factors on the standing pose to begin with, before and at take-off."""
+"""Factors on the standing pose in the initial guess, before and at take-off."""
 MOST, SMALL, PATIENCE = 60, 1e-3, 6
-"""Improvements of a motion at most; those below this share of the cost are small; so many of them end it."""
+"""Largest number of iterations; relative decrease of the cost that is small; small decreases that end a plan."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Of squares: place [1/m^2], turning [1/rad^2], joints [1/rad^2], velocities of base and joints [s^2]."""
+    """Weights of squared errors: position [1/m^2], orientation, joints [1/rad^2], velocities of base, joints [s^2]."""
 
     place: float
     turning: float
@@ -55,15 +55,15 @@ HIGHEST = Weights(1000.0, 10.0, 0.1, 0.1, 0.01)
 STANDING = Weights(5.0, 5.0, 1.0, 0.5, 0.05)
 LAST = Weights(30.0, 30.0, 5.0, 3.0, 0.3)
 TARGETS = 0.01
-"""Weight of the squares of targets' distance from the standing pose [1/rad^2]."""
+"""Weight of the squared distance of targets from the standing pose [1/rad^2]."""
 
 
 class Jump:
     """The cost of a jump, see `ilqr.Cost`.
 
     Args:
-        model: The robot.
-        height: How much higher than it stands the base is to be at the apex [m].
+        model: Model of the robot.
+        height: Height of the base at the apex above its standing height [m].
     """
 
     target_slope = float(np.sqrt(TARGETS))
@@ -72,7 +72,7 @@ class Jump:
         self.standing, self.nv, self.height = model.standing_q, model.nv, height
 
     def _at(self, i: int) -> tuple[Array, float]:
-        """Return square roots of weights by row of [q; v], shape (2 nv,), and the height that is wanted."""
+        """Return square roots of the weights of [q; v], shape (2 nv,), and the desired height [m]."""
         t, end, joints = i * HOLD * TICK, round(END / (HOLD * TICK)), self.nv - 6
         apex = abs(i - round(APEX / (HOLD * TICK))) <= 1
         w = HIGHEST if apex else LAST if i == end else STANDING if t > STANDS + 1e-9 else ALONG
@@ -102,10 +102,10 @@ class Jump:
 
 
 class Jumper:
-    """Jumps of one robot on a level.
+    """Planner and simulation of jumps of one robot at one level.
 
     Args:
-        robot: Name, or path of its file.
+        robot: Name of the robot, or path of its file.
         level: Transmission level.
         height: See `Jump`.
     """
@@ -117,25 +117,25 @@ class Jumper:
         self.standing = self.model.standing_q[7:]
 
     def simulator(self, n: int) -> ce_gym.Simulator:
-        """Return n robots whose feet may touch the ground, and whose motors have limits."""
+        """Return a simulator of n robots with contacts of the feet and motor limits."""
         return ce_gym.Simulator(self.model, n, TICK, contacts="foot", motors="limited", outputs=())
 
     @cached_property
     def rest(self) -> State:
-        """A robot that has come to rest."""
+        """State of a robot that stands at rest."""
         sim = self.simulator(1)
         sim.step(self.standing, round(SETTLE / TICK))
         return ce_gym.StepDerivatives(sim).state()
 
     @cached_property
     def solver(self) -> ILQR:
-        """What plans; its kernels are compiled."""
+        """Solver with compiled kernels."""
         solver = ILQR(self.simulator, Jump(self.model, self.height), self.rest, HOLD)
         solver.linearized(solver.first(self.standing[None]))
         return solver
 
     def plan(self) -> tuple[Plan, int]:
-        """Plan longer and longer parts of the jump, each beginning with the one before; return iterations, too."""
+        """Plan increasing parts of the jump; return the plan and the number of iterations."""
         n, plan, solver, count = round(END / (HOLD * TICK)), None, self.solver, 0
         guess = np.tile(self.standing, (n, 1))
         off = round(TAKE_OFF / (HOLD * TICK))
@@ -157,14 +157,14 @@ class Jumper:
         return solver.with_feedback(plan), count
 
     def follow(self, plan: Plan, feedback: bool) -> Plan:
-        """Return what happens when a robot of this level follows a plan."""
+        """Return the motion of a robot of this level that follows a plan, with or without feedback."""
         plan = plan if feedback else replace(plan, gains=np.zeros_like(plan.gains))
         robots = self.solver.candidates
         lengths = np.zeros(robots.simulator.num_envs)
-        return chosen(0, *self.solver.follow(plan, np.zeros_like(plan.targets), lengths, robots), plan.gains)
+        return select(0, *self.solver.follow(plan, np.zeros_like(plan.targets), lengths, robots), plan.gains)
 
     def rollout(self, motion: Plan, label: str) -> Rollout:
-        """Return a motion to look at."""
+        """Return a motion as a rollout."""
         times = np.linspace(0.0, TICK * (len(motion.states["q"]) - 1), len(motion.states["q"]))
         return Rollout(
             self.name, self.model.transmission, TICK, times, motion.states["q"], motion.states["v"],
@@ -173,7 +173,7 @@ class Jumper:
 
 
 def figures(motion: Plan, height: float) -> dict[str, float]:
-    """What a motion does: how high, how upright then, and how it stands at the end."""
+    """Return height and tilt at the apex and at the end, distance and speed at the end, and cost of a motion."""
     q, v = motion.states["q"], motion.states["v"]
     top, tilt = int(q[:, 2].argmax()), np.degrees(2 * np.arcsin(np.minimum(np.linalg.norm(q[:, 4:6], axis=1), 1)))
     return {
@@ -192,9 +192,9 @@ UNITS = {"apex": "m", "tilt at apex": "deg", "height at the end": "m", "tilt at 
 
 
 def jump(args: argparse.Namespace) -> int:
-    """Plan, follow, print and write the page."""
+    """Plan, simulate, print the results and write the page."""
     jumpers = {level: Jumper(args.robot, level, args.height) for level in args.level}
-    judge = jumpers[args.level[0]]
+    evaluator = jumpers[args.level[0]]
     rows, rollouts, times = list[dict[str, float | str]](), list[Rollout](), dict[str, dict[str, float]]()
     for level, jumper in jumpers.items():
         _ = jumper.solver
@@ -205,11 +205,11 @@ def jump(args: argparse.Namespace) -> int:
         motions = {f"as planned, on {level}": plan}
         for feedback in (True, False):
             how = f"on {args.level[0]}, {'with feedback' if feedback else 'targets alone'}"
-            motions[how] = judge.follow(plan, feedback)
-            rollouts.append(judge.rollout(motions[how], f"planned on {level}, {how}"))
-        standing = float(judge.rest["q"][0, 2])
+            motions[how] = evaluator.follow(plan, feedback)
+            rollouts.append(evaluator.rollout(motions[how], f"planned on {level}, {how}"))
+        standing = float(evaluator.rest["q"][0, 2])
         rows += [{"plan": level, "followed": how, **figures(one, standing)} for how, one in motions.items()]
-    page = write_html(rollouts, args.page or Path(f"{judge.model.robot.name}_jump.html"), spacing=0.0)
+    page = write_html(rollouts, args.page or Path(f"{evaluator.model.robot.name}_jump.html"), spacing=0.0)
     print_result({"times": times, "motions": rows, "page": str(page)}, _text(rows, times, page), args.json)
     return 0
 
@@ -228,10 +228,12 @@ def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(description="Plan a jump by iterative LQR, and show it.")
     parser.add_argument("robot", metavar="ROBOT", help="name or path of a robot with a floating base")
-    parser.add_argument("--height", type=above_zero, default=0.3, metavar="M", help="of the jump [m] (default 0.3)")
+    parser.add_argument(
+        "--height", type=above_zero, default=0.3, metavar="M", help="height of the jump [m] (default 0.3)"
+    )
     parser.add_argument(
         "--level", nargs="+", choices=ce_gym.LEVELS, default=list(LEVELS), metavar="LEVEL",
-        help="levels to plan on; the first is that on which plans are followed (default: exact armature)",
+        help="levels of the plans; all plans are simulated at the first level (default: exact armature)",
     )  # fmt: skip
     parser.add_argument("--page", type=Path, metavar="FILE", help="default: <robot>_jump.html")
     add_json_argument(parser)

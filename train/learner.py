@@ -1,9 +1,8 @@
-"""PPO whose updates run on several threads, each on its own share of a minibatch.
+"""PPO of Stable-Baselines3 with updates on several threads, each with its own share of a minibatch.
 
-Stable-Baselines3 leaves threads to torch, which splits every single matrix product and waits after each; on networks of
-this size that gains a third, and loses nearly everything as soon as another program wants a core. Here a thread
-computes the gradient of its share from beginning to end, and the shares are added in a fixed order: one barrier per
-minibatch, and the same result bit for bit on any number of threads.
+Torch splits every matrix product among its threads and waits after each product. For small networks this is only a
+third faster, and slower if another program uses a core. Here each thread computes the whole gradient of its share, and
+the shares are added in a fixed order. There is one barrier per minibatch, and the same bits on any number of threads.
 """
 
 from __future__ import annotations
@@ -23,12 +22,12 @@ from torch import Tensor
 from torch.nn import functional
 
 SHARES = 4
-"""Shares of a minibatch. Fixed, so that results do not depend on the number of threads."""
+"""Shares of a minibatch; fixed, so that results do not depend on the number of threads."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Collected steps, all of them or some; every tensor has one row per step."""
+    """Collected steps; every tensor has one row per step."""
 
     observations: Tensor | dict[str, Tensor]
     actions: Tensor
@@ -37,7 +36,7 @@ class Samples:
     returns: Tensor
 
     def at(self, rows: Tensor) -> Samples:
-        """The steps numbered `rows`."""
+        """Return the steps with the indices `rows`."""
         observations, *others = vars(self).values()
         chosen = (
             observations[rows] if isinstance(observations, Tensor) else {k: x[rows] for k, x in observations.items()}
@@ -47,7 +46,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Share:
-    """What one thread has found out about its share of a minibatch; `figures` are means over the share."""
+    """Gradient and statistics of a share of a minibatch; `figures` are means over the share."""
 
     weight: float
     gradient: tuple[Tensor, ...]
@@ -58,18 +57,18 @@ FIGURES = ("policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "c
 
 
 class ThreadedPPO(PPO):
-    """PPO of Stable-Baselines3 with the same loss and another division of labour.
+    """PPO of Stable-Baselines3 with the same loss and threads of its own.
 
-    Its policies are saved and loaded as those of `PPO`. Torch itself is expected to use one thread.
+    Policies are saved and loaded in the same way as in `PPO`. Torch should use one thread.
 
     Attributes:
-        threads: Threads of an update.
+        threads: Number of threads in an update.
     """
 
     threads = 1
 
     def train(self) -> None:
-        """Update the policy with the steps collected last."""
+        """Update the policy with the last rollout."""
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         samples, figures = self._samples(), []
@@ -83,7 +82,7 @@ class ThreadedPPO(PPO):
         self._log(torch.stack(figures).mean(0).tolist())
 
     def _samples(self) -> Samples:
-        """The rollout buffer as tensors that share its memory."""
+        """Return the rollout buffer as tensors that share its memory."""
         buffer = self.rollout_buffer
         steps = buffer.buffer_size * buffer.n_envs
 
@@ -96,7 +95,7 @@ class ThreadedPPO(PPO):
         return Samples(observations, *(flat(a) for a in arrays))
 
     def _update(self, samples: Samples, rows: Tensor, workers: list[Any], each: Callable) -> Tensor:
-        """One step of the optimiser on the samples numbered `rows`; `each` maps over shares. Returns FIGURES."""
+        """Make one step of the optimiser on the samples `rows`; `each` is a map over shares. Return FIGURES."""
         advantages = samples.advantages[rows]
         centre, scale = advantages.mean(), advantages.std() + 1e-8
         parts = rows.chunk(SHARES)
@@ -114,7 +113,7 @@ class ThreadedPPO(PPO):
         return torch.stack([share.weight * share.figures for share in shares]).sum(0)
 
     def _share(self, policy: ActorCriticPolicy, s: Samples, centre: Tensor, scale: Tensor, weight: float) -> Share:
-        """Gradient of the loss on one share, times its weight (Schulman et al. 2017, arXiv:1707.06347, eq. 7 and 9)."""
+        """Return the weighted gradient of the loss on one share (Schulman et al. 2017, arXiv:1707.06347, eq. 7, 9)."""
         clip = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
         advantages = (s.advantages - centre) / scale
         values, log_probs, entropy = policy.evaluate_actions(s.observations, s.actions)  # type: ignore[arg-type]
@@ -131,7 +130,7 @@ class ThreadedPPO(PPO):
         return Share(weight, gradient, torch.stack([policy_loss, value_loss, entropy_loss, kl, clipped]).detach())
 
     def _log(self, figures: list[float]) -> None:
-        """Record what Stable-Baselines3 records; losses are those of the last epoch, not means over all."""
+        """Log the same entries as Stable-Baselines3; losses are means over the last epoch, not over all epochs."""
         for name, value in zip(FIGURES, figures, strict=True):
             self.logger.record(f"train/{name}", value)
         buffer = self.rollout_buffer
@@ -144,6 +143,6 @@ class ThreadedPPO(PPO):
 
 
 def _replica(policy: Any) -> Any:
-    """A policy with the same parameters, not copies of them, and all else its own: evaluating one changes it."""
+    """Return a copy of a policy that shares its parameters; evaluating a policy changes its other attributes."""
     shared = {id(parameter): parameter for parameter in policy.parameters()}
     return copy.deepcopy(policy, shared | {id(policy.optimizer): None})

@@ -1,4 +1,4 @@
-"""Compiled loops of PPO apart from its networks: sampling of actions, advantages, Adam."""
+"""Compiled loops of PPO: sampling of actions, advantages, Adam."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from numba import njit as numba_njit
 
 njit = partial(numba_njit, error_model="numpy")
-"""Divisions are not checked, as numpy does it: what is checked cannot be a vector instruction."""
+"""Without checks of divisions, as in numpy, so that loops become vector instructions."""
 
 ONE, ZERO = np.float32(1), np.float32(0)
 
 
 @njit(cache=True)
-def drawn(means, noise, log_std, actions, clipped, log_probs):
-    """Fill actions (n, n_actions), the same within -1..1, and log-probabilities (n,) of Gaussian actions.
+def sample_actions(means, noise, log_std, actions, clipped, log_probs):
+    """Fill actions (n, n_actions), actions clipped to -1..1, and log-probabilities (n,) of a Gaussian policy.
 
-    `noise` (n, n_actions) is what was drawn from the normal distribution.
+    `noise` (n, n_actions) are samples of the standard normal distribution.
     """
     n_actions, std = len(log_std), np.exp(log_std)
     constant = np.float32(n_actions * 0.5 * math.log(2 * math.pi))
@@ -37,7 +37,7 @@ def drawn(means, noise, log_std, actions, clipped, log_probs):
 
 @njit(cache=True)
 def adam(theta, gradient, first, second, step, rate, max_norm):
-    """One step of Adam (Kingma & Ba 2015) with the gradient clipped to a norm; all but the numbers in place."""
+    """Make one step of Adam (Kingma & Ba 2015) with the gradient clipped to a norm; changes the arrays in place."""
     square = 0.0
     for g in gradient:
         square += float(g) * float(g)
@@ -53,11 +53,11 @@ def adam(theta, gradient, first, second, step, rate, max_norm):
 
 
 @njit(cache=True)
-def advantages_of(rewards, values, last_values, dones, gamma, decay, advantages):
-    """Generalised advantage estimates (Schulman et al. 2016) of rewards (n_steps, n_envs), into `advantages`.
+def estimate_advantages(rewards, values, last_values, dones, gamma, decay, advantages):
+    """Fill `advantages` with generalised advantage estimates (Schulman et al. 2016), shape (n_steps, n_envs).
 
-    `values` are those of the observations acted on, `last_values` (n_envs,) of those after the last step; where an
-    episode ended, nothing that comes after it counts.
+    `values` (n_steps, n_envs) belong to the observations before each step, `last_values` (n_envs,) to the observations
+    after the last step. Rewards after the end of an episode do not count for steps before.
     """
     n_steps, n_envs = rewards.shape
     following = last_values.copy()

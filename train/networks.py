@@ -1,13 +1,13 @@
-"""Dense networks as compiled loops: forwards, backwards, PPO's gradient. Knows numbers only.
+"""Dense networks as compiled loops: forward pass, backward pass, and gradients of PPO.
 
-Layers of 64 or 128 are too small for frameworks and for BLAS libraries: what they spend around the multiplications
-costs as much as these. Here one block of the product stays in registers from beginning to end (`_emit`), and a chunk
-of samples goes forwards and backwards through a network while it is in the nearest memory.
+For layers of 64 or 128 units, the overhead of frameworks and BLAS libraries takes as long as the multiplications. Here
+one block of a matrix product stays in registers (`_emit`), and a chunk of samples stays in the cache during forward and
+backward pass.
 
-All parameters are one vector: for each layer weights (n_in, n_out) row by row, then biases; the actor's layers, the
-logarithms of the standard deviations, the critic's layers. Widths of layers are padded to whole vectors; what is padded
-is zero and stays so. Every sum is taken in a fixed order, rounded once per step, so that results depend neither on the
-number of threads nor on the width of the processor's vectors.
+All parameters are one vector. Each layer has weights (n_in, n_out) row by row, then biases. The order is: layers of the
+actor, logarithms of the standard deviations, layers of the critic. Widths of layers are padded to whole vectors, and
+the padding is always zero. Sums have a fixed order with one rounding per step, so that results do not depend on the
+number of threads or the width of the processor's vectors.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from numba.extending import intrinsic
 from ce_gym.policies import ACTIVATIONS
 
 LANES = 16
-"""Elements of a vector; narrower processors take several instructions for one."""
+"""Elements of a vector; processors with narrower vectors use several instructions."""
 
 ROWS, COLUMNS = (8 if binding.get_host_cpu_features().get("avx512f") else 3), 2
 """Rows and vectors of a block, so that it fits the registers."""
 
 CHUNK = 128
-"""Samples that go through the networks together."""
+"""Samples that pass the networks together."""
 
 KINDS = tuple(ACTIVATIONS)
-"""Activations by number."""
+"""Names of activations; the index is the argument `kind` of the functions below."""
 
 njit = partial(numba_njit, error_model="numpy")
-"""Divisions are not checked, as numpy does it: what is checked cannot be a vector instruction."""
+"""Without checks of divisions, as in numpy, so that loops become vector instructions."""
 
 FIGURES = ("policy_gradient_loss", "value_loss", "approx_kl", "clip_fraction")
-"""Means over a minibatch that `gradient` leaves behind the parameters' gradient."""
+"""Statistics of a minibatch that `actor_gradient` and `critic_gradient` compute."""
 
 
 def padded(width: int) -> int:
@@ -50,11 +50,15 @@ def padded(width: int) -> int:
 
 
 def _make_block(rows: int, columns: int) -> Any:
-    """Return a function for numba: a block of `c = start + a @ b`, `rows` times `columns` vectors, in registers."""
+    """Return a numba function for a block of `c = start + a @ b` in registers, `rows` times `columns` vectors."""
 
     @intrinsic
     def block(_typing, a, row_a, step_a, b, row_b, start, row_start, c, row_c, n):
-        """Addresses of the first elements, distances in elements between rows and steps of the sum, its length."""
+        """Compute a block.
+
+        Arguments are addresses of first elements, distances between rows and between terms of the sum in elements, and
+        the number of terms.
+        """
 
         def emit(context, builder, _signature, arguments):
             name = f"product_{rows}_{columns}"
@@ -68,7 +72,7 @@ def _make_block(rows: int, columns: int) -> Any:
 
 
 def _emit(module, name: str, rows: int, columns: int) -> ir.Function:
-    """Return the block as a function of a module: a loop over the sum, which has at least one term."""
+    """Return the block as a function of an LLVM module: a loop over the sum, which has at least one term."""
     word, lane = ir.IntType(64), ir.FloatType()
     vector = ir.VectorType(lane, LANES)
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [word] * 10), name)
@@ -78,8 +82,8 @@ def _emit(module, name: str, rows: int, columns: int) -> ir.Function:
     fused = f"llvm.fma.v{LANES}f32"
     fma = module.globals.get(fused) or ir.Function(module, ir.FunctionType(vector, [vector] * 3), fused)
     undefined, zeros = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    before, body, end = (function.append_basic_block(part) for part in ("before", "body", "end"))
-    builder: Any = ir.IRBuilder(before)
+    entry, body, end = (function.append_basic_block(part) for part in ("entry", "body", "end"))
+    builder: Any = ir.IRBuilder(entry)
 
     def element(base, row, distance, offset):
         index = builder.add(builder.mul(distance, word(row)), offset)
@@ -102,7 +106,7 @@ def _emit(module, name: str, rows: int, columns: int) -> ir.Function:
     added = [builder.call(fma, [left[i], right[j], sums[p]]) for p, (i, j) in enumerate(places)]
     following = builder.add(k, word(1))
     for phi, old, new in ((k, word(0), following), *zip(sums, first, added, strict=True)):
-        phi.add_incoming(old, before)
+        phi.add_incoming(old, entry)
         phi.add_incoming(new, body)
     builder.cbranch(builder.icmp_signed("<", following, n), body, end)
     builder.position_at_end(end)
@@ -118,7 +122,7 @@ _wide_row, _narrow_row = _make_block(1, COLUMNS), _make_block(1, 1)
 
 @njit
 def _product(a, row_a, step_a, b, row_b, start, row_start, c, row_c, m, n, k):
-    """`c = start + a @ b` of addresses, shapes (m, n) and the sum over k; n whole vectors."""
+    """Compute `c = start + a @ b` from addresses, shape (m, n) with k terms per sum; n is a multiple of `LANES`."""
     wide, j = LANES * COLUMNS, 0
     while j < n:
         two, i = j + wide <= n, 0
@@ -143,7 +147,7 @@ def _product(a, row_a, step_a, b, row_b, start, row_start, c, row_c, m, n, k):
 
 @njit
 def _tanh(x):
-    """Hyperbolic tangent by the rational function of Eigen, to 4e-7; without branches, as loops of vectors want it."""
+    """Return the hyperbolic tangent by Eigen's rational function, error 4e-7, without branches for vector loops."""
     x = x if x < np.float32(7.9) else np.float32(7.9)
     x = x if x > np.float32(-7.9) else np.float32(-7.9)
     s = x * x
@@ -191,7 +195,7 @@ def _activate(y, width, kind):
 
 @njit
 def _times_slope(d, y, n, kind):
-    """Multiply the first n of d in place by the derivative of an activation, whose values are y."""
+    """Multiply the first n elements of d in place by the derivative of an activation with the values y."""
     if kind == TANH:
         for i in range(n):
             d[i] *= ONE - y[i] * y[i]
@@ -211,13 +215,13 @@ def _times_slope(d, y, n, kind):
 
 @njit
 def _width(sizes, layer):
-    """Width of a layer in memory; that of the observation is its own."""
+    """Return the width of a layer in memory; the observation has no padding."""
     return sizes[0] if layer == 0 else (sizes[layer] + LANES - 1) // LANES * LANES
 
 
 @njit
 def _forwards(theta, sizes, kind, values, n):
-    """Fill `values`, layer after layer of n samples each, the first of which is the observation; return the last."""
+    """Fill `values` with the layers of n samples, after the observations; return the last layer."""
     at, here, n_out = 0, 0, sizes[0]
     parameters, first = theta.ctypes.data, values.ctypes.data
     for layer in range(len(sizes) - 1):
@@ -233,9 +237,10 @@ def _forwards(theta, sizes, kind, values, n):
 
 @njit
 def _backwards(theta, sizes, kind, values, n, d, other, turned, gradient):
-    """Add to `gradient` what follows from d, the derivative by the last layer of `values`, n rows.
+    """Add the gradient with respect to theta to `gradient`, from d, the gradient with respect to the last layer.
 
-    `d` and `other` are overwritten, each as large as n rows of the widest layer; `turned` as the largest matrix.
+    `d` and `other` are overwritten and have the size of n rows of the widest layer; `turned` has the size of the
+    largest weight matrix.
     """
     here, end = 0, 0
     for layer in range(len(sizes) - 1):
@@ -264,7 +269,7 @@ def _backwards(theta, sizes, kind, values, n, d, other, turned, gradient):
 
 @njit
 def _gather(observations, rows, values):
-    """Put chosen observations, one after the other, at the beginning of `values`."""
+    """Copy observations with the indices `rows` to the start of `values`."""
     size = observations.shape[1]
     for i in range(len(rows)):
         for j in range(size):
@@ -273,14 +278,14 @@ def _gather(observations, rows, values):
 
 @njit(cache=True, nogil=True)
 def outputs(theta, sizes, kind, observations, result, work):
-    """Run a network on observations (n, n_obs); `result` (n, n_out) is overwritten."""
+    """Compute the outputs of a network for observations (n, n_obs) into `result` (n, n_out)."""
     for start in range(0, len(observations), CHUNK):
         rows = np.arange(start, min(start + CHUNK, len(observations)))
         _gather(observations, rows, work[0])
-        found = _forwards(theta, sizes, kind, work[0], len(rows))
+        last_layer = _forwards(theta, sizes, kind, work[0], len(rows))
         for i in range(len(rows)):
             for j in range(sizes[-1]):
-                result[start + i, j] = found[i, j]
+                result[start + i, j] = last_layer[i, j]
 
 
 @njit(cache=True, nogil=True)
@@ -292,16 +297,16 @@ def actor_gradient(
     Args:
         theta: Parameters of the actor.
         log_std: Logarithms of the standard deviations, shape (n_actions,).
-        sizes: Of the layers, the observation first.
+        sizes: Sizes of the layers, the observation first.
         kind: Activation, see `KINDS`.
         samples: Observations, actions, log-probabilities, advantages of all samples.
-        rows: The samples that count.
-        scaling: Mean of the advantages of the minibatch, what they are divided by, and weight of a sample.
-        clip: Of the probability ratio.
+        rows: Indices of the samples of the minibatch.
+        scaling: Mean and reciprocal standard deviation of the minibatch's advantages, and weight of a sample.
+        clip: Clipping range of the probability ratio.
         entropy: Weight of the entropy bonus.
-        gradient: By theta, added to.
-        by_log_std: By log_std, added to.
-        figures: Sums of `FIGURES`, added to; the value loss is left alone.
+        gradient: Gradient with respect to theta, added to this array.
+        by_log_std: Gradient with respect to log_std, added to this array.
+        figures: Sums of `FIGURES` except the value loss, added to this array.
         work: Buffers of `make_work`.
     """
     observations, actions, log_probs, advantages = samples
@@ -343,9 +348,9 @@ def actor_gradient(
 
 @njit(cache=True, nogil=True)
 def critic_gradient(theta, sizes, kind, samples, rows, weight, coefficient, gradient, figures, work):
-    """Add the gradient of `coefficient` times the squared error of values; arguments as of `actor_gradient`.
+    """Add the gradient of `coefficient` times the squared error of values.
 
-    `samples` are observations and returns.
+    `samples` are observations and returns; see `actor_gradient` for the other arguments.
     """
     observations, returns = samples
     values, d, other, turned = work
@@ -353,10 +358,10 @@ def critic_gradient(theta, sizes, kind, samples, rows, weight, coefficient, grad
         chosen = rows[start : start + CHUNK]
         n = len(chosen)
         _gather(observations, chosen, values)
-        found = _forwards(theta, sizes, kind, values, n)
-        by_value = d[: found.size].reshape(found.shape)
+        last_layer = _forwards(theta, sizes, kind, values, n)
+        by_value = d[: last_layer.size].reshape(last_layer.shape)
         for i in range(n):
-            error = found[i, 0] - returns[chosen[i]]
+            error = last_layer[i, 0] - returns[chosen[i]]
             for j in range(1, by_value.shape[1]):
                 by_value[i, j] = ZERO
             by_value[i, 0] = np.float32(2) * coefficient * weight * error
@@ -371,18 +376,19 @@ def parameter_count(sizes) -> int:
 
 
 def layers_of(theta: np.ndarray, sizes) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return weights (n_in, n_out) and biases (n_out,) of each layer, without the padding, as views of `theta`."""
-    widths, found, at = [sizes[0], *(padded(size) for size in sizes[1:])], [], 0
+    """Return views of weights (n_in, n_out) and biases (n_out,) of each layer without padding."""
+    widths = [sizes[0], *(padded(size) for size in sizes[1:])]
+    layers, at = [], 0
     for i in range(len(sizes) - 1):
         end = at + widths[i] * widths[i + 1]
         weight = theta[at:end].reshape(widths[i], widths[i + 1])
-        found.append((weight[: sizes[i], : sizes[i + 1]], theta[end : end + sizes[i + 1]]))
+        layers.append((weight[: sizes[i], : sizes[i + 1]], theta[end : end + sizes[i + 1]]))
         at = end + widths[i + 1]
-    return found
+    return layers
 
 
 def start_layers(vector: np.ndarray, sizes, last: float, rng: np.random.Generator) -> None:
-    """Give the layers in a vector orthogonal weights, those of the last one times `last`; biases stay as they are."""
+    """Set orthogonal weights in a vector of parameters; `last` scales the last layer. Biases are unchanged."""
     layers = layers_of(vector, sizes)
     for i, (weight, _) in enumerate(layers):
         q, r = np.linalg.qr(rng.standard_normal((max(weight.shape), min(weight.shape))))
@@ -391,7 +397,7 @@ def start_layers(vector: np.ndarray, sizes, last: float, rng: np.random.Generato
 
 
 def make_work(sizes) -> tuple[np.ndarray, ...]:
-    """Return buffers for one thread and networks no larger than `sizes`."""
+    """Return buffers of one thread for networks up to these sizes."""
     widths = [padded(size) for size in sizes]
     lengths = (CHUNK * sum(widths), CHUNK * max(widths), CHUNK * max(widths), max(widths) ** 2)
     return tuple(np.zeros(length, np.float32) for length in lengths)

@@ -1,6 +1,6 @@
-"""Reverse mode of a network with respect to its weights and its input, for short-horizon actor-critic.
+"""Gradients of a network with respect to weights and inputs, for short-horizon actor-critic.
 
-Knows numbers only; layouts are those of `networks.py`.
+Arrays have the layout of `networks.py`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ njit = partial(numba_njit, error_model="numpy")
 
 @njit
 def _by_input(theta, sizes, first, n, turned, result):
-    """Fill `result`, n rows padded to whole vectors, with the gradient by observations; `first` is that by layer 1."""
+    """Fill `result` with the gradient with respect to observations, n rows padded to whole vectors; return the width.
+
+    `first` is the gradient with respect to the outputs of layer 1.
+    """
     n_in, n_out = sizes[0], _width(sizes, 1)
     wide = (n_in + LANES - 1) // LANES * LANES
     for j in range(n_out):
@@ -33,16 +36,16 @@ def _by_input(theta, sizes, first, n, turned, result):
 
 @njit(cache=True, nogil=True)
 def back_through(theta, sizes, kind, observations, by_output, gradient, by_observations, work):
-    """Go back through a network.
+    """Back-propagate through a network.
 
     Args:
-        theta: Its parameters.
-        sizes: Of its layers, the observation first.
+        theta: Parameters of the network.
+        sizes: Sizes of its layers, the observation first.
         kind: Activation, see `networks.KINDS`.
-        observations: Shape (n, n_obs).
-        by_output: Gradient of something with respect to its outputs, shape (n, n_out).
-        gradient: That by theta, added to.
-        by_observations: That by observations, shape (n, n_obs), overwritten.
+        observations: Inputs, shape (n, n_obs).
+        by_output: Gradient with respect to the outputs, shape (n, n_out).
+        gradient: Gradient with respect to theta, added to this array.
+        by_observations: Gradient with respect to observations, shape (n, n_obs), overwritten.
         work: Buffers of `networks.make_work`.
     """
     values, d, other, turned = work
@@ -50,13 +53,13 @@ def back_through(theta, sizes, kind, observations, by_output, gradient, by_obser
         rows = np.arange(start, min(start + CHUNK, len(observations)))
         n = len(rows)
         _gather(observations, rows, values)
-        found = _forwards(theta, sizes, kind, values, n)
-        width = found.shape[1]
+        last_layer = _forwards(theta, sizes, kind, values, n)
+        width = last_layer.shape[1]
         for i in range(n):
             for j in range(width):
                 d[i * width + j] = by_output[start + i, j] if j < sizes[-1] else ZERO
         _backwards(theta, sizes, kind, values, n, d, other, turned, gradient)
-        first, free = (d, other) if len(sizes) % 2 == 0 else (other, d)  # layers take turns in the two
+        first, free = (d, other) if len(sizes) % 2 == 0 else (other, d)  # each layer swaps the two buffers
         wide = _by_input(theta, sizes, first, n, turned, free)
         for i in range(n):
             for j in range(sizes[0]):

@@ -1,17 +1,13 @@
-"""Figures: errors and falls by transmission level, the learning curve, and the runs of a study."""
+"""Figures: errors and falls by transmission level, and the learning curve."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bootstrap import interquartile_mean
 
 INK, MUTED, LINE = "#22262b", "#6b7280", "#2a6f97"
-COLORS = (LINE, "#d1832b", "#6b7280", "#3f8f5b")
-"""Of ways of judging."""
 
 
 def _plotting() -> Any:
@@ -28,41 +24,41 @@ def _plotting() -> Any:
 
 
 def draw_transfer(result: dict[str, Any], file: Path) -> None:
-    """Draw two heat maps, velocity error and falls: levels of training downwards, levels of judgement to the right.
+    """Draw heat maps of velocity error and falls, with training levels as rows and evaluation levels as columns.
 
     Args:
-        result: As `transfer.judge` returns it.
-        file: PNG to write.
+        result: Result of `transfer.evaluate_policies`.
+        file: PNG file to write.
     """
     plt = _plotting()
-    found = result["summary"]
-    trained, judged = list(found), list(next(iter(found.values())))
+    summary = result["summary"]
+    trained, evaluated = list(summary), list(next(iter(summary.values())))
     panels = (("velocity error [m/s]", "velocity_error", "{:.3f}", 1.0), ("falls [%]", "falls", "{:.1f}", 100.0))
     height = 1.9 + 0.62 * len(trained)
     figure, axes = plt.subplots(1, 2, figsize=(9.6, height), layout="constrained")
     for ax, (title, key, form, unit) in zip(axes, panels, strict=True):
-        cells = [[found[row][column][key] for column in judged] for row in trained]
+        cells = [[summary[row][column][key] for column in evaluated] for row in trained]
         values = unit * np.array([[cell["mean"] for cell in row] for row in cells])
         top = max(float(values.max()) * 1.15, 1.0 if key == "falls" else 1e-9)
         low = 0.0 if key == "falls" else float(values.min()) * 0.85
         picture = ax.imshow(values, cmap="YlGnBu", vmin=low, vmax=top, aspect="auto")
         for (i, j), value in np.ndenumerate(values):
-            half, own = cells[i][j]["ci95"], trained[i] == judged[j]
+            half, own = cells[i][j]["ci95"], trained[i] == evaluated[j]
             text = form.format(value) + ("" if half is None else "\n± " + form.format(unit * half))
             color = "white" if value > low + 0.5 * (top - low) else INK
             ax.text(j, i, text, ha="center", va="center", color=color, weight="bold" if own else "normal")
-        ax.set_xticks(range(len(judged)), judged)
+        ax.set_xticks(range(len(evaluated)), evaluated)
         ax.set_yticks(range(len(trained)), trained)
-        ax.set_xticks(np.arange(len(judged) - 1) + 0.5, minor=True)
+        ax.set_xticks(np.arange(len(evaluated) - 1) + 0.5, minor=True)
         ax.set_yticks(np.arange(len(trained) - 1) + 0.5, minor=True)
         ax.grid(which="minor", color="white", linewidth=2)
         ax.tick_params(which="both", length=0)
         ax.spines[:].set_visible(False)
         ax.set_title(title)
-        ax.set_xlabel("judged on")
+        ax.set_xlabel("evaluated at")
         figure.colorbar(picture, ax=ax, shrink=0.9, pad=0.02).outline.set_visible(False)  # type: ignore[union-attr]
-    axes[0].set_ylabel("trained on")
-    seeds = max(cell["falls"]["n"] for row in found.values() for cell in row.values())
+    axes[0].set_ylabel("trained at")
+    seeds = max(cell["falls"]["n"] for row in summary.values() for cell in row.values())
     over = "one seed" if seeds == 1 else f"mean of {seeds} seeds ± 95 % confidence"
     heading = f"{result['env']}: {over}, {result['episodes']} episodes each; bold: level of training"
     figure.suptitle(heading, fontsize=10)
@@ -74,9 +70,9 @@ def draw_curve(rows: list[dict[str, float]], title: str, file: Path) -> None:
     """Draw reward and length of episodes over the steps of training.
 
     Args:
-        rows: As `callbacks.Curve` writes them.
+        rows: Rows of `curve.csv`.
         title: Heading.
-        file: PNG to write.
+        file: PNG file to write.
     """
     plt = _plotting()
     steps = np.array([row["steps"] for row in rows]) / 1e6
@@ -91,34 +87,4 @@ def draw_curve(rows: list[dict[str, float]], title: str, file: Path) -> None:
         ax.spines[["top", "right"]].set_visible(False)
     figure.suptitle(title, fontsize=10)
     figure.savefig(file, dpi=80)
-    plt.close(figure)
-
-
-def draw_study(panels: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], file: Path) -> None:
-    """Draw every run of a study as a point, and a line through the interquartile mean of each group.
-
-    Args:
-        panels: Values by title of the panel, arm, and way of judging.
-        file: PNG to write.
-    """
-    plt = _plotting()
-    figure, axes = plt.subplots(1, len(panels), figsize=(3.4 * len(panels), 3.0), layout="constrained", squeeze=False)
-    for ax, (title, arms) in zip(axes[0], panels.items(), strict=True):
-        for i, ways in enumerate(arms.values()):
-            for j, (way, values) in enumerate(ways.items()):
-                x, x_mean = np.array(values), i + 0.25 * (j - (len(ways) - 1) / 2)
-                if len(x):
-                    ax.plot(np.full(len(x), x_mean), x, "o", color=COLORS[j], alpha=0.5, markersize=4, linewidth=0)
-                    mean = interquartile_mean(x)
-                    ax.plot([x_mean - 0.1, x_mean + 0.1], [mean, mean], color=COLORS[j], linewidth=2, label=way)
-        ax.set_xticks(range(len(arms)), [arm.replace(", ", ",\n") for arm in arms], fontsize=8)
-        ax.set_title(title)
-        ax.grid(axis="y", color="#e5e7eb", linewidth=0.8)
-        ax.spines[["top", "right"]].set_visible(False)
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    shown = dict(zip(labels, handles, strict=True))
-    figure.legend(
-        shown.values(), [f"judged on {way}" for way in shown], loc="outside lower center", ncols=3, fontsize=8
-    )
-    figure.savefig(file, dpi=100)
     plt.close(figure)

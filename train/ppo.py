@@ -1,8 +1,8 @@
-"""Train a policy with PPO: any registered environment, any transmission level, from one settings file.
+"""Train a policy with PPO of Stable-Baselines3: any registered environment, any transmission level.
 
-Writes into the output folder: `policy.zip` (Stable-Baselines3), `policy.json` (what it was trained on), `progress.csv`,
-`curve.csv` (how learning went, from the very beginning), TensorBoard logs and `checkpoints/`. Uses public names of
-ce_gym only, and no name of a robot or task.
+Writes to the output folder: `policy.zip` (Stable-Baselines3), `policy.json` (the record), `progress.csv`, `curve.csv`
+(reward and length of episodes since the first step), TensorBoard logs and `checkpoints/`. Uses public names of ce_gym
+only, and no name of a robot or task.
 
     python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0
     python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0 --transmission armature --seeds 0 1 2
@@ -37,12 +37,13 @@ from callbacks import (
     SpreadEpisodes,
     Stop,
     WriteCurve,
+    WriteLog,
 )
 from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record, resumed_record
 from job import main as run_jobs
 from learner import ThreadedPPO
-from progress import StopInOrder, read_curve
-from run_folder import going_on, make_folder, save_somewhere, write_whole
+from progress import CURVE, LOG, Log, StopInOrder, earlier_rows
+from run_folder import continue_if_full, make_folder, save_somewhere, write_whole
 from settings import Settings
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, configure
@@ -54,7 +55,7 @@ from ce_gym.adapters.sb3_asymmetric import AsymmetricPolicy
 from ce_gym.policies import PolicyError, read_weights
 
 TRANSIENT = ["_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"]
-"""What the learner holds that is of no use in a saved policy."""
+"""Attributes of the learner that a saved policy does not need."""
 
 
 def train(job: Job) -> Trained:
@@ -63,7 +64,7 @@ def train(job: Job) -> Trained:
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
-    torch.set_num_threads(1)  # threads belong to the learner and to the kernel, see learner.py
+    torch.set_num_threads(1)  # learner.py and the simulation have their own threads
     make_folder(job.out)
     options = {"num_threads": job.threads, **job.env_kwargs, **job.settings.training}
     envs = make_sb3_vec_env(job.env_id, job.settings.num_envs, job.seed, **options)
@@ -76,10 +77,11 @@ def train(job: Job) -> Trained:
 
 def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
-    logger = configure(str(job.out), ["csv", "tensorboard"] if job.tensorboard else ["csv"])
-    model.set_logger(Logger(str(job.out), [Lenient(writer) for writer in logger.output_formats]))
-    settings, before = job.settings, model.num_timesteps
-    earlier = read_curve(job.resume.parent / "curve.csv") if job.resume else []
+    settings, steps_before = job.settings, model.num_timesteps
+    log = Log(job.out / "progress.csv", earlier_rows(job.resume, "progress.csv", LOG), steps_before)
+    board = configure(str(job.out), ["tensorboard"]).output_formats if job.tensorboard else []
+    model.set_logger(Logger(str(job.out), [WriteLog(log), *map(Lenient, board)]))
+    earlier = earlier_rows(job.resume, "curve.csv", CURVE)
     progress = ShowProgress(settings.steps)
     native, clock = acting_environment(job, envs.envs.unwrapped), Clock()
 
@@ -89,7 +91,7 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
         return written | {"activation": activation, "finished": finished, "shares": progress.shares}
 
     def checkpoint() -> None:
-        with going_on():
+        with continue_if_full():
             save(model, record(), job.out / "checkpoints" / f"policy_{model.num_timesteps}")
 
     present = Present(lambda path: save(model, record(), path), job.out, job.page)
@@ -104,8 +106,8 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
             callbacks.append(NoiseSchedule(settings.initial_std, settings.final_std, settings.steps))
         if settings.target_kl:
             callbacks.append(AdaptiveLearningRate(settings.target_kl))
-        if before < settings.steps:
-            model.learn(settings.steps - before, callbacks, reset_num_timesteps=False)  # type: ignore[arg-type]
+        if steps_before < settings.steps:
+            model.learn(settings.steps - steps_before, callbacks, reset_num_timesteps=False)  # type: ignore[arg-type]
     model.logger.close()
     written = record(finished=not stop.interrupted)
     policy = save_somewhere(lambda folder: save(model, written, folder / "policy"), job.out)
@@ -113,7 +115,7 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
 
 
 def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
-    """A fresh learner, or the one saved in `job.resume` with the settings of this job.
+    """Return a new learner, or the learner saved in `job.resume` with the settings of this job.
 
     Raises:
         PolicyError: If the saved policy does not fit the environment or the settings.
@@ -126,7 +128,7 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
         "ortho_init": True,
     }
     options: dict[str, Any] = ppo_arguments(s) | {"stats_window_size": s.num_envs, "device": "cpu"}
-    if s.target_kl:  # it begins there and is adapted
+    if s.target_kl:  # initial rate, which is adapted later
         options["learning_rate"] = s.learning_rate
     policy = AsymmetricPolicy if isinstance(envs.observation_space, gymnasium.spaces.Dict) else "MlpPolicy"
     model = ThreadedPPO(policy, envs, policy_kwargs=network, seed=job.seed, **options)
@@ -137,7 +139,7 @@ def make_learner(envs: SB3VecEnv, job: Job) -> PPO:
 
 
 def ppo_arguments(s: Settings) -> dict[str, Any]:
-    """Return our settings in the form that PPO of Stable-Baselines3, and of SBX, takes; the rate falls linearly."""
+    """Return settings as arguments of PPO in Stable-Baselines3 and SBX; the learning rate falls linearly."""
     return {
         "learning_rate": LinearSchedule(s.learning_rate, 0.0, 1.0),
         "n_steps": s.rollout,
@@ -153,41 +155,41 @@ def ppo_arguments(s: Settings) -> dict[str, Any]:
 
 
 def restore(model: PPO, job: Job) -> None:
-    """Let a fresh learner go on from `job.resume`: weights, the state of the optimiser, the steps done.
+    """Restore a new learner from `job.resume`: weights, state of the optimiser, and number of steps.
 
-    Arrays are read and nothing else: Stable-Baselines3's own `PPO.load` unpickles objects, which can run any code.
-    Environments and random numbers begin anew.
+    Only arrays are read, because `PPO.load` of Stable-Baselines3 unpickles objects, which can run any code.
+    Environments and random numbers start again.
 
     Raises:
         PolicyError: If the saved policy does not fit the environment or the settings.
     """
     file, record = Path(job.resume), resumed_record(job)  # type: ignore[arg-type]
     if file.suffix != ".zip":
-        raise PolicyError(f"{file}: expected a policy.zip of train/ppo.py, which has what training needs")
+        raise PolicyError(f"{file}: expected a policy.zip of train/ppo.py, which contains the state of the optimiser")
     try:
         weights, optimizer = (tensors(read_weights(file, f"{name}.pth")) for name in ("policy", "policy.optimizer"))
         model.policy.load_state_dict(weights)
         model.policy.optimizer.load_state_dict(optimizer)
-    except Exception as error:  # damage shows in every kind of them
+    except Exception as error:  # damaged files raise errors of many classes
         raise PolicyError(f"{file}: does not fit {job.env_id}: {' '.join(str(error).split())[:300]}") from None
     if not all(torch.isfinite(parameter).all() for parameter in model.policy.parameters()):
         raise PolicyError(f"{file}: a weight is NaN or infinite; expected finite numbers")
     model.num_timesteps = record["steps"]
-    if job.settings.target_kl:  # go on with the rate it had been adapted to
+    if job.settings.target_kl:  # continue with the adapted rate
         model.lr_schedule = FloatSchedule(model.policy.optimizer.param_groups[0]["lr"])
 
 
-def tensors(found: Any) -> Any:
-    """Return dictionaries and lists of arrays as the same of tensors."""
-    if isinstance(found, dict):
-        return {key: tensors(value) for key, value in found.items()}
-    if isinstance(found, list | tuple):
-        return type(found)(tensors(value) for value in found)
-    return torch.tensor(found) if isinstance(found, np.ndarray) else found
+def tensors(arrays: Any) -> Any:
+    """Return nested dictionaries and lists with tensors in place of arrays."""
+    if isinstance(arrays, dict):
+        return {key: tensors(value) for key, value in arrays.items()}
+    if isinstance(arrays, list | tuple):
+        return type(arrays)(tensors(value) for value in arrays)
+    return torch.tensor(arrays) if isinstance(arrays, np.ndarray) else arrays
 
 
 def save(model: PPO, record: dict[str, Any], path: Path) -> Path:
-    """Write `path`.zip and `path`.json, both or neither, and return the path of the policy.
+    """Write `path`.zip and `path`.json, both or no file, and return the path of the policy.
 
     Raises:
         OSError: If they cannot be written.

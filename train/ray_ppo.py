@@ -1,11 +1,11 @@
 # pyright: reportMissingImports=false
-"""PPO of train/fast_ppo.py on many cores or machines: actors of Ray, each with environments of its own.
+"""PPO of train/fast_ppo.py on several cores or machines, with workers that Ray starts.
 
-Ray starts the processes, wherever they are; gradients are averaged by torch's all-reduce, see averaged_ppo.py. If a
-process or its machine is lost, all are started again from the last iteration. Settings, files and arguments are those
-of train/fast_ppo.py, and each goes on from the other's policies; `num_envs` and `steps` count all processes together.
-Needs the extra `ray` in an environment of its own, see docs/how-to/learners.md. (Ray is not installed where types are
-checked, hence the line above.) Uses public names of ce_gym only, and no name of a robot or task.
+Each worker has its own environments, and torch's all-reduce averages the gradients, see averaged_ppo.py. If a worker or
+its machine fails, all workers restart from the last iteration. Settings, files and arguments are the same as in
+train/fast_ppo.py, and both scripts can resume each other's policies; `num_envs` and `steps` count all workers together.
+Needs the extra `ray` in a separate virtual environment, see docs/how-to/learners.md. Uses public names of ce_gym only,
+and no name of a robot or task.
 
     python train/ray_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --workers 2
     python train/ray_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --workers 8 --address auto --threads 16
@@ -41,21 +41,21 @@ from torch import distributed
 from ce_gym.policies import Actor
 
 PATIENCE = timedelta(seconds=60)
-"""How long a process waits for the others before it takes them for lost."""
+"""Time after which a worker regards the others as lost."""
 
 ATTEMPTS = 3
-"""How often an iteration is begun before the fault is taken for one that stays."""
+"""Attempts at an iteration before training ends with an error."""
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """What a worker reports of an iteration.
+    """Report of a worker after an iteration.
 
     Attributes:
-        figures: What the log shows.
-        means: Of recent episodes.
-        times: In the environment and in collection, since the beginning, and of the processor in all [s].
-        learned: What the others could go on from.
+        figures: Statistics for the log.
+        means: Means of recent episodes.
+        times: Time in the environment, time in collection, and processor time since the start [s].
+        learned: State of the learner.
         actor: The policy.
     """
 
@@ -67,19 +67,19 @@ class Iteration:
 
 
 class Worker:
-    """A process of its own, made by Ray."""
+    """A process started by Ray."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
 
     def meeting_point(self) -> str:
-        """Return an address at which this process can be met."""
+        """Return an address for the process group."""
         with socket.socket() as free:
             free.bind(("", 0))
             return f"tcp://{ray.util.get_node_ip_address()}:{free.getsockname()[1]}"
 
     def join(self, point: str, rank: int, count: int, learned: dict[str, NDArray]) -> Iteration:
-        """Meet the others and begin, or go on from what was learnt."""
+        """Join the process group, and continue from `learned` if it is not empty."""
         distributed.init_process_group("gloo", init_method=point, rank=rank, world_size=count, timeout=PATIENCE)
         self.learner = AveragedPPO(environments(self.job), self.job)
         if learned:
@@ -103,19 +103,21 @@ class Episodes:
         self.each: list[dict[str, float]] = []
 
     def means(self) -> dict[str, float]:
-        """Mean of every entry; empty before the first episode ends."""
-        known = [means for means in self.each if means]
-        return {name: float(np.mean([means[name] for means in known])) for name in known[0]} if known else {}
+        """Return the mean of every entry; empty before the first episode ends."""
+        reported = [means for means in self.each if means]
+        if not reported:
+            return {}
+        return {name: float(np.mean([means[name] for means in reported])) for name in reported[0]}
 
 
 class RayPPO:
-    """Workers that learn one policy, as a learner of `run_learner`.
+    """Learner of `run_learner` whose workers train one policy.
 
     Args:
-        envs: Like the workers' environments, as many as one likes; they are not stepped.
+        envs: Environments of the same kind as the workers' ones; they are not stepped.
         job: The training run.
-        workers: How many there are.
-        threads: Of each.
+        workers: Number of workers.
+        threads: Threads of each worker.
 
     Raises:
         SettingsError: If the environments cannot be divided among the workers.
@@ -130,29 +132,29 @@ class RayPPO:
         self._attempt(lambda: None)
 
     def iterate(self) -> dict[str, float]:
-        """Let all workers collect and learn; return what the log shows."""
+        """Let all workers collect and learn; return statistics for the log."""
         reports = self._attempt(lambda: ray.get([worker.iterate.remote() for worker in self.workers]))
-        self._take(reports)
+        self._store(reports)
         self.steps += sum(s.settings.num_envs * s.settings.rollout for s in self.shares)
         return reports[0].figures
 
     def actor(self) -> Actor:
-        """The layers that turn observations into mean actions."""
+        """Return the layers from observations to mean actions."""
         return self._actor
 
     def state(self) -> dict[str, NDArray]:
-        """All that going on needs, as arrays."""
+        """Return the state of the learner as arrays."""
         return self.learned
 
     def restore(self, state: dict[str, NDArray]) -> None:
-        """Go on from a state; environments begin anew."""
+        """Continue from a state; environments are reset."""
         self.learned = {name: state[name] for name in ("facts", "theta", "moments")}
         self.steps = json.loads(str(state["facts"]))["steps"]
         self._stop()
         self._attempt(lambda: None)
 
     def _attempt(self, work: Any) -> Any:
-        """Do some work of all workers, who are started where they are not or no longer there."""
+        """Return the result of a function that uses the workers; start the workers first if they are not running."""
         for _ in range(ATTEMPTS):
             try:
                 if not self.workers:
@@ -168,7 +170,7 @@ class RayPPO:
         self.workers = [make.remote(job) for job in self.shares]
         point = ray.get(self.workers[0].meeting_point.remote())
         joined = [worker.join.remote(point, rank, count, self.learned) for rank, worker in enumerate(self.workers)]
-        self._take(ray.get(joined))
+        self._store(ray.get(joined))
 
     def _stop(self) -> None:
         for worker in self.workers:
@@ -176,8 +178,8 @@ class RayPPO:
                 ray.kill(worker)
         self.workers = []
 
-    def _take(self, reports: list[Iteration]) -> None:
-        """Keep what the workers report."""
+    def _store(self, reports: list[Iteration]) -> None:
+        """Store the reports of the workers."""
         times = np.array([report.times for report in reports])
         self.step_seconds, self.collect_seconds = times[:, :2].mean(axis=0).tolist()
         self.processor_seconds = float(times[:, 2].sum())
@@ -191,7 +193,7 @@ def train(job: Job, workers: int, address: str | None) -> Trained:
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
         SettingsError: If the environments cannot be divided among the workers.
-        ValueError: If workers fail again and again.
+        ValueError: If workers fail in `ATTEMPTS` attempts.
     """
     threads = job.threads if address else max(job.threads // workers, 1)
     cores = None if address else workers * threads
@@ -203,7 +205,7 @@ def train(job: Job, workers: int, address: str | None) -> Trained:
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Add what other learners do not have."""
+    """Add the options of this learner."""
     clusters = "Ray cluster, such as auto; --threads are then each worker's, otherwise they are shared among workers"
     parser.add_argument(
         "--workers", type=whole(1, 10_000), default=2, metavar="N", help="processes that learn (default 2)"

@@ -1,6 +1,6 @@
-"""Gradient of a network's squared error, for a student that learns what a teacher would have done.
+"""Gradient of a network's squared error, for a student that imitates a teacher.
 
-Knows numbers only; layouts are those of `networks.py`.
+Arrays have the layout of `networks.py`.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ njit = partial(numba_njit, error_model="numpy")
 
 @njit(cache=True, nogil=True)
 def squared_error_gradient(theta, sizes, kind, observations, labels, rows, gradient, work):
-    """Add the gradient of the mean squared error of outputs, over rows and outputs; return that mean.
+    """Add the gradient of the mean squared error over rows and outputs; return the mean squared error.
 
     Args:
         theta: Parameters of the network.
-        sizes: Of its layers, the observation first.
+        sizes: Sizes of its layers, the observation first.
         kind: Activation, see `networks.KINDS`.
-        observations: Shape (n, n_obs).
-        labels: What outputs should have been, shape (n, n_out).
-        rows: The samples that count.
-        gradient: By theta, added to.
+        observations: Inputs, shape (n, n_obs).
+        labels: Desired outputs, shape (n, n_out).
+        rows: Indices of the samples.
+        gradient: Gradient with respect to theta, added to this array.
         work: Buffers of `networks.make_work`.
     """
     values, d, other, turned = work
@@ -35,11 +35,11 @@ def squared_error_gradient(theta, sizes, kind, observations, labels, rows, gradi
         chosen = rows[start : start + CHUNK]
         n = len(chosen)
         _gather(observations, chosen, values)
-        found = _forwards(theta, sizes, kind, values, n)
-        by_output = d[: found.size].reshape(found.shape)
+        last_layer = _forwards(theta, sizes, kind, values, n)
+        by_output = d[: last_layer.size].reshape(last_layer.shape)
         for i in range(n):
             for j in range(n_out):
-                error = found[i, j] - labels[chosen[i], j]
+                error = last_layer[i, j] - labels[chosen[i], j]
                 total += error * error
                 by_output[i, j] = np.float32(2) * weight * error
             for j in range(n_out, by_output.shape[1]):

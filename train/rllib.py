@@ -1,11 +1,10 @@
 # pyright: reportMissingImports=false
-"""Train a policy with RLlib's PPO: processes that step a native batch each, on one machine or on a cluster.
+"""Train a policy with RLlib's PPO: several processes, each with a native batch, on one machine or a cluster.
 
-Needs the extra `ray` in an environment of its own, see docs/how-to/learners.md. Settings come from the same files as
-those of train/ppo.py; `num_envs` counts the environments of all processes together. The policy is written as
-`policy.onnx` with its specification, which evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read. Uses
-public names of ce_gym only, and no name of a robot or task. (Ray is not installed where types are checked, hence the
-line above.)
+Needs the extra `ray` in a separate virtual environment, see docs/how-to/learners.md. Settings files are the same as for
+train/ppo.py; `num_envs` counts the environments of all processes together. The policy is written as `policy.onnx` with
+its specification. evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read this file. Uses public names of
+ce_gym only, and no name of a robot or task.
 
     python train/rllib.py --env ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --minutes 1
 """
@@ -26,6 +25,7 @@ import numpy as np
 import ray
 from console import SEED, THREADS, Parser, above_zero, run, whole
 from export import to_onnx, write
+from job import basic_record
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
@@ -37,15 +37,15 @@ from ce_gym.policies import Actor, add_env_arg, keep_map
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
-    """Return RLlib's PPO with our settings, except what changes on the way: `final_std`, `final_entropy`, `fall_cost`.
+    """Return RLlib's PPO with the given settings, except `final_std`, `final_entropy` and `fall_cost`.
 
     Args:
         env_id: Registered environment id.
-        s: What shapes learning. The divergence is kept near `target_kl` by a penalty; without one the rate falls.
-        runners: Processes that step environments; 0 steps them here.
-        learners: Processes that learn; 0 learns here.
-        seed: Of everything.
-        **env_kwargs: Given to the environments.
+        s: Settings. A penalty keeps the divergence near `target_kl`; if that is 0, the learning rate falls.
+        runners: Number of processes that step environments; 0 uses this process.
+        learners: Number of processes that learn; 0 uses this process.
+        seed: Seed of all random numbers.
+        **env_kwargs: Arguments of the environments.
 
     Raises:
         SettingsError: If the environments cannot be divided among the processes.
@@ -93,12 +93,12 @@ def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: i
 
 
 def importable(env_id: str) -> str:
-    """An id that any process finds: `module:id`, which imports the module that registers it."""
+    """Return an id that works in every process: `module:id` imports the module that registers the environment."""
     return env_id if ":" in env_id else f"ce_gym:{env_id}"
 
 
 def set_initial_std(algo: Algorithm, std: float) -> None:
-    """Set the standard deviation of the actions, which RLlib starts at 1, in every process."""
+    """Set the standard deviation of the actions in every process; RLlib starts with 1."""
 
     def set_weights(weights: dict[str, Any]) -> None:
         for name in weights:
@@ -113,7 +113,7 @@ def set_initial_std(algo: Algorithm, std: float) -> None:
 
 
 def actor_of(algo: Algorithm, activation: str) -> Actor:
-    """Return the layers of an algorithm's actor, the mean of its actions; `activation` as in torch.nn."""
+    """Return the layers of an algorithm's actor up to the mean action; `activation` as in torch.nn."""
     weights = next(iter(algo.learner_group.get_weights().values()))
     layers = [
         (np.asarray(weights[name], np.float32), np.asarray(weights[name.removesuffix("weight") + "bias"], np.float32))
@@ -124,7 +124,7 @@ def actor_of(algo: Algorithm, activation: str) -> Actor:
 
 
 def train(algo: Algorithm, steps: float, seconds: float) -> int:
-    """Train until so many environment steps are done or so much time is over; return the steps done."""
+    """Train for a number of environment steps or a time [s], and return the steps done."""
     start, done = time.monotonic(), 0
     while done < steps and time.monotonic() - start < seconds:
         result = algo.train()
@@ -156,7 +156,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--address", metavar="HOST:PORT", help="cluster to connect to; 'auto' for this node's own")
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
-    parser.add_argument("--minutes", type=above_zero, default=float("inf"), metavar="M", help="stop after so long")
+    parser.add_argument(
+        "--minutes", type=above_zero, default=float("inf"), metavar="M", help="longest training time [min]"
+    )
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
     args = parser.parse_args(argv)
@@ -164,13 +166,13 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _work(args: argparse.Namespace) -> int:
-    """Train, write the policy, and say where."""
+    """Train, write the policy, and print its path."""
     path = config_file(args.env)
     kwargs = {"transmission": args.transmission} if args.transmission else {}
     kwargs |= {**load_env_args(path), **dict(args.env_args), "num_threads": args.threads}
     s = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
     s = with_named(s, dict(args.env_args))
-    one = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # says in one line what is wrong, and fills the cache
+    env = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # reports errors in one line, and fills the kernel cache
     ray.init(address=args.address, log_to_driver=False, include_dashboard=False)
     algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **{**kwargs, **s.training})
     set_initial_std(algo, s.initial_std)
@@ -179,26 +181,12 @@ def _work(args: argparse.Namespace) -> int:
     make_folder(out)
     keep_map(kwargs, out)
     algo.save_to_path(str((out / "checkpoint").resolve()))
-    record = _record(one.unwrapped, args.env, kwargs, s, steps)
+    kept = {key: value for key, value in kwargs.items() if key != "num_threads"}
+    record = basic_record(env.unwrapped, args.env, kept, s) | {"steps": steps}
     write(to_onnx(actor_of(algo, s.activation), record), record, out / "policy.onnx")
     algo.stop()
     print(out / "policy.onnx")
     return 0
-
-
-def _record(native: Any, env_id: str, kwargs: dict[str, Any], s: Settings, steps: int) -> dict[str, Any]:
-    """The record of the policy."""
-    return {
-        "env": env_id,
-        "env_kwargs": {key: value for key, value in kwargs.items() if key != "num_threads"},
-        "transmission": native.model.transmission,
-        "observation_size": native.single_observation_space.shape[0],
-        "action_size": native.single_action_space.shape[0],
-        "activation": s.activation,
-        "policy_spec": native.policy_spec(),
-        "settings": s.as_dict(),
-        "steps": steps,
-    }
 
 
 if __name__ == "__main__":

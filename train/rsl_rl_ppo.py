@@ -1,8 +1,8 @@
-"""Train a policy with rsl_rl's PPO: any registered environment, from the same settings files as train/ppo.py.
+"""Train a policy with rsl_rl's PPO: any registered environment, with the settings files of train/ppo.py.
 
-Writes rsl_rl's own checkpoints and TensorBoard logs into the output folder, and the policy as `policy.onnx` with its
-specification, which evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read. Needs the extra `rsl-rl`.
-Uses public names of ce_gym only, and no name of a robot or task.
+Writes rsl_rl's checkpoints and TensorBoard logs to the output folder, and the policy as `policy.onnx` with its
+specification. evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read this file. Needs the extra
+`rsl-rl`. Uses public names of ce_gym only, and no name of a robot or task.
 
     python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --steps 6e6
     python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --critic contact_forces base_height
@@ -24,7 +24,7 @@ import torch
 from console import EPISODES, SEED, Parser, run
 from evaluate import evaluate, report
 from export import to_onnx, write
-from job import Job, acting_environment, env_kwargs_of
+from job import Job, acting_environment, basic_record, env_kwargs_of
 from rsl_rl.runners import OnPolicyRunner
 from run_folder import make_folder
 from settings import Settings, config_file, load_env_args, load_settings, with_named
@@ -33,14 +33,14 @@ from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
 from ce_gym.policies import Actor, add_env_arg, keep_map, load_policy
 
 DIVERGENCE = 0.01
-"""What the learning rate is adapted to where settings ask for one that falls linearly; usual with rsl_rl."""
+"""KL divergence that is usual with rsl_rl, for settings with `target_kl` 0; rsl_rl has no linear decay of the rate."""
 
 
 def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str, Any]:
-    """Return our settings in the form that rsl_rl's runner takes; `groups` are those of the observations.
+    """Return settings in the form of rsl_rl's runner; `groups` are the observation groups.
 
-    The weight of the entropy bonus stays as it is at the start, the noise is learned, and falls cost nothing: rsl_rl
-    has no schedules for them. Nor has it one for the learning rate but that which a divergence sets.
+    rsl_rl has no schedules for the entropy bonus, the noise and the cost of falls. So the weight of the entropy bonus
+    is constant, the noise is learned, and falls have no cost. The learning rate follows the KL divergence.
     """
     network = {"class_name": "MLPModel", "hidden_dims": list(s.hidden), "activation": s.activation.lower()}
     spread = {"class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log"}
@@ -70,7 +70,7 @@ def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str
 
 
 def train(envs: RslRlVecEnv, settings: Settings, seed: int, out: Path | None = None) -> OnPolicyRunner:
-    """Train until the steps of the settings are done; with a folder, log and save there."""
+    """Train for the steps of the settings, and return the runner; log and save in `out` if it is given."""
     torch.manual_seed(seed)
     chosen = runner_settings(settings, tuple(map(str, envs.get_observations().keys())), seed)
     runner = OnPolicyRunner(envs, chosen, str(out) if out else None, device=str(envs.device))
@@ -84,21 +84,6 @@ def actor_of(runner: OnPolicyRunner, activation: str) -> Actor:
     modules = runner.alg.get_policy().mlp.modules()
     linear = [module for module in modules if isinstance(module, torch.nn.Linear)]
     return Actor(tuple((x.weight.detach().cpu().numpy(), x.bias.detach().cpu().numpy()) for x in linear), activation)
-
-
-def record_of(envs: RslRlVecEnv, env_id: str, env_kwargs: dict[str, Any], settings: Settings) -> dict[str, Any]:
-    """The record of the policy."""
-    native: Any = envs.envs.unwrapped
-    return {
-        "env": env_id,
-        "env_kwargs": env_kwargs,
-        "transmission": native.model.transmission,
-        "observation_size": envs.get_observations()["policy"].shape[-1],
-        "action_size": envs.num_actions,
-        "activation": settings.activation,
-        "policy_spec": native.policy_spec(),
-        "settings": settings.as_dict(),
-    }
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -121,7 +106,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _work(args: argparse.Namespace) -> int:
-    """Train, write the policy, and say where."""
+    """Train, write and evaluate the policy, and print its path."""
     path = config_file(args.env)
     kwargs: dict[str, Any] = {"dtype": "float32"} if args.device.startswith("cuda") else {}
     kwargs |= load_env_args(path) | env_kwargs_of(args)
@@ -133,9 +118,8 @@ def _work(args: argparse.Namespace) -> int:
     training = {**kwargs, **settings.training}
     envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **training)
     runner = train(envs, settings, args.seed, out)
-    record = record_of(envs, args.env, kwargs, settings)
     acting = acting_environment(Job(args.env, settings, out, kwargs), envs.envs.unwrapped)
-    record["policy_spec"] = acting.policy_spec()
+    record = basic_record(acting, args.env, kwargs, settings)
     write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
     policy = load_policy(out / "policy.onnx")
     print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))

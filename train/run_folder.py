@@ -1,4 +1,4 @@
-"""The folder of a training run: files are written whole or not at all, and a full disk does not end training."""
+"""Write the files of a training run: completely or not at all; a full disk does not end training."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from console import said
+from console import file_error
 
 
 def make_folder(out: Path) -> None:
-    """Make the folder of a run, and see that it can be written to, before any time is spent.
+    """Make the folder of a run and check that files can be written.
 
     Raises:
-        OSError: If it cannot.
+        OSError: If they cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=out) as file:
@@ -23,41 +23,45 @@ def make_folder(out: Path) -> None:
 
 
 def write_whole(files: Mapping[Path, bytes]) -> None:
-    """Write files that belong together: each is replaced only when all are on the disk.
+    """Write several files; existing files are replaced only when all new ones are on the disk.
 
     Raises:
-        OSError: If they cannot be written; then nothing has changed.
+        OSError: If they cannot be written; then all files are unchanged.
     """
-    fresh = {file.with_name(f".{file.name}"): file for file in files}
+    temporaries = {file.with_name(f".{file.name}"): file for file in files}
     try:
-        for temporary, file in fresh.items():
+        for temporary, file in temporaries.items():
             file.parent.mkdir(parents=True, exist_ok=True)
             temporary.write_bytes(files[file])
-        for temporary, file in fresh.items():
+        for temporary, file in temporaries.items():
             temporary.replace(file)
     finally:
-        for temporary in fresh:
+        for temporary in temporaries:
             temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def going_on() -> Iterator[None]:
-    """Do something that training can go on without; should a disk be full, that is one line."""
+def continue_if_full() -> Iterator[None]:
+    """Print a warning instead of raising an error if a file cannot be written, so that training continues."""
     try:
         yield
     except OSError as error:
-        print(f"warning: {said(error)}; training goes on", file=sys.stderr, flush=True)
+        print(f"warning: {file_error(error)}; training continues", file=sys.stderr, flush=True)
 
 
 def save_somewhere(save: Callable[[Path], Path], out: Path) -> Path:
-    """Save a policy into a folder, or into a temporary one if that is full or gone; return what `save` returns.
+    """Save a policy in a folder, or in a temporary folder if that fails, and return its path.
+
+    Args:
+        save: Function that saves the policy in a folder and returns its path.
+        out: Folder of the run.
 
     Raises:
-        OSError: If that cannot be written either.
+        OSError: If both folders cannot be written.
     """
     try:
         return save(out)
     except OSError as error:
         elsewhere = Path(tempfile.mkdtemp(prefix="ce_gym-"))
-        print(f"warning: {said(error)}; saving to {elsewhere}", file=sys.stderr, flush=True)
+        print(f"warning: {file_error(error)}; saving to {elsewhere}", file=sys.stderr, flush=True)
         return save(elsewhere)

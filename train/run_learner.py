@@ -1,7 +1,8 @@
-"""A training run of a learner over plain arrays, such as `fast_ppo.FastPPO`: from its environments to its files.
+"""Train a learner on plain arrays, such as `fast_ppo.FastPPO`, and write its files.
 
-A learner has `iterate`, `actor`, `state` and `restore`, and the attributes `steps`, `episodes`, `envs`, `step_seconds`
-and `collect_seconds`; one that works in other processes too has `processor_seconds`, their processor time [s].
+A learner has the methods `iterate`, `actor`, `state` and `restore`, and the attributes `steps`, `episodes`, `envs`,
+`step_seconds` and `collect_seconds`. A learner with other processes also has `processor_seconds`, their processor time
+[s].
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
-from progress import Curve, Log, ProgressBar, StopInOrder, read_curve
-from run_folder import going_on, make_folder, save_somewhere, write_whole
+from progress import CURVE, LOG, Curve, Log, ProgressBar, StopInOrder, earlier_rows, log_row
+from run_folder import continue_if_full, make_folder, save_somewhere, write_whole
 from training_page import Present
 
 from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
@@ -30,10 +31,10 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str, num_
     """Train with a learner, and save the policy even if Ctrl-C ends training early.
 
     Args:
-        kind: Makes the learner.
+        kind: Function that returns the learner.
         job: The training run.
-        name: Of the learner's file.
-        num_envs: Environments that the learner is given, if not those of the settings.
+        name: Name of the learner's file.
+        num_envs: Number of environments; None takes the number in the settings.
 
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
@@ -50,7 +51,7 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job, name: str, num_
 
 
 def environments(job: Job, num_envs: int | None = None) -> VectorEnv:
-    """Return the environments of a training run, as many as its settings say if nothing else is asked for."""
+    """Return the environments of a training run, `num_envs` or the number in the settings."""
     options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
     mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **job.settings.training}
     return gymnasium.make_vec(
@@ -62,8 +63,9 @@ def _learn(learner: Any, job: Job, name: str) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
     s, native = job.settings, acting_environment(job, learner.envs.unwrapped)
     start, clock = time.perf_counter(), Clock()
-    curve = Curve(job.out / "curve.csv", _earlier(job.resume), learner.steps)
-    bar, log = ProgressBar(s.steps, learner.steps), Log(job.out / "progress.csv")
+    curve = Curve(job.out / "curve.csv", earlier_rows(job.resume, "curve.csv", CURVE), learner.steps)
+    log = Log(job.out / "progress.csv", earlier_rows(job.resume, "progress.csv", LOG), learner.steps)
+    bar = ProgressBar(s.steps, learner.steps)
 
     def record(finished: bool = False) -> dict[str, Any]:
         written = make_record(job, native, learner.steps, clock, ("numba",))
@@ -74,15 +76,16 @@ def _learn(learner: Any, job: Job, name: str) -> Trained:
     present = Present(lambda path: save_policy(learner, record(), path), job.out, job.page)
     with StopInOrder(job.seconds) as stop:
         while learner.steps < s.steps and not stop.due:
-            before = learner.steps // every
+            checkpoints = learner.steps // every
             figures, means = learner.iterate(), learner.episodes.means()
             curve.add(learner.steps, means)
-            log.add(learner.steps, time.perf_counter() - start, means, figures)
+            if means:
+                log.add(log_row(learner.steps, time.perf_counter() - start, means, figures))
             bar.advance(learner.steps)
             bar.describe(means, learner.step_seconds, learner.collect_seconds)
             present.keep()
-            if learner.steps // every > before and learner.steps < s.steps:
-                with going_on():
+            if learner.steps // every > checkpoints and learner.steps < s.steps:
+                with continue_if_full():
                     save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
         bar.close()
     written = record(finished=not stop.interrupted)
@@ -91,7 +94,7 @@ def _learn(learner: Any, job: Job, name: str) -> Trained:
 
 
 def save(learner: Any, record: dict[str, Any], path: Path) -> Path:
-    """Write `path`.npz, .json and .learner.npz, all or none, and return the path of the policy.
+    """Write `path`.npz, .json and .learner.npz, all or no file, and return the path of the policy.
 
     Raises:
         OSError: If they cannot be written.
@@ -106,10 +109,10 @@ def save(learner: Any, record: dict[str, Any], path: Path) -> Path:
 
 
 def save_policy(learner: Any, record: dict[str, Any], path: Path) -> None:
-    """Write `path`.npz alone: to act, not to go on from.
+    """Write `path`.npz, the policy without the state of its learner.
 
     Raises:
-        OSError: If it cannot be written.
+        OSError: If the file cannot be written.
     """
     policy = io.BytesIO()
     write_npz(learner.actor(), record, policy)
@@ -117,25 +120,20 @@ def save_policy(learner: Any, record: dict[str, Any], path: Path) -> None:
 
 
 def resume(learner: Any, policy: Path) -> None:
-    """Let a learner go on from a policy.
+    """Let a learner continue from a policy.
 
     Raises:
-        PolicyError: If what it was trained by is missing, damaged or of another network.
+        PolicyError: If the state of the policy's learner is missing, damaged or of another network.
     """
     file = _learner_file(policy)
     try:
         with np.load(file, allow_pickle=False) as arrays:
             learner.restore({name: arrays[name] for name in arrays.files})
     except FileNotFoundError:
-        raise PolicyError(f"{file}: no such file; expected what its learner writes beside a policy") from None
+        raise PolicyError(f"{file}: no such file; expected the file that its learner writes beside a policy") from None
     except (OSError, LookupError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise PolicyError(f"{file}: cannot be gone on from: {' '.join(str(error).split())[:200]}") from None
+        raise PolicyError(f"{file}: training cannot continue: {' '.join(str(error).split())[:200]}") from None
 
 
 def _learner_file(policy: Path) -> Path:
     return locate_policy(policy).with_suffix(".learner.npz")
-
-
-def _earlier(policy: Path | None) -> list[dict[str, float]]:
-    """The learning curve of the policy gone on from."""
-    return read_curve(locate_policy(policy).parent / "curve.csv") if policy else []

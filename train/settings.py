@@ -1,7 +1,6 @@
-"""Settings of learners: what they are, and how they are read from a YAML file and the command line.
+"""Settings of learners, and their values from a YAML file and the command line.
 
-One file per robot and task lies in `config/`, found by the name of the environment. A file is complete: every setting
-is in it, none is inherited.
+`config/` has one file per robot and task, found by the name of the environment. Each file contains all settings.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any, ClassVar
 from ce_gym.policies import ACTIVATIONS, checked_arguments, listed_names, parse_yaml
 
 Activation = str
-"""One of those with which a policy can be run without its learner."""
+"""Name of an activation function in `ce_gym.policies.ACTIVATIONS`."""
 
 LIMITS = {
     "steps": 1e12, "num_envs": 2**20, "rollout": 10_000, "minibatches": 10_000, "epochs": 1000, "hidden": 2**13,
@@ -24,22 +23,22 @@ LIMITS = {
     "fall_cost": (0, 1e6), "max_grad_norm": (1e-6, 1e9),
     "decay": (1e-3, 1), "target_memory": (0, 1), "max_adjoint": (1e-9, 1e30),
 }  # fmt: skip
-"""The largest of whole numbers, whose smallest is 1; the smallest and largest of other numbers."""
+"""Largest value of whole numbers, whose smallest value is 1; smallest and largest value of other numbers."""
 
 MOST_SAMPLES = 10**8
-"""Steps between two updates, over all environments: more would not fit into memory."""
+"""Largest number of steps between two updates, over all environments, because of memory."""
 
 ENV_ARGS = "env_args"
-"""Key of a settings file under which arguments of the environment stand, by name; the only one that may be missing."""
+"""Key of the arguments of the environment in a settings file; the only optional key."""
 
 NETWORK = ("hidden", "activation")
-"""What a policy keeps for life."""
+"""Settings that cannot change when training continues."""
 
 CONFIG_FOLDER = Path(__file__).parent / "config"
 
 
 class SettingsError(ValueError):
-    """A settings file or override that cannot be used; the message is one line for the user."""
+    """A settings file or override cannot be used; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
@@ -48,22 +47,21 @@ class CommonSettings:
 
     Attributes:
         steps: Environment steps to train for, over all environments.
-        num_envs: Environments stepped at once.
+        num_envs: Environments stepped in parallel.
         rollout: Control steps of each environment between two updates.
-        minibatches: Parts into which the collected steps are divided.
-        epochs: Times each update goes over the collected steps.
+        minibatches: Number of minibatches of an update.
+        epochs: Number of passes over the collected steps in each update.
         hidden: Sizes of the hidden layers, the same for policy and value.
         activation: Tanh, ReLU, ELU, SELU, Sigmoid or Softplus, as in `torch.nn`.
         initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
-        final_std: At the end, geometric in between.
-        learning_rate: Of Adam, at the start.
+        final_std: Standard deviation of the actions at the end, geometric in between.
+        learning_rate: Learning rate of Adam at the start.
         gamma: Discount per step.
-        gae_lambda: Of generalised advantage estimation, or of the critic's targets, TD(lambda).
-        fall_cost: What an episode that ends as a failure takes from the reward of its last step, in the end; see
-            `progress.fall_cost`. Rewards that are reported are without it.
+        gae_lambda: Lambda of generalised advantage estimation (PPO), or of the critic's TD(lambda) targets (SHAC).
+        fall_cost: Final cost that is subtracted from the last reward of an episode that ends as a failure; see
+            `progress.fall_cost`. Reported rewards do not contain it.
         max_grad_norm: Gradients of the networks are clipped to this norm.
-        training: Arguments of the environment for training only, by which no policy is judged; those that go with the
-            policy are `env_args`.
+        training: Arguments of the environment for training only. Arguments that belong to the policy are in `env_args`.
     """
 
     steps: int
@@ -83,21 +81,21 @@ class CommonSettings:
     training: Mapping[str, Any]
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain data, for a record beside the policy."""
+        """Return the settings as plain data, for the record of a policy."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Settings(CommonSettings):
-    """Everything that shapes learning by PPO, apart from the environment itself and the seed.
+    """Settings of PPO.
 
     Attributes:
-        final_std: 0 lets the learner choose it during training. Of use where robots fall by the mean action, by which
-            policies are judged, that stood with the noise of training.
-        target_kl: KL divergence of an update that the learning rate is adapted to; with 0 it falls linearly to 0.
+        final_std: Standard deviation of the actions at the end, geometric in between; 0 lets PPO learn it. A small
+            value helps if robots stand with the noise of training and fall with the mean action.
+        target_kl: KL divergence per update to which the learning rate is adapted; with 0 the rate falls linearly to 0.
         clip: Clipping range of PPO's probability ratio.
         entropy: Weight of the entropy bonus at the start.
-        final_entropy: At the end, linear in between.
+        final_entropy: Weight of the entropy bonus at the end, linear in between.
         value: Weight of the value loss.
     """
 
@@ -111,10 +109,10 @@ class Settings(CommonSettings):
 
 
 def config_file(env_id: str, folder: Path = CONFIG_FOLDER) -> Path:
-    """The settings file of an environment, in the folder of a learner.
+    """Return the settings file of an environment in the folder of a learner.
 
-    `namespace/MyRobotTask-Level-v0` takes `my_robot_task_level.yaml` if there is one, else `my_robot_task.yaml`, else
-    `default.yaml`.
+    The file of `namespace/MyRobotTask-Level-v0` is the first of `my_robot_task_level.yaml`, `my_robot_task.yaml` and
+    `default.yaml` that exists.
     """
     name = re.sub(r"-v\d+$", "", env_id.rsplit("/", 1)[-1])
     for candidate in (name.replace("-", ""), name.split("-")[0]):
@@ -125,20 +123,20 @@ def config_file(env_id: str, folder: Path = CONFIG_FOLDER) -> Path:
 
 
 def load_settings(path: Path, overrides: Iterable[str] = (), kind: type = Settings) -> Any:
-    """Read a settings file of a learner and apply `KEY=VALUE` overrides; `kind` is its dataclass of settings.
+    """Return the settings in a file, with `KEY=VALUE` overrides; `kind` is the learner's dataclass of settings.
 
     Raises:
-        SettingsError: If the file cannot be read, or a key is missing, unknown or of the wrong kind.
+        SettingsError: If the file cannot be read, a key is missing or unknown, or a value is wrong.
     """
     data = {key: value for key, value in _read(path).items() if key != ENV_ARGS}
     return make_settings(data | parsed(overrides), str(path), kind)
 
 
 def load_env_args(path: Path) -> dict[str, Any]:
-    """Return the arguments of the environment that a settings file asks for; none if it says nothing of them.
+    """Return the arguments of the environment in a settings file, or an empty dictionary.
 
     Raises:
-        SettingsError: If the file cannot be read, or they are no plain data by name.
+        SettingsError: If the file cannot be read, or the arguments are not plain data by name.
     """
     try:
         return checked_arguments(_read(path).get(ENV_ARGS, {}))
@@ -149,7 +147,7 @@ def load_env_args(path: Path) -> dict[str, Any]:
 
 
 def with_named(settings: Any, env_args: Mapping[str, Any]) -> Any:
-    """Return settings whose `training` gives way to arguments that a command line names; mappings are merged by key."""
+    """Return settings whose `training` does not override arguments of the command line; mappings are merged."""
     training = dict(settings.training)
     for name, value in env_args.items():
         if isinstance(value, Mapping) and isinstance(training.get(name), Mapping):
@@ -160,7 +158,7 @@ def with_named(settings: Any, env_args: Mapping[str, Any]) -> Any:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return what a settings file says, unchecked."""
+    """Return the content of a settings file, unchecked."""
     try:
         data = parse_yaml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -172,10 +170,15 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def make_settings(data: Mapping[str, Any], source: str, kind: type = Settings) -> Any:
-    """Check plain data, key by key, and return it as settings of a kind; `source` names it in errors.
+    """Check plain data and return it as settings.
+
+    Args:
+        data: Values by key.
+        source: Name of the data in errors, such as the path of a file.
+        kind: The learner's dataclass of settings.
 
     Raises:
-        SettingsError: If a key is missing, unknown or of the wrong kind.
+        SettingsError: If a key is missing or unknown, or a value is wrong.
     """
     known = {field.name: str(field.type) for field in fields(kind)}
     for key in data:
@@ -190,7 +193,7 @@ def make_settings(data: Mapping[str, Any], source: str, kind: type = Settings) -
 
 
 def _check_samples(source: str, s: Any) -> None:
-    """See that every minibatch has two samples, or the spread of its advantages would be 0 / 0."""
+    """Check that every minibatch has two samples, otherwise the variance of its advantages would be 0 / 0."""
     samples = s.num_envs * s.rollout
     if samples > MOST_SAMPLES:
         raise SettingsError(
@@ -207,7 +210,7 @@ def parsed(overrides: Iterable[str]) -> dict[str, Any]:
     """Return overrides, each `KEY=VALUE`, as plain data.
 
     Raises:
-        SettingsError: If one is something else.
+        SettingsError: If an override has another form.
     """
     return dict(_parse_override(text) for text in overrides)
 
@@ -225,28 +228,28 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 
 def _convert(source: str, key: str, value: Any, kind: str) -> Any:
-    """Convert one value. Numbers may be quoted."""
-    wanted = f"one of {', '.join(ACTIVATIONS)}" if kind == "Activation" else "a list of layer sizes"
+    """Return one value with the type of its setting; numbers may be quoted."""
+    expected = f"one of {', '.join(ACTIVATIONS)}" if kind == "Activation" else "a list of layer sizes"
     try:
         if kind == "int":
             high: Any = LIMITS[key]
-            wanted = f"a positive whole number, at most {high:g}"
+            expected = f"a positive whole number, at most {high:g}"
             number = float(value)
             if isinstance(value, bool) or number != int(number) or not 1 <= number <= high:
                 raise ValueError
             return int(number)
         if kind == "float":
             low, high = LIMITS[key]  # type: ignore[misc]
-            wanted = f"a number from {low:g} to {high:g}"
+            expected = f"a number from {low:g} to {high:g}"
             number = float(value)
             if isinstance(value, bool) or not low <= number <= high:
                 raise ValueError
             return number
         if kind.startswith("Mapping"):
-            wanted = "arguments of the environment by name, as plain data"
+            expected = "arguments of the environment by name, as plain data"
             return checked_arguments(value)
         if kind == "str":
-            wanted = "a name or a path"
+            expected = "a name or a path"
             if not isinstance(value, str) or not value:
                 raise ValueError
             return value
@@ -258,9 +261,9 @@ def _convert(source: str, key: str, value: Any, kind: str) -> Any:
     except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, SettingsError):
             raise
-        raise SettingsError(f"{source}: {key}: {repr(value)[:200]}; expected {wanted}") from None
+        raise SettingsError(f"{source}: {key}: {repr(value)[:200]}; expected {expected}") from None
 
 
 def _snake(name: str) -> str:
-    """`MyRobotTask` as `my_robot_task`."""
+    """Return `MyRobotTask` as `my_robot_task`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()

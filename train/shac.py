@@ -1,10 +1,10 @@
 """Train a policy with analytic gradients: rewards differentiated through physics, contacts and transmissions.
 
-Short-horizon actor-critic (Xu et al. 2022, arXiv:2204.07137). Robots act for a window of control steps; the gradient
-of their rewards, and of a critic's value of where the window ends, goes back through `env.unwrapped.differentiable()`
-to the weights of the policy. Same command line, files and settings machinery as train/fast_ppo.py; settings are in
-train/config/shac. They may change the task (`env_args`: a policy is judged with that) and how it is trained
-(`training`: softer ground, say). Uses public names of ce_gym only, and no name of a robot or task.
+Short-horizon actor-critic (Xu et al. 2022, arXiv:2204.07137). Robots act for a window of control steps. The gradient of
+rewards, and of the critic's value at the end of the window, is propagated through `env.unwrapped.differentiable()` to
+the weights of the policy. Command line and files are the same as in train/fast_ppo.py; settings are in
+train/config/shac. `env_args` in a settings file changes the task, `training` changes training only, such as softer
+ground. Uses public names of ce_gym only, and no name of a robot or task.
 
     python train/shac.py --env ce_gym/MiniCheetahVelocity-v0
 """
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from console import say_missing
+from console import report_missing
 from gymnasium.vector import VectorEnv
 from job import Job, Trained
 from job import main as run_jobs
@@ -33,11 +33,11 @@ from run_learner import run_learner
 from settings import CONFIG_FOLDER, CommonSettings
 
 try:
-    from loops import adam, advantages_of
+    from loops import adam, estimate_advantages
     from networks import KINDS, critic_gradient, layers_of, make_work, outputs, padded, parameter_count, start_layers
     from pathwise import back_through
 except ModuleNotFoundError as error:
-    raise SystemExit(say_missing("shac.py", error)) from None
+    raise SystemExit(report_missing("shac.py", error)) from None
 
 from ce_gym.policies import Actor
 
@@ -46,16 +46,16 @@ F = np.float32
 
 @dataclass(frozen=True)
 class Settings(CommonSettings):
-    """Everything that shapes learning by SHAC, apart from the environment's id and the seed.
+    """Settings of SHAC.
 
-    A rollout is a window that is differentiated as a whole; minibatches and epochs are those of the critic.
+    A rollout is a window that is differentiated as a whole. Minibatches and epochs belong to updates of the critic.
 
     Attributes:
-        activation: Follows the policy's last layer, too, so that Tanh squashes its actions.
-        learning_rate: Of policy and critic, until the last part of training.
-        decay: That part: a share of training, over which the rate goes down to 0.
-        target_memory: Share of the target critic that is kept in each update.
-        max_adjoint: A robot's gradient is shortened to this norm between control steps.
+        activation: Activation, also after the policy's last layer, so that Tanh limits actions.
+        learning_rate: Learning rate of policy and critic until the last part of training.
+        decay: Length of the last part, as a fraction of training; there the learning rate falls linearly to 0.
+        target_memory: Weight of the old target critic in each update of the target critic.
+        max_adjoint: The gradient of each robot is clipped to this norm between control steps.
     """
 
     folder: ClassVar[Path] = CONFIG_FOLDER / "shac"
@@ -69,13 +69,13 @@ class SHAC:
     """Short-horizon actor-critic.
 
     Args:
-        envs: A vector environment of ours in SAME_STEP autoreset mode.
+        envs: A vector environment of ce_gym in SAME_STEP autoreset mode.
         job: The training run.
 
     Attributes:
-        theta: All parameters: those of the policy, then those of the value.
+        theta: Parameters of the policy, then of the critic.
         steps: Environment steps done.
-        step_seconds, collect_seconds: Time spent inside the environment, and in collection as a whole [s].
+        step_seconds, collect_seconds: Time inside the environment, and in collection including it [s].
     """
 
     def __init__(self, envs: VectorEnv, job: Job) -> None:
@@ -84,7 +84,7 @@ class SHAC:
         self.differentiable = native.differentiable(s.max_adjoint)
         spaces: Any = envs.single_observation_space, envs.single_action_space
         size, self.n_actions = (space.shape[0] for space in spaces)
-        # the last layer is the identity and stays it: so activations, which stand between layers, squash actions
+        # The last layer is a constant identity, so that an activation follows the layer of the actions.
         self.actor_sizes = np.array([size, *s.hidden, self.n_actions, self.n_actions])
         self.critic_sizes = np.array([size, *s.hidden, 1])
         self.kind, self.rng = KINDS.index(s.activation), np.random.default_rng(job.seed)
@@ -106,13 +106,13 @@ class SHAC:
         spread_episodes(native, self.rng)
 
     def _start_parameters(self) -> None:
-        """Orthogonal weights, small ones where actions come from; biases are zero."""
+        """Set orthogonal weights, small in the layer of the actions, and zero biases."""
         for theta, sizes, last in ((self.policy, self.actor_sizes[:-1], 0.1), (self.value, self.critic_sizes, 1.0)):
             start_layers(theta, sizes, last, self.rng)
         layers_of(self.policy, self.actor_sizes)[-1][0][:] = np.eye(self.n_actions)
 
     def iterate(self) -> dict[str, float]:
-        """Act for a window and learn from it; return what the log shows."""
+        """Act for a window and learn from it; return statistics for the log."""
         s, done = self.settings, min(self.steps / self.settings.steps, 1.0)
         rate = s.learning_rate * min(1.0, (1 - done) / s.decay)
         start = time.perf_counter()
@@ -137,9 +137,9 @@ class SHAC:
                 self.after[t][self.dones[t]] = infos["final_obs"][self.dones[t]]
 
     def learn_actor(self, rate: float) -> dict[str, float]:
-        """Ascend discounted rewards of the window, and what the target critic thinks of where robots end.
+        """Make one step of gradient ascent on discounted rewards of the window plus the target critic's final values.
 
-        A robot that falls is worth nothing from then on; with the next episode discounts begin anew.
+        The value after a fall is 0. Discounts start again with each episode.
         """
         s, (steps, n) = self.settings, self.dones.shape
         weight = np.ones((steps, n), F)
@@ -163,26 +163,26 @@ class SHAC:
         return {"train/gradient_norm": float(np.linalg.norm(gradient)) / n}
 
     def _value_gradient(self, observations: NDArray, weight: NDArray) -> NDArray:
-        """Gradient of weighted values with respect to observations, where weights are not 0."""
+        """Return the gradient of weighted values with respect to observations; rows with weight 0 stay 0."""
         result, rows = np.zeros_like(observations), np.flatnonzero(weight)
         if len(rows):
-            found, unused = np.empty_like(observations[rows]), np.zeros_like(self.target)
+            gradient, unused = np.empty_like(observations[rows]), np.zeros_like(self.target)
             by_value, seen = np.ascontiguousarray(weight[rows, None]), observations[rows]
-            back_through(self.target, self.critic_sizes, self.kind, seen, by_value, unused, found, self.work)
-            result[rows] = found
+            back_through(self.target, self.critic_sizes, self.kind, seen, by_value, unused, gradient, self.work)
+            result[rows] = gradient
         return result
 
     def learn_critic(self, rate: float, cost: float) -> dict[str, float]:
-        """Fit values to TD(lambda) targets, which the target critic makes; a fall takes `cost` from the reward."""
+        """Fit values to TD(lambda) targets of the target critic; `cost` is subtracted from the reward of a fall."""
         s, n = self.settings, self.dones.size
         seen, rewards = self.seen.reshape(n, -1), self.rewards.copy()
         self.values[:] = self._run(self.target, self.critic_sizes, seen).reshape(self.values.shape)
         rewards[self.terminated] -= F(cost)
-        late = self.dones & ~self.terminated  # an episode that was cut off by time is worth what its end is
+        late = self.dones & ~self.terminated  # the value of the last observation replaces rewards after the time limit
         if late.any():
             rewards[late] += F(s.gamma) * self._run(self.target, self.critic_sizes, self.after[late])[:, 0]
         last = self._run(self.target, self.critic_sizes, self.after[-1])[:, 0]
-        advantages_of(rewards, self.values, last, self.dones, F(s.gamma), F(s.gae_lambda), self.advantages)
+        estimate_advantages(rewards, self.values, last, self.dones, F(s.gamma), F(s.gae_lambda), self.advantages)
         returns, size = (self.advantages + self.values).reshape(n), -(-n // s.minibatches)
         figures, (first, second) = np.zeros(4, F), self.moments[:, self.n_actor :]
         for _ in range(s.epochs):
@@ -205,27 +205,27 @@ class SHAC:
         return result
 
     def actor(self) -> Actor:
-        """The layers that turn observations into mean actions, copies."""
+        """Return copies of the layers from observations to mean actions."""
         layers = layers_of(self.policy, self.actor_sizes)
         return Actor(tuple((weight.T.copy(), bias.copy()) for weight, bias in layers), self.settings.activation)
 
     def state(self) -> dict[str, NDArray]:
-        """All that going on needs, as arrays: see `restore`."""
+        """Return the state of learner and environments as arrays; see `restore`."""
         native: Any = self.envs.unwrapped
         facts = {
             "steps": self.steps, "updates": [self.updates, self.critic_updates], "rng": self.rng.bit_generator.state,
             "sizes": [self.actor_sizes.tolist(), self.critic_sizes.tolist()], "activation": self.settings.activation,
             "episodes": self.episodes.names,
         }  # fmt: skip
-        found = {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
-        found |= {"target": self.target, "observed": self.observed, "episodes": self.episodes.rows()}
-        return found | {f"env/{name}": array for name, array in native.snapshot().items()}
+        state = {"facts": np.array(json.dumps(facts)), "theta": self.theta, "moments": self.moments}
+        state |= {"target": self.target, "observed": self.observed, "episodes": self.episodes.rows()}
+        return state | {f"env/{name}": array for name, array in native.snapshot().items()}
 
     def restore(self, state: dict[str, NDArray]) -> None:
-        """Go on from a state; environments begin anew if they are more or fewer.
+        """Continue from a state; environments are reset if their number differs.
 
         Raises:
-            ValueError: If it is of another network.
+            ValueError: If the state has another network.
         """
         facts = json.loads(str(state["facts"]))
         native: Any = self.envs.unwrapped

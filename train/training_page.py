@@ -1,6 +1,6 @@
-"""The page of a training run, `--page`: another process serves it, and reads what training writes into its folder.
+"""Show a training run in a browser, for `--page`: another process reads the files of the run and serves the page.
 
-So training is not slowed but by the processor time that the page takes, and lives on if the page does not.
+The page uses processor time but does not block training, and training continues if the page fails.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from run_folder import going_on
+from run_folder import continue_if_full
 
 PERIOD = 5.0
-"""Between two policies that are written for the page [s]."""
+"""Time between two policies for the page [s]."""
 
 PRESENT = "present"
-"""Folder of these policies; it is removed at the end."""
+"""Subfolder of a run with these policies; it is removed at the end."""
 
 PATIENCE = 20.0
-"""How long a page may take to end before it is killed [s]."""
+"""Longest time in which the page may end before it is killed [s]."""
 
 
 class TrainingPage:
-    """Serves the page of runs, from a process of its own, for as long as the context lasts.
+    """Context in which another process serves the page of training runs.
 
-    The process ends as soon as its standard input does: also if training is killed.
+    The process ends when its standard input is closed, so it also ends if training is killed.
 
     Args:
-        folders: Of the runs, which need not have begun.
+        folders: Folders of the runs; the runs need not have started.
         env_id: Registered environment id.
     """
 
@@ -42,19 +42,19 @@ class TrainingPage:
     def __enter__(self) -> TrainingPage:
         """Start the process."""
         command = [sys.executable, "-m", "ce_gym", "watch", *map(str, self._folders), "--env", self._env_id]
-        paths = [str(Path.cwd()), *sys.path]  # the module that registers a robot is found there as it is here
-        alone: dict[str, Any] = {"start_new_session": True}  # a Ctrl-C is meant for training
+        paths = [str(Path.cwd()), *sys.path]  # so that the page finds modules that register robots
+        detached: dict[str, Any] = {"start_new_session": True}  # so that Ctrl-C reaches training only
         if sys.platform == "win32":
-            alone = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+            detached = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(dict.fromkeys(path for path in paths if path))}
-        self._process = subprocess.Popen([*command, "--until-eof"], stdin=subprocess.PIPE, env=environment, **alone)
+        self._process = subprocess.Popen([*command, "--until-eof"], stdin=subprocess.PIPE, env=environment, **detached)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End it, and remove the policies written for it."""
+        """End the process, and remove the policies of the page."""
         with self._process:
             try:
-                self._process.communicate(timeout=PATIENCE)  # closes its input
+                self._process.communicate(timeout=PATIENCE)  # closes the standard input
             except subprocess.TimeoutExpired:
                 self._process.kill()
         for folder in self._folders:
@@ -62,22 +62,22 @@ class TrainingPage:
 
 
 class Present:
-    """Writes the present policy of a run now and then.
+    """Writes the current policy of a run periodically.
 
     Args:
-        save: Writes it as a path says, without ending.
+        save: Function that writes the policy to a path without suffix.
         out: Folder of the run.
-        wanted: Whether anybody asked for it.
+        enabled: Whether there is a page; otherwise nothing is written.
     """
 
-    def __init__(self, save: Callable[[Path], Any], out: Path, wanted: bool) -> None:
+    def __init__(self, save: Callable[[Path], Any], out: Path, enabled: bool) -> None:
         self._save, self._path = save, out / PRESENT / "policy"
-        self._due = 0.0 if wanted else float("inf")
+        self._due = 0.0 if enabled else float("inf")
 
     def keep(self) -> None:
-        """Write the policy if the last one is old."""
+        """Write the policy if the last one is older than `PERIOD`."""
         if time.monotonic() < self._due:
             return
-        with going_on():
+        with continue_if_full():
             self._save(self._path)
         self._due = time.monotonic() + PERIOD

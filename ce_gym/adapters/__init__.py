@@ -1,4 +1,4 @@
-"""Thin shells that show a batched environment to a learning library in that library's own terms.
+"""Wrappers that give batched environments the interfaces of learning libraries.
 
-Each module imports the library it serves, so none is imported here: `import ce_gym` stays free of torch.
+Each module imports its library. This file imports none of the modules, so that `import ce_gym` does not import torch.
 """

@@ -3,8 +3,8 @@
     step = make_steps(sim, n_substeps=4)
     gradient = jax.grad(lambda target: loss(step(state, target)))(target)
 
-They are made on the CPU by callbacks, also in compiled functions. The way back makes the steps once more, since a
-function of JAX has no memory.
+The steps run on the CPU, by callbacks, also inside compiled functions. The backward pass repeats the steps, because a
+JAX function cannot keep intermediate results.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import numpy as np
 from ce_gym import Simulator
 from ce_gym.adapters.pure_steps import PureSteps
 
-jax: Any = import_module("jax")  # no extra of ours: it may be absent, and so may its types
+jax: Any = import_module("jax")  # ce_gym has no extra for JAX; its types may be missing
 
 State = Mapping[str, Any]
-"""Parts of the state of all robots by name, shape (num_envs, size) each; "q" are coordinates, quaternions included."""
+"""State of all robots by name, shape (num_envs, size) each; "q" are coordinates with quaternions."""
 
 
 def make_steps(
     simulator: Simulator, n_substeps: int = 1, keep_every: int = 1
 ) -> tuple[Callable[[State, Any], State], State]:
-    """Return a function (state, target) -> state after the steps, and the state that the simulator is in.
+    """Return a function (state, target) -> state after the steps, and the current state of the simulator.
 
     Args:
-        simulator: What makes the steps, of the same precision as the arrays; its state is overwritten.
-        n_substeps: How many sub-steps are made at a time, with the same target.
-        keep_every: Every how many sub-steps the state is kept, see `ce_gym.StepDerivatives`.
+        simulator: Simulator with the same precision as the arrays; its state is overwritten.
+        n_substeps: Number of sub-steps per call, with the same target.
+        keep_every: Number of sub-steps between two stored states, see `ce_gym.StepDerivatives`.
 
     Raises:
         ValueError: If the simulator's steps cannot be differentiated.
@@ -40,23 +40,24 @@ def make_steps(
     pure = PureSteps(simulator, n_substeps, keep_every)
     start = pure.state()
     shapes = {name: jax.ShapeDtypeStruct(rows.shape, rows.dtype) for name, rows in start.items()}
-    of_target = jax.ShapeDtypeStruct((simulator.num_envs, len(simulator.target_names)), simulator.dtype)
+    target_shape = jax.ShapeDtypeStruct((simulator.num_envs, len(simulator.target_names)), simulator.dtype)
 
-    def stepped(state: State, target: Any) -> State:
+    def step(state: State, target: Any) -> State:
         return pure.forward(_rows(state), np.asarray(target), record=False)[0]
 
-    def pulled_back(state: State, target: Any, weights: State) -> tuple[State, Any]:
+    def pull_back(state: State, target: Any, weights: State) -> tuple[State, Any]:
         _, recorded = pure.forward(_rows(state), np.asarray(target))
-        found, by_target = pure.backward(recorded, _rows(weights))
-        return {name: rows.astype(simulator.dtype) for name, rows in found.items()}, by_target.astype(simulator.dtype)
+        by_state, by_target = pure.backward(recorded, _rows(weights))
+        dtype = simulator.dtype
+        return {name: rows.astype(dtype) for name, rows in by_state.items()}, by_target.astype(dtype)
 
     @jax.custom_vjp
     def steps(state: State, target: Any) -> State:
-        return jax.pure_callback(stepped, shapes, state, target)
+        return jax.pure_callback(step, shapes, state, target)
 
     steps.defvjp(
         lambda state, target: (steps(state, target), (state, target)),
-        lambda given, weights: jax.pure_callback(pulled_back, (shapes, of_target), *given, weights),
+        lambda inputs, weights: jax.pure_callback(pull_back, (shapes, target_shape), *inputs, weights),
     )
     return steps, start
 

@@ -1,7 +1,7 @@
-"""rsl_rl's `VecEnv` over a native Gymnasium `VectorEnv`: arrays shown as tensors, without copies; a GPU's stay there.
+"""rsl_rl's `VecEnv` for a native Gymnasium `VectorEnv`: arrays become tensors without copies; GPU data stays there.
 
-rsl_rl (5.x, https://github.com/leggedrobotics/rsl_rl) never resets environments; it wants observations as groups in a
-`TensorDict`, time-outs apart from failures, and the end of an episode to be followed at once by the next.
+rsl_rl (5.x, https://github.com/leggedrobotics/rsl_rl) never resets environments. It expects groups of observations in a
+`TensorDict`, time-outs separate from failures, and the first observation of the next episode when one ends.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 POLICY = "policy"
-"""Group of observations that come as one vector."""
+"""Name of the group if observations are one vector."""
 
 
 class RslRlVecEnv(VecEnv):
-    """A batch of environments as rsl_rl expects it.
+    """A batch of environments with the interface of rsl_rl.
 
-    Observations that come as a dictionary are groups by their keys, others the one group "policy"; so `obs_groups` of a
+    Each key of a dictionary observation is a group; a vector observation is the group "policy". So `obs_groups` of a
     runner is `{"actor": ["policy"], "critic": ["critic"]}` or `{"actor": ["policy"], "critic": ["policy"]}`.
 
     Args:
-        envs: A vector environment in SAME_STEP autoreset mode that returns fresh arrays from every call.
-        seed: Of the first reset, see `gymnasium.vector.VectorEnv.reset`.
-        device: Where tensors go; physics is where `envs` has it.
+        envs: A vector environment in SAME_STEP autoreset mode that returns new arrays from every call.
+        seed: Seed of the first reset, see `gymnasium.vector.VectorEnv.reset`.
+        device: Device of the tensors; the device of the physics is chosen in `envs`.
 
     Attributes:
         envs: The wrapped environment.
         num_envs: Number of environments.
         num_actions: Length of an action.
-        max_episode_length: Control steps until time is up.
-        device: Where tensors go.
-        cfg: What the logger records of the environment.
+        max_episode_length: Time limit of an episode [control steps].
+        device: Device of the tensors.
+        cfg: Data about the environment for the logger.
 
     Raises:
-        ValueError: If `envs` resets in another mode.
+        ValueError: If `envs` has another autoreset mode.
     """
 
     def __init__(self, envs: VectorEnv, seed: int | None = 0, device: str | torch.device = "cpu") -> None:
@@ -59,7 +59,7 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Control steps since each episode began, shape (num_envs,); set to spread the first ends of episodes."""
+        """Control steps since each episode began, shape (num_envs,); rsl_rl sets them to spread ends of episodes."""
         return self._tensor(self._native.elapsed_steps)
 
     @episode_length_buf.setter
@@ -71,17 +71,17 @@ class RslRlVecEnv(VecEnv):
         return self._observations
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Step all environments; those that are done show the first observation of their next episode.
+        """Step all environments; one that is done returns the first observation of its next episode.
 
         Args:
             actions: Shape (num_envs, num_actions).
 
         Returns:
-            Observations, rewards (num_envs,), dones (num_envs,), and extras: `time_outs` (num_envs,), episodes that
-            ended without a failure; `log`, means over the episodes that have just ended.
+            Observations, rewards (num_envs,), dones (num_envs,), and extras: `time_outs` (num_envs,), whether the
+            episode ended without a failure; `log`, means over the episodes that ended in this step.
         """
-        given: Any = actions.detach() if self._on_gpu else actions.detach().cpu().numpy()
-        obs, rewards, terminated, truncated, infos = self.envs.step(given)
+        on_device: Any = actions.detach() if self._on_gpu else actions.detach().cpu().numpy()
+        obs, rewards, terminated, truncated, infos = self.envs.step(on_device)
         self._observations = self._groups(obs)
         dones = terminated | truncated
         extras: dict[str, Any] = {"time_outs": self._tensor(truncated & ~terminated), "log": {}}
@@ -106,14 +106,14 @@ class RslRlVecEnv(VecEnv):
 def make_rsl_rl_vec_env(
     env_id: str, num_envs: int = 1, seed: int | None = 0, device: str | torch.device = "cpu", **kwargs: Any
 ) -> RslRlVecEnv:
-    """Make `num_envs` environments of a registered id, ready for rsl_rl.
+    """Return a batch of environments with the interface of rsl_rl.
 
     Args:
-        env_id: Such as `"ce_gym/MiniCheetahVelocity-v0"`.
-        num_envs: Size of the batch.
+        env_id: Registered id, such as `"ce_gym/MiniCheetahVelocity-v0"`.
+        num_envs: Number of environments.
         seed: Environment i gets `seed + i`. None seeds from the operating system.
-        device: Where tensors go; with "cuda" or "cuda:N", physics is there too.
-        **kwargs: Given to the environment, such as `transmission="armature"` or `obs_mode="dict"`.
+        device: Device of the tensors; with "cuda" or "cuda:N" also of the physics.
+        **kwargs: Arguments of the environment, such as `transmission="armature"` or `obs_mode="dict"`.
 
     Raises:
         gymnasium.error.Error: If the id is unknown or has no native vector environment.

@@ -1,8 +1,8 @@
-"""Stable-Baselines3's `VecEnv` over a native Gymnasium `VectorEnv`, without processes and without copies.
+"""Stable-Baselines3's `VecEnv` for a native Gymnasium `VectorEnv`, without processes and without copies.
 
-Stable-Baselines3 expects one information dictionary per environment and step. Building thousands of them costs more
-than the physics, so every running environment shares one empty dictionary, and only those whose episode has just ended
-get one of their own.
+Stable-Baselines3 expects one information dictionary per environment and step. Building thousands of dictionaries takes
+longer than the physics. So all running environments share one empty dictionary, and only environments whose episode
+has just ended get a new one.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 _RUNNING: dict[str, Any] = {}
-"""What every environment reports in the middle of an episode. Shared: it must not be written to."""
+"""Information dictionary of every environment whose episode continues; shared, so it must not be changed."""
 
 
 class SB3VecEnv(VecEnv):
-    """A batch of environments as Stable-Baselines3 expects it.
+    """A batch of environments with the interface of Stable-Baselines3.
 
-    Arrays are handed on as they come; tensors of environments on a GPU are copied to the host, for Stable-Baselines3
-    knows nothing else. Stable-Baselines3 keeps observations past the next step and adds to rewards in
-    place, so the wrapped environment must return fresh arrays from every call, as ce_gym's do.
+    Arrays are passed on without copies; tensors on a GPU are copied to the host, because Stable-Baselines3 needs numpy
+    arrays. Stable-Baselines3 keeps observations for later and changes rewards in place, so the wrapped environment must
+    return new arrays from every call, as environments of ce_gym do.
 
     Args:
         envs: A vector environment in SAME_STEP autoreset mode.
@@ -37,7 +37,7 @@ class SB3VecEnv(VecEnv):
         step_seconds: Wall time spent inside `envs.step` so far [s].
 
     Raises:
-        ValueError: If `envs` resets in another mode.
+        ValueError: If `envs` has another autoreset mode.
     """
 
     def __init__(self, envs: VectorEnv) -> None:
@@ -51,7 +51,7 @@ class SB3VecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
-        """Reset all environments with the seed and options given since the last reset.
+        """Reset all environments with the seed and options that were set since the last reset.
 
         Returns:
             Observations, shape (num_envs, n_obs), or a dictionary of such arrays.
@@ -69,9 +69,9 @@ class SB3VecEnv(VecEnv):
         """Step all environments.
 
         Returns:
-            Observations as of `reset`, rewards (num_envs,), dones (num_envs,) and one dictionary per environment.
-            An environment that is done already shows the first observation of its next episode; its dictionary holds
-            the last one of the old episode as `terminal_observation`, `TimeLimit.truncated`, and `episode`.
+            Observations as in `reset`, rewards (num_envs,), dones (num_envs,) and one dictionary per environment.
+            An environment that is done returns the first observation of its next episode. Its dictionary has the last
+            observation of the old episode as `terminal_observation`, `TimeLimit.truncated`, and `episode`.
         """
         start = time.perf_counter()
         obs, rewards, terminated, truncated, infos = map(_on_host, self.envs.step(self._actions))
@@ -80,7 +80,7 @@ class SB3VecEnv(VecEnv):
         return obs, rewards.astype(np.float32, copy=False), dones, self._dicts(dones, truncated & ~terminated, infos)
 
     def _dicts(self, dones: np.ndarray, timed_out: np.ndarray, infos: dict[str, Any]) -> list[dict[str, Any]]:
-        """One dictionary per environment, the shared empty one for those that run on."""
+        """Return one dictionary per environment; the shared empty one where the episode continues."""
         dicts = [_RUNNING] * self.num_envs
         ended = np.flatnonzero(dones)
         if not len(ended):
@@ -97,7 +97,7 @@ class SB3VecEnv(VecEnv):
         return dicts
 
     def _episodes(self, ended: np.ndarray, infos: dict[str, Any]) -> list[dict[str, float]]:
-        """Return `r`, length `l`, clock `t` and every reward term and metric of the episodes that have just ended."""
+        """Return return `r`, length `l`, time `t`, reward terms and metrics of each episode that has just ended."""
         columns = {key: np.asarray(values)[ended] for key, values in _episode_entries(infos).items()}
         columns["t"] = np.full(len(ended), time.monotonic() - self._start)
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
@@ -108,7 +108,7 @@ class SB3VecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the batch, once for each environment asked for.
+        """Return an attribute of the batch, once for each environment in `indices`.
 
         Raises:
             AttributeError: If the wrapped environment has no such attribute.
@@ -138,7 +138,7 @@ class SB3VecEnv(VecEnv):
         return [getattr(owner, method_name)(*method_args, **method_kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        """Say yes to `Monitor` only: its `episode` entry is supplied here, and evaluation relies on it."""
+        """Return True for `Monitor` only, whose `episode` entry this class supplies and SB3's evaluation needs."""
         return [issubclass(wrapper_class, Monitor)] * self._count(indices)
 
     def get_images(self) -> Sequence[np.ndarray | None]:
@@ -147,34 +147,38 @@ class SB3VecEnv(VecEnv):
         return list(frames or ())
 
     def _count(self, indices: VecEnvIndices) -> int:
-        """How many environments `indices` names."""
+        """Return the number of environments in `indices`."""
         return len(list(self._get_indices(indices)))
 
     def _require_all(self, name: str, indices: VecEnvIndices) -> None:
-        """The batch is one object; a change to a part of it is refused rather than applied to all."""
+        """Refuse to change only some of the environments: the batch is one object.
+
+        Raises:
+            ValueError: If `indices` does not contain all environments.
+        """
         named: Iterable[int] = self._get_indices(indices)
         if set(named) != set(range(self.num_envs)):
             raise ValueError(f"{name}: indices is {indices}, expected None: the batch is one environment object")
 
 
 def _on_host(value: Any) -> Any:
-    """Return arrays as they are, tensors as copies on the host, and dictionaries of either likewise."""
+    """Return arrays unchanged and tensors as copies on the host; also inside dictionaries."""
     if isinstance(value, Mapping):
         return {key: _on_host(part) for key, part in value.items()}
     return value.cpu().numpy() if hasattr(value, "cpu") else value
 
 
 def _row(observations: Any, i: int) -> Any:
-    """Observation of environment `i` from an array or a dictionary of arrays with one row per environment."""
+    """Return the observation of environment `i` from an array, or a dictionary of arrays, with one row for each."""
     if isinstance(observations, Mapping):
         return {key: rows[i] for key, rows in observations.items()}
     return observations[i]
 
 
 def _episode_entries(infos: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Entries of ended episodes, each shape (num_envs,), under the names that Stable-Baselines3 uses.
+    """Return statistics of ended episodes, shape (num_envs,) each, with the names of Stable-Baselines3.
 
-    ce_gym's environments report `episode_terms`; others report `episode` through Gymnasium's `RecordEpisodeStatistics`.
+    Environments of ce_gym report `episode_terms`; others report `episode`, by Gymnasium's `RecordEpisodeStatistics`.
     """
     if "episode_terms" not in infos:
         return infos["episode"]
@@ -183,14 +187,14 @@ def _episode_entries(infos: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwargs: Any) -> SB3VecEnv:
-    """Make `num_envs` environments of a registered id, ready for Stable-Baselines3.
+    """Return a batch of environments with the interface of Stable-Baselines3.
 
     Args:
-        env_id: Such as `"ce_gym/MiniCheetahVelocity-v0"`.
-        num_envs: Size of the batch.
-        seed: Used by the first reset; environment i gets `seed + i`. None seeds from the operating system.
-        **kwargs: Given to the environment, such as `transmission="armature"`, `num_threads=2` or `obs_mode="dict"`
-            for the learner's "MultiInputPolicy" and our `AsymmetricPolicy`.
+        env_id: Registered id, such as `"ce_gym/MiniCheetahVelocity-v0"`.
+        num_envs: Number of environments.
+        seed: Seed of the first reset; environment i gets `seed + i`. None seeds from the operating system.
+        **kwargs: Arguments of the environment, such as `transmission="armature"`, `num_threads=2` or `obs_mode="dict"`
+            for "MultiInputPolicy" and `AsymmetricPolicy`.
 
     Returns:
         The batch, not yet reset.
@@ -211,7 +215,7 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwa
     options = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
     try:
         envs = SB3VecEnv(gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode=mode, **options))
-    except (TypeError, ImportError) as error:  # an argument or a module that is not there
+    except (TypeError, ImportError) as error:  # an unknown argument or module
         raise ValueError(f"environment {env_id!r}: {error}") from error
     if seed is not None:
         envs.seed(seed)

@@ -3,8 +3,8 @@
     envs = make_sb3_vec_env(env_id, 512, obs_mode="dict", critic=("contact_forces", "parameters"))
     model = PPO(AsymmetricPolicy, envs)
 
-A critic is needed in simulation only, so it may be shown what no sensor of the robot measures (Pinto et al. 2017,
-arXiv:1710.06542).
+The critic is needed during training only, so it may use quantities that no sensor of the robot measures (Pinto et al.
+2017, arXiv:1710.06542).
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtr
 from stable_baselines3.common.type_aliases import Schedule
 
 ACTOR, CRITIC = "policy", "critic"
-"""Keys of what the actor and the critic see."""
+"""Keys of the observations of actor and critic."""
 
 
 class ObservationPart(BaseFeaturesExtractor):
-    """Takes one vector out of a dictionary of observations.
+    """Selects one vector from a dictionary of observations.
 
     Args:
-        observation_space: The dictionary.
-        key: Of the vector.
+        observation_space: Space of the dictionary.
+        key: Key of the vector.
     """
 
     def __init__(self, observation_space: Dict, key: str = ACTOR) -> None:
@@ -32,23 +32,23 @@ class ObservationPart(BaseFeaturesExtractor):
         self.key = key
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Return the vectors, shape (n, n_features)."""
+        """Return the selected vectors, shape (n, n_features)."""
         return observations[self.key]
 
 
 class AsymmetricPolicy(ActorCriticPolicy):
-    """Actor and critic without shared layers, on `observations["policy"]` and `observations["critic"]`.
+    """Actor and critic without shared layers; their inputs are `observations["policy"]` and `observations["critic"]`.
 
-    Parameters have the names that they have in Stable-Baselines3's own policies.
+    Parameters have the same names as in the policies of Stable-Baselines3.
 
     Args:
         observation_space: A dictionary with vectors "policy" and "critic".
-        action_space: As for `ActorCriticPolicy`.
-        lr_schedule: As for `ActorCriticPolicy`.
-        **kwargs: As for `ActorCriticPolicy`, but for those about feature extractors.
+        action_space: Same as for `ActorCriticPolicy`.
+        lr_schedule: Same as for `ActorCriticPolicy`.
+        **kwargs: Other arguments of `ActorCriticPolicy`, except arguments of feature extractors.
 
     Raises:
-        ValueError: If the observations are no such dictionary.
+        ValueError: If the observation space is not such a dictionary.
     """
 
     def __init__(self, observation_space: Space, action_space: Space, lr_schedule: Schedule, **kwargs) -> None:
@@ -61,7 +61,7 @@ class AsymmetricPolicy(ActorCriticPolicy):
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
-        """Stable-Baselines3 gives actor and critic features of one size; the critic's layers are made anew here."""
+        """Build layers of both; Stable-Baselines3 itself would give the critic the input size of the actor."""
         self.vf_features_extractor = ObservationPart(self.observation_space, CRITIC)  # type: ignore[arg-type]
         actor, critic = (
             MlpExtractor(part.features_dim, self.net_arch, self.activation_fn, self.device)

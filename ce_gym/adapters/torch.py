@@ -17,16 +17,16 @@ from ce_gym import Simulator
 from ce_gym.adapters.pure_steps import PureSteps
 
 State = Mapping[str, torch.Tensor]
-"""Parts of the state of all robots by name, shape (num_envs, size) each; "q" are coordinates, quaternions included."""
+"""State of all robots by name, shape (num_envs, size) each; "q" are coordinates with quaternions."""
 
 
 class Steps:
-    """Steps of a simulator on the CPU that autograd goes through; tensors share the memory of its arrays.
+    """Steps of a simulator on the CPU that torch's autograd differentiates; tensors share memory with numpy arrays.
 
     Args:
-        simulator: What makes the steps; its state is overwritten.
-        n_substeps: How many sub-steps are made at a time, with the same target.
-        keep_every: Every how many sub-steps the state is kept, see `ce_gym.StepDerivatives`.
+        simulator: Simulator; its state is overwritten.
+        n_substeps: Number of sub-steps per call, with the same target.
+        keep_every: Number of sub-steps between two stored states, see `ce_gym.StepDerivatives`.
 
     Raises:
         ValueError: If the simulator's steps cannot be differentiated.
@@ -36,14 +36,14 @@ class Steps:
         self._pure = PureSteps(simulator, n_substeps, keep_every)
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Return the state that the simulator is in."""
+        """Return the current state of the simulator."""
         return {name: torch.from_numpy(rows) for name, rows in self._pure.state().items()}
 
     def __call__(self, state: State, target: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the state after the steps.
 
         Args:
-            state: Before them, all parts that `state` returns.
+            state: State before the steps, with all entries that the method `state` returns.
             target: As for `Simulator.step`, shape (num_envs, n_targets).
         """
         parts = self._pure.parts
@@ -52,7 +52,7 @@ class Steps:
 
 
 class _Steps(torch.autograd.Function):
-    """One call; differentiable once."""
+    """One call of `Steps`; it can be differentiated once."""
 
     @staticmethod
     def forward(ctx: Any, pure: PureSteps, target: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -66,5 +66,5 @@ class _Steps(torch.autograd.Function):
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         pure, dtype = ctx.pure, gradients[0].dtype
         weights = {name: gradient.numpy() for name, gradient in zip(pure.parts, gradients, strict=True)}
-        found, target = pure.backward(ctx.recorded, weights)
-        return None, *(torch.from_numpy(rows).to(dtype) for rows in (target, *(found[name] for name in pure.parts)))
+        state, target = pure.backward(ctx.recorded, weights)
+        return None, *(torch.from_numpy(rows).to(dtype) for rows in (target, *(state[name] for name in pure.parts)))

@@ -1,1 +1,1 @@
-"""Benchmarks: every figure the project states can be measured again with `python -m ce_gym.bench <name>`."""
+"""Benchmarks; `python -m ce_gym.bench <name>` measures the numbers in the documentation."""

@@ -1,8 +1,8 @@
 """The command `python -m ce_gym.bench`: lists the benchmarks, or runs one and prints its report.
 
-A benchmark is a module of this package or of a package in it, or the module `benchmark` of such a package, with
-`add_arguments(parser)` and `run(arguments) -> Report`; the first line of its docstring is its entry in the list. Only
-the one that runs is imported.
+A benchmark is a module of this package or of a subpackage, or the module `benchmark` of a subpackage. It has the
+functions `add_arguments(parser)` and `run(arguments) -> Report`, and the first line of its docstring is its entry in
+the list. Only the selected benchmark is imported.
 """
 
 from __future__ import annotations
@@ -56,7 +56,11 @@ def listing() -> str:
 
 
 def _check_robots(arguments: argparse.Namespace) -> None:
-    """Check the names of robots before anything is measured."""
+    """Check the names of robots before the measurement.
+
+    Raises:
+        RobotError: If there is no such robot.
+    """
     for option in ("robot", "robots"):
         names = getattr(arguments, option, None) or ()
         for name in [names] if isinstance(names, str) else names:
@@ -65,7 +69,7 @@ def _check_robots(arguments: argparse.Namespace) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     print_anything()
     argv = sys.argv[1:] if argv is None else list(argv)
     if not argv or argv[0] in ("-h", "--help"):
@@ -75,8 +79,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in BENCHMARKS:
         print(f"ce_gym.bench: no benchmark {name!r}; expected one of {listed_names(name, BENCHMARKS)}", file=sys.stderr)
         return 2
-    parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name))
-    parser.add_argument("--json", metavar="FILE", help="also write the report to a JSON file")
+    json_option = Parser(add_help=False)
+    json_option.add_argument("--json", metavar="FILE", help="also write the report to a JSON file")
+    parser = Parser(prog=f"python -m ce_gym.bench {name}", description=summary(name), parents=[json_option])
     try:
         benchmark = load(name)
         benchmark.add_arguments(parser)
@@ -92,8 +97,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         missing = f"{name} needs {error.name}, which is not installed"
         print(f'ce_gym.bench: {missing}: pip install "ce_gym[bench]"', file=sys.stderr)
         return 2
-    words = [word for word in argv if word not in ("--json", arguments.json)]
-    report.command = f"python -m ce_gym.bench {shlex.join(words)}"
+    words = json_option.parse_known_args(rest)[1]
+    report.command = shlex.join(["python", "-m", "ce_gym.bench", name, *words])
     print(report.as_text())
     if arguments.json:
         Path(arguments.json).write_text(report.as_json(), encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Run the benchmarks one after the other and write the report of each as `<name>.json` into a folder.
+"""Run the benchmarks one after the other and write the report of each as `<name>.json` to a folder.
 
-Each runs in a process of its own. A benchmark for which something is missing on this machine (a package, a GPU) is
-skipped with its reason, and its old file stays. The documentation takes its figures from `docs/results`.
+Each benchmark runs in its own process. A benchmark whose package or GPU is missing is skipped with the reason, and its
+old file stays. The documentation takes its numbers from `docs/results`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Report:
-    """Run the benchmarks and return a table of what came of each."""
+    """Run the benchmarks and return a table of their outcomes."""
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name in progress(arguments.only, "benchmarks"):
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def run_one(command: list[str], file: Path) -> str:
-    """Run one benchmark in a process of its own, and return how many of its requirements were met, or what failed."""
+    """Run one benchmark in a new process; return the number of met requirements, or the reason of a failure."""
     line = [sys.executable, "-m", "ce_gym.bench", *command, "--json", str(file)]
     finished = subprocess.run(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
     if finished.returncode > 1 or not file.exists():

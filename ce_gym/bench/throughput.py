@@ -1,4 +1,4 @@
-"""Environment steps per second with random actions, all included; overhead of a call; compile time."""
+"""Environment steps per second with random actions; overhead of a call; compile time."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ MEASURED = ("exact", "armature")
 DTYPES = ("float64", "float32")
 CALLS = 20
 REQUIRED = 400_000.0
-"""Environment steps per second of the exact level on two or more cores."""
+"""Required environment steps per second at the level `exact` on all cores."""
 
 LONGEST_COMPILE = 10.0
-"""Longest first `gymnasium.make`, nothing cached [s]."""
+"""Longest first `gymnasium.make`, without a kernel cache [s]."""
 
 LONGEST_MAKE = 1.0
 """Longest `gymnasium.make` in a later process [s]."""
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def steps_per_second(arguments: argparse.Namespace, report: Report) -> None:
-    """Measure levels, types and thread counts in one run."""
+    """Measure steps per second by level, precision and number of threads."""
     cores = usable_cores()
     settings = [(level, d, n) for level in MEASURED for d in DTYPES for n in sorted({1, cores}, reverse=True)]
     competitors = {
@@ -94,7 +94,7 @@ def stepping(env_id: str, num_envs: int, **options: Any) -> Competitor:
 
 
 def overhead(arguments: argparse.Namespace, report: Report) -> None:
-    """Measure calls whose physics is negligible: one tile, and the single environment."""
+    """Measure the time of a call for one environment and for a batch of 8, where physics takes little time."""
     import gymnasium
 
     env = gymnasium.make(arguments.env)
@@ -119,7 +119,7 @@ def overhead(arguments: argparse.Namespace, report: Report) -> None:
 
 
 def first_step(arguments: argparse.Namespace, report: Report) -> None:
-    """Measure a process that finds nothing cached, and the next one."""
+    """Measure the first steps of a process without a kernel cache, and of the next process."""
     with tempfile.TemporaryDirectory() as folder:
         cold, warm = (fresh_process(arguments.env, folder) for _ in range(2))
     rows = (("first process, nothing cached", *cold), ("next process", *warm))
@@ -133,7 +133,7 @@ def first_step(arguments: argparse.Namespace, report: Report) -> None:
 
 
 def fresh_process(env_id: str, cache_folder: str) -> tuple[float, float, float]:
-    """Return seconds of import, make, and reset with one step, in a new process with its own kernel cache."""
+    """Return times of import, make, and reset with one step [s], in a new process with a given kernel cache."""
     environment = os.environ | {"CE_GYM_CACHE_DIR": cache_folder}
     command = [sys.executable, "-c", FIRST_STEP, env_id]
     finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

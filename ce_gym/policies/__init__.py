@@ -1,4 +1,4 @@
-"""Trained policies: found by name, read without running code that they may carry, run by numpy."""
+"""Trained policies: find them by name, read them without running code from files, run them with numpy."""
 
 from ce_gym.model.errors import listed_names
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy

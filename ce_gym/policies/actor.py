@@ -1,4 +1,4 @@
-"""The network that acts: linear layers with an activation in between, run by numpy."""
+"""The policy network: linear layers with an activation in between, run by numpy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {
     "Sigmoid": lambda x: 0.5 * (1 + np.tanh(0.5 * x)),
     "Softplus": lambda x: np.logaddexp(x, np.float32(0)),
 }  # fmt: skip
-"""By their names in torch.nn, with the defaults that they have there."""
+"""Activation functions by their names in `torch.nn`, with the default parameters of `torch.nn`."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Actor:
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy that can act, in the shape in which Stable-Baselines3 and its tools expect one.
+    """A policy with the method `predict` of Stable-Baselines3.
 
     Attributes:
-        act: Actions (n, n_actions) for observations (n, n_obs), float32; `n` may be missing.
-        record: What training wrote: `env`, `env_kwargs`, `transmission`, `policy_spec`, seed, settings and so on.
+        act: Function from observations (n, n_obs) to actions (n, n_actions), float32; `n` may be missing.
+        record: Data of the training run: `env`, `env_kwargs`, `transmission`, `policy_spec`, seed, settings and others.
     """
 
     act: Callable[[NDArray], Array]
@@ -63,13 +63,13 @@ class Policy:
         """Return the mean action, shape (n, n_actions) or (n_actions,), and no state.
 
         Args:
-            observation: An array (n, n_obs) or (n_obs,), or a dictionary that has one as "policy".
-            state: Of recurrent policies in Stable-Baselines3; not used.
-            episode_start: Likewise.
+            observation: An array (n, n_obs) or (n_obs,), or a dictionary with this array under "policy".
+            state: Not used; recurrent policies of Stable-Baselines3 have one.
+            episode_start: Not used.
             deterministic: Must be True: a policy file has mean actions only.
 
         Raises:
-            PolicyError: If the observation has another size than the policy, or actions are to be drawn at random.
+            PolicyError: If the observation has another size than in training, or `deterministic` is False.
         """
         if not deterministic:
             raise PolicyError("deterministic=False; expected True: a policy file has mean actions only")

@@ -1,7 +1,7 @@
-"""Untrusted zip files, read within a limit on memory and without unpickling.
+"""Read untrusted zip files with limited memory and without unpickling.
 
-Sizes in headers are not trusted: a member is never unpacked beyond its stated size, that size is checked
-before anything is allocated, and an array must fill its member exactly.
+Sizes in headers are not trusted: the stated size is checked before memory is allocated, a member is never unpacked
+beyond it, and an array must fill its member exactly.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 MOST_BYTES = 2**28
-"""Most bytes that a file may unpack to, unless said otherwise: 256 MiB."""
+"""Default limit on the unpacked size of a file [bytes]: 256 MiB."""
 
 
 def read_member(archive: zipfile.ZipFile, name: str, most_bytes: int = MOST_BYTES) -> bytes:
     """Return the bytes of a member of a zip file.
 
     Raises:
-        KeyError, ValueError, zipfile.BadZipFile, zlib.error, RuntimeError: If there is none, it is too large, packed in
-            an unusual way, encrypted or damaged.
+        KeyError, ValueError, zipfile.BadZipFile, zlib.error, RuntimeError: If the member is missing, too large,
+            encrypted, damaged, or compressed with another method than deflate.
     """
     member = archive.getinfo(name)
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -34,18 +34,18 @@ def read_member(archive: zipfile.ZipFile, name: str, most_bytes: int = MOST_BYTE
     if member.file_size > most_bytes:
         raise ValueError(f"{name}: {member.file_size} bytes unpacked; expected at most {most_bytes}")
     with archive.open(member) as opened:
-        return opened.read(member.file_size)  # the size bounds what is unpacked, which a bare read() does not
+        return opened.read(member.file_size)  # a bare read() would not limit the unpacked size
 
 
 def read_npz(file: Path, most_bytes: int = MOST_BYTES) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an npz by name: numbers and text, no objects.
+    """Return the arrays of an npz file by name: numbers and text, no objects.
 
     Args:
-        file: To read.
-        most_bytes: Most that all of them may take.
+        file: File to read.
+        most_bytes: Limit on the unpacked size of all arrays together [bytes].
 
     Raises:
-        OSError, ValueError, zipfile.BadZipFile, zlib.error, RuntimeError: If it cannot be read.
+        OSError, ValueError, zipfile.BadZipFile, zlib.error, RuntimeError: If the file cannot be read.
     """
     _check_regular(file)
     with zipfile.ZipFile(file) as archive:
@@ -56,7 +56,11 @@ def read_npz(file: Path, most_bytes: int = MOST_BYTES) -> dict[str, NDArray[Any]
 
 
 def _check_regular(file: Path) -> None:
-    """Refuse folders; and pipes and devices, which may never end."""
+    """Refuse folders, and pipes and devices, whose data may never end.
+
+    Raises:
+        OSError: If the path is not a regular file.
+    """
     if not file.exists():
         raise FileNotFoundError(f"{file}: no such file")
     if not file.is_file():
@@ -64,7 +68,11 @@ def _check_regular(file: Path) -> None:
 
 
 def _array(data: bytes, name: str) -> NDArray[Any]:
-    """Return the array of a npy file, if it is one of numbers or text that fills the file."""
+    """Return the array of an npy file of numbers or text.
+
+    Raises:
+        ValueError: If the array has other elements, or does not fill the file.
+    """
     stream = io.BytesIO(data)
     version = npy.read_magic(stream)
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
@@ -73,19 +81,20 @@ def _array(data: bytes, name: str) -> NDArray[Any]:
     shape, fortran, dtype = read(stream)
     if dtype.kind not in "biufU":
         raise ValueError(f"{name}: elements of type {dtype}; expected numbers or text")
-    needed, found = math.prod(shape) * dtype.itemsize, len(data) - stream.tell()
-    if needed != found:
-        raise ValueError(f"{name}: shape {shape} takes {needed} bytes; found {found}")
-    if not found:
+    needed = math.prod(shape) * dtype.itemsize
+    size = len(data) - stream.tell()
+    if needed != size:
+        raise ValueError(f"{name}: shape {shape} takes {needed} bytes; found {size}")
+    if not size:
         return np.zeros(shape, dtype)
     return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
 def read_json(file: Path, most_bytes: int = 2**24) -> Any:
-    """Return what a JSON file holds.
+    """Return the content of a JSON file.
 
     Raises:
-        OSError, ValueError, RecursionError: If it is missing, larger than `most_bytes`, or no JSON.
+        OSError, ValueError, RecursionError: If the file is missing, larger than `most_bytes`, or not JSON.
     """
     _check_regular(file)
     if file.stat().st_size > most_bytes:

@@ -1,4 +1,4 @@
-"""Arguments of environments as users write them: `--env-arg KEY=VALUE`, or a mapping in a settings file."""
+"""Read arguments of environments: `--env-arg KEY=VALUE`, or a mapping in a settings file."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any
 
 from ce_gym.model.formats.reading import parse_yaml
 
-CHOSEN = {
+RESERVED = {
     "act", "autoreset_mode", "device", "env", "env_id", "episodes", "id", "label", "model", "num_envs", "policy",
     "render_mode", "robots", "script", "seconds", "seed", "vector_kwargs", "vectorization_mode", "wrappers",
 }  # fmt: skip
-"""Arguments with options of their own on the command line; records and settings must not hold them."""
+"""Arguments that have their own command-line options; records and settings must not contain them."""
 
 DEEPEST = 20
-"""Most levels of lists and mappings within a value."""
+"""Largest depth of nested lists and mappings in a value."""
 
 
 def add_env_arg(parser: Any) -> None:
-    """Add `--env-arg`, which leaves pairs in `env_args`."""
+    """Add `--env-arg`, which collects pairs of name and value in `env_args`."""
     parser.add_argument(
         "--env-arg",
         dest="env_args",
@@ -48,7 +48,7 @@ def env_argument(text: str) -> tuple[str, Any]:
     """Read `KEY=VALUE`, whose value is JSON or YAML.
 
     Raises:
-        argparse.ArgumentTypeError: If it is something else; one line that names the key.
+        argparse.ArgumentTypeError: If the text has another form; one line that names the key.
     """
     key, equals, value = text.partition("=")
     if not (equals and key.strip().isidentifier()):
@@ -62,15 +62,15 @@ def env_argument(text: str) -> tuple[str, Any]:
 
 
 def checked_arguments(given: Any) -> dict[str, Any]:
-    """Return arguments of an environment if they are plain data that a record can hold.
+    """Return a copy of an environment's arguments after checking that they are plain data.
 
     Raises:
-        ValueError: If they are not, or one is chosen in another way; one line that names the key.
+        ValueError: If a value is not plain data, or a key has its own option; one line that names the key.
     """
     if not isinstance(given, Mapping):
         raise ValueError(f"{repr(given)[:200]}; expected arguments of the environment by name")
     for key, value in given.items():
-        if not isinstance(key, str) or key in CHOSEN:
+        if not isinstance(key, str) or key in RESERVED:
             raise ValueError(f"{key}: expected an argument of the environment alone")
         if not _is_plain(value):
             raise ValueError(f"{key}: {repr(value)[:200]}; expected finite numbers, text, true, false, lists, mappings")
@@ -78,6 +78,7 @@ def checked_arguments(given: Any) -> dict[str, Any]:
 
 
 def _is_plain(value: Any, depth: int = 0) -> bool:
+    """Return whether a value consists of finite numbers, text, booleans, None, lists and mappings."""
     if depth > DEEPEST:
         return False
     if isinstance(value, list):

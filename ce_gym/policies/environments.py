@@ -1,7 +1,7 @@
 """The environment of a policy whose file is not trusted.
 
-Gymnasium imports `module` when an environment `module:id` is made. So an id with a module is taken from the user's own
-words only, never from a file, unless the module is imported already.
+Gymnasium imports `module` when an environment `module:id` is made. An id with a module is therefore accepted from the
+user's command line only. From a file it is accepted only if the module has been imported already.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ def environment_of(record: Mapping[str, Any], named: str | None = None) -> str:
     """Return the id of the environment that a policy runs in.
 
     Args:
-        record: Of the policy.
-        named: What the user named, such as `my_module:ce_gym/MyRobotVelocity-v0`; it goes before the record.
+        record: Record of the policy.
+        named: Id that the user gave, such as `my_module:ce_gym/MyRobotVelocity-v0`; it replaces that in the record.
 
     Raises:
-        PolicyError: If the record names an environment that is not registered, or one for which a module would have to
-            be imported.
+        PolicyError: If the record names an environment that is not registered, or that needs the import of a module.
     """
     if named:
         return named
@@ -44,5 +43,5 @@ def environment_of(record: Mapping[str, Any], named: str | None = None) -> str:
 
 
 def shown(text: str) -> str:
-    """Return text as a terminal may show it."""
+    """Return text with a question mark in place of each character that a terminal cannot print."""
     return "".join(c if c.isprintable() else "?" for c in text)

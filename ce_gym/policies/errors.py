@@ -4,8 +4,8 @@ from __future__ import annotations
 
 
 class PolicyError(ValueError):
-    """A policy that cannot be used; the message is one line for the user."""
+    """A policy cannot be used; the message is one line for the user."""
 
 
 class LevelWarning(UserWarning):
-    """A policy runs on another transmission level than it was trained on."""
+    """A policy runs at another transmission level than in training."""

@@ -1,12 +1,12 @@
-"""Policy files, read and written.
+"""Read and write policy files.
 
-| file          | what it is                                                                                        |
-|---------------|---------------------------------------------------------------------------------------------------|
-| `policy.zip`  | of Stable-Baselines3, as train/ppo.py writes it, its `policy.json` beside it: weights only are read |
-| `policy.npz`  | weights of the actor and the record, nothing else; a tenth of the zip: policies are shipped so     |
-| `policy.onnx` | as train/export.py writes it, the record in its metadata; needs onnxruntime                        |
+| file          | content                                                                                         |
+|---------------|-------------------------------------------------------------------------------------------------|
+| `policy.zip`  | archive of Stable-Baselines3, written by train/ppo.py with the record in `policy.json` beside it |
+| `policy.npz`  | weights of the actor and the record; a tenth of the size of the zip; format of shipped policies |
+| `policy.onnx` | network written by train/export.py, with the record in its metadata; needs onnxruntime          |
 
-All but ONNX are read within a limit on memory.
+Zip and npz files are read with limited memory, and only their weights and records.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.archive import read_json, read_npz
-from ce_gym.policies.arguments import CHOSEN
+from ce_gym.policies.arguments import RESERVED
 from ce_gym.policies.environments import shown
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.height_maps import with_map
@@ -30,30 +30,30 @@ from ce_gym.policies.places import locate_policy
 from ce_gym.policies.weights import read_weights
 
 RECORD_KEY = "ce_gym_policy"
-"""Key under which an ONNX file holds the record of its policy."""
+"""Key of the record in the metadata of an ONNX file."""
 
 REQUIRED: dict[str, type] = {
     "env": str, "env_kwargs": dict, "transmission": str, "observation_size": int, "action_size": int,
     "activation": str, "policy_spec": dict,
 }  # fmt: skip
-"""What a record must say."""
+"""Required keys of a record, with their types."""
 
 KINDS = {str: "text", dict: "a JSON object", int: "a whole number"}
 
 
 def load_policy(path: str | Path, transmission: str | None = None) -> Policy:
-    """Read a policy without running code that it may carry.
+    """Read a policy without running code from its file.
 
     Args:
-        path: A file; a folder that has one; or the name of a shipped policy such as "mini_cheetah_velocity_exact",
-            whose level may be left out if it is exact.
-        transmission: Level that it will run on; a `LevelWarning` is issued if it was trained on another.
+        path: A policy file; a folder that contains one; or the name of a shipped policy such as
+            "mini_cheetah_velocity_exact", where "_exact" may be omitted.
+        transmission: Level at which the policy will run; a `LevelWarning` is issued if its training level differs.
 
     Returns:
         The policy. `policy.predict(obs)[0]` is its mean action; `policy.record["env"]` names its environment.
 
     Raises:
-        PolicyError: If a file is missing, damaged or of another kind.
+        PolicyError: If the file is missing, damaged or not a policy.
 
     Examples:
         >>> policy = ce_gym.load_policy("mini_cheetah_velocity")
@@ -72,7 +72,7 @@ def read_actor(path: str | Path) -> tuple[Actor, dict[str, Any]]:
     """Return the layers and the record of a `policy.npz`, or of a `policy.zip` and the JSON beside it.
 
     Raises:
-        PolicyError: If a file is missing, damaged or no policy of linear layers.
+        PolicyError: If a file is missing, damaged or not a policy of linear layers.
     """
     file = locate_policy(path)
     layers, record = (_read_npz if file.suffix == ".npz" else _read_zip)(file)
@@ -82,10 +82,10 @@ def read_actor(path: str | Path) -> tuple[Actor, dict[str, Any]]:
 
 
 def write_npz(actor: Actor, record: Mapping[str, Any], out: Path | BinaryIO) -> None:
-    """Write an actor's weights, float32, and its record, as JSON, into one file that numpy reads without unpickling.
+    """Write weights (float32) and record (JSON) of an actor to one file that numpy reads without unpickling.
 
     Raises:
-        PolicyError: If that cannot be done.
+        PolicyError: If the file cannot be written.
     """
     arrays: dict[str, Any] = {}
     for i, (weight, bias) in enumerate(actor.layers):
@@ -101,7 +101,7 @@ def _read_npz(file: Path) -> tuple[Any, dict[str, Any]]:
         arrays = read_npz(file)
         record = json.loads(str(arrays.pop("record")))
         layers = tuple(_layer(arrays[f"weight_{i}"], arrays[f"bias_{i}"]) for i in range(len(arrays) // 2))
-    except Exception as error:  # damage shows in every kind of them
+    except Exception as error:  # damaged files raise errors of many classes
         raise PolicyError(f"{file}: no weights of an actor can be read from it: {_one_line(error)}") from None
     return layers, _checked(record, file)
 
@@ -111,7 +111,10 @@ def _read_zip(file: Path) -> tuple[Any, dict[str, Any]]:
     try:
         record = read_json(beside)
     except FileNotFoundError:
-        raise PolicyError(f"{beside}: no such file; expected the policy.json that training writes") from None
+        raise PolicyError(
+            f"{beside}: no such file; expected the record that train/ppo.py writes beside a policy. Train with "
+            f"train/ppo.py, or run {file.name} with PPO.load of Stable-Baselines3 and ce_gym.adapters.sb3"
+        ) from None
     except (OSError, ValueError, RecursionError) as error:
         raise PolicyError(f"{beside}: cannot be read as JSON: {_one_line(error)}") from None
     record = _checked(record, beside)
@@ -120,13 +123,17 @@ def _read_zip(file: Path) -> tuple[Any, dict[str, Any]]:
         hidden = [name.removesuffix(".weight") for name in weights if name.startswith("mlp_extractor.policy_net")]
         names = [*(name for name in hidden if f"{name}.bias" in weights), "action_net"]
         layers = tuple(_layer(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names)
-    except Exception as error:  # damage shows in every kind of them
+    except Exception as error:  # damaged files raise errors of many classes
         raise PolicyError(f"{file}: no weights of an actor can be read from it: {_one_line(error)}") from None
     return layers, record
 
 
 def _layer(weight: NDArray, bias: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the arrays of a linear layer, if they are."""
+    """Return the arrays of a linear layer after checking them.
+
+    Raises:
+        ValueError: If they are not finite floating-point arrays with 2 and 1 axes.
+    """
     for array, axes in ((weight, 2), (bias, 1)):
         if array.dtype.kind != "f" or array.ndim != axes:
             raise ValueError(f"{array.dtype} of shape {array.shape}; expected a layer's numbers along {axes} axes")
@@ -144,7 +151,7 @@ def _read_onnx(file: Path) -> Policy:
         session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
         record = json.loads(session.get_modelmeta().custom_metadata_map.get(RECORD_KEY, "null"))
         name = session.get_inputs()[0].name
-    except Exception as error:  # onnxruntime has a class of its own for each kind of damage
+    except Exception as error:  # onnxruntime raises a different class for each kind of damage
         raise PolicyError(f"{file}: not an ONNX file that can be run: {_one_line(error)}") from None
     record = _checked(record, file)
 
@@ -154,16 +161,20 @@ def _read_onnx(file: Path) -> Policy:
         return actions.reshape(*rows.shape[:-1], -1)
 
     try:
-        found = act(np.zeros((2, record["observation_size"]), np.float32))
+        actions = act(np.zeros((2, record["observation_size"]), np.float32))
     except Exception as error:
         raise PolicyError(f"{file}: not an ONNX file that can be run: {_one_line(error)}") from None
-    if found.shape != (2, record["action_size"]) or not np.isfinite(found).all():
-        raise PolicyError(f"{file}: gives {found.shape[-1]} numbers; expected {record['action_size']}, finite ones")
+    if actions.shape != (2, record["action_size"]) or not np.isfinite(actions).all():
+        raise PolicyError(f"{file}: gives {actions.shape[-1]} numbers; expected {record['action_size']}, finite ones")
     return Policy(act, record)
 
 
 def _checked(record: Any, file: Path) -> dict[str, Any]:
-    """Return a record if it has what is needed to run its policy."""
+    """Return a record after checking the keys that running its policy needs.
+
+    Raises:
+        PolicyError: If a key is missing or has a wrong value.
+    """
     if isinstance(record, dict):
         record = {str(key): value for key, value in record.items()}
     for key, kind in REQUIRED.items():
@@ -171,8 +182,8 @@ def _checked(record: Any, file: Path) -> dict[str, Any]:
             raise PolicyError(f"{file}: {key}: missing; expected a record written by this version of train/ppo.py")
         if type(record[key]) is not kind:  # a bool is an int
             raise PolicyError(f"{file}: {key}: {_shortened(record[key])}; expected {KINDS[kind]}")
-    if taken := CHOSEN & record["env_kwargs"].keys():
-        raise PolicyError(f"{file}: env_kwargs: {min(taken)}: expected arguments of the environment alone")
+    if reserved := RESERVED & record["env_kwargs"].keys():
+        raise PolicyError(f"{file}: env_kwargs: {min(reserved)}: expected arguments of the environment alone")
     if record["activation"] not in ACTIVATIONS:
         raise PolicyError(
             f"{file}: activation: {_shortened(record['activation'])}; expected one of {', '.join(ACTIVATIONS)}"
@@ -182,7 +193,11 @@ def _checked(record: Any, file: Path) -> dict[str, Any]:
 
 
 def _check_sizes(actor: Actor, record: dict[str, Any], file: Path) -> None:
-    """See that each layer takes what the one before gives, and both ends are as the record says."""
+    """Check the sizes of all layers against each other and against the record.
+
+    Raises:
+        PolicyError: If two sizes differ.
+    """
     sizes = [record["observation_size"], *(len(bias) for _, bias in actor.layers)]
     for (weight, bias), size in zip(actor.layers, sizes, strict=False):
         if weight.shape != (len(bias), size):
@@ -196,7 +211,7 @@ def _one_line(error: Exception) -> str:
 
 
 def _shortened(value: Any, text: Callable[[Any], str] = repr) -> str:
-    """Return a value as text of at most 200 characters that a terminal shows as they are."""
+    """Return a value as text of at most 200 printable characters."""
     try:
         return shown(text(value)[:200])
     except RecursionError:

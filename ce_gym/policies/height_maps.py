@@ -1,4 +1,4 @@
-"""The height map that a policy was trained on: a copy lies beside the policy, so that it plays from any folder."""
+"""Height maps of policies: a copy beside the policy lets the policy run from any working directory."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from ce_gym.policies.places import is_file
 
 
 def with_map(env_kwargs: Mapping[str, Any], policy: Path) -> dict[str, Any]:
-    """Return arguments of an environment with the path of their height map, where a copy lies near the policy.
+    """Return arguments of an environment whose height map is the copy near the policy, if there is a copy.
 
     Args:
-        env_kwargs: As a record has them.
-        policy: File of the policy; the copy is beside it, or one folder above, as for checkpoints.
+        env_kwargs: Arguments from a record.
+        policy: File of the policy; the copy is in its folder, or one folder above for a checkpoint.
     """
     name = _map_of(env_kwargs)
     folders = [policy.parent, *([policy.parent.parent] if policy.parent.name in ("checkpoints", "present") else [])]
@@ -25,10 +25,10 @@ def with_map(env_kwargs: Mapping[str, Any], policy: Path) -> dict[str, Any]:
 
 
 def keep_map(env_kwargs: Mapping[str, Any], folder: Path) -> None:
-    """Copy the height map of an environment's arguments, if they name one, into the folder of a policy.
+    """Copy the height map of an environment, if its arguments name one, into the folder of a policy.
 
     Raises:
-        OSError: If it cannot be written.
+        OSError: If the copy cannot be written.
     """
     name = _map_of(env_kwargs)
     copy = folder / Path(name).name
@@ -37,7 +37,7 @@ def keep_map(env_kwargs: Mapping[str, Any], folder: Path) -> None:
 
 
 def _map_of(env_kwargs: Mapping[str, Any]) -> str:
-    """Return the path of a height map, "" if there is none; records are not trusted to hold what they should."""
+    """Return the path of the height map in untrusted arguments, or an empty string."""
     terrain = env_kwargs.get("terrain")
     file = terrain.get("file") if isinstance(terrain, Mapping) else None
     return file if isinstance(file, str) else ""

@@ -1,4 +1,4 @@
-"""Finds policies: files, folders of training runs, and shipped ones. Opens a file only to see what kind it is."""
+"""Find policies: files, folders of training runs, and shipped policies."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from ce_gym.model import assets_folder
 from ce_gym.policies.errors import PolicyError
 
 FORMATS = (".zip", ".npz", ".onnx")
-"""Kinds of policy files, in the order in which a folder is searched: what training wrote goes before copies of it."""
+"""Suffixes of policy files, in the order in which a folder is searched: files from training before exported copies."""
 
 WHERE = "a file (policy.zip, .npz or .onnx), the folder of a training run, or the name of a shipped policy"
-"""What `locate_policy` takes, for help texts."""
+"""The argument of `locate_policy` in words, for help texts."""
 
 
 def shelf() -> Path:
-    """Return the folder of shipped policies, which has a folder for each, named `<robot>_<task>_<level>`."""
+    """Return the folder of shipped policies; each has a subfolder `<robot>_<task>_<level>`."""
     return assets_folder() / "policies"
 
 
 def shipped_policies() -> list[str]:
-    """Return the names of the policies that come with the package."""
+    """Return the names of the policies in the package."""
     return sorted(file.parent.name for file in shelf().glob("*/policy.npz"))
 
 
 def find_policy(path: str | Path) -> Path | None:
-    """Return the file of a policy, None if `path` means none; see `locate_policy`."""
+    """Return the file of a policy, or None if there is no such policy; see `locate_policy`."""
     path = Path(path)
     if path.suffix in FORMATS:
         return path if is_file(path) and not _is_other_npz(path) else None
@@ -41,11 +41,11 @@ def locate_policy(path: str | Path) -> Path:
     """Return the file of a policy.
 
     Args:
-        path: A file; a folder that has one; or the name of a shipped policy, whose level may be left out if it is
-            exact.
+        path: A policy file; a folder that contains one; or the name of a shipped policy, where "_exact" may be
+            omitted.
 
     Raises:
-        PolicyError: If there is none.
+        PolicyError: If there is no such policy.
     """
     file = find_policy(path)
     if file is None:
@@ -57,7 +57,7 @@ def locate_policy(path: str | Path) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Return whether there is a regular file; a path that no system would take means none."""
+    """Return whether a regular file exists; False also for a path that the system refuses."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -65,11 +65,11 @@ def is_file(path: Path) -> bool:
 
 
 def _is_other_npz(path: Path) -> bool:
-    """Whether a file is a readable npz that holds something else, such as a rollout."""
+    """Return whether a file is a readable npz of another kind, such as a rollout."""
     if path.suffix != ".npz" or not zipfile.is_zipfile(path):
         return False
     try:
         with zipfile.ZipFile(path) as arrays:
             return "record.npy" not in arrays.namelist()
-    except zipfile.BadZipFile:  # reading it reports that
+    except zipfile.BadZipFile:  # the reader reports the damage
         return False

@@ -1,8 +1,8 @@
-"""The weights in a `policy.zip` of Stable-Baselines3, read without torch and without running code.
+"""Read the weights in a `policy.zip` of Stable-Baselines3 without torch and without running code.
 
-The zip holds files of torch's, such as `policy.pth`: zips of their own, in which `data.pkl` is a pickle that names the
-arrays and `data/` has their bytes. A pickle can name any function to call; this reader knows the few that rebuild an
-array and refuses all others.
+The zip contains files of torch such as `policy.pth`. Each of these files is a zip, too: `data.pkl` is a pickle that
+names the arrays, and `data/` has their bytes. A pickle can call any function. This reader knows the few functions that
+rebuild an array and refuses all others.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from ce_gym.policies.archive import read_member
 
 
 def read_weights(file: Path, member: str = "policy.pth") -> dict[str, Any]:
-    """Return the arrays of a policy by name; or the content of another member.
+    """Return the arrays of a policy by name, or the content of another member.
 
     Raises:
-        Exception: Of many kinds, if the file is damaged, too large, or names anything but arrays.
+        Exception: Errors of many classes, if the file is damaged, too large, or names anything but arrays.
     """
     with zipfile.ZipFile(file) as outer, zipfile.ZipFile(io.BytesIO(read_member(outer, member))) as inner:
         return dict(_Arrays(inner).load())
 
 
 class _Arrays(pickle.Unpickler):
-    """Rebuilds arrays; anything else that a file may name is refused."""
+    """Unpickler that rebuilds arrays and refuses everything else."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         (index,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
@@ -42,7 +42,7 @@ class _Arrays(pickle.Unpickler):
         known = {
             "collections.OrderedDict": OrderedDict,
             "torch._utils._rebuild_tensor_v2": _rebuild,
-            "torch.FloatStorage": "<f4",  # text, since a pickle may change the state of objects that it names
+            "torch.FloatStorage": "<f4",  # as text: a pickle may change the state of objects
             "torch.DoubleStorage": "<f8",
         }
         if f"{module}.{name}" not in known:

@@ -3,10 +3,12 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 from ce_gym.bench import __main__ as command
+from ce_gym.bench.measure.report import Report
 
 
 def test_without_a_name_it_lists_every_benchmark():
@@ -46,3 +48,14 @@ def test_report_is_printed_and_written(tmp_path, capsys):
     written = json.loads(file.read_text())
     assert written["machine"]["cores"]
     assert [r["met"] for r in written["requirements"]] == [True, True]
+
+
+@pytest.mark.parametrize("separator", [" ", "="])
+def test_the_report_has_the_command_without_its_own_file(separator, tmp_path, monkeypatch, capsys):
+    benchmark = SimpleNamespace(
+        add_arguments=lambda parser: parser.add_argument("--robot"), run=lambda arguments: Report("tracking")
+    )
+    monkeypatch.setattr(command, "load", lambda name: benchmark)
+    file = tmp_path / "report.json"
+    assert command.main(["tracking", *f"--json{separator}{file}".split(" "), "--robot", "tello"]) == 0
+    assert json.loads(file.read_text())["command"] == "python -m ce_gym.bench tracking --robot tello"

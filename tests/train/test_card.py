@@ -48,7 +48,7 @@ def test_a_shipped_policy_is_found_by_name(run, shelf, monkeypatch, capsys):
     assert folder.joinpath("policy.npz").stat().st_size < 0.5 * (run / "policy.zip").stat().st_size
     text = (folder / "card.md").read_text()
     assert str(run) not in text
-    assert "Not judged: not asked for" in text
+    assert "Not evaluated: not requested" in text
     capsys.readouterr()
     assert evaluate_main(["mini_cheetah_velocity", "--episodes", "2", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["effort"]["motors"]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from crossing import cross, crossing_table, steered
+from crossing import cross, crossing_table, steering_command
 
 from ce_gym.policies import Policy, PolicyError
 
@@ -17,7 +17,7 @@ def pose(x, heading):
 def test_a_point_that_follows_its_commands_comes_to_its_line(side):
     x, y, heading, dt = 0.4, 0.0, -side * 1.0, 0.02
     for _ in range(1000):
-        forward, sideways, turn = steered(pose(x, heading), np.zeros(1), np.array([side]), 0.5)[0]
+        forward, sideways, turn = steering_command(pose(x, heading), np.zeros(1), np.array([side]), 0.5)[0]
         assert (forward, sideways) == (0.5, 0.0)
         assert abs(turn) <= 1
         heading += dt * turn

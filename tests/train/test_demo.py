@@ -69,7 +69,7 @@ def test_the_rollout_has_states_forces_and_commands(demo):
 @pytest.mark.slow
 def test_fresh_trains_again(demo, capsys):
     assert demo_main([*QUICK, "--fresh", "--seed", "4", "--out", str(demo)]) == 0
-    assert "Training from nothing" in capsys.readouterr().out
+    assert "Training a new policy" in capsys.readouterr().out
     assert load_policy(demo / "policy.npz").record["seed"] == 4
 
 

@@ -169,21 +169,26 @@ def test_columns_are_in_the_order_of_the_teacher():
 @pytest.mark.parametrize(
     ("teacher", "known", "scan", "said"),
     [
-        ("mini_cheetah_velocity", {"gyro": 3}, {}, "velocity: sees base_linear_velocity; expected it among what the"),
+        (
+            "mini_cheetah_velocity",
+            {"gyro": 3},
+            {},
+            "observes base_linear_velocity; expected one of the critic's blocks",
+        ),
         (
             "mini_cheetah_velocity",
             {"base_linear_velocity": 2},
             {},
-            "sees base_linear_velocity of {}, 3 numbers; here it has {}, 2 numbers",
+            "observes base_linear_velocity with {}, size 3; here it has {}, size 2",
         ),
         (
             "mini_cheetah_stairs",
             None,
             {"centre": [0.2, 0.0]},
-            r"sees height_scan of .*'centre': \[0.1, 0.0\].*here it has .*0.2",
+            r"observes height_scan with .*'centre': \[0.1, 0.0\].*here it has .*0.2",
         ),
-        ("mini_cheetah_stairs", None, {"clip": 0.5}, r"sees height_scan of .*here it has .*'clip': 0.5"),
-        ("mini_cheetah_rough", None, {}, "mini_cheetah_rough: history=3; expected a teacher that sees the present"),
+        ("mini_cheetah_stairs", None, {"clip": 0.5}, r"observes height_scan with .*here it has .*'clip': 0.5"),
+        ("mini_cheetah_rough", None, {}, "mini_cheetah_rough: history=3; expected a teacher without history"),
     ],
 )
 def test_a_teacher_without_its_observation_is_refused_in_one_line(teacher, known, scan, said):

@@ -129,7 +129,7 @@ def test_a_policy_that_cannot_be_resumed_is_refused_in_one_line(tmp_path):
     state = trained.with_suffix(".learner.npz")
     whole = state.read_bytes()
     state.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(PolicyError, match=r"policy\.learner\.npz: cannot be gone on from"):
+    with pytest.raises(PolicyError, match=r"policy\.learner\.npz: training cannot continue"):
         train(job(tmp_path / "out", 2048, resume=trained))
     state.unlink()
     with pytest.raises(PolicyError, match=r"policy\.learner\.npz: no such file"):

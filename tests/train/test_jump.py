@@ -6,7 +6,7 @@ import ilqr
 import jump
 import numpy as np
 import pytest
-from ilqr import ILQR, apart
+from ilqr import ILQR, difference
 from tripod import TRIPOD
 
 import ce_gym
@@ -106,7 +106,7 @@ def test_the_way_between_states_is_that_of_derivatives():
         turn[:3] += ahead[3:6] + 2 * np.cross(u, np.cross(u, ahead[3:6]) + w * ahead[3:6])
         turn[7:] += ahead[6:]
         there = {"q": turn[None], "v": np.zeros((1, model.nv)), "load": np.ones((1, 3))}
-        way = apart(model, there, here)[0]
+        way = difference(model, there, here)[0]
         np.testing.assert_allclose(way[: model.nv], ahead, rtol=0, atol=1e-11)
         assert (way[-3:] == 1).all()
         change = cost.residuals(5, turn[None], here["v"][None]) - cost.residuals(5, q[None], here["v"][None])

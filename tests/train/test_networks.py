@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from loops import adam, advantages_of, drawn
+from loops import adam, estimate_advantages, sample_actions
 from networks import (
     KINDS,
     actor_gradient,
@@ -139,7 +139,7 @@ def test_actions_are_drawn_with_their_probabilities():
     rng, log_std = np.random.default_rng(3), np.array([-0.5, 0.4], F)
     means, noise = (rng.standard_normal((50, 2)).astype(F) for _ in range(2))
     actions, clipped, log_probs = np.zeros((50, 2), F), np.zeros((50, 2), F), np.zeros(50, F)
-    drawn(means, noise, log_std, actions, clipped, log_probs)
+    sample_actions(means, noise, log_std, actions, clipped, log_probs)
     np.testing.assert_allclose(actions, means + np.exp(log_std) * noise, atol=1e-6)
     np.testing.assert_array_equal(clipped, np.clip(actions, -1, 1))
     normal = Normal(torch.tensor(means), torch.tensor(log_std).exp())
@@ -152,7 +152,7 @@ def test_advantages_are_discounted_sums_of_what_follows():
     rewards, values = (rng.standard_normal((12, 3)).astype(F) for _ in range(2))
     last, dones = rng.standard_normal(3).astype(F), rng.random((12, 3)) < 0.2
     found = np.zeros((12, 3), F)
-    advantages_of(rewards, values, last, dones, F(gamma), F(decay), found)
+    estimate_advantages(rewards, values, last, dones, F(gamma), F(decay), found)
     following = np.concatenate([values[1:], last[None]])
     for t in range(12):
         for i in range(3):

@@ -129,9 +129,9 @@ def test_resuming_goes_on_with_environment_and_settings_of_the_run(trained, tmp_
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ("hidden=[8]", "hidden: trained with [16], asked for [8]; expected the same"),
-        ("hidden=[16, 16]", "hidden: trained with [16], asked for [16, 16]"),
-        ("activation=ReLU", "activation: trained with Tanh, asked for ReLU"),
+        ("hidden=[8]", "hidden: trained with [16], requested [8]; expected the same"),
+        ("hidden=[16, 16]", "hidden: trained with [16], requested [16, 16]"),
+        ("activation=ReLU", "activation: trained with Tanh, requested ReLU"),
     ],
 )
 def test_resuming_with_another_network_is_refused(trained, tmp_path, capsys, change, words):

@@ -9,8 +9,9 @@ pytest.importorskip("rsl_rl")
 import torch
 from evaluate import evaluate
 from evaluate import main as evaluate_main
+from job import basic_record
 from point_mass import ID
-from rsl_rl_ppo import actor_of, main, record_of, train
+from rsl_rl_ppo import actor_of, main, train
 from settings import config_file, load_settings
 from toy import SMALL
 
@@ -33,7 +34,7 @@ def test_it_learns(obs_mode, capsys):
     runner = train(envs, settings, seed=0)
     assert runner.alg.critic.obs_groups == ["critic" if obs_mode == "dict" else "policy"]
     actor = actor_of(runner, settings.activation)
-    policy = Policy(actor, record_of(envs, ID, {}, settings))
+    policy = Policy(actor, basic_record(envs.envs.unwrapped, ID, {}, settings))
     result = evaluate(policy, ID, episodes=32)
     assert result["forward_error"] < 0.15  # half a unit without learning
     assert result["falls"] == 0.0

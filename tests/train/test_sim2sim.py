@@ -13,7 +13,7 @@ import sim2sim
 from job import Job
 from ppo import train
 from settings import config_file, load_settings
-from sim2sim import MujocoWorld, OurWorld, course, main, play, table, verdicts
+from sim2sim import MujocoWorld, OurWorld, main, play, random_course, table, verdicts
 from tripod import TRIPOD
 
 import ce_gym
@@ -220,8 +220,8 @@ def test_a_history_is_kept_newest_first():
 def test_commands_last_a_period_and_stay_in_range():
     policy_spec = {"control_dt": 0.02, "command": {"range": [[-1, 1], [0, 0.5], [2, 2]]}}
     first = np.full((200, 3), 9.0)
-    assert (course(policy_spec, first, 0.5, every=np.inf, seed=1).commands == first).all()
-    drawn = course(policy_spec, first, 0.5, every=0.1, seed=1).commands
+    assert (random_course(policy_spec, first, 0.5, every=np.inf, seed=1).commands == first).all()
+    drawn = random_course(policy_spec, first, 0.5, every=0.1, seed=1).commands
     assert drawn.shape == (26, 200, 3)
     assert (drawn[:5] == first).all()
     assert (drawn[5:10] == drawn[5]).all()
@@ -259,7 +259,7 @@ def test_standing_robots_stand_and_tilted_ones_fall():
     state["q"][1, 3:7] = (np.cos(0.6), np.sin(0.6), 0.0, 0.0)  # rolled by 69 degrees
     assert not made.native.look({**state, "action": np.zeros((2, 12))})[1].any()
     made.twin.start(state["q"], state["v"])
-    result = play(stand, made, obs, course(made.policy_spec, np.zeros((2, 3)), 1.0, every=1.0, seed=0))
+    result = play(stand, made, obs, random_course(made.policy_spec, np.zeros((2, 3)), 1.0, every=1.0, seed=0))
     assert result["falls"] == 0.5
 
 
@@ -309,7 +309,7 @@ def test_the_program_compares_four_simulations(tmp_path, capsys):
     code = main(arguments)
     result = json.loads(capsys.readouterr().out)
     assert main([*arguments, str(tmp_path / "result.json")]) == code
-    assert "asked for" in capsys.readouterr().out
+    assert "required: at least" in capsys.readouterr().out
     assert result == json.loads((tmp_path / "result.json").read_text())
     simulations = result["simulations"]
     assert list(simulations) == ["ce_gym, exact", "ce_gym, armature", "MuJoCo, armature", "MuJoCo, rotors as bodies"]

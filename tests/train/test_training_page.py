@@ -30,7 +30,7 @@ def test_learners_write_their_present_policy_if_asked(train, tmp_path):
 def test_it_is_written_now_and_then(monkeypatch, tmp_path):
     clock, written = [0.0], []
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    present = Present(written.append, tmp_path, wanted=True)
+    present = Present(written.append, tmp_path, enabled=True)
     for clock[0] in (1.0, 2.0, 1.0 + training_page.PERIOD, 2.0 + training_page.PERIOD):
         present.keep()
     assert written == [tmp_path / PRESENT / "policy"] * 2
@@ -40,8 +40,8 @@ def test_a_full_disk_does_not_end_training(tmp_path, capsys):
     def fail(path):
         raise OSError(28, "No space left on device")
 
-    Present(fail, tmp_path, wanted=True).keep()
-    assert "No space left on device; training goes on" in capsys.readouterr().err
+    Present(fail, tmp_path, enabled=True).keep()
+    assert "No space left on device; training continues" in capsys.readouterr().err
 
 
 def test_the_page_ends_with_training_and_leaves_nothing(tmp_path, capfd):

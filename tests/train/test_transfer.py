@@ -72,7 +72,7 @@ def test_an_interrupted_run_is_gone_on_with(runs, trainings, monkeypatch):
 def test_a_run_of_another_kind_is_not_overwritten(runs, trainings, capsys):
     assert main([*SMALL, "--levels", "exact", "--steps", "700", "--runs", str(runs)]) == 2
     error = capsys.readouterr().err.strip()
-    assert "trained with steps = 600, asked for 700" in error
+    assert "trained with steps = 600, requested 700" in error
     assert "\n" not in error
     assert not trainings
 

@@ -10,7 +10,7 @@ from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
 from skrl.trainers.torch import SequentialTrainer
 
 envs = gymnasium.make_vec(
-    "watched:watched/Stand-v0", 64, vectorization_mode="vector_entry_point", autoreset_mode="SameStep"
+    "ce_gym:ce_gym/MiniCheetahStand-v0", 64, vectorization_mode="vector_entry_point", autoreset_mode="SameStep"
 )
 env = wrap_env(envs)
 n_seen, n_actions = env.observation_space.shape[0], env.action_space.shape[0]
@@ -24,7 +24,7 @@ def layers(n_outputs):
 
 
 class Actor(GaussianMixin, Model):
-    """Mean and spread of actions."""
+    """Mean and standard deviation of actions."""
 
     def __init__(self):
         Model.__init__(self, **spaces)
@@ -32,7 +32,7 @@ class Actor(GaussianMixin, Model):
         self.net, self.log_std = layers(n_actions), torch.nn.Parameter(torch.full((n_actions,), -1.0))
 
     def compute(self, inputs, role):
-        """Return what skrl asks for."""
+        """Return mean and logarithm of the standard deviation, and no further outputs."""
         return self.net(inputs["observations"]), {"log_std": self.log_std}
 
 
@@ -45,7 +45,7 @@ class Critic(DeterministicMixin, Model):
         self.net = layers(1)
 
     def compute(self, inputs, role):
-        """Return what skrl asks for."""
+        """Return values, and no further outputs."""
         return self.net(inputs["observations"]), {}
 
 
@@ -54,5 +54,5 @@ chosen = PPO_CFG(rollouts=64, learning_epochs=5, mini_batches=4, discount_factor
 chosen.experiment.write_interval = chosen.experiment.checkpoint_interval = 0
 agent = PPO(models={"policy": Actor(), "value": Critic()}, memory=memory, cfg=chosen, **spaces)
 SequentialTrainer(
-    env=env, agents=agent, cfg={"timesteps": 10**9, "disable_progressbar": True, "headless": True}
+    env=env, agents=agent, cfg={"timesteps": 15_000, "disable_progressbar": True, "headless": True}
 ).train()

@@ -1,1 +1,1 @@
-"""Time against error."""
+"""Time against error of methods and simulators."""

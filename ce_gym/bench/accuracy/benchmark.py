@@ -1,8 +1,8 @@
-"""Time against error: work-precision curves of ours, MuJoCo's and Drake's methods, in flight, in loops and in contact.
+"""Time against error: work-precision curves of methods of ce_gym, MuJoCo and Drake, in flight, in loops, in contact.
 
-For every scene each method runs at steps from 20 ms down; its error is compared with its time on one core. In smooth
-scenes the truth is what two independent codes agree on. In contact every code has a law of its own, and the error of
-each is that against its own limit for short steps.
+Each method runs every scene with steps of at most 20 ms; its error is compared with its time on one core. In smooth
+scenes the reference solution is one on which two independent codes agree. In contact each code has its own contact law,
+so the error of a code is the distance from its own limit for short steps.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.console import progress
 
 REQUIRED = 20.0
-"""How many times as long as ours a peer has to take at every error that both reach."""
+"""Required ratio of times, peer to ce_gym, at every error that both reach."""
 LARGEST_MEDIAN = 3.0
-"""Largest median over scenes and tolerances of the adaptive method's error, as a multiple of its tolerance."""
+"""Largest allowed median of the adaptive method's error over scenes and tolerances, divided by the tolerance."""
 PEERS = ("MuJoCo", "Drake")
 QUICK_SCENES, QUICK_STEPS = ("tumble", "belt_leg", "drop_3cm", "slide"), (1, 5, 20, 100)
 
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def time_table(measured: list[Measured], code: str) -> Table:
-    """Return the least times at every decade of error, ours and a peer's."""
+    """Return the shortest times of ce_gym and of a peer at every decade of error."""
     rows: list[tuple[Cell, ...]] = []
     for m in measured:
         for c in comparisons(m, code):
@@ -96,7 +96,7 @@ def time_table(measured: list[Measured], code: str) -> Table:
 
 
 def reference_table(measured: list[Measured], code: str) -> Table:
-    """Return how far two codes agree on the truth, and how well the limits of a peer's methods are known."""
+    """Return the difference of the two reference codes, and the accuracy of the limits of a peer's methods."""
     rows: list[tuple[Cell, ...]] = []
     for m in measured:
         second = "MuJoCo's matrices, null space of its Jacobian" if m.scene.smooth else "our law again, explicit"
@@ -108,7 +108,7 @@ def reference_table(measured: list[Measured], code: str) -> Table:
 
 
 def requirement(m: Measured, code: str = "MuJoCo") -> Requirement:
-    """Return whether a peer takes long enough at every error that both reach."""
+    """Return the requirement on the ratio of times at every error that both reach."""
     both = [c for c in comparisons(m, code) if c.ratio is not None]
     claim = f"{m.scene.name}: {code} / ce_gym, time at equal error, at least {REQUIRED:.0f}"
     if not both:
@@ -120,7 +120,7 @@ def requirement(m: Measured, code: str = "MuJoCo") -> Requirement:
 
 
 def add_tolerances(measured: Sequence[Measured], report: Report) -> None:
-    """Add the error that the adaptive method delivers at each tolerance, and its time beside fixed steps."""
+    """Add errors and times of the adaptive method at each tolerance, compared with fixed steps, to the report."""
     rows = [row for m in measured for row in tolerance_rows(m)]
     if not rows:
         return
@@ -134,7 +134,7 @@ def add_tolerances(measured: Sequence[Measured], report: Report) -> None:
 
 
 def tolerance_rows(m: Measured) -> list[tuple[str, float, float, float, float, float | None]]:
-    """Return a row for each tolerance that a step of a whole hold misses and whose error the references can tell."""
+    """Return a row for each tolerance, if one step per hold is not enough and the references are accurate enough."""
     ours = {curve.method: curve for curve in m.curves if curve.code == "ce_gym" and curve.level == m.scene.exact}
     if not {"adaptive", "extrapolated"} <= ours.keys():
         return []
@@ -150,7 +150,7 @@ def tolerance_rows(m: Measured) -> list[tuple[str, float, float, float, float, f
 
 
 def write_points(path: Path, measured: list[Measured]) -> None:
-    """Write every point: both errors and the time."""
+    """Write both errors and the time of every point."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(

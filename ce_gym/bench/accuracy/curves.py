@@ -1,8 +1,8 @@
-"""Work-precision curves: what is measured of a scene, and what follows from it.
+"""Work-precision curves of a scene: errors and times of all methods, and comparisons between codes.
 
-An error is the root mean square over all recorded times and position channels, 1 m and 1 rad counting alike, the
-orientation of a base by its logarithm; against the truth, and against the limit that a code itself tends to as its step
-goes to zero. Time is that of one core for one robot and one simulated second.
+An error is the root mean square over all recorded times and positions, where 1 m and 1 rad have equal weight and the
+orientation of a base is a rotation vector. There are two errors: against the reference solution, and against the limit
+of the same code for short steps. Time is the processor time of one core for one robot and one simulated second.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from ce_gym.bench.accuracy.scenarios import HOLD, SINGLE, Array, Scene, Way
 from ce_gym.bench.measure.timing import Competitor, interleaved
 
 OUR_STEPS = (1, 2, 5, 10, 20, 50, 100, 200)
-"""Steps to a hold at which ours is measured."""
+"""Steps per hold of methods of ce_gym."""
 PEER_STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
-"""The same for peers; the fourth-order method makes no use of the last."""
+"""Steps per hold of peers; the fourth-order method does not use the last."""
 NUM_ENVS = 256
-"""Robots in a batch of ours."""
+"""Robots in a batch of ce_gym."""
 TOLERANCES = (0.3, 0.1, 0.03, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
-"""Of our steps that adapt [rad or m]."""
+"""Tolerances of the adaptive method [rad or m]."""
 FINEST_SINGLE = 20, 1e-4
-"""Most steps to a hold and least tolerance [rad or m] in single precision, where rounding does not show."""
+"""Largest number of steps per hold and smallest tolerance [rad or m] in single precision, because of rounding."""
 ERROR_CONTROL = "error control"
-"""Method of a peer's curve whose points are not steps but what was asked of an integrator."""
+"""Method of a peer's curve whose points are accuracies of an integrator instead of step lengths."""
 MARGIN = 10.0
-"""How far below an error two references have to agree for it to count."""
+"""Smallest ratio of an error to the difference of the references."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class Point:
     """One step length of one method.
 
     Attributes:
-        dt: [s]; of steps that adapt, the tolerance [rad or m].
+        dt: Step length [s]; tolerance of an adaptive method [rad or m].
         seconds: Time for one robot and simulated second [s].
-        truth: Error against the truth; not a number if the robot diverged.
-        own: Error against the method's own limit.
+        truth: Error against the reference solution; NaN if the robot diverged.
+        own: Error against the limit of the method.
     """
 
     dt: float
@@ -62,9 +62,10 @@ class Curve:
 
     Attributes:
         code: "ce_gym", "MuJoCo" or "Drake".
-        level: Transmission level, and for peers what else decides about the limit: how equalities are held, the law.
+        level: Transmission level; for peers also the kind of equality constraints or contact law, if the limit depends
+            on them.
         method: Time-stepping method and solver.
-        points: From long steps to short ones.
+        points: Points from long to short steps.
     """
 
     code: str
@@ -74,19 +75,19 @@ class Curve:
 
     @property
     def label(self) -> str:
-        """Name for tables."""
+        """Return the name for tables."""
         return f"{self.code} {self.level}, {self.method}"
 
 
 @dataclass
 class Measured:
-    """Everything about one scene.
+    """Measurements of one scene.
 
     Attributes:
         scene: The scene.
-        curves: One for each method.
-        agreement: Error between the two codes that the truth comes from.
-        limits: How well the own limit of each family of curves is known, by (code, level).
+        curves: One curve for each method.
+        agreement: Difference of the two reference codes.
+        limits: Error of the limit of each family of curves, by (code, level).
     """
 
     scene: Scene
@@ -95,32 +96,32 @@ class Measured:
     limits: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def error(self, point: Point) -> float:
-        """Return the error that is compared: codes with different contact laws have different truths."""
+        """Return the error for comparisons: against the reference in smooth scenes, the own limit in contact."""
         return point.truth if self.scene.smooth else point.own
 
     def known(self, curve: Curve) -> float:
-        """Return how well that which the errors of a curve are taken against is known."""
+        """Return the error of the reference of a curve."""
         if self.scene.smooth:
             return self.agreement
         limit = self.limits[curve.code, curve.level]
         return max(limit, self.agreement) if curve.code == "ce_gym" else limit
 
     def errors(self, curve: Curve) -> list[float]:
-        """Return the errors of a curve's points, none smaller than can be told from none."""
+        """Return the errors of a curve's points, limited from below by the error of the reference."""
         return [max(self.error(point), MARGIN * self.known(curve)) for point in curve.points]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The least time in which each side reaches an error.
+    """The shortest time in which both sides reach an error.
 
     Attributes:
         error: The error.
-        ours: Our time for one robot and simulated second [s], None if not reached.
-        method: Which method of ours.
-        double: Our time without single precision [s], None if not reached.
-        theirs: The peer's [s], None if not reached.
-        peer: Which of its settings.
+        ours: Time of ce_gym for one robot and simulated second [s], None if not reached.
+        method: Method of ce_gym.
+        double: Time of ce_gym in double precision [s], None if not reached.
+        theirs: Time of the peer [s], None if not reached.
+        peer: Settings of the peer.
     """
 
     error: float
@@ -132,26 +133,26 @@ class Comparison:
 
     @property
     def ratio(self) -> float | None:
-        """How many times as long the peer takes; None if not both reach the error."""
+        """Return the ratio of times, peer to ce_gym; None unless both reach the error."""
         return self.theirs / self.ours if self.ours and self.theirs else None
 
     @property
     def double_ratio(self) -> float | None:
-        """The same with ours in double precision."""
+        """Return the ratio with ce_gym in double precision."""
         return self.theirs / self.double if self.double and self.theirs else None
 
 
 def measure(
     scene: Scene, our_steps: Sequence[int], peer_steps: Sequence[int], rounds: int, more: Sequence[More] = ()
 ) -> Measured:
-    """Measure all curves of a scene, competitors taking turns.
+    """Return all curves of a scene, with competitors timed alternately.
 
     Args:
         scene: The scene.
-        our_steps: Steps to a hold of our methods.
-        peer_steps: The same of MuJoCo's; none leaves it out.
-        rounds: How often each point is timed.
-        more: Other peers, where they are installed.
+        our_steps: Steps per hold of methods of ce_gym.
+        peer_steps: Steps per hold of MuJoCo; if empty, MuJoCo is not measured.
+        rounds: Number of timings of each point.
+        more: Other peers, if they are installed.
     """
     truth, ours_limit, measured = reference(scene)
     sides = our_sides(scene, our_steps, ours_limit)
@@ -176,14 +177,14 @@ def measure(
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One point of one curve, to be run.
+    """One point of one curve, before the measurement.
 
     Attributes:
         name: Code, level and method.
-        dt: Length of a step [s]; of steps that adapt, the tolerance [rad or m].
-        run: Runs through the scene and returns positions, shape (n_holds, nq).
-        robots: How many at a time.
-        limit: What the method tends to, shape (n_holds, nq).
+        dt: Step length [s]; tolerance of an adaptive method [rad or m].
+        run: Function that simulates the scene and returns positions, shape (n_holds, nq).
+        robots: Number of robots in a batch.
+        limit: Positions in the limit of short steps, shape (n_holds, nq).
     """
 
     name: tuple[str, str, str]
@@ -194,11 +195,11 @@ class Side:
 
 
 More: TypeAlias = Callable[[Scene, Array, Measured], list[Side]]
-"""Sides of another peer from a scene, its truth and what is measured of it, which gets the limits of that peer."""
+"""Function that returns the sides of another peer from scene, reference and measurements, and adds its limits."""
 
 
 def reference(scene: Scene) -> tuple[Array, Array, Measured]:
-    """Return the truth and the limit of our exact level, (n_holds, nq) each, and how far two codes agree on them."""
+    """Return reference and limit of the exact level, shape (n_holds, nq), and measurements with their agreement."""
     if scene.smooth:
         truth = accuracy_references.ours(scene, scene.reference // 2)
         return (
@@ -215,13 +216,13 @@ def reference(scene: Scene) -> tuple[Array, Array, Measured]:
 
 
 def our_sides(scene: Scene, steps: Sequence[int], exact: Array) -> list[Side]:
-    """Return our methods at all step lengths; approximate levels tend to a truth of their own."""
+    """Return methods of ce_gym at all step lengths; simplified levels have their own limits."""
     sides = []
     for way in scene.ours:
         limit = exact if way.level == scene.exact else accuracy_references.ours(scene, scene.reference // 2, way.level)
         name, single = ("ce_gym", way.level, way.name), way.dtype == "float32"
         batch = Ours(scene, way, NUM_ENVS)
-        if way.method == "adaptive":  # as long as a tolerance allows, a hold at most
+        if way.method == "adaptive":  # the tolerance limits steps, and a hold is the longest
             for tolerance in (t for t in TOLERANCES if not single or t >= FINEST_SINGLE[1]):
                 sides.append(Side(name, tolerance, partial(batch.run, 1, tolerance), NUM_ENVS, limit))
             continue
@@ -231,7 +232,7 @@ def our_sides(scene: Scene, steps: Sequence[int], exact: Array) -> list[Side]:
 
 
 def peer_sides(scene: Scene, steps: Sequence[int], measured: Measured) -> list[Side]:
-    """Return MuJoCo's levels, ways to hold equalities and integrators at all step lengths."""
+    """Return MuJoCo's levels, kinds of equality constraints and integrators at all step lengths."""
     sides = []
     for family in families(scene):
         finest = PEER_LIMIT if scene.robot.independent else 4 * PEER_LIMIT
@@ -246,12 +247,12 @@ def peer_sides(scene: Scene, steps: Sequence[int], measured: Measured) -> list[S
 
 INTEGRATORS = ("Euler", "implicitfast", "discrete", "RK4")
 PEER_LIMIT = 1000
-"""Steps to a hold from which MuJoCo's own limit is taken, compared with half as many; four times as many of a block."""
+"""Steps per hold for MuJoCo's limit, compared with half as many steps; four times as many for a block."""
 MOST_STEPS_RK4 = 200
 
 
 def rms_error(scene: Scene, path: Array, reference: Array) -> float:
-    """Return the error of positions (n_holds, nq), see the top of this file; not a number if `path` has one."""
+    """Return the error of positions (n_holds, nq), see the top of this file; NaN if `path` contains NaN."""
     difference = path - reference
     if scene.robot.floating:
         turn = _relative_rotation(reference[:, 3:7], path[:, 3:7])
@@ -270,13 +271,15 @@ def _relative_rotation(a: Array, b: Array) -> Array:
 
 
 def time_to(curve: Curve, errors: Sequence[float], error: float) -> float | None:
-    """Return the time in which a curve reaches an error for good [s], between its points on a log-log line.
+    """Return the time at which a curve reaches an error [s], by interpolation on log-log axes.
+
+    A point reaches the error only if all shorter steps also have smaller errors, because a curve can cross its final
+    error by chance.
 
     Args:
-        curve: Its points from long steps to short ones.
-        errors: Those of the points. A point counts if all shorter steps stay below `error` as well: where a curve
-            crosses its final error by chance, nothing is reached.
-        error: To reach.
+        curve: Curve with points from long to short steps.
+        errors: Errors of the points.
+        error: Error to reach.
     """
     reached = None
     for i in reversed(range(len(errors))):
@@ -294,9 +297,10 @@ def time_to(curve: Curve, errors: Sequence[float], error: float) -> float | None
 
 
 def comparisons(measured: Measured, code: str = "MuJoCo") -> list[Comparison]:
-    """Compare both sides at every decade of error, from the first that takes one of them more than its longest step.
+    """Return comparisons at every decade of error, from the first that needs more than the longest step.
 
-    Ours are the exact curves, those of the peer `code` all it has. Ends where the limit of ours is known no better.
+    The curves of ce_gym at the exact level are compared with all curves of the peer `code`. The smallest error is the
+    accuracy of the limit of ce_gym.
     """
     ours = [curve for curve in measured.curves if curve.code == "ce_gym" and curve.level == measured.scene.exact]
     theirs = [curve for curve in measured.curves if curve.code == code]

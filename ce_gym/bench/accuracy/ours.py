@@ -1,4 +1,4 @@
-"""Our side of the accuracy benchmark: the simulator's own kernel, of which one serves every point of a curve."""
+"""ce_gym in the accuracy benchmark: one kernel of the simulator computes all points of a curve."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ce_gym.sim.tiles import tiles, write_rows
 
 
 class Ours:
-    """A batch of robots that run through a scene, the first of them from exactly the start of the scene.
+    """A batch of robots in a scene; the first robot starts exactly at the initial state of the scene.
 
     Args:
         scene: The scene.
         way: Method, level, friction and precision.
-        num_envs: Robots.
+        num_envs: Number of robots.
     """
 
     def __init__(self, scene: Scene, way: Way, num_envs: int) -> None:
@@ -53,13 +53,13 @@ class Ours:
         self.targets = [np.ascontiguousarray(row, way.dtype) for row in rows]
 
     def run(self, n: int, tolerance: float | None = None) -> Array:
-        """Run through the scene; returns positions of the first robot at the end of every hold, (n_holds, nq).
+        """Simulate the scene and return positions of the first robot at the end of every hold, shape (n_holds, nq).
 
-        Stretches of transmissions are not among them.
+        Positions do not contain elastic stretches.
 
         Args:
-            n: Sub-steps to a hold.
-            tolerance: Of a method with steps of its own [rad or m].
+            n: Sub-steps per hold.
+            tolerance: Tolerance of an adaptive method [rad or m].
         """
         for name, rows in self.starts.items():
             write_rows(self.arrays[name], rows)
@@ -79,11 +79,11 @@ class Ours:
         return path
 
     def _starts(self) -> dict[str, Array]:
-        """Rows of every state array at the start: robots differ a little, or all would need the same iterations."""
+        """Return initial rows of every state array; robots differ slightly, so that iterations differ, too."""
         model, scene = self.model, self.scene
         base = 7 if scene.robot.floating else 0
         q, v = np.zeros((self.num_envs, model.nq)), np.zeros((self.num_envs, model.nv))
-        q[:, : len(scene.q)], v[:, : len(scene.v)] = scene.q, scene.v  # stretches, if any, come last
+        q[:, : len(scene.q)], v[:, : len(scene.v)] = scene.q, scene.v  # elastic stretches are last
         noise = scene.spread * np.random.default_rng(0).normal(size=(self.num_envs, len(scene.q) - base + 1))
         noise[0] = 0.0
         q[:, base : len(scene.q)] += noise[:, 1:]

@@ -1,8 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""MuJoCo's side of the accuracy benchmark: the same scene through the project's MJCF export and `mujoco.rollout`.
-
-(MuJoCo's compiled modules carry no types, hence the line above.)
-"""
+"""MuJoCo in the accuracy benchmark: the same scene by MJCF export and `mujoco.rollout`."""
 
 from __future__ import annotations
 
@@ -21,11 +18,11 @@ from ce_gym.export.mujoco_batch import STATE
 from ce_gym.export.mujoco_model import STIFF, Settings
 from ce_gym.model.mechanism import ELASTIC
 
-mujoco.set_mju_user_warning(lambda _: None)  # it would write to a file; `Peer.diverged` says what matters
+mujoco.set_mju_user_warning(lambda _: None)  # no log file; `Peer.diverged` has the information
 
 
 def compiled(scene: Scene, level: str, stiff: bool = False) -> mujoco.MjModel:
-    """Compile a scene for MuJoCo at a transmission level; torques act on the joints directly, without actuators."""
+    """Return the MuJoCo model of a scene at a level; torques act on the joints directly, without actuators."""
     robot, level, also = stated(scene, level)
     model = mujoco_model.compile_model(robot, level, Settings(1e-3, solimp=STIFF if stiff else None), also)
     if scene.control == "torque":
@@ -34,7 +31,7 @@ def compiled(scene: Scene, level: str, stiff: bool = False) -> mujoco.MjModel:
 
 
 def initial_state(scene: Scene, model: mujoco.MjModel) -> mujoco.MjData:
-    """Return MuJoCo's data with every joint, rotors included, at the start of the scene."""
+    """Return MuJoCo's data at the start of the scene, with all joints and rotors."""
     ours, data = Model(scene.robot), mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     q, v = ours.spanning(scene.q, scene.v)
@@ -52,7 +49,7 @@ def initial_state(scene: Scene, model: mujoco.MjModel) -> mujoco.MjData:
 
 
 def forces(scene: Scene, model: mujoco.MjModel, hold: int, level: str) -> Array:
-    """Return applied generalised forces during a hold, MuJoCo's coordinates, shape (nv,)."""
+    """Return applied generalised forces during a hold in MuJoCo's coordinates, shape (nv,)."""
     force = np.zeros(model.nv)
     if scene.control == "torque":
         names, torques = scene.robot.independent, scene.drive[hold]
@@ -68,12 +65,12 @@ def forces(scene: Scene, model: mujoco.MjModel, hold: int, level: str) -> Array:
 
 
 class Family:
-    """A scene at one transmission level with one way to hold equalities, for MuJoCo.
+    """A scene in MuJoCo at one transmission level with one kind of equality constraints.
 
     Args:
         scene: The scene.
         level: Transmission level.
-        stiff: Whether equalities are held as stiffly as the step allows, or by MuJoCo's default.
+        stiff: Whether equality constraints are as stiff as the step allows, or MuJoCo's default.
     """
 
     def __init__(self, scene: Scene, level: str, stiff: bool) -> None:
@@ -91,23 +88,23 @@ class Family:
 
     @property
     def tied(self) -> bool:
-        """Whether there are equalities to hold."""
+        """Return whether the model has equality constraints."""
         return self.model.neq > 0
 
 
 def families(scene: Scene) -> list[Family]:
-    """Return MuJoCo's ways to state a scene: levels, then equalities held stiffly where there are any."""
+    """Return all families of a scene: levels, and stiff equality constraints for levels with constraints."""
     soft = [Family(scene, level, stiff=False) for level in scene.levels]
     return [*soft, *(Family(scene, family.level, stiff=True) for family in soft if family.tied)]
 
 
 class Peer:
-    """One robot of MuJoCo's that runs through a scene.
+    """One robot in MuJoCo in a scene.
 
     Args:
-        family: What it is.
+        family: Scene, level and equality constraints.
         integrator: "Euler", "implicitfast", "discrete" or "RK4".
-        per_hold: Steps to a hold.
+        per_hold: Steps per hold.
     """
 
     def __init__(self, family: Family, integrator: str, per_hold: int) -> None:
@@ -123,7 +120,7 @@ class Peer:
         self.pool = rollout.Rollout(nthread=0)
 
     def run(self) -> Array:
-        """Run through the scene; returns positions in our coordinates at the end of every hold, (n_holds, nq)."""
+        """Simulate the scene; return positions of ce_gym at the end of every hold, shape (n_holds, nq)."""
         start, spec = self.family.start, int(self.family.spec)
         self.data.warning.number[:] = 0
         mujoco.mj_setState(self.model, self.data, start, STATE)
@@ -136,12 +133,12 @@ class Peer:
 
     @property
     def diverged(self) -> bool:
-        """Whether MuJoCo has met a bad state in the last run (it then resets that robot silently)."""
+        """Return whether MuJoCo warned of a bad state in the last run, after which MuJoCo resets the robot."""
         bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
         return any(self.data.warning[int(kind)].number > 0 for kind in bad)
 
 
 def positions(scene: Scene, model: mujoco.MjModel, qpos: Array) -> Array:
-    """Return positions in our coordinates, shape (..., nq), for MuJoCo's."""
+    """Convert positions from MuJoCo to coordinates of ce_gym, shape (..., nq)."""
     joints = [model.joint(name).qposadr[0] for name in scene.robot.independent]
     return qpos[..., [*range(7 if scene.robot.floating else 0), *joints]]

@@ -1,7 +1,7 @@
-"""The picture of the accuracy benchmark: one panel for each scene, error against time. Needs matplotlib.
+"""Picture of the accuracy benchmark: error against time, one panel for each scene. Needs matplotlib.
 
-Lines are ours in blue and green, dotted in single precision, MuJoCo's in orange and red, Drake's in yellow; the palette
-is that of Okabe and Ito.
+Lines of ce_gym are blue and green, dotted in single precision. MuJoCo is orange and red, Drake is yellow. The palette
+is by Okabe and Ito.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import matplotlib
 from ce_gym.bench.accuracy.curves import MARGIN, Curve, Measured
 from ce_gym.bench.accuracy.scenarios import SINGLE
 
-matplotlib.use("Agg")  # pictures go to files, whether or not there is a display
+matplotlib.use("Agg")  # works without a display
 from matplotlib import pyplot as plt
 
 BLUE, SKY, GREEN, ORANGE, RED, GREY = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#777777"
@@ -39,7 +39,7 @@ OURS = {
 }
 APPROXIMATE = ("ce_gym, armature or coupled, Euler", GREY, "o-")
 COLORS = {"": ORANGE, "exact": "#CC79A7", "stiff": RED}
-"""MuJoCo's: without rotors, rotors as bodies or loops at its default, and held stiffly."""
+"""Colours of MuJoCo: without rotors; rotors or loops with default constraints; with stiff constraints."""
 VARIANTS = {"": "without rotor bodies", "exact": "with rotor bodies", "stiff": "the same, stiff"}
 DRAKE, DRAKE_MARKERS = "#B8A000", {"discrete": "P", "fixed steps": "X", "error control": "*"}
 """Yellow, dark enough for thin lines."""
@@ -81,7 +81,7 @@ def draw(measured: list[Measured], file: Path) -> None:
 
 
 def _look(curve: Curve, exact: str) -> tuple[str, dict[str, Any]]:
-    """Return label and style of a curve."""
+    """Return label and line style of a curve."""
     if curve.code == "ce_gym":
         method = curve.method.removesuffix(f", {SINGLE}")
         label, color, line = OURS[method] if curve.level == exact else APPROXIMATE

@@ -1,8 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""What MJCF of the project's export leaves out, said in MuJoCo's terms: springs of transmissions, stairs, capsules.
-
-(MuJoCo's compiled modules carry no types, hence the line above.)
-"""
+"""Elements of scenes that the MJCF export lacks, added for MuJoCo: transmission springs, stairs, capsules."""
 
 from __future__ import annotations
 
@@ -21,11 +18,11 @@ from ce_gym.model.checks.collisions import capsules_of
 from ce_gym.model.mechanism import ELASTIC, build_mechanism
 
 Stating: TypeAlias = Callable[[Scene, mujoco.MjSpec], None]
-"""Adds something of a scene to a description."""
+"""Function that adds elements of a scene to a MuJoCo specification."""
 
 
 def stated(scene: Scene, level: str) -> tuple[Robot, str, Callable[[mujoco.MjSpec], None]]:
-    """Return the robot that is to be exported, at which level, and what completes its description."""
+    """Return robot and level of the export, and a function that completes the MuJoCo specification."""
 
     def also(spec: mujoco.MjSpec) -> None:
         for say in said:
@@ -44,13 +41,13 @@ def stated(scene: Scene, level: str) -> tuple[Robot, str, Callable[[mujoco.MjSpe
 
 
 def ratios(robot: Robot) -> dict[str, dict[str, float]]:
-    """Return how far each rotor turns for a unit of each independent joint, by rotor and joint."""
+    """Return the ratio of each rotor to each independent joint, by rotor and joint."""
     ties = joint_ties(build_mechanism(robot, "exact", eliminate=False))
     return {rotor.name: ties[rotor.name].ratios for rotor in robot.rotors()}
 
 
 def tendons(scene: Scene, spec: mujoco.MjSpec) -> None:
-    """Let rotors turn freely but for tendons, whose length is the stretch, with stiffness and damping."""
+    """Add tendons between rotors and joints, whose length is the stretch, with stiffness and damping."""
     of = ratios(scene.robot)
     for elastic in scene.robot.elastic:
         tendon = spec.add_tendon(name=f"{elastic.rotor}_spring", springlength=[0.0, 0.0])
@@ -61,7 +58,7 @@ def tendons(scene: Scene, spec: mujoco.MjSpec) -> None:
 
 
 def capsules(scene: Scene, spec: mujoco.MjSpec) -> None:
-    """Add the capsules of links that push each other apart, without friction; each pair has a bit of its own."""
+    """Add capsules of links with contact between each other, without friction; each pair has its own bit."""
     for i, pair in enumerate(scene.touching):
         for link, bits in zip(pair, ({"contype": 2 << i}, {"conaffinity": 2 << i}), strict=True):
             for capsule in capsules_of(scene.robot, link):
@@ -76,13 +73,13 @@ def capsules(scene: Scene, spec: mujoco.MjSpec) -> None:
 
 
 HALF_WIDTH, DEEP = 3.0, 1.0
-"""Of stairs in MuJoCo, to either side and downwards [m]."""
+"""Half width and depth of stairs in MuJoCo [m]."""
 
 
 def boxes(scene: Scene, spec: mujoco.MjSpec) -> None:
-    """Add a box for every step of stairs, sharp where a field of ours is round; MuJoCo's height field is slower."""
+    """Add a box for every step of stairs; edges are sharp, but MuJoCo's height field is slower."""
     terrain = scene.terrain
-    assert terrain is not None  # asked for only where there is a field
+    assert terrain is not None  # called only for scenes with a height field
     heights = terrain.heights[:, 0]
     x = terrain.origin[0] + terrain.cell * np.arange(len(heights))
     edges = [*np.flatnonzero(np.diff(heights)), len(heights) - 1]

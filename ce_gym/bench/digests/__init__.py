@@ -1,1 +1,1 @@
-"""Which results a change alters."""
+"""Digests of results, to compare versions and machines."""

@@ -1,7 +1,7 @@
-"""Digests of what models, simulators and environments compute, to see whether a change or a machine changes a bit.
+"""Digests of results of models, simulators and environments, to compare bits between versions and machines.
 
-`--out` writes a record, `--against` compares with one and tells by how much numbers differ. A record has a row for each
-robot, level, precision and variation, and in it for each array a hash of its bytes, the sum of its numbers, and a few.
+`--out` writes a record. `--against` compares with a record and reports the size of differences. A record has a row for
+each robot, level, precision and variation. A row has a hash of the bytes, the sum and some numbers of each array.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ce_gym.console import progress
 from ce_gym.model import robots
 
 SAMPLES = 16
-"""Numbers of an array that are recorded as they are."""
+"""Numbers of each array that a record contains."""
 Rows = dict[str, dict[str, Any]]
 
 
@@ -55,12 +55,12 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def row(case: Case) -> dict[str, Any]:
-    """Return the record of a case: of each array by name, its digest, sum and samples."""
+    """Return the row of a case: digest, sum and samples of each array by name."""
     return {name: fingerprint(array) for name, array in case.arrays().items()}
 
 
 def fingerprint(array: NDArray) -> dict[str, Any]:
-    """Return the digest of an array's type, shape and bytes, the sum of its numbers, and some of them."""
+    """Return the digest of an array's type, shape and bytes, the sum of its numbers, and samples."""
     plain = np.ascontiguousarray(array)
     text = f"{plain.dtype.name} {plain.shape} ".encode()
     numbers = plain.astype(float).ravel()
@@ -78,7 +78,7 @@ def combined(arrays: Mapping[str, Any]) -> str:
 
 
 def compare(record: Rows, rows: Rows, report: Report) -> None:
-    """Add to the report which rows differ from a record and by how much, and the requirement that none does."""
+    """Add the differences from a record, and the requirement of equality, to the report."""
     common = [key for key in rows if key in record]
     different = [line for key in common for line in differences(key, record[key], rows[key])]
     if different:
@@ -93,7 +93,7 @@ def compare(record: Rows, rows: Rows, report: Report) -> None:
 
 
 def differences(key: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[tuple[str, str, float, float]]:
-    """Yield a line for each array of a row that differs: row, array, largest difference of samples and sums."""
+    """Yield a line for each array that differs: row, array, largest difference of samples and sums."""
     nothing = {"digest": "", "sum": math.nan, "samples": []}
     for name in sorted({*old, *new}):
         one, other = old.get(name, nothing), new.get(name, nothing)

@@ -1,7 +1,7 @@
-"""What `digests` records: models, simulators and environments with seeded inputs, by public names of the package only.
+"""Cases of `digests`: models, simulators and environments with seeded inputs, by public names of the package only.
 
-Inputs are made of `Generator.random` by single additions and multiplications, and rounded to single precision, so
-that every machine computes the same ones.
+Inputs come from `Generator.random` by single additions and multiplications, rounded to single precision, so that every
+machine computes the same inputs.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from ce_gym.model.mechanism import LEVELS
 
 DTYPES = ("float64", "float32")
 NUM_ENVS = 17
-"""Robots in a batch: no multiple of the lanes of a vector."""
+"""Robots in a batch, not a multiple of the vector width."""
 SUBSTEPS = 20
 CONTROL_STEPS = 30
 EPISODE = 20
-"""Control steps until time is up, so that every environment is also reset."""
+"""Time limit of an episode [control steps], so that every environment is also reset."""
 OUTPUTS = ("torque", "power", "contact_forces", "energy")
 QUICK_ENVIRONMENT = "ce_gym/MiniCheetahVelocity-Exact-v0"
 
@@ -48,10 +48,10 @@ SIMULATOR_VARIATIONS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     },
     "six_bar": {"extrapolated": {"method": "extrapolated"}, "rk4": {"method": "rk4"}},
 }
-"""Further arguments of `Simulator` by robot and name, at the exact level; `terrain` stands for rough ground."""
+"""Additional arguments of `Simulator` by robot and name, at the exact level; `terrain` means rough ground."""
 
 PARAMETERS = {"friction": [0.7], "ratio": [1.0], "rotor_inertia": [1.0]}
-"""What then differs from robot to robot, by up to 0.2."""
+"""Parameters that differ between robots, by up to 0.2."""
 
 ENVIRONMENT_VARIATIONS: Mapping[str, Mapping[str, Any]] = {
     "randomised": {
@@ -67,7 +67,7 @@ ENVIRONMENT_VARIATIONS: Mapping[str, Mapping[str, Any]] = {
     "terrain": {"terrain": {"kind": "stairs", "rise": 0.08}, "command_curriculum": 0.3},
     "motor_pd": {"actions": "motor_pd", "motors": "limited"},
 }
-"""Further arguments of the velocity environment of Mini Cheetah, by name."""
+"""Additional arguments of the velocity environment of Mini Cheetah, by name."""
 
 Arrays = dict[str, NDArray]
 
@@ -78,11 +78,11 @@ class Case:
 
     Attributes:
         kind: "model", "simulator" or "environment".
-        name: Of the robot, or the id of the environment.
+        name: Name of the robot, or id of the environment.
         level: Transmission level.
         dtype: "float64" or "float32".
-        variation: What is unusual; "" for the defaults.
-        arguments: Further arguments of the simulator or the environment.
+        variation: Name of the variation; "" for the defaults.
+        arguments: Additional arguments of the simulator or the environment.
     """
 
     kind: str
@@ -94,11 +94,11 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Everything but the arguments, in one line."""
+        """Return all attributes except the arguments in one line."""
         return " ".join((self.kind, self.name, self.level, self.dtype, self.variation)).rstrip()
 
     def arrays(self) -> Arrays:
-        """Compute what is recorded, by name."""
+        """Compute the recorded arrays by name."""
         return KINDS[self.kind](self)
 
 
@@ -106,10 +106,9 @@ def cases(robots: Collection[str], kinds: Collection[str], quick: bool) -> list[
     """Return the cases of some robots.
 
     Args:
-        robots: Names.
-        kinds: Among "model", "simulator" and "environment".
-        quick: Whether to keep to the exact level, and to one environment and one variation of each kind in one
-            precision.
+        robots: Names of robots.
+        kinds: Some of "model", "simulator" and "environment".
+        quick: Whether to use only the exact level, one environment, and one variation of each kind in one precision.
     """
     everything = [*_models(robots), *_simulators(robots), *_environments(robots)]
     return [case for case in everything if case.kind in kinds and (not quick or _is_quick(case))]
@@ -153,13 +152,13 @@ def _environments(robots: Collection[str]) -> Iterator[Case]:
 
 
 def _around(rng: np.random.Generator, centre: Any, width: float, *shape: int) -> NDArray:
-    """Return numbers within `width` of `centre` that single precision can hold, shape (*shape, *centre.shape)."""
+    """Return single-precision numbers within `width` of `centre`, shape (*shape, *centre.shape)."""
     centre = np.asarray(centre, dtype=float)
     return (centre + (rng.random((*shape, *centre.shape)) * 2 - 1) * width).astype(np.float32).astype(float)
 
 
 def _states(model: ce_gym.Model, rng: np.random.Generator, n: int, width: float, speed: float) -> tuple[Any, Any]:
-    """Return `n` states about the standing pose, floating bases up to 1 cm off the ground and level."""
+    """Return `n` states near the standing pose; floating bases are level and up to 1 cm above the ground."""
     q = np.tile(model.standing_q, (n, 1))
     joints = len(model.joint_links)
     q[:, -joints:] = _around(rng, model.standing_q[-joints:], width, n)
@@ -237,4 +236,4 @@ def _stacked(steps: list[Arrays]) -> Arrays:
 
 
 KINDS = {"model": _model, "simulator": _simulator, "environment": _environment}
-"""What computes the arrays of a case."""
+"""Functions that compute the arrays of a case, by kind."""

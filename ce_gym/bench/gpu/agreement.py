@@ -1,4 +1,4 @@
-"""How far a device is from the CPU's kernels after one step from random states: every robot, level and type."""
+"""Compare a device with the CPU after one step from random states, for every robot, level and precision."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device, to_numpy
 
 BOUND = {"float64": 1e-11, "float32": 1e-5}
-"""Largest difference allowed, relative to a robot's largest position or velocity, or to 1. There should be none."""
+"""Largest allowed difference, relative to a robot's largest position or velocity, or to 1."""
 State = dict[str, NDArray]
 
 
 def stepped(model: Model, dtype: str, device: str | Device, num_envs: int) -> State:
-    """State after one sub-step from random states about the standing pose, all contacts, by name, rows of robots.
+    """Return states after one sub-step from random states near the standing pose with all contacts, by name.
 
-    Feet are up to 5 mm in the ground and up to 20 mm above; velocities are normal with 0.5 rad/s or m/s, targets
-    uniform within 0.2 rad. States are rounded to single precision first, so that all types start alike.
+    Feet are from 5 mm below to 20 mm above the ground. Velocities are normal with 0.5 rad/s or m/s, targets are uniform
+    within 0.2 rad. Initial states are rounded to single precision, so that they are equal in both precisions.
     """
     rng = np.random.default_rng(3)
     sim = Simulator(model, num_envs, dtype=dtype, device=device)
@@ -37,7 +37,7 @@ def stepped(model: Model, dtype: str, device: str | Device, num_envs: int) -> St
 
 
 def difference(one: State, other: State) -> NDArray:
-    """Return the largest difference of each robot, relative to its largest number or 1, shape (num_envs,)."""
+    """Return the largest difference of each robot, relative to its largest value or 1, shape (num_envs,)."""
     each = [np.abs(one[k] - other[k]).max(1) / np.maximum(1, np.abs(one[k]).max(1)) for k in one]
     return np.max(each, axis=0)
 
@@ -45,18 +45,18 @@ def difference(one: State, other: State) -> NDArray:
 def measure(
     names: Sequence[str], levels: Sequence[str], num_envs: int, device: Device, where: str, report: Report
 ) -> None:
-    """Add the table, and what was required.
+    """Add a table of differences and the requirements to a report.
 
     Args:
-        names: Of robots.
+        names: Names of robots.
         levels: Transmission levels.
         num_envs: Robots in a batch.
-        device: What is compared with the CPU.
-        where: Its name, for the title.
-        report: Gets the table and the requirements.
+        device: Device that is compared with the CPU.
+        where: Name of the device in the title.
+        report: The report.
 
     Raises:
-        RuntimeError: If the device cannot run kernels at all.
+        RuntimeError: If the device cannot run kernels.
     """
     rows: list[tuple[Cell, ...]] = []
     worst = dict.fromkeys(BOUND, 0.0)

@@ -1,7 +1,7 @@
 """GPU: agreement with the CPU, registers, sub-steps and environment steps per second, MuJoCo Warp.
 
-Without a GPU it prints what can be known without one: agreement, of the emitted source run by the CPU, and what
-the kernels take, by the run-time compiler; the rest it names as not measured, with the reason.
+Without a GPU the benchmark compares the emitted source, run on the CPU, and reports registers from the run-time
+compiler. The other measurements are listed as not measured, with the reason.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DTYPES = ("float32", "float64")
 ARCHITECTURES = ("sm_80", "sm_90")
 BATCHES = (4096, 16384, 65536, 262144, 1048576)
 REQUIRED = {"sub-steps": 1e9, "environment": 200e6, "warp": 50.0}
-"""Sub-steps and environment steps per second, and times as fast as MuJoCo Warp."""
+"""Required sub-steps and environment steps per second, and ratio of speeds to MuJoCo Warp."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def _device() -> tuple[Device, str]:
-    """The GPU, or what stands in for it and why."""
+    """Return the GPU, or a replacement on the CPU with the reason."""
     try:
         return device_named("cuda"), ""
     except ValueError as problem:
@@ -73,7 +73,7 @@ def _device() -> tuple[Device, str]:
 def _speed(
     arguments: argparse.Namespace, device: Device, reason: str, report: Report, missing: list[tuple[str, str, str]]
 ) -> None:
-    """Time what needs a GPU, or say that there is none."""
+    """Add the rates on a GPU, or remarks that they were not measured, to the report."""
     required = {name: f"{figure:,.0f}" for name, figure in REQUIRED.items()}
     rows: list[tuple[str, str, Callable[..., None]]] = [
         ("sub-steps/s, exact, feet on the ground, best batch", required["sub-steps"], _substeps),
@@ -121,10 +121,10 @@ def _require(report: Report, what: str, claim: str, rates: dict[str, dict[int, f
 
 
 class _Stages(Emulated):
-    """Keeps the stages of the kernel that is asked for last, compiling nothing."""
+    """Device that stores the stages of the last kernel and compiles nothing."""
 
     def kernel(self, key: str, build: Any, dtype: str) -> Any:
-        """Build the stages; return what has only buffers."""
+        """Build the stages; return a kernel with buffers only."""
         self.stages = tuple(build())
         self.source = emit_source(self.stages, dtype)
         self.buffers = {b.name: b for b in self.source.layout.buffers}
@@ -132,7 +132,7 @@ class _Stages(Emulated):
 
 
 def _resources(robot: str) -> Table:
-    """What the kernels take on real architectures, by the run-time compiler; no GPU is needed."""
+    """Return registers and memory of the kernels on GPU architectures, from the run-time compiler, without a GPU."""
     program = make_program(robot, "velocity")
     rows = []
     for dtype in DTYPES:

@@ -1,4 +1,4 @@
-"""Rates on a GPU: sub-steps and environment steps. Every function here needs a GPU."""
+"""Sub-steps and environment steps per second on a GPU. All functions need a GPU."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from ce_gym.sim import Simulator
 from ce_gym.sim.devices import Device
 
 SUBSTEPS = 20
-"""Sub-steps of a launch; as in the CPU's benchmark, targets jump between launches."""
+"""Sub-steps of a launch; targets jump between launches, as in the CPU benchmark."""
 CALLS = 10
 DT = 0.005
 Rates = dict[str, dict[int, float]]
-"""Name -> size of the batch -> per second."""
+"""Rates per second by name and batch size."""
 
 
 class Unmeasured(Exception):
-    """Why something was not measured, in one line."""
+    """A rate was not measured; the message is the reason in one line."""
 
 
 def name_of(device: Device) -> str:
@@ -31,7 +31,7 @@ def name_of(device: Device) -> str:
 
 
 def best_rate(work: Callable[[], object], amount: int, rounds: int) -> float:
-    """Return the highest rate of `rounds`, each waited for; the first, untimed, compiles and warms."""
+    """Return the highest rate of `rounds` synchronised rounds, after one round for compilation and warm-up."""
     import torch
 
     seconds = []
@@ -45,7 +45,7 @@ def best_rate(work: Callable[[], object], amount: int, rounds: int) -> float:
 
 
 def substeps(robot: str, device: Device, sizes: Sequence[int], dtypes: Sequence[str], rounds: int) -> Rates:
-    """Return sub-steps per second of robots that stand on their feet and are told to move about."""
+    """Return sub-steps per second of robots that stand on their feet and follow changing targets."""
     import torch
 
     rates: Rates = {}
@@ -69,7 +69,7 @@ def substeps(robot: str, device: Device, sizes: Sequence[int], dtypes: Sequence[
 
 
 def environment(robot: str, device: Device, sizes: Sequence[int], dtypes: Sequence[str], rounds: int) -> Rates:
-    """Return environment steps per second of the velocity task, random actions, resets included."""
+    """Return environment steps per second of the velocity task with random actions and resets."""
     import torch
 
     from ce_gym.envs.vector import LeggedVectorEnv
@@ -90,7 +90,7 @@ def environment(robot: str, device: Device, sizes: Sequence[int], dtypes: Sequen
 
 
 def rate_table(title: str, rates: Rates) -> Table:
-    """Return rates by size of the batch, a column for each name."""
+    """Return a table of rates by batch size, with one column for each name."""
     sizes = sorted({size for by_size in rates.values() for size in by_size})
     rows = tuple((size, *(by_size.get(size) for by_size in rates.values())) for size in sizes)
     return Table(title, ("robots", *rates), rows)

@@ -1,8 +1,5 @@
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
-"""MuJoCo Warp as a peer on the GPU: the same robot, feet and step. Needs the package `mujoco-warp`, and a GPU.
-
-(MuJoCo's compiled modules carry no types, hence the line above.)
-"""
+"""MuJoCo Warp on the GPU, with the same robot, feet and step. Needs the package `mujoco-warp` and a GPU."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from ce_gym.model import load_robot
 
 
 def rates(robot: str, sizes: Sequence[int], rounds: int) -> Rates:
-    """Return sub-steps per second of MuJoCo Warp, at the exact and armature levels, from the standing pose.
+    """Return sub-steps per second of MuJoCo Warp at the levels exact and armature, from the standing pose.
 
     Raises:
         ImportError: If `mujoco_warp` is not installed.

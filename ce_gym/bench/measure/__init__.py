@@ -1,1 +1,1 @@
-"""What every benchmark shares: timing, the report, progress and the machine it ran on."""
+"""Timing, report and machine description of all benchmarks."""

@@ -1,4 +1,4 @@
-"""The machine a figure was measured on."""
+"""Description of the machine of a measurement."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PACKAGES = ("ce_gym", "numpy", "llvmlite", "casadi", "gymnasium", "mujoco")
 
 
 def describe() -> dict[str, str]:
-    """Return processor, cores, system, date and versions, in the order in which they are printed."""
+    """Return processor, cores, system, date and versions, in the order of the report."""
     versions = {name: version for name in PACKAGES if (version := _version(name))}
     return {
         "processor": processor(),
@@ -27,7 +27,7 @@ def describe() -> dict[str, str]:
 
 
 def commit() -> str:
-    """Return the commit of the source, with "-dirty" if files differ from it; empty outside of a repository."""
+    """Return the commit of the source, with "-dirty" if files were changed; empty outside a repository."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

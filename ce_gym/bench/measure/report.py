@@ -1,4 +1,4 @@
-"""What a benchmark returns: aligned plain-text tables, the machine and what was required."""
+"""Report of a benchmark: tables, requirements, remarks and machine, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Table:
     """A table of results.
 
     Attributes:
-        title: Printed above.
+        title: Title of the table.
         columns: Headings, with units.
         rows: One cell for each column; numbers are kept as numbers for JSON.
     """
@@ -25,18 +25,18 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
 
     def as_text(self) -> str:
-        """Return the table with aligned columns: text to the left, numbers to the right."""
+        """Return the table with aligned columns: text left, numbers right."""
         return f"{self.title}\n\n{table_text(self.columns, self.rows, indent='', text=cell_text)}"
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """A bar that a figure has to reach.
+    """A requirement on a measured value.
 
     Attributes:
-        claim: What is required, with the figure required.
-        measured: The figure.
-        met: Whether it is enough; None if there was nothing to judge.
+        claim: The requirement in words, with the required value.
+        measured: The measured value.
+        met: Whether the requirement is met; None without a measurement.
     """
 
     claim: str
@@ -45,13 +45,13 @@ class Requirement:
 
     @property
     def verdict(self) -> str:
-        """Return one word."""
+        """Return the result in one word."""
         return "none" if self.met is None else "met" if self.met else "MISSED"
 
 
 @dataclass
 class Report:
-    """Tables, requirements and remarks of one run, on one machine; `failed` asks for a non-zero exit status."""
+    """Tables, requirements and remarks of one run; if `failed`, the exit status is 1."""
 
     name: str
     tables: list[Table] = field(default_factory=list)
@@ -62,7 +62,7 @@ class Report:
     command: str = ""
 
     def as_text(self) -> str:
-        """Return everything as plain text."""
+        """Return the report as plain text."""
         parts = ["\n".join(f"{key:>10}: {value}" for key, value in self.machine.items())]
         parts += [table.as_text() for table in self.tables]
         if self.requirements:
@@ -71,7 +71,7 @@ class Report:
         return "\n\n".join(parts)
 
     def as_json(self) -> str:
-        """Return everything as JSON."""
+        """Return the report as JSON."""
         content = {
             "name": self.name,
             "command": self.command,
@@ -81,11 +81,11 @@ class Report:
             "requirements": [vars(r) for r in self.requirements],
             "remarks": self.remarks,
         }
-        return json.dumps(content, indent=2, default=lambda scalar: scalar.item()) + "\n"  # of numpy
+        return json.dumps(content, indent=2, default=lambda scalar: scalar.item()) + "\n"  # numpy scalars
 
 
 def read_report(file: Path) -> Report:
-    """Return the report that a JSON file holds."""
+    """Return the report in a JSON file."""
     content = json.loads(file.read_text(encoding="utf-8"))
     tables = [Table(t["title"], tuple(t["columns"]), tuple(map(tuple, t["rows"]))) for t in content["tables"]]
     requirements = [Requirement(**requirement) for requirement in content["requirements"]]
@@ -94,7 +94,7 @@ def read_report(file: Path) -> Report:
 
 
 def cell_text(cell: Cell) -> str:
-    """Return a cell as it is printed: four significant digits for a float, nothing for None."""
+    """Return a cell as text: four significant digits for a float, an empty string for None."""
     if cell is None:
         return ""
     if isinstance(cell, bool):

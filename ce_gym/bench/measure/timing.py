@@ -1,4 +1,4 @@
-"""Honest timing: competitors take turns in one run, so that a change of the machine's pace meets them all."""
+"""Compare run times: competitors run alternately, so that changes of the machine's speed affect all."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ce_gym.console import progress
 
 @dataclass(frozen=True)
 class Competitor:
-    """Something to time.
+    """A function to time.
 
     Attributes:
-        run: Does the work once.
+        run: The function.
         work: Units of work in one call, such as robots times sub-steps.
     """
 
@@ -25,34 +25,34 @@ class Competitor:
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds for one unit of work, one figure for each round.
+    """Times for one unit of work.
 
     Attributes:
-        seconds: In the order of the rounds [s].
+        seconds: Time in each round [s].
     """
 
     seconds: tuple[float, ...]
 
     @property
     def best(self) -> float:
-        """The fastest round [s], the one least disturbed by other processes."""
+        """The shortest time [s], which other processes disturb least."""
         return min(self.seconds)
 
     @property
     def median(self) -> float:
-        """The median round [s]."""
+        """The median time [s]."""
         return statistics.median(self.seconds)
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times as long one competitor takes as another.
+    """Ratio of the times of two competitors.
 
     Attributes:
-        of_best: The best round of one against the best round of the other.
-        median: Median over rounds, each compared with the same round of the other.
-        lowest: Smallest of those.
-        highest: Largest of those.
+        of_best: Ratio of the shortest times.
+        median: Median of the ratios in each round.
+        lowest: Smallest ratio of a round.
+        highest: Largest ratio of a round.
     """
 
     of_best: float
@@ -62,7 +62,7 @@ class Ratio:
 
     @property
     def cautious(self) -> float:
-        """The smaller of the two estimates."""
+        """The smaller one of `of_best` and `median`."""
         return min(self.of_best, self.median)
 
     def __str__(self) -> str:
@@ -72,13 +72,12 @@ class Ratio:
 def interleaved(
     competitors: Mapping[str, Competitor], rounds: int = 7, clock: Callable[[], float] = time.perf_counter
 ) -> dict[str, Timing]:
-    """Time competitors in turn.
+    """Time competitors alternately.
 
     Args:
-        competitors: By name. Each runs once untimed first.
-        rounds: How often each is timed.
-        clock: `time.perf_counter` for elapsed time, or `time.thread_time` for work that stays on the calling thread, on
-            a machine that others use too.
+        competitors: Competitors by name. Each runs once before the timing.
+        rounds: Number of timings of each competitor.
+        clock: `time.perf_counter` for elapsed time, or `time.thread_time` for the processor time of the calling thread.
 
     Returns:
         Timing of one unit of work, by name.
@@ -95,6 +94,6 @@ def interleaved(
 
 
 def ratio(slow: Timing, fast: Timing) -> Ratio:
-    """Compare two timings of one `interleaved` run."""
+    """Return the ratio of two timings of one `interleaved` run."""
     ratios = [a / b for a, b in zip(slow.seconds, fast.seconds, strict=True)]
     return Ratio(slow.best / fast.best, statistics.median(ratios), min(ratios), max(ratios))

@@ -1,1 +1,1 @@
-"""The figures of the constraint-embedding paper, drawn again."""
+"""Experiments of the constraint-embedding paper, repeated."""

@@ -1,6 +1,6 @@
-"""What exactness costs: instructions of the traced dynamics at every transmission level, beside the paper's library.
+"""Number of instructions of forward dynamics at each transmission level, compared with the paper's library.
 
-An instruction is one scalar operation of a CasADi function, `Function.n_instructions()`, the paper's own measure.
+An instruction is one scalar operation of a CasADi function, `Function.n_instructions()`, as in the paper.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from ce_gym.model.mechanism import LEVELS, is_axisymmetric
 
 FUNCTIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix")
 LARGEST_RATIO = {"gears": 1.03, "belts or differentials": 1.10}
-"""Most instructions that exact forward dynamics may take, as a multiple of armature, by what the robot has."""
+"""Largest allowed ratio of instructions, `exact` to `armature`, by kind of transmission."""
 
 
 @dataclass(frozen=True)
 class LibraryCount:
-    """Counts of the paper's C++ library, generalized_rbda at commit 45fa7c4, built with CasADi 3.8.2.
+    """Instructions of the paper's C++ library, generalized_rbda at commit 45fa7c4, built with CasADi 3.8.2.
 
-    Formed as in its Benchmarking/src/approximateBenchmark.cpp.
+    Counted as in its file Benchmarking/src/approximateBenchmark.cpp.
 
     Attributes:
         exact: Cluster-tree articulated-body algorithm.
-        approximate: Articulated-body algorithm with rotors deleted; None where the library has no such model.
+        approximate: Articulated-body algorithm without rotors; None if the library has no such model.
     """
 
     exact: int

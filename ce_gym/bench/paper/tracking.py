@@ -1,10 +1,10 @@
 """Joint torque error of simplified transmissions while a leg tracks a sinusoid (the paper's tracking experiment).
 
-The set-up is that of the constraint-embedding paper's authors, ROAM-Lab-ND/generalized_rbda branch v0.1.0,
-Benchmarking/src/accuracyBenchmarkEndEffectorTracking.cpp: every joint follows 0.5 sin(2 pi 1.5 t) rad for 5 s on a
-fixed base, sampled at 0.5 ms; the simplified models have no rotors at all ("unconstrained"), or the diagonal of their
-reflected inertia ("approximate"). The paper's 4.31 and 1.04 N m belong to the knee coordinate, though
-it calls them the ankle's.
+The experiment is defined by the authors of the constraint-embedding paper, ROAM-Lab-ND/generalized_rbda branch v0.1.0,
+Benchmarking/src/accuracyBenchmarkEndEffectorTracking.cpp. Every joint follows 0.5 sin(2 pi 1.5 t) rad for 5 s on a
+fixed base, sampled at 0.5 ms. The simplified models have no rotors ("unconstrained"), or the diagonal of their
+reflected inertia ("approximate"). The paper's values of 4.31 and 1.04 N m belong to the knee coordinate, which the
+paper calls the ankle.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ STEP = 5e-4
 SAMPLES = 10001
 SIMPLIFIED = {"none": "unconstrained", "armature": "approximate"}
 PUBLISHED = {("none", "knee_link"): 4.3096, ("armature", "knee_link"): 1.0446}
-"""Root mean square error of the knee [N m], as recomputed from the authors' program."""
+"""Root mean square error of the knee, computed with the authors' program [N m]."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""MuJoCo at its best: the fastest settings with which robots stand as they do at 1 ms with a converged solver."""
+"""Find the fastest settings of MuJoCo with which robots stand as with 1 ms steps and a converged solver."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from ce_gym.export.mujoco_model import STIFF, Settings, compile_model
 from ce_gym.model import Robot
 
 SOLVERS = (("Newton", 100, 50), ("Newton", 4, 4), ("Newton", 3, 4), ("Newton", 2, 4), ("CG", 5, 4), ("PGS", 5, 4))
-"""Solvers tried, with most iterations and most iterations of their line search."""
+"""Solvers, with limits on iterations and on iterations of their line search."""
 
 INTEGRATORS = ("Euler", "implicitfast", "discrete")
 IMPEDANCES = (STIFF, None)
-"""Tried for the equalities that stand for gears; None is MuJoCo's default."""
+"""Impedances of the equality constraints of gears; None is MuJoCo's default."""
 
 NUM_ENVS = 32
 
 
 def candidates(timestep: float, level: str) -> list[Settings]:
-    """Return the settings tried at a time step [s] and transmission level."""
+    """Return the settings to try at a time step [s] and transmission level."""
     impedances = IMPEDANCES if level == "exact" else (None,)
     return [Settings(timestep, i, *s, solimp) for i, s, solimp in itertools.product(INTEGRATORS, SOLVERS, impedances)]
 
 
 def watched(robot: Robot, level: str, settings: Settings, num_envs: int = NUM_ENVS) -> tuple[Batch, stand.Behaviour]:
-    """Return a batch that has stood for a while, and how it stood."""
+    """Return a batch of standing robots, and their behaviour."""
     model = compile_model(robot, level, settings)
     batch = Batch(model, num_envs)
     return batch, stand.watch_mujoco(batch, robot, Coordinates.of(model, robot))
 
 
 def fastest(robot: Robot, level: str, timestep: float) -> tuple[Settings, Batch, stand.Behaviour]:
-    """Return the fastest settings with which robots stand, at `timestep` [s] or, failing that, at smaller ones.
+    """Return the fastest settings with which robots stand, at `timestep` [s] or at a smaller step if necessary.
 
     Raises:
-        RuntimeError: If they stand with none.
+        RuntimeError: If robots fall with all settings.
     """
     _, reference = watched(robot, level, Settings(0.001, "Euler", solimp=STIFF), 16)
     for dt in (timestep, timestep / 2.5, timestep / 5.0):

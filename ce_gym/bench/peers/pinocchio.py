@@ -1,9 +1,8 @@
 # pyright: reportAttributeAccessIssue=false
-"""Pinocchio as a peer: the tree of a robot with armature; `aba` knows neither loops nor tied joints.
+"""Robots in Pinocchio: the tree of a robot with armature, because `aba` has no loops and no gears.
 
-Joints that are not numbered depth first make Pinocchio's `crba` wrong without a word. Its base velocity is [linear,
-angular], its quaternion (x, y, z, w); ours are the other way round. (Compiled modules carry no types, hence the line
-above.)
+Pinocchio's `crba` returns wrong results without an error if joints are not numbered depth first. Its base velocity is
+[linear, angular] and its quaternion (x, y, z, w); ce_gym has the opposite order.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ class Peer:
     """A robot in Pinocchio.
 
     Attributes:
-        robot: What it was made from.
-        model: The tree, armature included.
-        names: Our body of each of its joints, in Pinocchio's order.
+        robot: The robot in ce_gym.
+        model: The robot in Pinocchio, with armature.
+        names: Name of the body of each joint, in Pinocchio's order.
     """
 
     robot: Robot
@@ -45,20 +44,20 @@ class Peer:
     names: tuple[str, ...]
 
     def positions(self, q: Array) -> Array:
-        """Return Pinocchio's positions for ours, shape (nq,) to (model.nq,)."""
+        """Convert positions to Pinocchio's order, shape (nq,) to (model.nq,)."""
         base = 7 if self.robot.floating else 0
         joints = dict(zip(self.robot.independent, q[base:], strict=True))
         head = [*q[:3], *q[4:7], q[3]] if base else []
         return np.array([*head, *(joints[name] for name in self.names if name in joints)])
 
     def velocities(self, v: Array) -> Array:
-        """Return Pinocchio's velocities, or forces, for ours, shape (nv,) to (model.nv,)."""
+        """Convert velocities or forces to Pinocchio's order, shape (nv,) to (model.nv,)."""
         base = 6 if self.robot.floating else 0
         joints = dict(zip(self.robot.independent, v[base:], strict=True))
         return np.array([*v[3:base], *v[: min(3, base)], *(joints[name] for name in self.names if name in joints)])
 
     def accelerations(self, a: Array) -> Array:
-        """Return our accelerations for Pinocchio's, shape (model.nv,) to (nv,)."""
+        """Convert accelerations from Pinocchio's order, shape (model.nv,) to (nv,)."""
         base = 6 if self.robot.floating else 0
         names = self.names[1:] if base else self.names
         joints = dict(zip(names, a[base:], strict=True))
@@ -66,10 +65,10 @@ class Peer:
 
 
 def load(robot: Robot) -> Peer:
-    """Build a robot at transmission level `armature`.
+    """Return a robot at transmission level `armature`.
 
     Raises:
-        RobotError: If the robot has something that Pinocchio's forward dynamics does not.
+        RobotError: If the robot has an element that Pinocchio's forward dynamics lacks.
     """
     if robot.balls:
         raise RobotError(f"{robot.name}: ball joint of {robot.balls[0]!r}: expected none for this comparison")
@@ -90,7 +89,7 @@ def forward_dynamics(peer: Peer, n_states: int = 64) -> Competitor:
 
 
 def derivatives(peer: Peer, n_states: int = 64) -> Competitor:
-    """Return `computeABADerivatives` called from a Python loop on such states."""
+    """Return `computeABADerivatives` called from a Python loop on standing states with random velocities and forces."""
     model, data = peer.model, peer.model.createData()
     call = _loop(lambda q, v, tau: pin.computeABADerivatives(model, data, q, v, tau), _states(peer, n_states))
     return Competitor(call, n_states)
@@ -105,7 +104,7 @@ def _states(peer: Peer, n_states: int) -> list[tuple[Array, Array, Array]]:
 
 
 def overhead(n_calls: int = 64) -> Competitor:
-    """Return `aba` of a single joint called from a Python loop: mostly the way from Python and back."""
+    """Return `aba` of a single joint called from a Python loop, to measure the overhead of a call."""
     model = pin.Model()
     joint = model.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "x")
     model.appendBodyToJoint(joint, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
@@ -123,7 +122,7 @@ def _loop(method: Callable[[Array, Array, Array], object], states: list[tuple[Ar
 
 
 def _tree(mechanism: Mechanism, armature: dict[str, float]) -> tuple[pin.Model, tuple[str, ...]]:
-    """Add joints depth first."""
+    """Return the tree with joints numbered depth first, and the names of the bodies."""
     model, names = pin.Model(), []
     ids: dict[str | None, int] = {None: 0}
     model.gravity.linear = np.array(mechanism.robot.gravity)
@@ -150,7 +149,7 @@ def _joint(kind: str, axis: Array) -> pin.JointModel:
     if kind == "free":
         return pin.JointModelFreeFlyer()
     family = {"revolute": "R", "prismatic": "P"}[kind]
-    for i, letter in enumerate(AXES):  # along a coordinate axis there is a cheaper joint
+    for i, letter in enumerate(AXES):  # joints along a coordinate axis are faster
         if np.allclose(axis, np.eye(3)[i]):
             return getattr(pin, f"JointModel{family}{letter}")()
     return getattr(pin, {"R": "JointModelRevoluteUnaligned", "P": "JointModelPrismaticUnaligned"}[family])(axis)

@@ -1,4 +1,4 @@
-"""The scene of the speed benchmark: robots hold their standing pose while their targets jitter, contacts active."""
+"""Scene of the speed benchmark: robots stand on the ground while their joint targets jitter."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ JITTER = 0.05
 """Largest distance of a target from the standing pose [rad]."""
 
 HOLD = 0.02
-"""How long a target is held [s]."""
+"""Time between two targets [s]."""
 
 SETTLE, WATCH = 1.0, 1.0
-"""How long robots stand before they are judged, and how long they are watched [s]."""
+"""Time before the observation of standing robots, and length of the observation [s]."""
 
 
 LARGEST_SLIP = 0.1
-"""Gear error at a rotor beyond which a peer no longer simulates the same robot [rad]."""
+"""Largest allowed gear error at a rotor of a peer [rad]."""
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How robots stood while they were watched.
+    """Behaviour of standing robots during the observation.
 
     Attributes:
         finite: Whether no robot diverged.
@@ -48,13 +48,13 @@ class Behaviour:
     slip: float
 
     def like(self, reference: Behaviour) -> bool:
-        """Whether the robots stand as they do in a reference: upright, gears engaged, at most half as fast again."""
+        """Return whether robots stand as in a reference: upright, gears engaged, at most 1.5 times the speed."""
         engaged = self.slip <= LARGEST_SLIP
         return self.finite and engaged and self.height > 0.75 and self.speed <= 1.5 * reference.speed
 
 
 def bare(robot: Robot, contacts: str) -> Robot:
-    """Return the robot with one group of contacts ("all" keeps every one), and without visual shapes."""
+    """Return a robot with one group of contacts ("all" keeps all groups) and without visual shapes."""
     kept = tuple(contact for contact in robot.contacts if contacts in ("all", contact.group))
     bodies = tuple(replace(body, shapes=()) for body in robot.bodies)
     return replace(robot, contacts=kept, bodies=bodies)
@@ -69,7 +69,7 @@ def targets(robot: Robot, num_envs: int, n_targets: int, seed: int) -> Array:
 
 
 def watch_mujoco(batch: Batch, robot: Robot, coordinates: Coordinates) -> Behaviour:
-    """Settle MuJoCo's robots, watch them, and leave them standing."""
+    """Let MuJoCo's robots settle, and return their behaviour; the robots then still stand."""
     n = round(HOLD / batch.model.opt.timestep)
     before, after = round(SETTLE / HOLD), round(WATCH / HOLD)
     control = np.repeat(targets(robot, batch.num_envs, before + after, seed=1), n, axis=1)
@@ -94,7 +94,7 @@ def watch_mujoco(batch: Batch, robot: Robot, coordinates: Coordinates) -> Behavi
 
 
 def watch_ours(sim: Simulator, robot: Robot) -> Behaviour:
-    """Settle our robots, watch them, and leave them standing."""
+    """Let robots of ce_gym settle, and return their behaviour; the robots then still stand."""
     n = round(HOLD / sim.dt)
     before, after = round(SETTLE / HOLD), round(WATCH / HOLD)
     jitter = targets(robot, sim.num_envs, before + after, seed=1)

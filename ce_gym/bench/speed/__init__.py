@@ -1,1 +1,1 @@
-"""Time of forward dynamics and of sub-steps beside other simulators."""
+"""Speed of forward dynamics and sub-steps, compared with other simulators."""

@@ -1,7 +1,7 @@
-"""One robot's sub-step beside MuJoCo's at its best, in both precisions, and its share of the processor's peak.
+"""Time of one robot's sub-step, compared with MuJoCo's fastest settings and with the peak of the processor.
 
-Both sides stand on the same contact spheres, hold the same jittered position targets with the same gains, and are timed
-in turn; MuJoCo gets the fastest settings with which it still stands as it does at 1 ms with a converged solver.
+Both simulators have the same contact spheres, jittered position targets and gains, and run alternately. MuJoCo has the
+fastest settings with which the robot stands as with 1 ms steps and a converged solver.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from ce_gym.model import Robot, load_robot
 from ce_gym.sim import Simulator
 
 IN_DEPTH = ("armature", "exact")
-"""Levels that are compared."""
+"""Transmission levels."""
 DTYPES = ("float64", "float32")
 REQUIRED = {"armature": 30.0, "exact": 55.0}
-"""How many times as long as ours MuJoCo's sub-step has to take, both in double precision."""
+"""Required ratio of times, MuJoCo to ce_gym, both in double precision."""
 LEAST_GAIN = 1.7
-"""How many times as fast single precision has to be, exact."""
+"""Required ratio of times, double to single precision, at level `exact`."""
 LEAST_SHARE = 40.0
-"""Least share of the machine's peak that the exact sub-step has to reach, in either precision [%]."""
+"""Required fraction of the processor's peak for the exact sub-step in both precisions [%]."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def _compare(robot: Robot, arguments: argparse.Namespace, report: Report) -> None:
-    """Compare one robot's sub-step with MuJoCo at its best, and with the machine's peak."""
+    """Add the comparison of a robot's sub-step with MuJoCo and with the processor's peak to the report."""
     sides = [_our_side(robot, level, dtype, arguments) for level in IN_DEPTH for dtype in DTYPES]
     sides += [_mujoco_side(robot, level, arguments.dt) for level in IN_DEPTH]
     peaks = {f"peak {dtype}": competitors.peak(dtype) for dtype in DTYPES}
@@ -84,7 +84,7 @@ def _compare(robot: Robot, arguments: argparse.Namespace, report: Report) -> Non
 
 @dataclass(frozen=True)
 class Side:
-    """One competitor, how it is set up and how its robots stand."""
+    """One competitor with its settings and the behaviour of its robots."""
 
     name: str
     settings: str

@@ -1,8 +1,8 @@
-"""Every robot's sub-step beside MuJoCo's, same contacts and targets, one core; of MuJoCo also at its cheapest level.
+"""Time of a sub-step of every robot, compared with MuJoCo on one core, with the same contacts and targets.
 
-Ours is exact, in double precision; contacts but the feet's are looked at where they are near, as all of MuJoCo's are.
-MuJoCo, with Newton 4/4 as for robots that it is not tuned for, is timed at `exact`, where rotors are bodies and gears
-equalities, and at the simplest level that MJCF has for it: what most people run.
+ce_gym runs at level `exact` in double precision. It computes contacts of the feet always, and all other contacts only
+near the ground, as MuJoCo does for all contacts. MuJoCo has the solver Newton 4/4 and is timed at two levels: `exact`,
+with rotors as bodies and gears as equalities, and the simplest level in MJCF, which most users choose.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ce_gym.envs.custom import missing
 from ce_gym.model import Robot, RobotError, load_robot, robots
 
 REQUIRED = 40.0
-"""How many times as long as ours MuJoCo's sub-step has to take, exact."""
+"""Required ratio of times at level `exact`, MuJoCo to ce_gym."""
 SIMPLEST = ("armature", "coupled")
 NUM_ENVS, MUJOCO_ENVS = 1024, 32
 COLUMNS = ("robot", "contacts", "ours [us]", "MuJoCo exact [us]", "ratio", "MuJoCo simplest [us]", "level", "ratio ")

@@ -1,9 +1,8 @@
 # pyright: reportAttributeAccessIssue=false
-"""What the speed benchmarks time: sub-steps and forward dynamics, ours and MuJoCo's, and the peak of the processor.
+"""Competitors of the speed benchmarks: sub-steps and forward dynamics of ce_gym and peers, and the processor's peak.
 
-In sub-steps, targets jitter around the standing pose. Both sides go on for half a second and then return to the
-standing pose, so that a robot that falls is not timed on the ground. (MuJoCo's compiled modules carry no types, hence
-the line above.)
+In sub-steps, targets jitter around the standing pose. Robots return to the standing pose every half second, so that
+robots that fall are not timed on the ground.
 """
 
 from __future__ import annotations
@@ -41,24 +40,24 @@ from ce_gym.sim.kernel_key import model_key
 from ce_gym.sim.substeps import substeps
 
 SUBSTEPS = 4
-"""Sub-steps of one call: one step of a policy."""
+"""Sub-steps in one call, one step of a policy."""
 TARGETS = 8
-"""How many sets of targets take turns, one for each call."""
+"""Number of sets of targets; calls use them in turn."""
 CALLS_UNTIL_RESET = 25
-"""Calls after which robots begin again from the standing pose."""
+"""Calls after which robots return to the standing pose."""
 ROBOT_CALLS = 4096 * CALLS_UNTIL_RESET
-"""Robots times calls that are timed together: of batches up to 4096, whole half seconds."""
+"""Robots times calls in one timing; for batches up to 4096 a multiple of half a second."""
 CHAINS, LINKS = 16, 4
 """Chains of multiply-adds for the peak: enough to hide the latency of two units, and few enough to stay in registers.
-Code goes through one chain after the other, since links of all chains must fit into what a CPU looks ahead."""
+The code computes one chain after the other, so that the links of all chains fit into the CPU's reorder buffer."""
 PEAK_REPEATS = 400_000
-"""Several milliseconds: a core that has done scalar work takes a while to reach its pace in vector work."""
+"""Repeats for several milliseconds, because a core needs time to reach its full speed in vector work."""
 
 
 def sub_steps(
     model: Model, dtype: str, num_envs: int, num_threads: int, dt: float, seldom: Sequence[str] = ()
 ) -> Competitor:
-    """Return calls of `Simulator.step`, copying of targets included; one unit of work is one robot's sub-step."""
+    """Return calls of `Simulator.step` with copying of targets; one unit of work is one robot's sub-step."""
     sim = Simulator(model, num_envs, dt, dtype, num_threads, seldom=seldom)
     start, made = sim.snapshot(), count()
     calls = max(1, ROBOT_CALLS // num_envs)
@@ -74,7 +73,7 @@ def sub_steps(
 
 
 def operations(model: Model, dtype: str, dt: float) -> int:
-    """Return floating-point operations of one robot's sub-step; what only some steps do is not counted."""
+    """Return floating-point operations of one robot's sub-step, without operations that only some steps make."""
     sim = Simulator(model, 1, dt, dtype)
     _, _, steps = substeps(model.mechanism, sim.options, ("torque", "contact_forces"))
     calls = [call for call in calls_of(steps) if isinstance(call, Call) and not call.only_if]
@@ -82,8 +81,8 @@ def operations(model: Model, dtype: str, dt: float) -> int:
 
 
 def bytes_per_robot(model: Model, dtype: str, dt: float) -> int:
-    """Return the memory that one more robot of a Simulator takes [B]."""
-    Simulator(model, 8, dt, dtype)  # loads the kernel, whose memory is not the robots'
+    """Return the memory of one additional robot of a Simulator [B]."""
+    Simulator(model, 8, dt, dtype)  # loads the kernel, so that its memory is not counted
     sizes = []
     for num_envs in (1024, 2048):
         tracemalloc.start()
@@ -95,11 +94,11 @@ def bytes_per_robot(model: Model, dtype: str, dt: float) -> int:
 
 
 def mujoco_batch(robot: Robot, level: str, num_envs: int, num_threads: int, dt: float) -> Batch:
-    """Return MuJoCo's robots in their standing pose, at settings with which Mini Cheetah stands.
+    """Return a batch of MuJoCo in the standing pose, with settings with which Mini Cheetah stands.
 
     Raises:
-        RobotError: If MJCF cannot say what the robot is at this level.
-        ValueError: If MuJoCo refuses it.
+        RobotError: If MJCF cannot express the robot at this level.
+        ValueError: If MuJoCo refuses the robot.
     """
     settings = Settings(dt, "Euler", "Newton", 4, 4, STIFF if level == "exact" else None)
     return Batch(mujoco_model.compile_model(robot, level, settings), num_envs, num_threads)
@@ -124,12 +123,12 @@ def mujoco_steps(batch: Batch, robot: Robot) -> Competitor:
 
 
 def silence_mujoco() -> None:
-    """Keep MuJoCo from writing a log of robots that fall over."""
+    """Disable MuJoCo's warnings and log about robots that fall."""
     mujoco.set_mju_user_warning(lambda _: None)
 
 
 def dynamics_kernel(robot: Robot, level: str, dtype: str, derivatives: bool = False) -> Kernel:
-    """Compile forward dynamics of a robot, or its derivatives with respect to q, v and tau, on tiles."""
+    """Return a kernel for forward dynamics of a batch, or for its derivatives with respect to q, v and tau."""
     model = Model(robot, transmission=level)
 
     def build() -> Program:
@@ -147,7 +146,7 @@ def dynamics_kernel(robot: Robot, level: str, dtype: str, derivatives: bool = Fa
 def random_states(model: Model, num_envs: int) -> dict[str, np.ndarray]:
     """Return positions around the standing pose, random velocities and forces, shapes (num_envs, nq or nv)."""
     rng = np.random.default_rng(0)
-    q = model.standing_q + rng.uniform(-0.3, 0.3, (num_envs, model.nq))  # loops can still be assembled
+    q = model.standing_q + rng.uniform(-0.3, 0.3, (num_envs, model.nq))  # small enough for closed loops
     if model.robot.floating:
         q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
     shape = (num_envs, model.nv)
@@ -155,7 +154,7 @@ def random_states(model: Model, num_envs: int) -> dict[str, np.ndarray]:
 
 
 def forward_dynamics(robot: Robot, level: str, num_envs: int, derivatives: bool = False) -> Competitor:
-    """Return our kernel in double precision on random states; one unit of work is the acceleration of one robot."""
+    """Return forward dynamics of ce_gym, double precision, random states; one unit of work is one robot."""
     kernel, lanes, repeats = dynamics_kernel(robot, level, "float64", derivatives), lane_count("float64"), 8
     num_envs = -(-num_envs // lanes) * lanes
     rows = random_states(Model(robot, transmission=level), num_envs)
@@ -176,7 +175,7 @@ def mujoco_forward(robot: Robot, level: str, repeats: int = 256) -> Competitor:
     """Return `mj_forward` in the standing pose; one unit of work is one call.
 
     Raises:
-        RobotError: If MJCF cannot say what the robot is at this level.
+        RobotError: If MJCF cannot express the robot at this level.
     """
     model = mujoco_model.load(robot, level)
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT if model.neq else mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -192,10 +191,10 @@ def mujoco_forward(robot: Robot, level: str, repeats: int = 256) -> Competitor:
 
 
 def pinocchio_peer(robot: Robot) -> dict[str, Competitor]:
-    """Return Pinocchio's `aba`, its derivatives and the call of a single joint; nothing where it is not installed.
+    """Return Pinocchio's `aba`, its derivatives and a call for a single joint; empty if it is not installed.
 
     Raises:
-        RobotError: If Pinocchio's `aba` does not know the robot.
+        RobotError: If Pinocchio's `aba` does not support the robot.
     """
     try:
         from ce_gym.bench.peers import pinocchio
@@ -210,10 +209,10 @@ def pinocchio_peer(robot: Robot) -> dict[str, Competitor]:
 
 
 def peak(dtype: str) -> Competitor:
-    """Return chains of multiply-adds, compiled as steps are; one unit of work is one floating-point operation."""
+    """Return chains of multiply-adds in a compiled kernel; one unit of work is one floating-point operation."""
     kernel, lanes = peak_kernel(dtype), lane_count(dtype)
     arrays = {name: aligned_zeros((1, buffer.size, lanes), dtype) for name, buffer in kernel.buffers.items()}
-    arrays["factor"][:] = 0.5  # the chains settle at 1
+    arrays["factor"][:] = 0.5  # chains converge to 1
 
     def run() -> None:
         kernel(arrays, lanes, repeats={"times": PEAK_REPEATS}, num_threads=1)
@@ -222,7 +221,7 @@ def peak(dtype: str) -> Competitor:
 
 
 def peak_kernel(dtype: str) -> Kernel:
-    """Compile `CHAINS` chains in which `LINKS` times x becomes factor[0] x + factor[1]."""
+    """Return a kernel with `CHAINS` chains that replace x by factor[0] x + factor[1] `LINKS` times."""
 
     def build() -> Program:
         x, factor = ca.SX.sym("x", CHAINS), ca.SX.sym("factor", 2)

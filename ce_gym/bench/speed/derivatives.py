@@ -1,9 +1,9 @@
 # pyright: reportAttributeAccessIssue=false
-"""Time of derivatives beside that of steps, MuJoCo's finite differences and Pinocchio's analytic derivatives; one core.
+"""Time of derivatives, compared with steps, MuJoCo's finite differences and Pinocchio's derivatives, on one core.
 
-Robots fly, or stand on their feet; a window of sub-steps is stepped, and gone back through with its iterations made
-again. MuJoCo differentiates with `mjd_transitionFD`, at the fastest settings with which it stands. Everything takes
-turns in one run. (MuJoCo's compiled modules carry no types, hence the line above.)
+Robots fly or stand on their feet. A window of sub-steps is simulated, and the backward pass repeats its iterations.
+MuJoCo differentiates with `mjd_transitionFD`, with the fastest settings with which the robot stands. All competitors
+run alternately.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from ce_gym.sim.simulator import Simulator
 
 LEVELS, SCENES = ("exact", "armature"), ("in flight", "standing")
 WINDOW = 32
-"""Sub-steps that are gone back through."""
+"""Sub-steps of a backward pass."""
 HIGH = 1.0
-"""How much higher than they stand robots fly [m]."""
+"""Height of flying robots above the standing height [m]."""
 PARAMETERS = ("kp", "kd", "motor_strength", "rotor_inertia", "ratio", "stiffness", "damping", "friction")
-"""Figures with respect to which steps are differentiated, too."""
+"""Parameters with respect to which steps are also differentiated."""
 MUJOCO_STATES = 8
 DIFFERENCE = 1e-6
-"""Of MuJoCo's finite differences, forward ones, which are twice as fast as central ones."""
+"""Step of MuJoCo's forward differences, which are twice as fast as central differences."""
 LINEARIZE = {"in flight": 13.0, "standing": 25.0}
 LARGEST = {"backward": 3.0, "parameters": 1.3}
 LEAST_OVER_MUJOCO = 80.0
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def _ours(model: Model, arguments: argparse.Namespace) -> dict[str, Competitor]:
-    """Return steps and their linearisation; on exact transmissions the way back through steps, too."""
+    """Return steps and their linearisation; at level `exact` also the backward pass."""
     sides: dict[str, Competitor] = {}
     for scene in SCENES:
         where = f"{model.transmission}, {scene}"
@@ -90,7 +90,7 @@ def _ours(model: Model, arguments: argparse.Namespace) -> dict[str, Competitor]:
 
 
 def _standing(model: Model, arguments: argparse.Namespace, parameters: tuple[str, ...]) -> tuple[Simulator, np.ndarray]:
-    """Return robots that have stood for a while with jittering targets, and the last of these."""
+    """Return robots after a time of standing with jittering targets, and the last targets."""
     sim = Simulator(model, arguments.num_envs, arguments.dt, parameters=parameters, outputs=())
     jitter = stand.targets(model.robot, sim.num_envs, round(stand.SETTLE / stand.HOLD), seed=1)
     for i in range(jitter.shape[1]):
@@ -99,7 +99,7 @@ def _standing(model: Model, arguments: argparse.Namespace, parameters: tuple[str
 
 
 def _stepping(derivatives: StepDerivatives, target: np.ndarray) -> Callable[[], object]:
-    """Return a call that steps robots from where they are now."""
+    """Return a function that steps robots from their current state."""
     start = derivatives.state()
 
     def step() -> None:
@@ -110,7 +110,7 @@ def _stepping(derivatives: StepDerivatives, target: np.ndarray) -> Callable[[], 
 
 
 def _back(derivatives: StepDerivatives, target: np.ndarray) -> Callable[[], object]:
-    """Return a call that goes back through the same steps."""
+    """Return a function for the backward pass through the same steps."""
     sim, rng = derivatives.simulator, np.random.default_rng(0)
     weights = {name: rng.normal(size=(sim.num_envs, sim.model.nv)) for name in ("q", "v")}
     derivatives.step(target, WINDOW)
@@ -118,7 +118,7 @@ def _back(derivatives: StepDerivatives, target: np.ndarray) -> Callable[[], obje
 
 
 def _mujoco(robot: Robot, level: str, dt: float) -> dict[str, Competitor]:
-    """Return steps and finite differences of standing robots and of the same in the air."""
+    """Return steps and finite differences of robots that stand, and of robots in the air."""
     settings, batch, _ = mujoco_settings.fastest(robot, level, dt)
     sides: dict[str, Competitor] = {}
     for scene in SCENES:
@@ -156,7 +156,7 @@ def _mujoco_calls(
 
 
 def _steps(sides: dict[str, Competitor], timings: dict[str, Timing], report: Report) -> None:
-    """Add times of steps and their derivatives, and what is required of them."""
+    """Add times of steps and their derivatives, and the requirements, to the report."""
     rows: list[tuple[Cell, ...]] = []
     mujoco_steps = {name.split(" (")[0]: name for name in sides if name.startswith("mj_step")}
     for name, timing in timings.items():
@@ -184,7 +184,7 @@ def _steps(sides: dict[str, Competitor], timings: dict[str, Timing], report: Rep
 
 
 def _dynamics(robot: Robot, arguments: argparse.Namespace, report: Report) -> None:
-    """Add times of forward dynamics and of its derivatives by q, v and tau, beside Pinocchio's."""
+    """Add times of forward dynamics and its derivatives by q, v and tau, compared with Pinocchio, to the report."""
     n = 64
     model = Model(robot, "armature")
     given = [competitors.random_states(model, n)[name] for name in ("q", "v", "tau")]

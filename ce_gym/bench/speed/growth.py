@@ -1,8 +1,8 @@
-"""Cost as work grows: joints, contacts, robots in a batch; time to compile, memory.
+"""Time of a step as the number of joints, contacts or robots grows; compile time and memory.
 
-Chains of links with geared rotors grow from 2 to 200 joints, beside MuJoCo's `mj_forward` and Pinocchio's `aba` with
-armature; a plate stands on more and more spheres, beside MuJoCo. Competitors of a row take turns; times are those of
-the calling thread.
+Chains of links with geared rotors have 2 to 200 joints; MuJoCo's `mj_forward` and Pinocchio's `aba` run them with
+armature. A plate stands on an increasing number of spheres, also in MuJoCo. Competitors of a row run alternately. Times
+are processor times of the calling thread.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ JOINTS = (2, 5, 10, 20, 50, 100, 200)
 CONTACTS = (0, 1, 4, 16, 36, 64)
 ROBOTS = (1, 8, 64, 512, 4096, 32_768, 262_144, 1_048_576)
 LEAST_R2 = 0.99
-"""Share of the variance of instructions, and of times, that a straight line through the joints has to explain."""
+"""Required coefficient of determination of a straight line through instructions, or times, by joints."""
 PLATE_MASS = 10.0
 
 
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def joints(lengths: Collection[int], rounds: int, report: Report) -> None:
-    """Let a chain on a floating base grow: instructions at every level, times beside peers, time to compile."""
+    """Add instructions at each level, times compared with peers, and compile times of growing chains to the report."""
     rows: list[tuple[Cell, ...]] = []
     for n in progress(lengths, "joints"):
         robot = link_and_rotor_chain(1, n)
@@ -79,7 +79,7 @@ def joints(lengths: Collection[int], rounds: int, report: Report) -> None:
 
 
 def contacts(numbers: Collection[int], dt: float, rounds: int) -> Table:
-    """Let the spheres under a plate grow: time of a sub-step beside MuJoCo's."""
+    """Return times of a sub-step, compared with MuJoCo, by the number of spheres under a plate."""
     rows: list[tuple[Cell, ...]] = []
     for n in progress(numbers, "contacts"):
         robot = plate(n)
@@ -93,7 +93,7 @@ def contacts(numbers: Collection[int], dt: float, rounds: int) -> Table:
 
 
 def crowd(robot: Robot, sizes: Collection[int], dt: float, rounds: int) -> Table:
-    """Let the batch grow: time of one robot's sub-step on one core, and memory."""
+    """Return the time of one robot's sub-step on one core, and memory, by batch size."""
     model = Model(robot)
     rows: list[tuple[Cell, ...]] = []
     each = {dtype: competitors.bytes_per_robot(model, dtype, dt) for dtype in ("float64", "float32")}
@@ -107,7 +107,7 @@ def crowd(robot: Robot, sizes: Collection[int], dt: float, rounds: int) -> Table
 
 
 def plate(n: int) -> Robot:
-    """Return a square plate of 1 m on a floating base with `n` spheres in rows under it; each carries its share."""
+    """Return a square plate of 1 m on a floating base with `n` spheres under it, in rows, with equal loads."""
     side = max(1, int(np.ceil(np.sqrt(n))))
     at = np.linspace(-0.5, 0.5, side) if side > 1 else np.zeros(1)
     places = [(float(x), float(y), 0.0) for x in at for y in at][:n]
@@ -120,5 +120,5 @@ def plate(n: int) -> Robot:
 
 
 def straightness(x: list[Cell], y: list[Cell]) -> float:
-    """Return the share r^2 of the variance of y that a straight line in x explains."""
+    """Return the coefficient of determination r^2 of a straight line y(x)."""
     return float(np.corrcoef(np.array(x, float), np.array(y, float))[0, 1] ** 2)

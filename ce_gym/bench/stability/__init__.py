@@ -1,1 +1,1 @@
-"""Stability over steps, grounds and robots."""
+"""Stability by time step, ground and robot."""

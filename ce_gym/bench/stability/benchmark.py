@@ -1,6 +1,6 @@
-"""Stability: robots that stand and robots that collapse, at every time step, ground stiffness and slip speed.
+"""Stability of standing and collapsing robots, by time step, ground stiffness and slip speed.
 
-Small mechanisms with a known outcome are tests: `tests/sim/test_published_cases.py` and `tests/sim/test_stability.py`.
+Small mechanisms with a known motion are tests: `tests/sim/test_published_cases.py` and `tests/sim/test_stability.py`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> Report:
 
 
 def report_of(maps: dict[str, list[grid.Map]]) -> Report:
-    """Return one row for each robot, time step and stiffness, worst of all slip speeds, and the requirements."""
+    """Return one row for each robot, time step and stiffness, with the worst slip speed, and the requirements."""
     rows: list[tuple[Cell, ...]] = []
     for name, steps in maps.items():
         for m in steps:
@@ -81,10 +81,10 @@ def report_of(maps: dict[str, list[grid.Map]]) -> Report:
 
 
 def _at_most(claim: str, figures: np.ndarray, bound: float, unit: str) -> Requirement:
-    """Require that the figure of every cell is at most `bound`."""
+    """Return the requirement that the value in every cell is at most `bound`."""
     return _requirement(claim, figures <= bound, f", worst {figures.max():.1e}{unit}")
 
 
 def _requirement(claim: str, met: np.ndarray, worst: str) -> Requirement:
-    """Require something of every cell."""
+    """Return the requirement that a condition holds in every cell."""
     return Requirement(f"map: {claim}", f"{int(met.sum())} of {met.size}{worst}", bool(met.all()))

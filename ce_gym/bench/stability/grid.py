@@ -1,7 +1,6 @@
-"""The stability map: every time step with every ground stiffness and slip speed, standing and collapsing.
+"""The stability map: all combinations of time step, ground stiffness and slip speed, standing and collapsing.
 
-Robots of one kernel differ in stiffness, damping and slip speed, which are declared parameters, so that one kernel
-serves a whole time step.
+Stiffness, damping and slip speed are declared parameters, so that one kernel computes all cells of a time step.
 """
 
 from __future__ import annotations
@@ -20,37 +19,37 @@ Array = NDArray[Any]
 STEPS = (1e-4, 5e-4, 2e-3, 5e-3, 1e-2, 2e-2)
 """Time steps [s]."""
 STIFFNESSES = (1e3, 1e4, 1e5, 1e6, 1e7)
-"""Normal stiffnesses of the ground [N/m]; its damping keeps the ratio that the robot's own ground has."""
+"""Normal stiffnesses of the ground [N/m]; the damping ratio is the same as for the robot's own ground."""
 SLIP_SPEEDS = (1e-1, 1e-2, 1e-3, 1e-4)
 """Slip speeds [m/s]."""
 STARTS = 2
-"""Starts of each cell, different in attitude, joints and velocities."""
+"""Initial states of each cell, with different orientations, joint positions and velocities."""
 SHAPE = (len(STIFFNESSES), len(SLIP_SPEEDS))
-"""Of what is known of one time step."""
+"""Shape of the results of one time step."""
 
 DROP = 0.02
-"""Height from which robots that stand are let go [m]."""
+"""Initial height of standing robots [m]."""
 FALL = 0.1
-"""Height from which robots without motors are let go [m]."""
+"""Initial height of robots without motors [m]."""
 SILENCE = 1e-6
-"""Root mean square speed that counts as rest [m/s and rad/s]."""
+"""Root mean square speed below which a robot is at rest [m/s and rad/s]."""
 WATCHED = 100
-"""Steps over which it is taken, every one of them."""
+"""Number of steps in the mean of this speed."""
 ROUNDING = 1e-9
-"""Gain of energy that counts as rounding, as a share of all the energy there was to lose."""
+"""Gain of energy that counts as rounding, as a fraction of the initial energy."""
 
 
 @dataclass(frozen=True)
 class Map:
-    """What became of one robot at one time step; every array has shape SHAPE, worst of all starts.
+    """Results of one robot at one time step; every array has shape SHAPE, with the worst initial state of each cell.
 
     Attributes:
         dt: Time step [s].
         finite: Whether no robot diverged, standing or collapsing.
-        chatter: Root mean square speed at rest, every step counted [m/s and rad/s].
-        gain: Largest rise of the mechanical energy above its lowest value so far, springs included, while robots
-            collapse without motors, as a share of all they lose [-].
-        excess: Highest sum of kinetic and potential energy above that at the start, same unit [-].
+        chatter: Root mean square speed at rest, over all steps [m/s and rad/s].
+        gain: Largest rise of the mechanical energy, with springs, above its lowest value so far while robots collapse
+            without motors, as a fraction of the energy that they lose [-].
+        excess: Largest excess of kinetic and potential energy over the initial value, same unit [-].
     """
 
     dt: float
@@ -65,9 +64,9 @@ def measure(model: Model, dt: float, patience: float, collapse: float) -> Map:
 
     Args:
         model: A robot with a floating base.
-        dt: [s].
-        patience: How long robots may take to come to rest [s].
-        collapse: How long they are watched while they collapse [s].
+        dt: Time step [s].
+        patience: Longest time to come to rest [s].
+        collapse: Simulated time of a collapse [s].
     """
     upright, chatter = stand(model, dt, patience)
     lasting, *energies = fall(model, dt, collapse)
@@ -75,9 +74,9 @@ def measure(model: Model, dt: float, patience: float, collapse: float) -> Map:
 
 
 def stand(model: Model, dt: float, patience: float) -> tuple[Array, Array]:
-    """Drop robots that hold their standing pose; return whether they stay finite, and their speed at rest.
+    """Drop robots in their standing pose; return whether they stay finite, and their speed at rest.
 
-    On ground too soft for them humanoids topple; lying robots have to come to rest as well.
+    Humanoids fall on very soft ground; robots on the ground must come to rest, too.
     """
     sim = scene(model, dt, "position", ())
     q, v = starts(model, DROP, 0.0)
@@ -116,7 +115,7 @@ def fall(model: Model, dt: float, time: float) -> tuple[Array, Array, Array]:
 
 
 def scene(model: Model, dt: float, control: str, outputs: tuple[str, ...]) -> Simulator:
-    """Return robots of all cells, STARTS of each, on their grounds."""
+    """Return a simulator with STARTS robots for each cell, on the ground of the cell."""
     own = model.robot.material
     sim = Simulator(
         model, STARTS * SHAPE[0] * SHAPE[1], dt, control=control, outputs=outputs,
@@ -129,7 +128,7 @@ def scene(model: Model, dt: float, control: str, outputs: tuple[str, ...]) -> Si
 
 
 def starts(model: Model, height: float, speed: float) -> tuple[Array, Array]:
-    """Return positions near the standing pose, `height` [m] above it, and random velocities; the same in every cell."""
+    """Return positions near the standing pose, raised by `height` [m], and random velocities; equal in all cells."""
     rng, cells = np.random.default_rng(0), SHAPE[0] * SHAPE[1]
     q = np.tile(model.standing_q, (STARTS, 1))
     q[:, 2] += height
@@ -140,5 +139,5 @@ def starts(model: Model, height: float, speed: float) -> tuple[Array, Array]:
 
 
 def worst(x: Array) -> Array:
-    """Return the largest value of each cell over its starts, shape SHAPE."""
+    """Return the largest value of each cell over its initial states, shape SHAPE."""
     return np.asarray(x).reshape(STARTS, *SHAPE).max(axis=0)

@@ -1,4 +1,4 @@
-"""The stability map as a picture."""
+"""Picture of the stability map."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ce_gym.bench.stability.grid import ROUNDING, SILENCE, STIFFNESSES, Map
 
 
 def draw(maps: dict[str, list[Map]], file: Path) -> None:
-    """Draw one column for each robot: speed at rest above, gain of energy below, worst of all slip speeds."""
+    """Draw one column for each robot: speed at rest above, gain of energy below, at the worst slip speed."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""Drake's side of the accuracy benchmark, where Drake is installed."""
+"""Drake in the accuracy benchmark, if it is installed."""
 
 from __future__ import annotations
 

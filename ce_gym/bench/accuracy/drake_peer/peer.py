@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
-"""Drake's robots that run through a scene: by discrete steps of a length, or by integrators with error control."""
+"""Robots in Drake in a scene, with discrete steps or with integrators with error control."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ce_gym.dynamics.model import Model
 
 
 class Peer:
-    """One robot of Drake's.
+    """One robot in Drake.
 
     Args:
         scene: The scene.
         level: "none", "armature" or "exact".
-        method: An approximation of discrete contact ("sap", "similar", "lagged", "tamsi") or an integrator of Drake's,
-            such as "runge_kutta3", with "runge_kutta3, fixed" for steps of a length.
-        step: Length of a step [s], or the accuracy asked of an integrator.
+        method: An approximation of discrete contact ("sap", "similar", "lagged", "tamsi") or an integrator of Drake,
+            such as "runge_kutta3", or "runge_kutta3, fixed" for fixed steps.
+        step: Step length [s], or the accuracy of an integrator.
     """
 
     def __init__(self, scene: Scene, level: str, method: str, step: float) -> None:
@@ -63,9 +63,9 @@ class Peer:
                 joint.set_angular_rate(context, state[1])
 
     def run(self) -> Array:
-        """Run through the scene; returns positions in our coordinates at the end of every hold, (n_holds, nq).
+        """Simulate the scene; return positions in coordinates of ce_gym at the end of every hold, shape (n_holds, nq).
 
-        A run that ends with an error, as one whose integrator finds no step short enough, is not a number.
+        Positions are NaN if the run ends with an error, for example if the integrator finds no step short enough.
         """
         self.context.SetTime(0.0)
         self.stated.plant.SetPositionsAndVelocities(self.of_plant, self.start)
@@ -80,4 +80,4 @@ class Peer:
 
 
 DISCRETE = ("sap", "similar", "lagged", "tamsi")
-"""What Drake calls approximations of discrete contact; without contact and ties they are one method."""
+"""Drake's approximations of discrete contact; without contact and couplings they are the same method."""

@@ -1,11 +1,11 @@
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
-"""A scene as a diagram of Drake's: the robot at a transmission level, its drives and the ground.
+"""A scene as a diagram of Drake: the robot at a transmission level, its drives and the ground.
 
-The diagram is Drake's own C++ throughout, so that one call runs a scene: a source that holds targets or torques, the
-plant, and a log of what is recorded at the end of every hold. Python's Drake has a coupler of two joints but no
-constraint of several, as a parallel belt is; its parsers do, as `drake:tendon_constraint`
-(https://drake.mit.edu/doxygen_cxx/group__multibody__parsing.html). So the tree and its ties go through URDF. Masses
-there are stand-ins, since a parser would refuse published inertias that violate the triangle inequality.
+All parts of the diagram are C++ code of Drake, so that one call simulates a scene: a source of targets or torques, the
+plant, and a log of the state at the end of every hold. Drake's Python interface can couple two joints but not several,
+as a parallel belt does. The parsers can, with `drake:tendon_constraint`
+(https://drake.mit.edu/doxygen_cxx/group__multibody__parsing.html). So the robot and its couplings are written as URDF.
+The URDF has placeholder masses, because the parser refuses published inertias that violate the triangle inequality.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from ce_gym.export.mjcf_equalities import joint_armature
 from ce_gym.export.mjcf_text import text
 from ce_gym.model.mechanism import Mechanism, MovingBody, build_mechanism
 
-logging.getLogger("drake").setLevel(logging.ERROR)  # half spaces do not touch deformable bodies, TAMSI goes: no news
+logging.getLogger("drake").setLevel(logging.ERROR)  # no warnings about half spaces and TAMSI
 
 BEFORE = 1e-9
-"""How long before its hold a target is given [s]: steps begin at multiples of a length that rounds."""
+"""Time by which a target is set before its hold [s], because the start times of steps are rounded."""
 RIGID = 1e30
-"""Stiffness of belts [N m/rad], infinite to the solver, which takes what its step allows; URDF has no infinity."""
+"""Stiffness of belts [N m/rad], a replacement for infinity in URDF; the solver takes the largest possible value."""
 JOINTS = {"revolute": "continuous", "prismatic": "prismatic"}
 """Types of joints in URDF."""
 
@@ -49,9 +49,9 @@ class Stated:
 
     Attributes:
         diagram: Source, plant and log.
-        plant: The robot.
-        log: Of the plant's state.
-        mechanism: What it was made from.
+        plant: Plant of the robot.
+        log: Log of the plant's state.
+        mechanism: Mechanism of the robot in ce_gym.
     """
 
     diagram: Any
@@ -61,13 +61,13 @@ class Stated:
 
 
 def stated(scene: Scene, level: str, dt: float, approximation: str) -> Stated:
-    """State a scene at a transmission level.
+    """Return a scene in Drake at a transmission level.
 
     Args:
-        scene: The scene: torques or targets of joints, with a constant push at most.
+        scene: A scene with torques or targets of joints, and no push or a constant push.
         level: "none", "armature" or "exact".
-        dt: Length of discrete steps [s]; 0 is a plant in continuous time.
-        approximation: "sap", "similar", "lagged" or "tamsi" of a discrete plant.
+        dt: Length of discrete steps [s]; 0 for a plant in continuous time.
+        approximation: Approximation of a discrete plant: "sap", "similar", "lagged" or "tamsi".
     """
     mechanism = build_mechanism(scene.robot, level, eliminate=False)
     builder = DiagramBuilder()
@@ -96,7 +96,7 @@ def stated(scene: Scene, level: str, dt: float, approximation: str) -> Stated:
 
 
 def to_urdf(mechanism: Mechanism, ties: Mapping[str, Tie]) -> str:
-    """Return the URDF of a mechanism whose rotors, if it has any, are bodies; a joint is called after its body."""
+    """Return the URDF of a mechanism with its rotors as bodies; joints have the names of their bodies."""
     root = ET.Element("robot", name=mechanism.robot.name)
     for moving in mechanism.bodies.values():
         _add_body(root, moving)
@@ -122,7 +122,7 @@ def _add_body(root: ET.Element, moving: MovingBody) -> None:
 
 
 def _add_belt(root: ET.Element, name: str, tie: Tie) -> None:
-    """Tie a joint to several others: a tendon that can neither grow nor shrink, as stiff as the solver has it."""
+    """Couple a joint to several others by a tendon of constant length, with the largest stiffness of the solver."""
     tendon = ET.SubElement(root, "drake:tendon_constraint")
     for joint, ratio in {name: 1.0, **{joint: -ratio for joint, ratio in tie.ratios.items()}}.items():
         ET.SubElement(tendon, "drake:tendon_constraint_joint", name=joint, a=text(ratio))
@@ -132,7 +132,7 @@ def _add_belt(root: ET.Element, name: str, tie: Tie) -> None:
 
 
 def _add_couplers(plant: MultibodyPlant, mechanism: Mechanism, ties: Mapping[str, Tie]) -> None:
-    """Tie every joint that follows from a single other one; the rest are tendons of the description."""
+    """Couple every joint that depends on one other joint; other couplings are tendons in the URDF."""
     for name in mechanism.bodies:
         if name in ties and name not in ties[name].ratios and len(ties[name].ratios) == 1:
             ((other, ratio),) = ties[name].ratios.items()
@@ -141,7 +141,7 @@ def _add_couplers(plant: MultibodyPlant, mechanism: Mechanism, ties: Mapping[str
 
 
 def _add_actuators(plant: MultibodyPlant, scene: Scene, armature: dict[str, float]) -> None:
-    """Add a motor to every driven joint, with reflected inertia, gains and the limit of its torque."""
+    """Add a motor to every driven joint, with reflected inertia, gains and torque limit."""
     robot = scene.robot
     kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
     for name in robot.independent:
@@ -153,7 +153,7 @@ def _add_actuators(plant: MultibodyPlant, scene: Scene, armature: dict[str, floa
 
 
 def _add_contacts(plant: MultibodyPlant, scene: Scene, hunt_crossley: bool) -> None:
-    """Add contact spheres on a rigid half space; damping is ours, or that of ours at the load of standing."""
+    """Add contact spheres on a rigid half space, with the damping of ce_gym, for Hunt-Crossley at standing load."""
     robot, law = scene.robot, scene.robot.material
     properties, ground = ProximityProperties(), ProximityProperties()
     friction = CoulombFriction(law.friction, law.friction)
@@ -173,7 +173,7 @@ def _add_contacts(plant: MultibodyPlant, scene: Scene, hunt_crossley: bool) -> N
 
 
 def _drive(builder: DiagramBuilder, plant: MultibodyPlant, instance: Any, scene: Scene, dt: float) -> None:
-    """Hold targets or torques; a plant in continuous time needs an event at every change, which a hold makes."""
+    """Add the source of targets or torques; a plant in continuous time needs an event at every change."""
     if not plant.num_actuators():
         return
     drive = scene.drive if scene.control == "torque" else np.hstack([scene.drive, np.zeros_like(scene.drive)])
@@ -192,10 +192,10 @@ def _drive(builder: DiagramBuilder, plant: MultibodyPlant, instance: Any, scene:
 
 
 def put_inertias(stated: Stated, context: Any) -> None:
-    """Put the published inertias in place of the stand-ins."""
+    """Replace placeholder inertias by the published ones."""
     for moving in stated.mechanism.bodies.values():
         mass, com, inertia = mass_properties(moving.inertia)
-        mass = max(mass, SMALLEST_MASS)  # inertia is stated for a unit mass
+        mass = max(mass, SMALLEST_MASS)  # inertia for unit mass
         about_origin = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
         unit = about_origin / mass
         spatial = SpatialInertia(mass, com, UnitInertia(*unit.diagonal(), unit[0, 1], unit[0, 2], unit[1, 2]), True)

@@ -1,4 +1,4 @@
-"""Which of Drake's ways run through which scene, and what each of them tends to."""
+"""Drake's methods for each scene, and their limits for short steps."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from ce_gym.bench.accuracy.references import smooth as accuracy_references
 from ce_gym.bench.accuracy.scenarios import HOLD, Array, Scene
 
 STATED = ("humanoid", "tumble", "belt_leg", "stiff_1e3", "drop_3cm", "stick", "breakaway", "slide")
-"""Scenes that are stated in Drake. A push that varies would need a system of Python's; loops, links that touch, springs
-of belts and stairs are not stated; gains above 1e3 N m/rad, the trot and all landings but one, on which integrators
-spend minutes, are left out to keep the benchmark short."""
+"""Scenes in Drake. Other scenes have loops, self-contact, belt springs or stairs, or need a Python system for a varying
+push. Gains above 1e3 N m/rad, the trot and all landings except one are omitted, because integrators take minutes."""
 STEPS, STEPS_IN_CONTACT = (1, 2, 5, 10, 20, 50, 100, 200), (1, 2, 5, 10, 20, 50, 100)
-"""Steps to a hold."""
+"""Steps per hold, in flight and in contact."""
 FIXED = (1, 2, 5, 10, 20, 50)
-"""The same of Runge-Kutta methods without error control."""
+"""Steps per hold of Runge-Kutta methods without error control."""
 ACCURACIES, LOW_ORDER = tuple(10.0**-k for k in range(1, 12)), tuple(10.0**-k for k in range(1, 6))
-"""Asked of integrators: of those of high order, and of CENIC and of those whose level leaves something out."""
+"""Accuracies of integrators: of high order; of CENIC and of simplified levels."""
 LIMIT = 200
-"""Steps to a hold of the finest of three runs from which a discrete method's limit is extrapolated."""
+"""Steps per hold of the finest of three runs, from which the limit of a discrete method is extrapolated."""
 
 
 def sides(scene: Scene, truth: Array, measured: Measured) -> list[Side]:
-    """Return Drake's levels, methods and steps of a scene; none if it is not stated.
+    """Return Drake's levels, methods and steps for a scene; empty for a scene without a Drake version.
 
     Args:
         scene: The scene.
-        truth: What a smooth scene really does, shape (n_holds, nq).
-        measured: Gets how well the limits of contact are known.
+        truth: Reference solution of a smooth scene, shape (n_holds, nq).
+        measured: Measurements, to which the accuracy of limits in contact is added.
     """
     if scene.name not in STATED:
         return []
@@ -37,7 +36,7 @@ def sides(scene: Scene, truth: Array, measured: Measured) -> list[Side]:
 
 
 def _in_flight(scene: Scene, truth: Array) -> Iterator[Side]:
-    """Without contact all discrete approximations are one; integrators know no ties, and have rotors as armature."""
+    """Yield sides without contact: one discrete method, and integrators, which need armature instead of couplings."""
     for level in scene.levels:
         exact = level in (scene.exact, "none")
         limit = truth if exact else accuracy_references.ours(scene, scene.reference // 2, level)
@@ -54,12 +53,12 @@ def _in_flight(scene: Scene, truth: Array) -> Iterator[Side]:
 
 
 def _in_contact(scene: Scene, measured: Measured) -> Iterator[Side]:
-    """Each approximation is held against its own limit, as all in contact: so the cheapest level serves.
+    """Yield sides in contact, each compared with its own limit, at the fastest level.
 
-    CENIC integrates the law that `lagged` tends to, whose limit is better known.
+    CENIC integrates the limit of the law of `lagged`, so both have the same limit.
     """
     level = scene.levels[0]
-    for method in DISCRETE if level == "none" else DISCRETE[:3]:  # TAMSI knows no controlled joints
+    for method in DISCRETE if level == "none" else DISCRETE[:3]:  # TAMSI has no controlled joints
         coarse, middle, fine = (Peer(scene, level, method, HOLD / n).run() for n in (LIMIT // 4, LIMIT // 2, LIMIT))
         limit = 2.0 * fine - middle
         measured.limits["Drake", f"{level}, {method}"] = rms_error(scene, 2.0 * middle - coarse, limit)
@@ -75,7 +74,7 @@ def _side(scene: Scene, level: str, method: str, step: float, limit: Array) -> S
 
 
 def _kind(method: str) -> str:
-    """Return what kind of steps a method makes."""
+    """Return the kind of steps of a method."""
     if method in DISCRETE:
         return "discrete"
     return "fixed steps" if method.endswith("fixed") else ERROR_CONTROL

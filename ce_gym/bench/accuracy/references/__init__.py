@@ -1,1 +1,1 @@
-"""What scenes really do: two codes for each that share nothing but the description of the robot."""
+"""Reference solutions: two codes for each scene that share only the description of the robot."""

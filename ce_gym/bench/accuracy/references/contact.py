@@ -1,11 +1,10 @@
-"""What scenes with contact really do by our contact law, written a second time and integrated explicitly.
+"""Reference solutions of scenes with contact: the contact law of ce_gym, written again and integrated explicitly.
 
-The law is that of `ce_gym.dynamics.forces.contact` in the limit of no step length: a contact of depth d > 0 that moves
-out at v_n pushes with lam = max(0, k d - c v_n). Its bristle s follows the sliding velocity, s' = v_t, as far as
-|s| <= mu lam / k_t; it resists with min(1, mu lam / |x|) x, where x = k_t s + (mu lam / v_s) v_t. Nothing here is
-linearised, predicted or taken one step ahead, so the steps of the midpoint rule have to be tiny. Accelerations come
-from `Model`'s forward dynamics under wrenches. On stairs a sphere meets the plane that their surface has where a sphere
-on the plane under its centre would touch it.
+The law is the limit of `ce_gym.dynamics.forces.contact` for short steps. A contact of depth d > 0 that separates at v_n
+has the normal force lam = max(0, k d - c v_n). Its bristle s follows the sliding velocity, s' = v_t, within
+|s| <= mu lam / k_t. The friction force is min(1, mu lam / |x|) x, where x = k_t s + (mu lam / v_s) v_t. No term is
+linearised or predicted, so the midpoint rule needs tiny steps. `Model` computes accelerations under wrenches. On stairs
+a sphere touches the tangent plane of the surface at the point where a sphere on the plane under its centre would touch.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ SX = ca.SX
 
 
 def explicit(scene: Scene, n: int) -> Array:
-    """Return positions at the end of every hold, with `n` steps to a hold, shape (n_holds, nq)."""
+    """Return positions at the end of every hold, with `n` steps per hold, shape (n_holds, nq)."""
     model = Model(scene.robot)
 
     ground = "" if scene.terrain is None else f"{scene.terrain} {scene.terrain.heights[:, 0].tolist()}"
@@ -53,7 +52,7 @@ def explicit(scene: Scene, n: int) -> Array:
 
 
 def _midpoint_step(scene: Scene) -> ca.Function:
-    """Trace one explicit midpoint step of a floating robot under position control, against the ground and itself."""
+    """Trace one explicit midpoint step of a floating robot with position control, ground contact and self-contact."""
     model = Model(scene.robot)
     q, v, s = SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("s", 2 * len(model.contact_names))
     target, push, h = SX.sym("target", len(model.joint_links)), SX.sym("push", 3), SX.sym("dt")
@@ -71,7 +70,7 @@ def _midpoint_step(scene: Scene) -> ca.Function:
 
 
 def _rates(scene: Scene, model: Model, q: SX, v: SX, s: SX, target: SX, push: SX) -> tuple[SX, SX, SX, list[SX]]:
-    """Return time derivatives of positions and velocities, sliding velocities, and how far bristles may bend."""
+    """Return derivatives of positions and velocities, sliding velocities, and largest lengths of bristles."""
     law, robot = model.robot.material, model.robot
     w, x, y, z = ca.vertsplit(q[3:7])
     unit = ca.vertcat(w, x, y, z) / ca.norm_2(q[3:7])
@@ -93,14 +92,14 @@ def _rates(scene: Scene, model: Model, q: SX, v: SX, s: SX, target: SX, push: SX
     for i, sphere in enumerate(robot.contacts):
         which = model.body_names.index(sphere.body)
         columns = slice(3 * which, 3 * which + 3)
-        spin = turns[:, columns] @ rotations[:, columns].T  # of the body, as a skew matrix
+        spin = turns[:, columns] @ rotations[:, columns].T  # angular velocity of the body as a skew matrix
         height, n = plane(scene.terrain, centres[0, i], sphere.radius)
         arm, depth = -sphere.radius * n, sphere.radius - n[2] * (centres[2, i] - height)
         at, velocity = centres[:, i] + arm, velocities[:, i] + spin @ arm
         out = ca.dot(n, velocity)
         lam = ca.if_else(depth > 0, ca.fmax(law.stiffness * depth - law.damping * out, 0), 0)
         cone, slide, flat = law.friction * lam, velocity - out * n, s[2 * i : 2 * i + 2]
-        bristle = ca.vertcat(flat, -ca.dot(n[:2], flat) / n[2])  # in the plane
+        bristle = ca.vertcat(flat, -ca.dot(n[:2], flat) / n[2])  # in the contact plane
         trial = law.bristle * bristle + cone / law.slip_speed * slide
         force = -ca.fmin(1, cone / ca.sqrt(ca.sumsqr(trial) + 1e-30)) * trial + lam * n
         wrenches[which] += ca.vertcat(ca.cross(at, force), force)

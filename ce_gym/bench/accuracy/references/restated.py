@@ -1,7 +1,7 @@
-"""Parts of the explicit reference of scenes with contact: the ground, links that meet, springs and dampers of joints.
+"""Parts of the explicit reference of scenes with contact: ground, self-contact, springs and dampers of joints.
 
-Each is a second statement: stairs in closed form instead of a look-up, where segments are nearest by comparing five
-candidates instead of clipping, passive joints by the power and energy that they take up.
+Each part has other formulas than ce_gym: stairs in closed form instead of a table, closest points of segments from five
+candidates instead of clipping, passive joints from their power and energy.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SX = ca.SX
 
 
 def passive(model: Model, q: SX, v: SX) -> SX:
-    """Return what dampers and springs of all joints resist with, for a floating robot, shape (nv,)."""
+    """Return generalised forces of dampers and springs of all joints of a floating robot, shape (nv,)."""
     at_q, at_v, robot = SX.sym("q", model.nq), SX.sym("v", model.nv), model.robot
     positions, speeds = model.casadi_function("spanning")(at_q, at_v)
     rows, power, energy = robot.spanning_rows, SX(0), SX(0)
@@ -34,7 +34,7 @@ def passive(model: Model, q: SX, v: SX) -> SX:
 
 
 def plane(terrain: Terrain | None, x: SX, radius: float) -> tuple[SX | float, SX]:
-    """Return the height of the plane that a sphere meets, under its centre [m], and its normal, shape (3,)."""
+    """Return the height under a sphere's centre of the plane that it touches [m], and the normal, shape (3,)."""
     if terrain is None:
         return 0.0, SX([0.0, 0.0, 1.0])
     _, slope = stairs(terrain, x)
@@ -44,7 +44,7 @@ def plane(terrain: Terrain | None, x: SX, radius: float) -> tuple[SX | float, SX
 
 
 def stairs(terrain: Terrain, x: SX) -> tuple[SX, SX]:
-    """Return height [m] and slope of a field alike along y: each edge rises over two cells, in two parabolas."""
+    """Return height [m] and slope of stairs along x; each edge rises over two cells, in two parabolas."""
     heights = terrain.heights[:, 0]
     height, slope = SX(float(heights[0])), SX(0)
     for i in np.flatnonzero(np.diff(heights)):
@@ -60,8 +60,8 @@ class Moving:
     """Bodies in the world.
 
     Attributes:
-        names: Of the bodies.
-        poses: Their positions (3, n) and rotations (3, 3 n).
+        names: Names of the bodies.
+        poses: Positions (3, n) and rotations (3, 3 n).
         turns: Time derivatives of the rotations, shape (3, 3 n).
         moves: Time derivatives of the positions, shape (3, n).
     """
@@ -72,17 +72,17 @@ class Moving:
     moves: SX
 
     def place(self, which: int, point: tuple[float, ...]) -> SX:
-        """Return where a point of a body is [m], shape (3,)."""
+        """Return the position of a point of a body in the world [m], shape (3,)."""
         return self.poses[0][:, which] + self.poses[1][:, 3 * which : 3 * which + 3] @ SX(ca.DM(point))
 
     def velocity(self, which: int, place: SX) -> SX:
-        """Return the velocity of the point of a body that is at a place [m/s], shape (3,)."""
+        """Return the velocity of the point of a body at a position in the world [m/s], shape (3,)."""
         R, turn = (x[:, 3 * which : 3 * which + 3] for x in (self.poses[1], self.turns))
         return self.moves[:, which] + turn @ R.T @ (place - self.poses[0][:, which])
 
 
 def pressed(scene: Scene, bodies: Moving) -> list[tuple[int, SX]]:
-    """Return which bodies are pushed by others and how: world wrenches about the origin, shape (6,)."""
+    """Return self-contact forces: bodies and world wrenches about the origin, shape (6,)."""
     law, wrenches = scene.robot.material, []
     for first, second in colliding(scene.robot, scene.touching):
         a, b = (bodies.names.index(one.body) for one in (first, second))
@@ -98,7 +98,7 @@ def pressed(scene: Scene, bodies: Moving) -> list[tuple[int, SX]]:
 
 
 def nearest(a: SX, b: SX, c: SX, d: SX) -> tuple[SX, SX]:
-    """Return where two segments are nearest: where their lines are, if on both, or the best of an end and its foot."""
+    """Return the closest points of two segments: of their lines if inside both, or the best end and its projection."""
     u, w, r = b - a, d - c, c - a
     uu, ww, uw = ca.sumsqr(u), ca.sumsqr(w), ca.dot(u, w)
     s, t = (
@@ -114,5 +114,5 @@ def nearest(a: SX, b: SX, c: SX, d: SX) -> tuple[SX, SX]:
 
 
 def _foot(point: SX, start: SX, along: SX) -> SX:
-    """Return the place of a segment that is nearest to a point."""
+    """Return the point of a segment that is closest to a point."""
     return start + ca.fmax(0, ca.fmin(1, ca.dot(point - start, along) / ca.sumsqr(along))) * along

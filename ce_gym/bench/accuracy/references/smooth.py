@@ -1,10 +1,10 @@
 # pyright: reportAttributeAccessIssue=false
-"""What smooth scenes really do, from two codes that share nothing but the description of the robot.
+"""Reference solutions of smooth scenes, from two codes that share only the description of the robot.
 
-One is our eighth-order method with tiny steps, evaluated by CasADi. The other takes MuJoCo's mass matrix, bias forces
-and equality Jacobian, lets the spanning joints (rotors are bodies) accelerate only in the null space of that Jacobian,
-which MuJoCo itself does not do, and integrates them with the classical fourth-order method, in MuJoCo's coordinates.
-Where transmissions stretch, what their springs do is written down here once more.
+The first is the eighth-order method of ce_gym with tiny steps, evaluated by CasADi. The second uses MuJoCo's mass
+matrix, bias forces and equality Jacobian, with rotors as bodies. Accelerations are restricted to the null space of this
+Jacobian, which MuJoCo itself does not do, and integrated with the classical fourth-order method in MuJoCo's
+coordinates. This file has its own formulas for the springs of elastic transmissions.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from ce_gym.model.mechanism import ELASTIC
 
 
 def ours(scene: Scene, n: int, level: str | None = None) -> Array:
-    """Return positions at the end of every hold from rk8 with `n` steps to a hold, shape (n_holds, nq).
+    """Return positions at the end of every hold from rk8, shape (n_holds, nq).
 
     Args:
         scene: The scene.
-        n: Steps to a hold.
-        level: Transmission level; the one that leaves nothing out if None.
+        n: Steps per hold.
+        level: Transmission level; None takes the level `scene.exact`.
     """
     model = Model(scene.robot, transmission=level or scene.exact)
     step = step_function(model.mechanism, StepOptions(HOLD / n, control=scene.control, method="rk8"))
@@ -49,7 +49,7 @@ def ours(scene: Scene, n: int, level: str | None = None) -> Array:
 
 
 def theirs(scene: Scene, n: int) -> Array:
-    """Return the same from MuJoCo's matrices, with `n` classical Runge-Kutta steps to a hold, shape (n_holds, nq)."""
+    """Return positions from MuJoCo's matrices, with `n` Runge-Kutta steps per hold, shape (n_holds, nq)."""
     system = _Constrained(scene)
     y, h = np.concatenate([system.data.qpos, system.data.qvel]), HOLD / n
     path = []
@@ -147,7 +147,7 @@ class _Constrained:
 
 
 def springs(scene: Scene, model: mujoco.MjModel) -> Callable[[Array, Array], Array]:
-    """Return the generalised forces, MuJoCo's coordinates, that springs of transmissions resist with."""
+    """Return a function for the generalised forces of transmission springs in MuJoCo's coordinates."""
     if scene.exact != ELASTIC:
         return lambda qpos, qvel: np.zeros(model.nv)
     ties, stretch = ratios(scene.robot), np.zeros((len(scene.robot.elastic), model.nv))

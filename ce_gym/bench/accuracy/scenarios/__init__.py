@@ -1,4 +1,4 @@
-"""The scenes of the accuracy benchmark: which robot, from where, driven how and for how long."""
+"""Scenes of the accuracy benchmark: robot, initial state, drives and duration."""
 
 from __future__ import annotations
 
@@ -28,6 +28,6 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "shanks": shanks,
     "biped": biped,
 }
-"""All scenes, made when called for."""
+"""Functions that return the scenes, by name."""
 
 __all__ = ["BLOCK_FRICTION", "GRAVITY", "HOLD", "SCENES", "SINGLE", "Array", "Scene", "Way"]

@@ -1,4 +1,4 @@
-"""Scenes of a block on four corners: friction and nothing else."""
+"""Scenes of a block on four corners, with friction only."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ce_gym.bench.accuracy.scenarios.scene import HOLD, ROUGH, SLIP_SPEED, Array
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Pose, Robot
 
 BLOCK_HALF = (0.15, 0.1, 0.05)
-"""Half the edges of the block [m]."""
+"""Half lengths of the edges [m]."""
 BLOCK_MASS = 10.0
 BLOCK_FRICTION = 0.5
 GRAVITY = 9.81
 
 
 def block(name: str, title: str, push: Array) -> Scene:
-    """Return a block on four corners under a horizontal push, in parts of its weight, shape (n_holds,)."""
+    """Return a block on four corners under a horizontal force, as a fraction of its weight, shape (n_holds,)."""
     a, b, c = BLOCK_HALF
     third = BLOCK_MASS / 3.0
     inertia = diagonal(third * (b * b + c * c), third * (a * a + c * c), third * (a * a + b * b))
@@ -38,14 +38,14 @@ def block(name: str, title: str, push: Array) -> Scene:
 
 
 def stick() -> Scene:
-    """Return the block that holds against its push: as smooth as a scene without contact, so explicit methods serve."""
+    """Return the block that sticks; this scene is smooth, so explicit methods can simulate it."""
     push = 0.8 * BLOCK_FRICTION * np.ones(25)
     scene = block("stick", "Block that sticks, 0.8 of the cone", push)
     return replace(scene, ours=(*ROUGH, Way("rk4")))
 
 
 def blocks() -> dict[str, Callable[[], Scene]]:
-    """Return the friction scenes: sticking, breaking away, sliding and being pushed to and fro."""
+    """Return the friction scenes: sticking, breakaway, sliding, and an alternating force."""
     n = 25
     t = HOLD * np.arange(n)
     one = np.ones(n)

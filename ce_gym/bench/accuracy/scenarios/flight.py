@@ -1,4 +1,4 @@
-"""Scenes in which nothing touches: what flies, turns over, hangs or is held by stiff control."""
+"""Scenes without contact: floating robots, a tumbling box, closed loops, a leg on a fixed base, stiff control."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def tumble() -> Scene:
 
 
 def four_bar() -> Scene:
-    """Return a crank and rocker (0.15, 0.30, 0.25 m on a base of 0.30 m) thrown at 12 rad/s, for two turns."""
+    """Return a crank and rocker (0.15, 0.30, 0.25 m on a base of 0.30 m) with 12 rad/s at the start, for two turns."""
 
     def bar(name: str, parent: str | None, x: float, length: float) -> Body:
         m, square = 2.0 * length, length**2
@@ -55,17 +55,17 @@ def tello() -> Scene:
 
 
 LOOPED = ("coupled", "exact")
-"""Levels at which MJCF can state a robot whose rotors are driven through loops."""
+"""Levels of MJCF for a robot whose rotors are driven through loops."""
 
 
 def belt_leg() -> Scene:
-    """Return a leg with parallel belts on a fixed base, whose rotors carry much of the momentum."""
+    """Return a leg with parallel belts on a fixed base, whose rotors have a large part of the momentum."""
     robot = unbounded(load_robot("mit_humanoid_leg"))
     return driven("belt_leg", "Leg with belts, sinusoidal torques", robot, 0.5, 3.0, (*SMOOTH, APPROXIMATE))
 
 
 def stiff_leg(stiffness: float) -> Scene:
-    """Return the same leg under position control with gains of `stiffness` [N m/rad], well damped."""
+    """Return the leg with belts under position control with gain `stiffness` [N m/rad] and large damping."""
     robot = unbounded(load_robot("mit_humanoid_leg"))
     damping = 2.0 * np.sqrt(0.1 * stiffness)
     kp, kd = (tuple((name, value) for name in robot.independent) for value in (stiffness, damping))
@@ -86,11 +86,11 @@ STRETCHING: dict[str, tuple[float, float]] = {
     "knee_rotor": (9.0, 5e-3),
     "ankle_rotor": (9.0, 5e-3),
 }
-"""Stiffness [N m/rad] and damping [N m s/rad] at each rotor: orders of magnitude, ours; nobody publishes any."""
+"""Estimated stiffness [N m/rad] and damping [N m s/rad] at each rotor; no published values are known."""
 
 
 def elastic_leg() -> Scene:
-    """Return the leg with belts whose gears and belts all stretch, by torques of the motors."""
+    """Return the leg with belts, with elastic gears and belts, driven by motor torques."""
     robot = unbounded(load_robot("mit_humanoid_leg"))
     robot = replace(robot, elastic=tuple(Elasticity(name, *figures) for name, figures in STRETCHING.items()))
     ours = tuple(replace(way, level="elastic") for way in SMOOTH)

@@ -1,7 +1,7 @@
-"""What a scene is, and what many of them share.
+"""Description of a scene, and functions for several scenes.
 
-Everything is held for `HOLD` at a time, joint targets, torques and pushes alike, so that every code integrates the same
-motion whatever its step, and every step length divides `HOLD`.
+Joint targets, torques and pushes are constant for `HOLD` at a time, and every step length divides `HOLD`. So all codes
+integrate the same motion with any step length.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ce_gym.sim.terrain import Terrain
 Array = NDArray[np.float64]
 
 HOLD = 0.02
-"""How long a target, torque or push is held, and the time between two recorded positions [s]."""
+"""Time between two changes of targets, torques or pushes, and between two recorded positions [s]."""
 
 SLIP_SPEED = 1e-3
 """Slip speed of the contacts of every scene [m/s]."""
@@ -29,7 +29,7 @@ SLIP_SPEED = 1e-3
 
 @dataclass(frozen=True)
 class Way:
-    """How one of our curves is computed.
+    """Settings of a curve of ce_gym.
 
     Attributes:
         method: Name of a time-stepping method.
@@ -45,14 +45,14 @@ class Way:
 
     @property
     def name(self) -> str:
-        """Method, and what is not the default."""
+        """Return the method and all settings that differ from the default."""
         friction = [] if self.friction == "tangent" else [self.friction]
         return ", ".join([self.method, *friction, *([SINGLE] if self.dtype == "float32" else [])])
 
 
 METHODS_IN_CONTACT = ("euler", "extrapolated", "adaptive")
 SINGLE = "single precision"
-"""What the name of such a way ends with."""
+"""End of the name of a curve in single precision."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +60,21 @@ class Scene:
     """One scene.
 
     Attributes:
-        name: For tables and files.
-        title: For pictures.
-        robot: Limits of joints left out, only contacts that take part.
-        q: Positions at the start, shape (nq,), without stretches of transmissions, as all that is recorded.
-        v: Velocities at the start, shape (nv,), likewise.
+        name: Name in tables and files.
+        title: Title in pictures.
+        robot: The robot without joint limits, with active contacts only.
+        q: Initial positions, shape (nq,), without elastic stretches.
+        v: Initial velocities, shape (nv,), without elastic stretches.
         drive: Joint targets [rad] or torques [N m] of every hold, shape (n_holds, n_joints).
-        control: What `drive` is.
-        push: Acceleration of the base in place of a horizontal force, world axes [m/s^2], shape (n_holds, 3), or None.
-        ours: Our curves.
+        control: Kind of `drive`: targets or torques.
+        push: Horizontal force on the base divided by the mass, world axes [m/s^2], shape (n_holds, 3), or None.
+        ours: Curves of ce_gym.
         levels: Transmission levels of the peers.
-        exact: Transmission level that leaves nothing out of what the scene is.
-        terrain: The ground, alike along y; the plane z = 0 if None.
-        touching: Pairs of links that push each other apart.
-        spread: Standard deviation of the starting positions of the other robots of a batch [rad and m].
-        reference: Steps to a hold of the reference.
+        exact: Transmission level of the reference, without simplifications.
+        terrain: The ground, constant along y; the plane z = 0 if None.
+        touching: Pairs of links with contact between each other.
+        spread: Standard deviation of the initial positions of the other robots of a batch [rad and m].
+        reference: Steps per hold of the reference.
     """
 
     name: str
@@ -95,17 +95,17 @@ class Scene:
 
     @property
     def smooth(self) -> bool:
-        """Whether nothing touches anything."""
+        """Return whether the scene has no contact."""
         return not self.robot.contacts and not self.touching
 
     @property
     def duration(self) -> float:
-        """Simulated time [s]."""
+        """Return the simulated time [s]."""
         return self.holds * HOLD
 
     @property
     def holds(self) -> int:
-        """How many times the drive changes, the start included."""
+        """Return the number of holds."""
         return len(self.drive)
 
 
@@ -116,7 +116,7 @@ APPROXIMATE = Way("euler", "armature")
 
 
 def unbounded(robot: Robot) -> Robot:
-    """Return a robot without limits of joints and torques, and without shapes: limits are events of their own."""
+    """Return a robot without shapes and without limits of joints and torques, because limits are events."""
     bodies = tuple(
         replace(body, shapes=(), joint=replace(body.joint, position=(-np.inf, np.inf), torque=np.inf))
         for body in robot.bodies
@@ -125,14 +125,14 @@ def unbounded(robot: Robot) -> Robot:
 
 
 def on_feet(name: str) -> Robot:
-    """Return a robot that only its feet keep above the ground, with limited torques but free joints."""
+    """Return a robot with contacts of its feet only, with torque limits and without joint limits."""
     robot = bare(load_robot(name), "foot")
     bodies = tuple(replace(body, joint=replace(body.joint, position=(-np.inf, np.inf))) for body in robot.bodies)
     return replace(robot, bodies=bodies, material=replace(robot.material, slip_speed=SLIP_SPEED))
 
 
 def driven(name: str, title: str, robot: Robot, duration: float, torque: float, ours: tuple[Way, ...]) -> Scene:
-    """Start at rest in the standing pose; every joint has a frequency between 1 and 3 Hz and a phase of its own."""
+    """Return a scene from rest in the standing pose with sinusoidal torques of different frequencies, 1 to 3 Hz."""
     model = Model(robot)
     n, t = len(model.joint_links), HOLD * np.arange(round(duration / HOLD))[:, None]
     share = np.arange(n) / max(1, n - 1)

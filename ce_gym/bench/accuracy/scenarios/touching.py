@@ -1,4 +1,4 @@
-"""Scenes of robots that touch: dropped, trotting, on stairs, a biped with closed loops, legs pressed on each other."""
+"""Scenes with contact: a dropped robot, trotting, stairs, a biped with closed loops, legs pressed together."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ce_gym.sim.terrain import Terrain
 
 
 def drop(height: float, duration: float) -> Scene:
-    """Return Mini Cheetah let go `height` [m] above the ground, slightly tilted, holding its standing pose."""
+    """Return Mini Cheetah released `height` [m] above the ground, slightly tilted, in its standing pose."""
     robot = on_feet("mini_cheetah")
     model = Model(robot)
     q = model.standing_q.copy()
@@ -36,7 +36,7 @@ def drop(height: float, duration: float) -> Scene:
 
 
 def trot() -> Scene:
-    """Return Mini Cheetah with its diagonal legs lifted in turn by a fixed sequence of joint targets, 1 s."""
+    """Return Mini Cheetah that lifts diagonal legs alternately for 1 s, with fixed joint targets."""
     robot = on_feet("mini_cheetah")
     model = Model(robot)
     t = HOLD * np.arange(round(1.0 / HOLD))
@@ -50,11 +50,11 @@ def trot() -> Scene:
 
 
 RISE, TREAD, PITCH, YAW = 0.1, 0.3, 0.26, 0.1
-"""Of the stairs [m], and how the robot faces them [rad]: its left front foot lands on the edge of the first step."""
+"""Sizes of the stairs [m], and orientation of the robot [rad]; the left front foot lands on the first edge."""
 
 
 def stairs() -> Scene:
-    """Return Mini Cheetah let go above stairs, its front feet over the first step."""
+    """Return Mini Cheetah released above stairs, with its front feet over the first step."""
     robot = on_feet("mini_cheetah")
     model = Model(robot)
     terrain = Terrain.stairs(RISE, TREAD, 3, start=0.225)
@@ -67,7 +67,7 @@ def stairs() -> Scene:
 
 
 def biped() -> Scene:
-    """Return Cassie let go a centimetre above the ground, slightly tilted: rods close loops, leaf springs give way."""
+    """Return Cassie released 1 cm above the ground, slightly tilted, with closed loops of rods and leaf springs."""
     robot = on_feet("cassie")
     model = Model(robot)
     q = model.standing_q.copy()
@@ -80,11 +80,11 @@ def biped() -> Scene:
 
 PAIRS = (("FR_knee_link", "FL_knee_link"), ("HR_knee_link", "HL_knee_link"))
 CLOSE, CROSS = 0.6, 0.15
-"""How far hips swing inwards, and how far shanks are out of line with each other, or they would be parallel [rad]."""
+"""Inward angle of the hips, and angle between the shanks, so that the shanks are not parallel [rad]."""
 
 
 def shanks() -> Scene:
-    """Return Mini Cheetah, floating without gravity, whose hips press the shanks of its pairs of legs on each other."""
+    """Return Mini Cheetah, floating without gravity, whose hips press the shanks of each pair of legs together."""
     robot = load_robot("mini_cheetah")
     capsules = tuple(capsule for pair in PAIRS for link in pair for capsule in capsules_of(robot, link))
     robot = unbounded(replace(robot, contacts=(), capsules=capsules, gravity=(0.0, 0.0, 0.0)))
@@ -107,6 +107,6 @@ def shanks() -> Scene:
 
 
 def _turned(yaw: float, pitch: float) -> Array:
-    """Return the quaternion of a turn about z after one that lifts the front [rad]."""
+    """Return the quaternion of a pitch that lifts the front, followed by a yaw [rad]."""
     a, b = yaw / 2, -pitch / 2
     return np.array([np.cos(a) * np.cos(b), -np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b)])
