@@ -19,7 +19,7 @@ class Field:
         unit: Of each.
         meaning: One line for readers.
         reset: Its value after a reset: zeros, or the normal forces of contacts at rest.
-        explicit: Whether explicit methods can keep it.
+        explicit: Whether explicit methods can integrate it.
     """
 
     name: str
@@ -90,5 +90,11 @@ class State:
         return list(self.parts.items())
 
     def replaced(self, **parts: SX) -> State:
-        """Return the state with other values of some parts; parts that the scene does not have are ignored."""
+        """Return the state with other values of some parts; empty parts are ignored.
+
+        Raises:
+            KeyError: If the state has no such part.
+        """
+        if unknown := [name for name, value in parts.items() if value.numel() and name not in self.parts]:
+            raise KeyError(unknown[0])
         return State({name: parts.get(name, value) for name, value in self.parts.items()})

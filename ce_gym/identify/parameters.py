@@ -66,7 +66,7 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """Kind and element, such as "rotor_inertia:HR_hip_rotor"."""
+        """The kind, followed by the element if there is one, as in `rotor_inertia` of `HR_hip_rotor`."""
         return f"{self.kind}:{self.element}" if self.element else self.kind
 
     @property

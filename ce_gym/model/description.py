@@ -306,7 +306,7 @@ class Robot:
 
     @property
     def passive(self) -> tuple[str, ...]:
-        """The independent joints without an actuator: their torque limit is 0, and another joint's limit is not.
+        """The independent joints without an actuator, whose torque limit is 0 while the limit of another joint is not.
 
         CAD exports of URDF files have `effort="0"` everywhere. If the torque limit of all independent joints is 0,
         joints with a spring are passive. Passive joints have positions and speeds, and entries in targets without

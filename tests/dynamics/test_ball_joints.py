@@ -92,7 +92,10 @@ def with_joint(name: str, joint: Joint):
         (broken(independent=("a", "b", "d")), "independent is 'a': expected the name of a body whose joint has one"),
         (broken(constraints=(LinearConstraint("t", (("a", 1.0), ("b", 1.0))),)), "'t' is 'a': expected a body whose"),
         (broken(constraints=(LoopConstraint("t", "ball", "e", None),)), "the free joint of base"),
-        (broken(constraints=(LoopConstraint("t", "ball", "e", "d"),)), "the ball joint of c, which in a loop is three"),
+        (
+            broken(constraints=(LoopConstraint("t", "ball", "e", "d"),)),
+            "the ball joint of c, which must be three revolute joints in a loop",
+        ),
         (broken(pose=Pose(balls=(("b", TURNED),))), "pose.balls is 'b': expected the name of a body on a ball joint"),
         (broken(pose=Pose(balls=(("a", (1.0, 1.0, 0.0, 0.0)),))), "pose.balls.a is (1.0, 1.0, 0.0, 0.0): expected"),
         (with_joint("a", Joint("ball", position=(-1.0, 1.0))), "joint limits is (-1.0, 1.0): expected no lower one"),

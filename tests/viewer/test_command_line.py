@@ -92,7 +92,8 @@ def test_browser_opens_only_if_asked_and_possible(
 @pytest.mark.slow
 def test_list_and_inspect_name_the_robot(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
-    assert all(word in capsys.readouterr().out for word in ("list", "inspect", "view", "play", "bench"))
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("list", "inspect", "view", "play", "bench"))
     assert main(["list"]) == 0
     listed = capsys.readouterr().out.split()
     assert {ROBOT, "ce_gym/MiniCheetahVelocity-v0", "mini_cheetah_velocity_exact"} <= set(listed)

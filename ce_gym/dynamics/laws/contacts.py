@@ -73,7 +73,7 @@ class PlacedContacts(PlacedForce):
 
     start: Start
     laws: list[Contact]
-    culled: list[Contact] = field()
+    culled: list[Contact] = field()  # without the default of the base class
 
     def linearise(self, iterate: SX) -> ContactForces:
         """Linearise every contact about its part of the iterate."""
@@ -86,7 +86,7 @@ class ContactForces(LinearForce):
     """The forces of all contacts, linear in the accelerations."""
 
     start: Start
-    contacts: list[LinearContact] = field()
+    contacts: list[LinearContact] = field()  # without the default of the base class
     iterates: list[SX]
 
     def add_to(self, loads: Loads) -> None:
@@ -135,7 +135,7 @@ def compliance_of(scene: Scene) -> Compliance:
 
 
 def contacts_at(start: Start) -> list[Contact]:
-    """Place every contact of the scene against the plane that the ground is nearby."""
+    """Place every contact of the scene against the plane tangent to the ground nearby."""
     scene, state, options = start.scene, start.state, start.scene.options
     normal, friction = normal_law(options.normal_law, options.material), FRICTION[options.friction]
     resolves = METHODS[options.method].controlled

@@ -70,6 +70,10 @@ class Start:
 class Loads:
     """Forces in the equations of motion, linear in the accelerations.
 
+    The force on a body is `force - inertia @ a`, with `a` the acceleration of the body minus gravity, in its own axes;
+    the force on coordinates is `tau - slope @ ydd`. Both slopes are those of a force taken one step ahead: `dt` times
+    a damping, for example.
+
     Attributes:
         bodies: Terms of bodies by name.
         balls: Forces on ball joints.
@@ -109,7 +113,7 @@ class LinearForce:
         return SX(0, 1)
 
     def advance(self, motion: Motion) -> dict[str, SX]:
-        """Return the law's fields at the end of the step."""
+        """Return the law's fields at the end of the step; fields that are left out keep their values."""
         return {}
 
     def rates(self) -> dict[str, SX]:
@@ -125,7 +129,7 @@ class PlacedForce:
     """A force law at the start of a step.
 
     Attributes:
-        culled: Contacts that act only where some contact is near.
+        culled: Contacts that are seldom near; they act only if one of them is in range.
     """
 
     culled: Sequence[Contact] = ()
@@ -154,7 +158,7 @@ class PassiveForces(LinearForce, PlacedForce):
     def add_to(self, loads: Loads) -> None:
         """Add the forces to the joints."""
         loads.joints = sum(self.joints, loads.joints)
-        loads.balls = self.balls or loads.balls
+        loads.balls = loads.balls if self.balls is None else loads.balls + self.balls
 
 
 @dataclass
@@ -170,8 +174,8 @@ class ForceLaw:
         fields: The law's memory.
         output_sizes: Sizes of the outputs by name.
         size: Size of the iterate; all zero at first.
-        iterations: How many iterations of a step may follow the first.
-        culled_rows: Rows of the iterate of contacts that act only where some contact is near.
+        iterations: Number of further iterations of a step that the law may need.
+        culled_rows: Rows of the iterate of contacts that are seldom near.
     """
 
     mechanism: Mechanism

@@ -54,7 +54,7 @@ class PlacedPairs(PlacedForce):
     """The pairs at the start of a step."""
 
     laws: list[Pair]
-    culled: list[Pair] = field()
+    culled: list[Pair] = field()  # without the default of the base class
 
     def linearise(self, iterate: SX) -> PairForces:
         """Linearise every pair about its part of the iterate."""

@@ -92,7 +92,7 @@ class MotorDrives(ForceLaw):
         return total
 
 
-LOAD = "for each motor with load-dependent friction its torque, then the torque of all else on its rotor, then 1"
+LOAD = "torque of each motor with load-dependent friction, torque of all else on its rotor, then 1; zeros after a reset"
 LAG = "torque of each motor with a finite bandwidth at the end of the last step"
 WARMTH = "temperature above the air of each winding, then of each housing"
 SAG = "difference of the battery's voltage from that without load"
@@ -141,13 +141,13 @@ class MotorForces(LinearForce):
     def check(self, motion: Motion) -> SX:
         """Return 1 if a torque is beyond a limit that was not assumed, or its load is not known yet; else 0."""
         changed = self.force.check(motion)
-        if self.load.numel():
+        if self.load.numel():  # extrapolation needs loads of the same step in all of its stages
             extrapolates = METHODS[self.start.scene.options.method].estimates
             changed = ca.logic_or(changed, (self.iterate if extrapolates else self.load)[-1] < 0.5)
         return changed
 
     def next_iterate(self, motion: Motion, unconverged: SX) -> SX:
-        """Return expected torques and loads; loads only of iterations in which no rotor was stopped wrongly."""
+        """Return expected torques and loads; loads only of iterations in which no torque was at a wrong limit."""
         sound = ca.logic_and(unconverged, ca.logic_not(self.force.check(motion)))
         load = ca.if_else(sound, self._load_after(motion), self.load) if self.load.numel() else self.load
         return ca.vertcat(self.force.next_iterate(motion), load)

@@ -19,7 +19,10 @@ from ce_gym.dynamics.state import Field, Output, State
 from ce_gym.model.mechanism import Mechanism
 
 LAWS: list[type[ForceLaw]] = []
-"""All force laws. Sums of forces follow this order; `DriveMeshes` needs the sum of all others and is the last."""
+"""All force laws. Sums of forces follow this order.
+
+`DriveMeshes` is the last, because the response of a stretch depends on the slopes of all other forces.
+"""
 
 
 STEP_OUTPUTS = (

@@ -25,7 +25,7 @@ from ce_gym.dynamics.laws.scene_laws import iterate_size
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms, inward_inertia_pass
 from ce_gym.dynamics.recursion.ce_rnea import force_on_coordinates, inward_force_pass, net_forces, outward_acceleration
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, turning_momentum
-from ce_gym.dynamics.stepping.step import finish_step, linearise, no_loads, stacked
+from ce_gym.dynamics.stepping.step import finish_step, first_loads, linearise, stacked
 from ce_gym.dynamics.stepping.trace import Given
 from ce_gym.model.mechanism import Mechanism
 
@@ -189,7 +189,7 @@ class Equation:
         """Residual of the equation without contacts, shape (nv,), given inertias of clusters."""
         kinematics = self.system.start.kinematics
         f = net_forces(self.mechanism, kinematics, self.a)
-        for name, terms in no_loads(self.system.start).bodies.items():
+        for name, terms in first_loads(self.system.start).bodies.items():
             f[name] = f[name] - terms.force
         left = inward_force_pass(self.mechanism, kinematics, self.a, f, self.qdd)
         left += self.system.joints.slope @ self.vdot - self.system.joints.tau

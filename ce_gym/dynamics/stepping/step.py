@@ -6,12 +6,14 @@ moment.
 
     start = positions, velocities and memory of the robot
     forces = [law.place(start).linearise(iterate) for law in the scene's laws]      linear in the accelerations
-    vdot = CE-ABA(inertias, forces)
-    state, iterate = what integration and each force leave
+    vdot = CE-ABA(inertias, forces)         the constraint-embedding articulated-body algorithm
+    state, iterate = integrate(vdot), and the memory and next iterate of each force
 
 Which contacts act, slip or stick, which motors are at their limits and which joints dry friction holds is an active
 set. `iteration` makes the step with the set that its iterate assumes, says whether the accelerations confirm that set,
-and returns the next iterate.
+and returns the next iterate. The kernel repeats it for a tile of robots, from the same start, until all of them have
+converged, at most `iterations_needed` times. A robot that has converged earlier repeats its result to the bit, so that
+it does not depend on its neighbours.
 """
 
 from __future__ import annotations
@@ -55,7 +57,7 @@ class System:
         laws: The force laws of the scene.
         forces: The force of each law for the assumed active set.
         loads: Their sums on joints and bodies.
-        near: 1 where something is near that acts only where it is, else 0; None if all forces always act.
+        near: 1 if a contact that is seldom near is in range, else 0; None if all contacts always act.
     """
 
     start: Start
@@ -82,7 +84,8 @@ class System:
         Args:
             vdot: Acceleration, shape (nv,).
             a: Of each body minus gravity, body coordinates, shape (6,) each.
-            articulation: Of the recursion that found it; without one, iterates that depend on inertias stay.
+            articulation: Of the recursion that found it, for the loads of rotors and stretches; without it these keep
+                their old values.
         """
         ydd = vdot[self.start.scene.mechanism.robot.layout.joints_v :]
         return Solved(self, vdot, Motion(ydd, a, self.loads.gravity, articulation))
@@ -153,14 +156,14 @@ def linearise(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
     near = cull(placed, dt) if scene.choosing else None
     parts = split(iterate, [law.size for law in laws])
     forces = [force.linearise(part) for force, part in zip(placed, parts, strict=True)]
-    loads = no_loads(start)
+    loads = first_loads(start)
     for force in forces:
         force.add_to(loads)
     return System(start, laws, forces, loads, near)
 
 
 def cull(placed: Sequence[PlacedForce], dt: float) -> SX:
-    """Let seldom-near contacts act only where one of these contacts is near; return 1 if one is near, else 0."""
+    """Let contacts that are seldom near act only if one of them is in range, in place; return 1 if one is, else 0."""
     seldom = [contact for force in placed for contact in force.culled]
     near = any_in_range([contact.touch for contact in seldom], dt)
     for contact in seldom:
@@ -168,23 +171,26 @@ def cull(placed: Sequence[PlacedForce], dt: float) -> SX:
     return near
 
 
-def no_loads(start: Start) -> Loads:
+def first_loads(start: Start) -> Loads:
     """Return the loads before any force: only the couples that steady the bodies of ball joints."""
     mechanism, n = start.scene.mechanism, start.yd.numel()
     couples = {} if is_moment(start.dt) else steadying_couples(mechanism, start.kinematics, start.dt)
     bodies = {name: BodyTerms(SX(6, 6), ca.vertcat(couple, SX(3, 1))) for name, couple in couples.items()}
     bodies_in_world = start.kinematics.bodies
     gravity = {name: bodies_in_world[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
-    return Loads(bodies, JointForce(SX(0, 1), SX(0, 0)), JointForce(SX(n, 1), SX(n, n)), gravity)
+    n_balls = 3 * len(mechanism.robot.balls)
+    balls = JointForce(SX(n_balls, 1), SX(n_balls, n_balls))
+    return Loads(bodies, balls, JointForce(SX(n, 1), SX(n, n)), gravity)
 
 
 def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Solved:
     """Find the acceleration of one robot over a step by CE-ABA; arguments as for `linearise`."""
     system, mechanism = linearise(scene, state, target, dt, iterate), scene.mechanism
     kinematics, loads = system.start.kinematics, system.loads
+    # implicit parts of the gyroscopic torque of the base, and of the Coriolis forces of its joints
     momentum = None if is_moment(dt) else turning_momentum(mechanism, state.v, dt)
     turning = None if is_moment(dt) else TurningDamping(state.v, dt)
-    forces = SX.sym("forces", len(loads.pairs))
+    forces = SX.sym("forces", len(loads.pairs))  # the recursion is linear in them, and is solved for them
     external = add_pair_forces(loads.bodies, loads.pairs, forces)
     articulation = inward_inertia_pass(mechanism, kinematics, system.joints, external, turning)
     if loads.pairs:
@@ -205,12 +211,12 @@ def finish_step(solved: Solved) -> Stepped:
     mechanism, kinematics, dt = start.scene.mechanism, start.kinematics, start.dt
     q, v = advance(start.state.q, start.state.v, solved.vdot, dt, mechanism.robot.layout)
     sticks = [stick for force in forces for stick in force.sticks]
-    stand_still(mechanism, kinematics, sticks, start.state.q, q, v, dt)
+    stand_still(mechanism, kinematics, sticks, start.state.q, q, v, dt)  # changes q and v
     memory = {"dependent": guessed_coordinates(kinematics, solved.vdot, dt)}
     for force in forces:
         memory |= force.advance(motion)
     unconverged = any_check(forces, motion)
-    iterate = ca.vertcat(SX(0, 1), *[force.next_iterate(motion, unconverged) for force in forces])
+    iterate = stacked([force.next_iterate(motion, unconverged) for force in forces])
     return Stepped(start.state.replaced(q=q, v=v, **memory), solved, unconverged, iterate, error=SX(0))
 
 
