@@ -19,7 +19,8 @@ class Field:
         unit: Of each.
         meaning: One line for readers.
         reset: Its value after a reset: zeros, or the normal forces of contacts at rest.
-        explicit: Whether explicit methods can integrate it.
+        explicit: Whether explicit methods can keep it: the law returns its rate, or it follows from the forces at the
+            start of the step. Else explicit methods are refused.
     """
 
     name: str
@@ -27,7 +28,7 @@ class Field:
     unit: str
     meaning: str
     reset: Literal["zero", "resting_load"] = "zero"
-    explicit: bool = True
+    explicit: bool = False
 
 
 @dataclass(frozen=True)

@@ -250,3 +250,5 @@ def test_a_force_law_with_memory_a_parameter_and_an_output():
     np.testing.assert_allclose(sim.output("drag_force")[:, 0], -drag * snapshot["lagging_speed"][:, 0], rtol=1e-12)
     with pytest.raises(ValueError, match="drag=-1; expected 0 or more"):
         sim.set_parameter("drag", -1.0)
+    with pytest.raises(ValueError, match="method='rk4'; expected an implicit one: the state has the speed of the base"):
+        Simulator(Model(robot), contacts=(), parameters=("drag",), method="rk4")

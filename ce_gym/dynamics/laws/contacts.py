@@ -47,9 +47,9 @@ class Contacts(ForceLaw):
         bristles = 2 * n if options.material.bristle > 0 else 0
         self.acts = n > 0
         self.fields = (
-            Field("load", n, "N", "normal force of each contact over the last step", "resting_load"),
-            Field("whole_load", coarse, "N", "normal force over the last whole step, of two loads", "resting_load"),
-            Field("anchor", bristles, "m", "horizontal deflection of each contact's bristle, world axes"),
+            Field("load", n, "N", "normal force of each contact over the last step", "resting_load", True),
+            Field("whole_load", coarse, "N", "normal force over the last whole step", "resting_load", True),
+            Field("anchor", bristles, "m", "horizontal deflection of each bristle, world axes", explicit=True),
         )
         self.output_sizes = {"contact_forces": 3 * len(options.contacts)}
         self.size, self.iterations = Contact.size * n, FRICTION[options.friction].iterations

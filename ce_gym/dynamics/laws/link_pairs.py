@@ -26,7 +26,8 @@ class LinkPairs(ForceLaw):
         self.capsules = colliding(self.mechanism.robot, self.options.self_collisions)
         n = len(self.capsules)
         self.acts = n > 0
-        self.fields = (Field("pair_force", n, "N", "force between each pair of capsules over the last step"),)
+        meaning = "force between each pair of capsules over the last step"
+        self.fields = (Field("pair_force", n, "N", meaning, explicit=True),)
         self.size, self.iterations = Contact.size * n, Frictionless.iterations
         self.culled_rows = range(self.size)
 

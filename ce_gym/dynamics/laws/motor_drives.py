@@ -61,11 +61,11 @@ class MotorDrives(ForceLaw):
         load = 2 * loaded + 1 if loaded else 0
         held = len(target_names(self.mechanism, options.control)) + 1 if options.sampled else 0
         self.fields = (
-            Field("motor_load", load, "N m", LOAD),
-            Field("lagging_torque", len(lagging_motors(robot, model)), "N m", LAG, explicit=False),
-            Field("motor_warmth", 2 * warm, "K", WARMTH, explicit=False),
-            Field("battery_sag", battery, "V", SAG, explicit=False),
-            Field("held_torque", held, "N m or N; last s", HELD, explicit=False),
+            Field("motor_load", load, "N m", LOAD, explicit=True),
+            Field("lagging_torque", len(lagging_motors(robot, model)), "N m", LAG),
+            Field("motor_warmth", 2 * warm, "K", WARMTH),
+            Field("battery_sag", battery, "V", SAG),
+            Field("held_torque", held, "N m or N; last s", HELD),
         )
         self.output_sizes = {"torque": joints, "motor_torque": motors, "motor_speed": motors, "power": joints}
         self.output_sizes |= {"winding_temperature": warm, "battery_voltage": battery}

@@ -59,9 +59,9 @@ def state_fields(mechanism: Mechanism, options: StepOptions) -> tuple[Field, ...
     """Return the parts of the state of a robot in a scene, those that are empty left out."""
     layout = mechanism.robot.layout
     fields = [
-        Field("q", layout.nq, "rad or m", "positions"),
-        Field("v", layout.nv, "rad/s or m/s", "velocities"),
-        Field("dependent", len(reference_guess(mechanism)), "rad or m", "guess of coordinates found by iteration"),
+        Field("q", layout.nq, "rad or m", "positions", explicit=True),
+        Field("v", layout.nv, "rad/s or m/s", "velocities", explicit=True),
+        Field("dependent", len(reference_guess(mechanism)), "rad or m", "guess of loop coordinates", explicit=True),
     ]
     fields += [field for law in scene_laws(mechanism, options) for field in law.fields]
     return tuple(field for field in fields if field.size)
