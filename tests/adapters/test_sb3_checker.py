@@ -5,11 +5,13 @@ from __future__ import annotations
 import warnings
 
 import gymnasium
+import pytest
 from stable_baselines3.common.env_checker import check_env
 
 import ce_gym
 
 
+@pytest.mark.slow
 def test_the_checker_is_silent():
     """On every task and a skill; others differ in numbers only, and each has to be compiled."""
     tasks = {"velocity", "run", "stand", "jump", "backflip"}

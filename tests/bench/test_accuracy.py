@@ -205,6 +205,7 @@ def test_comparison_ends_where_references_do():
     assert accuracy.requirement(Measured(scene, 1e-6, [ours, lost])).verdict == "none"
 
 
+@pytest.mark.slow
 def test_single_precision_is_as_near_as_its_steps_allow():
     scene = short("drop_3cm", 10)
     double, single = (Ours(scene, Way("extrapolated", dtype=dtype), 16).run(10) for dtype in ("float64", "float32"))

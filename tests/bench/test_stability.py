@@ -46,6 +46,7 @@ def test_picture(tmp_path: Path):
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_command(tmp_path: Path, capsys):
     file = tmp_path / "stability.json"
     assert command.main(["stability", "--quick", "--json", str(file)]) == 0

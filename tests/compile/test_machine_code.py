@@ -53,6 +53,7 @@ def test_every_cpu_gives_the_same_bits(dtype, monkeypatch):
     assert all_passes == 3 * [True, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_kernels_without_optimisation_give_the_same_bits(dtype, monkeypatch, tmp_path):
     """Steps, randomisation and resets of an environment, compiled with the settings of tests/conftest.py."""

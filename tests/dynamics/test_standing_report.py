@@ -150,6 +150,7 @@ def test_the_gap_below_a_robot_is_that_of_its_lowest_contact(tmp_path: Path) -> 
     assert contact_heights(Model(file)).min() == pytest.approx(0.03, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_quadruped_stands(capsys: pytest.CaptureFixture[str]) -> None:
     assert "stands 30 s" in standing_report(Model("mini_cheetah"))
     assert main(["inspect", "mini_cheetah", "--no-errors", "--no-standing"]) == 0

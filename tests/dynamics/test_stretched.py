@@ -28,6 +28,7 @@ def test_elimination_solves_for_accelerations_and_what_is_felt(d: int):
     np.testing.assert_allclose(np.array(ca.evalf(more))[:, 0], force + U @ np.linalg.solve(D, u))
 
 
+@pytest.mark.slow
 def test_where_links_may_touch_motion_is_the_same():
     """With pairs of links, clusters are solved in the other order, because pair forces are not known before."""
     model, dt = Model("mini_cheetah", "elastic"), 0.005

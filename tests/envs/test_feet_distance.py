@@ -9,6 +9,7 @@ import ce_gym  # noqa: F401  (registers the environments)
 LEAST = 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "sides"), [("MitHumanoid", [(1, 0)]), ("MiniCheetah", [(1, 0), (3, 2), (1, 2), (3, 0)])]
 )

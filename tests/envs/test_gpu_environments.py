@@ -147,6 +147,7 @@ def test_without_a_gpu_one_line_says_so():
         make("cuda")
 
 
+@pytest.mark.slow
 def test_a_whole_environment_compiles_for_a_gpu():
     try:
         nvrtc.compiler_version()

@@ -65,6 +65,7 @@ def test_ids_work_in_a_process_that_has_not_imported_the_package():
     assert result.stdout.strip() == "made"
 
 
+@pytest.mark.slow
 def test_levels_are_treated_alike():
     envs = [
         gymnasium.make(VELOCITY, transmission=level).unwrapped for level in ("exact", "coupled", "armature", "none")

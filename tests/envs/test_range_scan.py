@@ -71,6 +71,7 @@ def rays(pattern: str) -> np.ndarray:
     return np.array(seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "pattern"), [("rough", "lidar"), ("flat", "camera")])
 def test_readings_are_those_of_a_ray_caster(kind, pattern):
     """The critic's within a millimetre; the policy's drift and are lost."""

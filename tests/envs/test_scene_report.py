@@ -76,6 +76,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "change"), CHANGES.items())
 def test_what_a_scene_is_asked_for_has_a_line_and_sums_add_up(name: str, change: dict):
     report = count_instructions("ce_gym/MiniCheetahVelocity-v0", **change)

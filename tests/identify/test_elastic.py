@@ -18,7 +18,7 @@ from ce_gym.identify import Identified, Log, identify, simulate_log, to_yaml
 from ce_gym.model import Gains, Joint
 
 pytest.importorskip("scipy")
-pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")]
 
 URDF = """\
 <robot name="arm">

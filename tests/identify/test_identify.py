@@ -57,6 +57,7 @@ def test_held_out_error_is_that_of_the_encoders(result: Identified):
     assert result.held_out_before.min() > 5 * result.held_out.max()
 
 
+@pytest.mark.slow
 def test_friction_and_mass_of_joints_without_motors():
     planted = {"joint_friction:shank_driver": 0.03, "joint_damping:thigh": 0.02, "added_mass:foot": 0.05}
     log = simulate_log("planar_leg_linkage", 4.0, planted=planted, noise=1e-4, substep=1e-3)

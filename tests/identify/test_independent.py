@@ -14,6 +14,8 @@ import pytest
 from ce_gym import Model, Robot, Simulator, load_robot
 from ce_gym.identify import Identified, Log, identify, to_yaml
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("scipy")
 
 URDF = """\

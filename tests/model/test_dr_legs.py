@@ -101,6 +101,7 @@ def test_mass_matrix_and_inverse_dynamics_are_those_of_mujocos_tree(robot):
         np.testing.assert_allclose(G.T @ data.qfrc_inverse, force, atol=1e-9 * np.abs(force).max())
 
 
+@pytest.mark.slow
 def test_it_stands_without_a_policy(robot):
     model = Model(robot)
     sim = Simulator(model, 4, outputs=("loop_gap",))

@@ -100,6 +100,7 @@ def test_damping_and_stop():
     np.testing.assert_allclose(free.v[0], np.array([1.0, 2.0, 3.0]) * np.exp(-damping / 0.01 * 0.2), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_slopes_of_a_step():
     """On the ground, beyond a stop, with damping: against central differences, all at once and in reverse."""
     robot = with_balls(True, damping=0.2, position=(-np.inf, 0.3))

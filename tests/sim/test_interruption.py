@@ -89,6 +89,7 @@ def watch(sim: Simulator, monkeypatch: pytest.MonkeyPatch, interrupted: int = 0,
     return lengths
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are sent otherwise here")
 def test_no_memory_is_freed_that_a_thread_still_writes_to():
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}  # freed memory is returned immediately

@@ -41,6 +41,7 @@ def test_every_robot_with_loops_is_here():
     assert loops == set(LOOPS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_loops_stay_closed(name: str):
     """60 s under random torque, 10 s of large robots: the gap that the kernel itself sees is at most 1e-10 m."""
@@ -118,6 +119,7 @@ def flailing(robot: Robot) -> int:
     return int(simulator.diverged.sum())
 
 
+@pytest.mark.slow
 def test_stops_keep_loops_from_their_dead_centres():
     """Stops of feet or of cranks: without either, feet are thrown past the end of their rods' reach."""
     robot, unlimited = load_robot("tello"), (-np.inf, np.inf)

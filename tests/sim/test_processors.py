@@ -39,6 +39,7 @@ def hashes(folder, cpu="", **environment):
     return done.stdout.split()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="compiles for a processor of 2013, x86-64")
 def test_short_vectors_give_the_numbers_of_long_ones(tmp_path):
     """A hundred sub-steps with contacts, by AVX2 as by what this processor has (AVX-512, where the test says most)."""

@@ -64,6 +64,7 @@ def test_environments_for_long(minutes: float):
     soaked(accounts, minutes)
 
 
+@pytest.mark.slow
 def test_an_environment_for_seconds():
     soaked({"ce_gym/MiniCheetahVelocity-v0": Account()}, 0.05)
 

@@ -13,6 +13,8 @@ from run_learner import environments
 from settings import SettingsError
 from toy import job as toy_job
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):

@@ -35,6 +35,7 @@ def shelf(tmp_path, monkeypatch):
     return tmp_path / "policies"
 
 
+@pytest.mark.slow
 def test_a_shipped_policy_is_found_by_name(run, shelf, monkeypatch, capsys):
     assert main([str(run), "--ship", "--episodes", "2", "--robots", "0", "--levels", "none"]) == 0
     folder = shelf / "mini_cheetah_velocity_exact"

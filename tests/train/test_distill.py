@@ -56,6 +56,7 @@ def test_the_gradient_is_that_of_torch(kind):
     close(layers, gradient, sizes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_teacher_sees_the_numbers_of_its_own_environment(path):
     """Of shipped files, whose students see late, noisy, in the wrong place: the teacher is shown the truth."""
@@ -112,6 +113,7 @@ def test_the_student_acts_and_the_teacher_labels(tmp_path):
     assert np.abs(learner.labels).mean() > 0.05
 
 
+@pytest.mark.slow
 def test_it_learns_to_walk_without_the_velocity_of_its_base(tmp_path):
     trained = train(job(tmp_path, 300_000, ["num_envs=256", "rollout=24", "minibatches=8"], seed=3))
     assert "base_linear_velocity" not in str(trained.record["policy_spec"]["observation"]["blocks"])

@@ -46,6 +46,7 @@ def write_mjcf(folder: Path) -> Path:
     return folder / "rover.xml"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ce_gym.model.LossyImportWarning")
 @pytest.mark.parametrize(("write", "name", "seen"), [(write_urdf, "Scout", 3), (write_mjcf, "Rover", 3)])
 def test_everything_takes_it(write, name, seen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd) -> None:

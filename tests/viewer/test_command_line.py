@@ -130,6 +130,7 @@ def test_view_simulates_a_policy(stander: Path, capsys: pytest.CaptureFixture[st
     assert not list(stander.glob("*.html"))
 
 
+@pytest.mark.slow
 def test_play_shows_levels_as_ghosts_of_the_same_start(stander: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["play", "stander", "--transmission", "exact", "armature", "--command", "0.4", "0.5", "0", "0"]
     assert main([*command, "--save", "kept"]) == 0

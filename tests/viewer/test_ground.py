@@ -36,6 +36,7 @@ def test_a_piece_is_the_field(terrain: Terrain) -> None:
     np.testing.assert_allclose(piece.at(x, y), terrain.at(x, y), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cell", "length"), [(0.02, 5.0), (0.1, 90.0), (0.01, 60.0)])
 def test_a_piece_is_never_large(cell: float, length: float) -> None:
     terrain = Terrain.from_function(lambda x, y: 0.1 * np.sin(x + 0.5 * y), cell, 8.0)

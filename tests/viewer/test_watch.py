@@ -152,6 +152,7 @@ def watched(run: Path) -> Iterator[tuple[Path, Watching]]:
         watching.close()
 
 
+@pytest.mark.slow
 def test_the_page_gets_curves_and_the_present_policy(watched: tuple[Path, Watching]):
     run, events = watched
     curves = events.next("curves")
@@ -173,6 +174,7 @@ def test_the_page_gets_curves_and_the_present_policy(watched: tuple[Path, Watchi
     assert (state["finished"], state["notice"]) == (True, "")
 
 
+@pytest.mark.slow
 def test_policies_that_cannot_act_are_told(watched: tuple[Path, Watching]):
     run, events = watched
     (run / "policy.npz").write_bytes(b"no policy")
