@@ -18,7 +18,7 @@ from ce_gym.__main__ import main
 from ce_gym.model import load_robot
 from ce_gym.viewer.live.runner import Runner
 from ce_gym.viewer.live.setup import named
-from ce_gym.viewer.meshes.triangles import Triangles, read_meshes
+from ce_gym.viewer.meshes.triangles import Triangles, drawn_meshes
 from ce_gym.viewer.stream import serving
 
 for package in ("mujoco", "meshcat", "trimesh", "fast_simplification"):
@@ -77,7 +77,7 @@ def test_everything_takes_it(write, name, seen, tmp_path: Path, monkeypatch: pyt
         assert Path("run.html").exists()
         with serving(Runner(named("run", env), tmp_path)):
             pass
-        drawn = read_meshes(load_robot(file))
+        drawn = drawn_meshes(load_robot(file))
         assert sum(isinstance(one, Triangles) for shapes in drawn.values() for one in shapes) >= seen
         assert "not drawn" not in capfd.readouterr().err
     finally:

@@ -11,7 +11,7 @@ from ce_gym.dynamics import Model
 from ce_gym.model import load_robot
 from ce_gym.model.description import Shape
 from ce_gym.viewer import Rollout
-from ce_gym.viewer.meshes.triangles import MOST, Triangles, read_meshes
+from ce_gym.viewer.meshes.triangles import MOST, Triangles, drawn_meshes
 from ce_gym.viewer.page.html import page
 from ce_gym.viewer.page.robot import body_paths, extent, robot_commands
 from ce_gym.viewer.raytrace.mesh import mesh_of
@@ -61,7 +61,7 @@ def urdf(folder: Path, mesh: str, more: str = "") -> Path:
 def only_mesh(file: Path) -> Triangles:
     """The only shape of the robot of a file."""
     robot = load_robot(file) if file.suffix == ".xml" else load_robot(file, floating=True)
-    (shape,) = read_meshes(robot)["base"]
+    (shape,) = drawn_meshes(robot)["base"]
     assert isinstance(shape, Triangles)
     return shape
 
@@ -138,8 +138,8 @@ def round_robot(tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_meshes_are_simplified_and_keep_their_form(round_robot) -> None:
-    (full,) = read_meshes(round_robot)["base"]
-    (shape,) = read_meshes(round_robot, most=600)["base"]
+    (full,) = drawn_meshes(round_robot)["base"]
+    (shape,) = drawn_meshes(round_robot, most=600)["base"]
     assert isinstance(shape, Triangles)
     assert 300 < len(shape.faces) <= 600 < len(full.faces) <= MOST
     np.testing.assert_allclose(np.linalg.norm(shape.vertices, axis=1), 0.5, atol=0.02)
@@ -224,7 +224,7 @@ def test_a_bad_mesh_hides_only_itself(
         (file.parent / name).write_bytes(content)
     robot = load_robot(file, floating=True)
     with pytest.warns(UserWarning, match=message) as caught:
-        meshes = read_meshes(robot)
+        meshes = drawn_meshes(robot)
     (warning,) = [str(item.message) for item in caught if item.category is UserWarning]
     assert "\n" not in warning
     if alone:

@@ -45,7 +45,7 @@ class Triangles:
     color: Color = Shape.color
 
 
-def read_meshes(robot: Robot, most: int = MOST) -> dict[str, tuple[Shape | Triangles, ...]]:
+def drawn_meshes(robot: Robot, most: int = MOST) -> dict[str, tuple[Shape | Triangles, ...]]:
     """Return meshes and shapes of the bodies with readable meshes, by name.
 
     Meshes are simplified to at most `most` triangles together, in proportion to the triangles of their files.

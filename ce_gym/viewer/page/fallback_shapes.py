@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ce_gym.model.description import Body, ContactSphere, Robot, Shape
 from ce_gym.model.frames import Placement, Vec3
-from ce_gym.viewer.meshes.triangles import MOST, Triangles, read_meshes
+from ce_gym.viewer.meshes.triangles import MOST, Triangles, drawn_meshes
 from ce_gym.viewer.meshes.visuals import visuals_of
 from ce_gym.viewer.page.three import Color
 
@@ -24,7 +24,7 @@ def shapes_of(robot: Robot, triangles: int = MOST) -> dict[str, tuple[Shape | Tr
         robot: The robot.
         triangles: Most triangles of all meshes together.
     """
-    meshes = read_meshes(robot, triangles)
+    meshes = drawn_meshes(robot, triangles)
     if meshes or any(body.shapes for body in robot.bodies):
         return {body.name: meshes.get(body.name, body.shapes) for body in robot.bodies}
     return {**stick_figure(robot)}
