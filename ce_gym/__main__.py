@@ -1,7 +1,7 @@
-"""The command `python -m ce_gym`: what is there, what a robot is made of, how a rollout looked, how fast it all is.
+"""The command `python -m ce_gym`: lists and inspects robots, shows policies and rollouts, identifies, benchmarks.
 
-Only parses arguments and hands over; whatever a subcommand needs is imported when it runs, so that `--help` is
-instant. Errors that a user can mend are one line on stderr and exit code 2.
+This file only parses arguments. A subcommand imports its code when it runs, so that `--help` is instant. Errors that a
+user can fix are one line on stderr and exit code 2.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Each has --help. In Python: gymnasium.make("ce_gym:ce_gym/MiniCheetahVelocity-v0
 
 
 READER_NOTES = ("left out: ", "joint ", "link ")
-"""How notes begin that readers of files make, other than those that a robot's file has itself."""
+"""Beginnings of the notes that readers of files add to the notes of a robot's file."""
 MOST_NOTES = 8
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0, or 2 if the user has something to mend."""
+    """Run the command line and return its exit code: 0, or 2 for an error that the user can fix."""
     print_anything()
     argv = sys.argv[1:] if argv is None else list(argv)
     if not argv:
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _run(argv)
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # whoever read our output has had enough
+    except BrokenPipeError:  # the reader of the output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
@@ -204,7 +204,7 @@ def _inspect_environment(args: argparse.Namespace) -> int:
         print(scene_report(name, **dict(args.env_args)))
     except ImportError as error:
         raise RobotError(f"environment {args.name!r}: {error}") from error
-    except ValueError as error:  # names what is wrong
+    except ValueError as error:
         raise RobotError(str(error)) from error
     return 0
 

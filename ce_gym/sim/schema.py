@@ -1,6 +1,6 @@
-"""What a robot of a batch carries from call to call: a schema with one row for each state buffer.
+"""The schema of the state of a batch: one row for each buffer that lasts from call to call.
 
-Arrays on a device, the buffers of kernels, resets, snapshots and copies are made from the rows and from nothing else.
+Arrays on a device, buffers of kernels, resets, snapshots and copies follow from the rows alone.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from ce_gym.sim.substeps import DT, FRAME
 Writer = Literal["physics", "task", "term", "drift", "host", "scene"]
 
 TOLERANCE = 1e-3
-"""What is asked for where nothing is said [rad or m]."""
+"""Default tolerance of adaptive steps [rad or m]."""
 TOLERATED = "tolerance"
-"""Name of the buffer with that of each robot."""
+"""Name of the buffer with the tolerance of each robot."""
 FIRST = 10
-"""The first step that a robot tries is so many times shorter than a sub-step."""
+"""Length of a sub-step over the length of the first step that a robot tries."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class Row:
 
     Attributes:
         name: Of the buffer.
-        size: Numbers that one robot has there; 0 for a plain array of one number for each robot.
-        writer: Who changes it: "physics" (the sub-steps), "task" (what an environment does around them), "term" (a
-            reward, observation, termination or metric with memory), "drift" (a sensor's error, drawn by resets), "host"
-            (Python only; no reset touches it) or "scene" (constant: how it is stepped, and no part of a snapshot).
-        reset: With what a robot begins, a number or shape (size,).
-        dtype: Of a plain array, shape (num_envs, size), or (num_envs,) for size 0; "" for one in lanes.
-        quaternions: Places at which quaternions of unit length begin.
+        size: Numbers of each robot; 0 for a plain array with one number for each robot.
+        writer: The part that changes the buffer: "physics" (the sub-steps), "task" (the environment around them),
+            "term" (a reward, observation, termination or metric with memory), "drift" (resets draw a sensor's error),
+            "host" (Python; resets leave it) or "scene" (nobody: an option of the scene, left out of snapshots).
+        reset: Value after a reset, a number or shape (size,).
+        dtype: Of a plain array, shape (num_envs, size), or (num_envs,) for size 0; "" for an array in lanes.
+        quaternions: Rows at which unit quaternions begin.
     """
 
     name: str
@@ -60,14 +60,14 @@ class Row:
 def physics_rows(
     model: Model, options: StepOptions, outputs: Sequence[str], dt: float, tolerance: float | None = None
 ) -> list[Row]:
-    """Return the rows of what the sub-steps of a scene read and write.
+    """Return the rows of the buffers that the sub-steps of a scene read and write.
 
     Args:
         model: The robot at a transmission level.
         options: The scene.
-        outputs: What is computed besides the state.
+        outputs: Names of outputs to compute.
         dt: Length of a sub-step [s].
-        tolerance: Of a method with steps of its own [rad or m]; `TOLERANCE` if None.
+        tolerance: Of adaptive steps [rad or m]; `TOLERANCE` if None.
     """
     start = {"q": model.standing_q, "dependent": model.guess}
     fields = state_fields(model.mechanism, options)
@@ -96,20 +96,20 @@ def physics_rows(
 
 
 def state_buffers(rows: Iterable[Row]) -> list[Buffer]:
-    """Return the buffers of a kernel that rows in its lanes are."""
+    """Return the kernel buffers of the rows that are in lanes."""
     return [Buffer(row.name, row.size, "tiles") for row in rows if not row.dtype]
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps that robots have made at lengths of their own, shape (num_envs,) each.
+    """Adaptive steps of each robot, shape (num_envs,) each.
 
     Attributes:
-        taken: How many.
-        refused: How many were tried again, shorter.
-        missed: How many of those taken missed the tolerance: they were as short as can be.
-        length: What is tried next, unless the end of an interval is nearer [s].
-        error: Estimated error of the last one that was taken [rad or m].
+        taken: Number of accepted steps.
+        refused: Number of steps that were tried again with a shorter length.
+        missed: Number of accepted steps that missed the tolerance, at the shortest length.
+        length: Length of the next step, unless the end of the interval is nearer [s].
+        error: Estimated error of the last accepted step [rad or m].
     """
 
     taken: Array

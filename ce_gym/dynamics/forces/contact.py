@@ -16,11 +16,11 @@ when it is active, and its terms in the recursion.
 
 A contact becomes active if it *will* be in the ground by the end of the step, `d - dt v_n > 0`, and pushes. A corner
 that its velocity does not take there, but the velocity it has after another one hit the ground, becomes active in the
-second iteration. A point that the law would pull down to the surface, because it is turned back before, makes a third
-iteration, with a damper `-share (c + dt k) v_n+` in place of the spring, which can do no work. `share = 1 - d / (dt
-v_n)` is the part of the step that the point spends in the ground. The prediction knows the velocity but not yet the
+second iteration. A point that is turned back before it reaches the surface would be pulled down by the law. It makes a
+third iteration, in which the damper `-share (c + dt k) v_n+` replaces the spring and can do no work. `share = 1 - d /
+(dt v_n)` is the part of the step that the point spends in the ground. The prediction knows the velocity but not yet the
 acceleration: a loaded foot that its spring has just lifted would be taken to be gone, fall back, and bounce on the
-steps for ever. So a contact that pushed at the end of the last step stays active as long as it is in the ground.
+steps for ever. So a contact that pushed at the end of the last step stays active while it is in the ground.
 
 In the step in which a point lands, damping acts over the whole step, although the point is in the ground only for a
 share of it, and friction has no load yet. Both are errors of first order in the step. Methods with `resolves_landing`

@@ -84,9 +84,9 @@ def yielding_joints(mechanism: Mechanism) -> list[tuple[int, Joint, str]]:
 def yielding_forces(mechanism: Mechanism, kinematics: Kinematics, dt: float) -> list[JointForce]:
     """Return springs of joints with one coordinate, and viscous friction and stops of dependent ones.
 
-    With `W` its row of the constraint Jacobian a joint moves at `W yd`, and its torque on the independent joints is
-    `W^T tau`. Near the end of a loop's reach `W` grows without bound, and with it what a stop there can resist: no stop
-    of an independent joint could.
+    With `W` the row of the constraint Jacobian of a joint, the joint moves at `W yd` and acts on the independent joints
+    with `W^T tau`. Near the end of a loop's reach `W` grows without bound, and with it the load that the stop of a
+    dependent joint can resist.
     """
     robot, found, layout = mechanism.robot, [], mechanism.robot.layout
     for k, joint, name in yielding_joints(mechanism):

@@ -58,9 +58,9 @@ class Contacts(ForceLaw):
 
     def place(self, start: Start) -> PlacedContacts:
         """Place every contact against the ground."""
-        laws = contacts_at(start)
-        named = zip(self.options.touches, laws, strict=True)
-        return PlacedContacts(start, laws, [law for name, law in named if name in self.options.seldom])
+        contacts = contacts_at(start)
+        named = zip(self.options.touches, contacts, strict=True)
+        return PlacedContacts(start, contacts, [contact for name, contact in named if name in self.options.seldom])
 
     def energy(self, start: Start) -> SX:
         """Return the energy of the contacts' springs and bristles [J]."""
@@ -72,13 +72,14 @@ class PlacedContacts(PlacedForce):
     """The contacts at the start of a step."""
 
     start: Start
-    laws: list[Contact]
+    contacts: list[Contact]
     culled: list[Contact] = field()  # without the default of the base class
 
     def linearise(self, iterate: SX) -> ContactForces:
         """Linearise every contact about its part of the iterate."""
         parts = ca.vertsplit(iterate, Contact.size)
-        return ContactForces(self.start, [law.linearise(x) for law, x in zip(self.laws, parts, strict=True)], parts)
+        linear = [contact.linearise(part) for contact, part in zip(self.contacts, parts, strict=True)]
+        return ContactForces(self.start, linear, parts)
 
 
 @dataclass
@@ -138,7 +139,7 @@ def contacts_at(start: Start) -> list[Contact]:
     """Place every contact of the scene against the plane tangent to the ground nearby."""
     scene, state, options = start.scene, start.state, start.scene.options
     normal, friction = normal_law(options.normal_law, options.material), FRICTION[options.friction]
-    resolves = METHODS[options.method].controlled
+    compliance, resolves = compliance_of(scene), METHODS[options.method].controlled
     contacts = []
     for i, (sphere, centre) in enumerate(contact_centres(scene)):
         body = start.kinematics.bodies[sphere.body]
@@ -150,7 +151,6 @@ def contacts_at(start: Start) -> list[Contact]:
             up = ca.vertcat(-slope, 1) / ca.sqrt(1 + ca.sumsqr(slope))
         anchor = state["anchor"][2 * i : 2 * i + 2] if state["anchor"].numel() else state["anchor"]
         touch = touch_ground(body, sphere, centre, height, up, state["load"][i], anchor)
-        compliance = compliance_of(scene)
         contacts.append(Contact(sphere.body, touch, compliance, normal, friction, start.dt, resolves_landing=resolves))
     return contacts
 

@@ -57,7 +57,7 @@ class DriveMeshes(ForceLaw):
     def declare(self) -> None:
         """Iterate over an acceleration for each mesh with two sides; the last entry is 1 once there is an iterate."""
         elastic = stretching(self.mechanism)
-        two_sided = sum(not one.linear for _, one in elastic)
+        two_sided = sum(not drive.linear for _, drive in elastic)
         self.acts = bool(elastic)
         self.size, self.iterations = two_sided + (two_sided > 0), MESH_ITERATIONS if two_sided else 0
 
@@ -110,9 +110,9 @@ class Mesh:
 
     def wrong(self, motion: Motion, again: SX) -> SX:
         """Return 1 if the assumption about a side is wrong by more than the accepted error, else 0."""
-        (over, under), most = self.beyond(motion), ca.if_else(again > 0, self.harmless, 0)
-        one = ca.if_else(self.ahead, -over, over) > most
-        return ca.logic_or(one, ca.if_else(self.behind, -under, under) > most)
+        (over, under), accepted = self.beyond(motion), ca.if_else(again > 0, self.harmless, 0)
+        ahead_is_wrong = ca.if_else(self.ahead, -over, over) > accepted
+        return ca.logic_or(ahead_is_wrong, ca.if_else(self.behind, -under, under) > accepted)
 
     def free_acceleration(self, motion: Motion, resistance: SX) -> SX:
         """Return the acceleration of the stretch without the mesh; where sides overlap, with it."""
@@ -215,10 +215,10 @@ def stretch_resistances(
         Inertias, by the stretch's row among the joints' coordinates [kg m^2].
     """
     base = mechanism.robot.layout.base_nv
-    with_sides, found = {row for row, elastic in stretching(mechanism) if not elastic.linear}, {}
+    with_sides, resistances = {row for row, elastic in stretching(mechanism) if not elastic.linear}, {}
     for k, D in whole.items():
         for i, row in enumerate(row - base for row in kinematics.rows[k]):
             if row in with_sides:  # subtracting the slope of a stiff mesh would lose digits
                 own, others = bare[k][i, i] + slope[row, row], [j for j in range(D.shape[0]) if j != i]
-                found[row] = own - D[i, others] @ solve_positive_definite(D[others, others], D[others, i])
-    return found
+                resistances[row] = own - D[i, others] @ solve_positive_definite(D[others, others], D[others, i])
+    return resistances

@@ -64,7 +64,7 @@ class Rubbing:
 
 def rubbing_clusters(mechanism: Mechanism) -> list[Rubbing]:
     """Return the clusters with dry friction."""
-    robot, found = mechanism.robot, []
+    robot, clusters = mechanism.robot, []
     for k, cluster in enumerate(mechanism.tree.clusters):
         joints = {name: robot.body(name).joint for name in cluster.bodies}
         friction = {
@@ -73,8 +73,8 @@ def rubbing_clusters(mechanism: Mechanism) -> list[Rubbing]:
             if joint.type != "free" and has_dry_friction(joint.friction)
         }
         if friction:
-            found.append(Rubbing(k, [robot.independent.index(name) for name in cluster.independent], friction))
-    return found
+            clusters.append(Rubbing(k, [robot.independent.index(name) for name in cluster.independent], friction))
+    return clusters
 
 
 @dataclass
@@ -88,17 +88,18 @@ class JointFriction(PlacedForce):
         start, n, last = self.start, self.start.yd.numel(), iterate[-1] > STICK_ITERATIONS - 0.5
         force = SaturatedForce(SX(n, 1), SX(n, n), iterate.numel(), count=iterate[-1] + 1)
         for cluster in rubbing_clusters(start.scene.mechanism):
-            for friction, own in self._torques(cluster).values():
-                way, place = SX(1, n), len(force.limited)
-                way[cluster.rows] = own
-                alone = len(cluster.rows) == 1
-                one, rests, damping = dry_friction(friction, way @ start.yd, way, start.dt, iterate, place, alone)
-                force.limited[place] = one
-                acts = one.free if not cluster.declared else ca.logic_and(one.free, friction > 0)
+            for friction, unit in self._torques(cluster).values():
+                direction, place = SX(1, n), len(force.limited)
+                direction[cluster.rows] = unit
+                alone, speed = len(cluster.rows) == 1, direction @ start.yd
+                limited, rests, damping = dry_friction(friction, speed, direction, start.dt, iterate, place, alone)
+                force.limited[place] = limited
+                acts = limited.free if not cluster.declared else ca.logic_and(limited.free, friction > 0)
                 sticks = ca.logic_and(acts, ca.logic_not(last))
-                force.tau += way.T @ ca.if_else(last, ca.fmax(-friction, ca.fmin(friction, one.expected)), one.given)
-                force.slope += way.T @ ca.if_else(sticks, start.dt * damping, 0) @ way
-                force.frictions.append(Stick(way, sticks, rests))
+                settled = ca.fmax(-friction, ca.fmin(friction, limited.expected))
+                force.tau += direction.T @ ca.if_else(last, settled, limited.given)
+                force.slope += direction.T @ ca.if_else(sticks, start.dt * damping, 0) @ direction
+                force.frictions.append(Stick(direction, sticks, rests))
         return FrictionForces(force, iterate)
 
     def _torques(self, cluster: Rubbing) -> dict[str, tuple[SX, SX]]:

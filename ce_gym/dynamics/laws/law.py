@@ -71,8 +71,8 @@ class Loads:
     """Forces in the equations of motion, linear in the accelerations.
 
     The force on a body is `force - inertia @ a`, with `a` the acceleration of the body minus gravity, in its own axes;
-    the force on coordinates is `tau - slope @ ydd`. Both slopes are those of a force taken one step ahead: `dt` times
-    a damping, for example.
+    the force on coordinates is `tau - slope @ ydd`. Slopes come from taking a force one step
+    ahead: `dt` times a damping, for example.
 
     Attributes:
         bodies: Terms of bodies by name.

@@ -33,8 +33,8 @@ class LinkPairs(ForceLaw):
 
     def place(self, start: Start) -> PlacedPairs:
         """Place the capsules of every pair against each other."""
-        laws = self._pairs_at(start)
-        return PlacedPairs(laws, laws)
+        pairs = self._pairs_at(start)
+        return PlacedPairs(pairs, pairs)
 
     def energy(self, start: Start) -> SX:
         """Return the energy of the springs between links [J]."""
@@ -54,13 +54,13 @@ class LinkPairs(ForceLaw):
 class PlacedPairs(PlacedForce):
     """The pairs at the start of a step."""
 
-    laws: list[Pair]
+    pairs: list[Pair]
     culled: list[Pair] = field()  # without the default of the base class
 
     def linearise(self, iterate: SX) -> PairForces:
         """Linearise every pair about its part of the iterate."""
         parts = ca.vertsplit(iterate, Contact.size)
-        return PairForces([law.linearise(x) for law, x in zip(self.laws, parts, strict=True)], parts)
+        return PairForces([pair.linearise(part) for pair, part in zip(self.pairs, parts, strict=True)], parts)
 
 
 @dataclass

@@ -46,14 +46,13 @@ def step_function(
         mechanism: The robot at a transmission level.
         options: The scene.
         outputs: Names among `OUTPUTS`, or `MOVED` or `OFF`; others cost nothing.
-        follows: Whether contacts that move find the plane of the ground higher or lower there; for derivatives on a
-            field. `places`, where the centres of contacts are, is one more of what is given then.
+        follows: Whether the height of the ground changes with the place of a contact, by the slope of its plane; for
+            derivatives on a field. The function then has the input `places`, the centres of the contacts.
 
     Returns:
-        Function (*state, diverged, *given) -> (*state, diverged, *outputs): `state` are the parts of `State` that the
-        scene has; `given` is `target` if there are joints, `parameters` if any are declared, `ground` on a field and
-        `region_points` on one with hulls, and
-        `dt` if the options leave it open.
+        Function (*state, diverged, *given) -> (*state, diverged, *outputs). `state` are the fields of the scene. Inputs
+        in `given` are `target` if there are joints, `parameters` if any are declared, `ground` on a field,
+        `region_points` on a field with hulls, and `dt` if the options leave it open.
     """
     given, plan = Given(mechanism, options, follows), METHODS[options.method]
     parts = unrolled(plan, given.scene, given.state, given.target, given.dt)
@@ -75,8 +74,8 @@ def iteration_function(
         options: The scene.
         outputs: See `step_function`.
         follows: See `step_function`.
-        chooses: Whether what is seldom near is left out where it is not; `NEAR`, which is 1 or 0, says it then, and
-            `near_iterate` is what of the iterate nobody looks at elsewhere.
+        chooses: Whether contacts that are seldom near are left out where none is in range. The output `NEAR` is then 1
+            if one is in range, else 0, and `near_iterate` holds the part of the iterate of these contacts.
 
     Returns:
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
