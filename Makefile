@@ -2,7 +2,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := viewer,video,fast,identify,train,export,rsl-rl,gpu,bench,docs,dev
+EXTRAS := viewer,video,identify,train,sb3,export,rsl-rl,gpu,bench,docs,dev
 
 .PHONY: help venv demo test quick arm lint types docs gallery links wheel clean
 

@@ -13,11 +13,19 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ce_gym.console import Parser, examples, print_anything
+from ce_gym.console import InputError, Parser, examples, file_error, print_anything
 from ce_gym.identify.command import add_identify_command
+from ce_gym.learn.commands.evaluate import (
+    add_card_command,
+    add_evaluate_command,
+    add_sim2sim_command,
+    add_transfer_command,
+)
+from ce_gym.learn.commands.export import add_export_command
+from ce_gym.learn.commands.train import add_train_command
 from ce_gym.policies import add_env_arg
 from ce_gym.viewer.cli import add_live_command, add_play_command, add_view_command, add_watch_command
 
@@ -27,6 +35,12 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
   python -m ce_gym new my_robot.urdf     write the YAML file that a robot of one's own needs, guesses marked
   python -m ce_gym inspect mini_cheetah  clusters and gears of a robot, errors of each transmission level
   python -m ce_gym inspect ENVIRONMENT   scalar operations of an environment's step, feature by feature
+  python -m ce_gym train ENVIRONMENT     train a policy
+  python -m ce_gym evaluate POLICY       errors, falls, motors and pushes of a policy
+  python -m ce_gym transfer POLICY       a policy on every transmission level
+  python -m ce_gym sim2sim POLICY        a policy in MuJoCo
+  python -m ce_gym export POLICY         write a policy as ONNX, for a robot's computer
+  python -m ce_gym card RUN              evaluate a trained policy completely, and write its card
   python -m ce_gym play POLICY           let a trained policy act, and show it in a browser
   python -m ce_gym live POLICY           drive, push and throw it in a browser
   python -m ce_gym watch RUN             see how training goes: curves, and the present policy
@@ -49,11 +63,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not argv:
         print(WELCOME)
         return 0
+    return run(lambda: _run(argv))
+
+
+def run(work: Callable[[], int]) -> int:
+    """Do the work of a command and return its exit code: 2 after an error that the user can fix, 130 after Ctrl-C."""
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            return _run(argv)
+            return work()
     except KeyboardInterrupt:
+        print("ce_gym: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of the output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -61,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if not _can_be_mended(error):
             raise
-        print(f"ce_gym: {error}", file=sys.stderr)
+        print(f"ce_gym: {file_error(error) if isinstance(error, OSError) else error}", file=sys.stderr)
         return 2
 
 
@@ -118,6 +138,12 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, metavar="YAML", help="the file to write; by default beside FILE, ending in .yaml"
     )
     new.set_defaults(run=_new)
+    add_train_command(commands)
+    add_evaluate_command(commands)
+    add_transfer_command(commands)
+    add_sim2sim_command(commands)
+    add_export_command(commands)
+    add_card_command(commands)
     add_play_command(commands)
     add_view_command(commands)
     add_live_command(commands)
@@ -223,7 +249,7 @@ def _can_be_mended(error: Exception) -> bool:
     from ce_gym.policies import PolicyError
     from ce_gym.viewer import RolloutError, ViewerError
 
-    return isinstance(error, (RobotError, PolicyError, RolloutError, ViewerError, OSError))
+    return isinstance(error, (InputError, RobotError, PolicyError, RolloutError, ViewerError, OSError))
 
 
 if __name__ == "__main__":

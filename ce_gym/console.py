@@ -1,15 +1,24 @@
-"""Command lines: a parser with errors of one line, and a progress bar."""
+"""Command lines: a parser with errors of one line, types of arguments, results as text and JSON, a progress bar."""
 
 from __future__ import annotations
 
 import argparse
 import io
+import json
 import os
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 T = TypeVar("T")
+
+Table = list[list[str]]
+"""Rows of cells; the first row is the heading."""
+
+
+class InputError(ValueError):
+    """A value of a user cannot be used; the message is one line."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -50,3 +59,79 @@ def progress(items: Collection[T], label: str) -> Iterator[T]:
     except ImportError:
         return iter(items)
     return iter(tqdm(items, label, leave=False, disable=None, dynamic_ncols=True))
+
+
+def file_error(error: OSError) -> str:
+    """Return file and reason of an error."""
+    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror or str(error)
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """Return a function that reads a whole number within limits from the command line."""
+
+    def read(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            number = low - 1
+        if not low <= number <= high:
+            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number from {low} to {high}")
+        return number
+
+    return read
+
+
+def above_zero(text: str) -> float:
+    """Read a number above 0, or inf, from the command line."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not number > 0:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected a number above 0")
+    return number
+
+
+SEED = whole(0, 2**31 - 1)
+"""Type of `--seed`."""
+
+WEIGHTS_SEED = whole(0, 2**32 - 1)
+"""Type of `--seed` in evaluations, which may use all 32 bits."""
+
+THREADS = whole(1, 1024)
+"""Type of `--threads`."""
+
+EPISODES = whole(1, 1_000_000)
+"""Type of `--episodes`."""
+
+
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`, the argument of `print_result`."""
+    text = "write the result to FILE as JSON as well; without FILE, print JSON and nothing else"
+    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help=text)
+
+
+def print_result(result: Any, text: str, json_file: str | None) -> None:
+    """Print a result as text or JSON, and write it to the file of `--json`.
+
+    Args:
+        result: Plain data.
+        text: The result as text.
+        json_file: Value of `--json`: None, a file, or "-" for JSON instead of text.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    data = json.dumps(result, indent=2)
+    print(data if json_file == "-" else text)
+    if json_file not in (None, "-"):
+        Path(str(json_file)).write_text(data + "\n", encoding="utf-8")
+
+
+def markdown(table: Table) -> str:
+    """Return a table as Markdown with aligned columns."""
+    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
+    heading, *rows = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in table
+    ]
+    return "\n".join([heading, "|" + "|".join("-" * (width + 2) for width in widths) + "|", *rows])

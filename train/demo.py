@@ -1,15 +1,11 @@
 """Train a robot, evaluate it, and show it in a browser, in one command.
 
-A second call uses the finished policy, or continues an interrupted training; `--fresh` starts again. Uses public names
-of ce_gym only.
+A second call uses the finished policy, or continues an interrupted training; `--fresh` starts again.
 
     python train/demo.py
 """
 
 from __future__ import annotations
-
-import interruption  # noqa: F401
-import single_blas  # noqa: F401
 
 # isort: split
 
@@ -17,15 +13,17 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from console import EPISODES, SEED, THREADS, Parser, above_zero, run
-from episodes import EVALUATION_SEED
-from evaluate import report
-from job import Job, Trained
-from settings import config_file, load_env_args, load_settings
-from transfer import summary, table, transfer
 
 from ce_gym import usable_cores
-from ce_gym.policies import add_env_arg, keep_map, load_policy, with_map
+from ce_gym.__main__ import run
+from ce_gym.console import EPISODES, SEED, THREADS, Parser, above_zero
+from ce_gym.learn.commands.errors import in_one_line
+from ce_gym.learn.evaluate.episodes import EVALUATION_SEED
+from ce_gym.learn.evaluate.evaluation import report
+from ce_gym.learn.evaluate.transfer import summary, table, transfer
+from ce_gym.learn.runs.job import Trained
+from ce_gym.learn.training import make_job, run_job
+from ce_gym.policies import add_env_arg, load_policy, with_map
 from ce_gym.viewer import Rollout, walk, write_html
 
 ENV = "ce_gym/MiniCheetahVelocity-v0"
@@ -33,30 +31,22 @@ ENV = "ce_gym/MiniCheetahVelocity-v0"
 
 def obtain_policy(args: argparse.Namespace) -> Path:
     """Return the policy in the output folder, trained now if necessary, and print which."""
-    from fast_ppo import train  # prints the missing extra if it is not installed
-
-    policy, path = args.out / "policy.npz", config_file(args.env)
-    env_kwargs, resume = {**load_env_args(path), **dict(args.env_args)}, None
+    job = make_job(
+        args.env, out=args.out, seed=args.seed, overrides=[f"steps={args.steps}"] if args.steps else [],
+        env_kwargs=dict(args.env_args), threads=args.threads, seconds=60.0 * args.minutes,
+    )  # fmt: skip
+    policy = args.out / "policy.npz"
     if policy.exists() and not args.fresh:
         record = load_policy(policy).record
-        same = (record["env"], record["env_kwargs"]) == (args.env, with_map(env_kwargs, policy))
+        same = (record["env"], record["env_kwargs"]) == (args.env, with_map(job.env_kwargs, policy))
         if record.get("finished") and same:
             print(f"Using the policy trained earlier: {policy}, {record['steps']:,} steps. --fresh trains a new one.")
             return policy
-        resume = policy if same else None
-    overrides = [f"steps={args.steps}"] if args.steps else []
-    settings = load_settings(path, overrides)
-    job = Job(
-        args.env, settings, args.out, env_kwargs=env_kwargs, seed=args.seed, threads=args.threads, resume=resume,
-        seconds=60.0 * args.minutes,
-    )  # fmt: skip
-    begin = f"Continuing {policy}" if resume else "Training a new policy"
-    print(
-        f"{begin}: {args.env}, {settings.steps:,} steps or {args.minutes:g} minutes. Ctrl-C stops and keeps the policy."
-    )
-    trained = train(job)
-    keep_map(job.env_kwargs, args.out)
-    return _announce(trained)
+        job = job.replace(resume=policy if same else None)
+    begin = f"Continuing {policy}" if job.resume else "Training a new policy"
+    length = f"{job.settings.steps:,} steps or {args.minutes:g} minutes"
+    print(f"{begin}: {args.env}, {length}. Ctrl-C stops and keeps the policy.")
+    return _announce(run_job(job))
 
 
 def _announce(trained: Trained) -> Path:
@@ -84,7 +74,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     args = parser.parse_args(argv)
-    return run("demo.py", lambda: show(obtain_policy(args), args.episodes, args.out, args.env))
+    return run(in_one_line(lambda: show(obtain_policy(args), args.episodes, args.out, args.env)))
 
 
 def show(policy: Path, episodes: int, out: Path, env: str | None = None) -> int:

@@ -9,8 +9,6 @@ name of a robot.
 
 from __future__ import annotations
 
-import interruption  # noqa: F401
-
 # isort: split
 
 import argparse
@@ -20,10 +18,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from console import Parser, above_zero, add_json_argument, markdown, print_result, run
 from ilqr import ILQR, Array, Plan, State, select
 
 import ce_gym
+from ce_gym.__main__ import run
+from ce_gym.console import Parser, above_zero, add_json_argument, markdown, print_result
+from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.viewer import Rollout, write_html
 
 SETTLE, TICK, HOLD = 2.0, 0.005, 2
@@ -238,7 +238,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--page", type=Path, metavar="FILE", help="default: <robot>_jump.html")
     add_json_argument(parser)
     args = parser.parse_args(argv)
-    return run("jump.py", lambda: jump(args))
+    return run(in_one_line(lambda: jump(args)))
 
 
 if __name__ == "__main__":

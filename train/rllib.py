@@ -11,8 +11,6 @@ ce_gym only, and no name of a robot or task.
 
 from __future__ import annotations
 
-import interruption  # noqa: F401
-
 # isort: split
 
 import argparse
@@ -23,16 +21,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 import ray
-from console import SEED, THREADS, Parser, above_zero, run, whole
-from export import to_onnx, write
-from job import basic_record
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
-from run_folder import make_folder
-from settings import Settings, SettingsError, config_file, load_env_args, load_settings, with_named
 
 import ce_gym  # noqa: F401  (registers the environments in this process)
+from ce_gym.__main__ import run
+from ce_gym.console import SEED, THREADS, Parser, above_zero, whole
+from ce_gym.learn.commands.errors import in_one_line
+from ce_gym.learn.export import to_onnx, write
+from ce_gym.learn.runs.folder import make_folder
+from ce_gym.learn.runs.job import basic_record
+from ce_gym.learn.runs.settings import Settings, SettingsError, config_file, load_env_args, load_settings, with_named
 from ce_gym.policies import Actor, add_env_arg, keep_map
 
 
@@ -162,7 +162,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
     args = parser.parse_args(argv)
-    return run("rllib.py", lambda: _work(args))
+    return run(in_one_line(lambda: _work(args)))
 
 
 def _work(args: argparse.Namespace) -> int:

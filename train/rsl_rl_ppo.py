@@ -11,8 +11,6 @@ specification. evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` 
 
 from __future__ import annotations
 
-import interruption  # noqa: F401
-
 # isort: split
 
 import argparse
@@ -21,15 +19,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from console import EPISODES, SEED, Parser, run
-from evaluate import evaluate, report
-from export import to_onnx, write
-from job import Job, acting_environment, basic_record, env_kwargs_of
 from rsl_rl.runners import OnPolicyRunner
-from run_folder import make_folder
-from settings import Settings, config_file, load_env_args, load_settings, with_named
 
+from ce_gym.__main__ import run
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
+from ce_gym.console import EPISODES, SEED, Parser
+from ce_gym.learn.commands.errors import in_one_line
+from ce_gym.learn.commands.train import env_kwargs_of
+from ce_gym.learn.evaluate.evaluation import evaluate, report
+from ce_gym.learn.export import to_onnx, write
+from ce_gym.learn.runs.folder import make_folder
+from ce_gym.learn.runs.job import Job, acting_environment, basic_record
+from ce_gym.learn.runs.settings import Settings, config_file, load_env_args, load_settings, with_named
 from ce_gym.policies import Actor, add_env_arg, keep_map, load_policy
 
 DIVERGENCE = 0.01
@@ -102,7 +103,7 @@ def main(argv: list[str] | None = None) -> int:
         "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation at the end"
     )
     args = parser.parse_args(argv)
-    return run("rsl_rl_ppo.py", lambda: _work(args))
+    return run(in_one_line(lambda: _work(args)))
 
 
 def _work(args: argparse.Namespace) -> int:
@@ -118,7 +119,7 @@ def _work(args: argparse.Namespace) -> int:
     training = {**kwargs, **settings.training}
     envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **training)
     runner = train(envs, settings, args.seed, out)
-    acting = acting_environment(Job(args.env, settings, out, kwargs), envs.envs.unwrapped)
+    acting = acting_environment(Job("rsl_rl", args.env, settings, out, kwargs), envs.envs.unwrapped)
     record = basic_record(acting, args.env, kwargs, settings)
     write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
     policy = load_policy(out / "policy.onnx")

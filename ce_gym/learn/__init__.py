@@ -1,0 +1,1 @@
+"""Training of policies: learners, runs, evaluation, export. Needs the extra `train`."""

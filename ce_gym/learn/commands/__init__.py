@@ -1,0 +1,1 @@
+"""Commands of `python -m ce_gym` that train, evaluate and export policies."""

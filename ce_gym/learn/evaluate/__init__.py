@@ -1,0 +1,1 @@
+"""Evaluation of policies: errors, falls, pushes, crossing, motors, transfer, MuJoCo, cards."""

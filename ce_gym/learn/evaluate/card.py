@@ -1,0 +1,318 @@
+"""Evaluate the policy of a training run and write its card: training, results, and the command that repeats it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from ce_gym.console import Table, markdown
+from ce_gym.learn.evaluate.crossing import cross, crossing_table
+from ce_gym.learn.evaluate.effort import effort
+from ce_gym.learn.evaluate.episodes import weights_seed
+from ce_gym.learn.evaluate.evaluation import evaluate, metrics
+from ce_gym.learn.evaluate.pictures import draw_curve
+from ce_gym.learn.evaluate.pushes import direction_name, push_envelope
+from ce_gym.learn.evaluate.suites import evaluate_suites, level_table, suite_table
+from ce_gym.learn.runs.progress import read_curve
+from ce_gym.learn.runs.settings import config_file, load_settings
+from ce_gym.learn.training import learner, learner_of
+from ce_gym.model.mechanism import LEVELS
+from ce_gym.policies import (
+    Policy,
+    PolicyError,
+    environment_of,
+    keep_map,
+    locate_policy,
+    read_actor,
+    shelf,
+    write_npz,
+)
+
+FINER = 5
+"""Ratio of sub-step lengths of a second evaluation, because a policy may rely on the length of its training."""
+
+
+def card_results(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[str] = LEVELS) -> dict[str, Any]:
+    """Return all results for the card of a policy.
+
+    Args:
+        policy: Policy with its record.
+        episodes: Episodes at each level, and of each suite.
+        sim2sim_robots: Number of robots in MuJoCo; 0 skips MuJoCo.
+        levels: Levels of the evaluation, in addition to the training level.
+
+    Returns:
+        - seed: Seed of all evaluations, computed from the weights.
+        - levels: Result of `evaluate` by level.
+        - finer: The same at the training level with sub-steps `FINER` times shorter.
+        - effort, suites, pushes: Results at the training level.
+        - crossing: See `crossing.cross`, if the ground has levels.
+        - sim2sim: Result in MuJoCo, or sim2sim_missing: why there is no result.
+
+        Policies without commands have no suites, crossing, pushes and sim2sim.
+    """
+    record, kwargs, seed = policy.record, policy.record["env_kwargs"], weights_seed(policy)
+    by_level = {
+        level: evaluate(policy, record["env"], episodes=episodes, seed=seed, **{**kwargs, "transmission": level})
+        for level in dict.fromkeys((*levels, record["transmission"]))
+    }
+    longest = gymnasium.spec(record["env"]).max_episode_steps or math.inf
+    seconds = min(10.0, longest * record["policy_spec"]["control_dt"])
+    result: dict[str, Any] = {"seed": seed, "levels": by_level}
+    shorter = {**kwargs, **_shorter(record["policy_spec"])}
+    result["finer"] = evaluate(policy, record["env"], episodes=episodes, seed=seed, **shorter)
+    result["effort"] = effort(policy, seconds=seconds, seed=seed, **kwargs)
+    if not by_level[record["transmission"]]["commanded"]:
+        return result | {"sim2sim_missing": "the policy has no commands, which the comparison needs"}
+    result["suites"] = evaluate_suites(policy, episodes, seed, **kwargs)
+    result["pushes"] = push_envelope(policy, seed=seed, **kwargs)
+    if by_level[record["transmission"]].get("levels"):
+        result["crossing"] = cross(policy, episodes, seed, **kwargs)
+    if not sim2sim_robots:
+        return result | {"sim2sim_missing": "not requested"}
+    try:
+        from ce_gym.learn.evaluate.sim2sim import compare
+
+        return result | {"sim2sim": compare(policy, episodes=sim2sim_robots, seed=seed)}
+    except ImportError:
+        return result | {"sim2sim_missing": "MuJoCo is not installed: pip install ce_gym[mjcf]"}
+    except ValueError as error:  # MuJoCo cannot express every robot
+        why = " ".join(str(error).split()).replace(f"{shelf().parent}/", "")  # no paths in cards
+        return result | {"sim2sim_missing": why}
+
+
+def _shorter(spec: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments of an environment with the same control steps and `FINER` times as many sub-steps."""
+    dt = spec["physics_dt"] / FINER
+    return {"dt": dt, "n_substeps": round(spec["control_dt"] / dt)}
+
+
+def command(record: dict[str, Any]) -> str:
+    """Return the command line that repeats a training run.
+
+    Raises:
+        PolicyError: If training continued from another policy, so that no single command repeats it.
+    """
+    if record["resumed_from"]:
+        raise PolicyError(f"resumed from {record['resumed_from']}; expected a run from the beginning")
+    algo = learner_of(record)
+    words = ["python", "-m", "ce_gym", "train", record["env"], "--algo", algo, "--seed", str(record["seed"])]
+    kwargs = dict(record["env_kwargs"])
+    if level := kwargs.pop("transmission", None):
+        words += ["--transmission", level]
+    if isinstance(kwargs.get("critic"), list) and kwargs.pop("obs_mode", None) == "dict":
+        words += ["--critic", *kwargs.pop("critic")]
+    for key, value in kwargs.items():
+        words += ["--env-arg", f"{key}={json.dumps(value)}"]
+    kind = learner(algo).Settings
+    usual = json.loads(json.dumps(asdict(load_settings(config_file(record["env"], kind.folder), kind=kind))))
+    # A deadline may have ended training, so the steps done replace the setting.
+    chosen = record["settings"] | {"steps": min(record["settings"]["steps"], record["steps"])}
+    changed = {key: value for key, value in chosen.items() if value != usual[key]}
+    texts = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in changed.items()}
+    words += ["--set", *(f"{key}={text}" for key, text in texts.items())] if texts else []
+    return shlex.join(words)
+
+
+def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, float]], name: str) -> str:
+    """Return the card as Markdown.
+
+    Args:
+        record: Record of the policy.
+        result: Result of `card_results`.
+        curve: Rows of the learning curve.
+        name: Name of the policy.
+    """
+    versions = ", ".join(f"{package} {number}" for package, number in record["versions"].items())
+    seconds = max([record["training_seconds"], *(row["seconds"] for row in curve)])
+    facts: Table = [
+        ["what", ""],
+        ["environment", f"`{record['env']}`"],
+        ["trained on", f"`{record['transmission']}` transmissions"],
+        ["seed", str(record["seed"])],
+        ["steps", f"{record['steps']:,}"],
+        ["wall-clock time", f"{seconds:.0f} s"],
+        *([["processor time", f"{spent:.0f} s"]] if (spent := record.get("processor_seconds")) else []),
+        ["observation, action", f"{record['observation_size']} numbers, {record['action_size']} numbers"],
+        ["date", record["date"]],
+        ["versions", versions],
+    ]
+    settings: Table = [["setting", "value"], *([key, str(value)] for key, value in record["settings"].items())]
+    parts = [
+        f"# {name}",
+        f"{markdown(facts)}\n\n{_how_to_repeat(record)}",
+        *(["![Learning curve](curve.png)"] if curve else []),
+        f"## On transmission levels\n\n{_levels(record, result)}",
+        *_on_terrain(record, result["levels"]),
+        *_crossing(result),
+        *_suites(result),
+        *([f"## Motors\n\n{_motors(result['effort'])}"] if result["effort"] else []),
+        *([f"## Pushes\n\n{_pushes(result['pushes'])}"] if "pushes" in result else []),
+        f"## In MuJoCo\n\n{_sim2sim(result)}",
+        f"## Settings\n\n{markdown(settings)}",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _how_to_repeat(record: dict[str, Any]) -> str:
+    try:
+        return f"Trained by\n\n```sh\n{command(record)}\n```"
+    except PolicyError as error:
+        return f"No single command repeats it: {error}"
+
+
+def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:
+    level, spec = record["transmission"], record["policy_spec"]
+    results = {f"`{name}`" + " (trained)" * (name == level): each for name, each in result["levels"].items()}
+    results[f"`{level}`, sub-steps of {1e3 * _shorter(spec)['dt']:g} ms"] = result["finer"]
+    rows: Table = []
+    for name, figures in results.items():
+        shown = _errors(figures) if figures["commanded"] else metrics(figures)
+        rows = rows or [["evaluated at", *shown, "falls", "reward"]]
+        last = (f"{figures['falls']:.1%}", f"{figures['reward']:.2f}")
+        rows.append([name, *(f"{figure:.3f}" for figure in shown.values()), *last])
+    count, length = figures["episodes"], spec["control_dt"]
+    note = "Mean absolute errors over every step" if figures["commanded"] else "Means, in SI units,"
+    note = f"{note} of {count} episodes of the mean action; a step is {length:g} s"
+    note = f"{note}, of sub-steps of {spec['physics_dt'] * 1e3:g} ms."
+    return f"{markdown(rows)}\n\n{note} Seed {result['seed']}: the first 32 bits of the SHA-256 of the weights."
+
+
+def _errors(figures: dict[str, Any]) -> dict[str, float]:
+    titles = {"forward [m/s]": "forward_error", "sideways [m/s]": "lateral_error", "yaw rate [rad/s]": "yaw_rate_error"}
+    return {title: figures[key] for title, key in titles.items()}
+
+
+def _suites(result: dict[str, Any]) -> list[str]:
+    """Return the section on suites of commands, if they were evaluated."""
+    if "suites" not in result:
+        return []
+    return [f"## With special commands\n\n{suite_table(result['suites'])}\n\nOn the level of training."]
+
+
+def _on_terrain(record: dict[str, Any], levels: dict[str, dict[str, Any]]) -> list[str]:
+    """Return the section on terrain levels, if the ground has levels."""
+    rows = levels.get(record["transmission"], {}).get("levels")
+    return [f"## On every level of the ground\n\n{level_table(rows)}"] if rows else []
+
+
+def _crossing(result: dict[str, Any]) -> list[str]:
+    """Return the section on crossing the ground, if it was evaluated."""
+    if "crossing" not in result:
+        return []
+    note = "Fraction of robots that walk this distance straight ahead without a fall, with the mean action"
+    table = crossing_table(result["crossing"])
+    return [f"## Across the ground\n\n{table}\n\n{note}; see `ce_gym.learn.evaluate.crossing`."]
+
+
+def _motors(effort: dict[str, Any]) -> str:
+    rows: Table = [["", ""], ["mean speed", f"{effort['speed']:.2f} m/s"], ["power", f"{effort['power']:.0f} W"]]
+    if effort["cost_of_transport"] is not None:
+        rows.append(["cost of transport", f"{effort['cost_of_transport']:.2f}"])
+        rows.append(["the same, braking recovered", f"{effort['cost_of_transport_net']:.2f}"])
+    for what in ("torque", "power"):
+        if effort[f"mean_{what}"] is not None:
+            peak = f"{effort[f'peak_{what}']:.0%} of its limit (`{effort[f'peak_{what}_at']}`)"
+            rows += [[f"mean {what} of a motor", f"{effort[f'mean_{what}']:.0%} of its limit"], [f"peak {what}", peak]]
+    return f"{markdown(rows)}\n\nMechanical, at the rotors, measured at every sub-step."
+
+
+def _pushes(pushes: dict[str, Any]) -> str:
+    rows: Table = [["pushed towards", *(f"{speed:g} m/s" for speed in pushes["speeds"])]]
+    for angle, row in zip(pushes["directions"], pushes["survived"], strict=True):
+        rows.append([direction_name(angle), *(f"{share:.0%}" for share in row)])
+    walking = f"{pushes['command'][0]:g} m/s forward"
+    return f"{markdown(rows)}\n\nShare on its feet after a sudden change of velocity, at {walking}."
+
+
+def _sim2sim(result: dict[str, Any]) -> str:
+    if "sim2sim" not in result:
+        return f"Not evaluated: {result['sim2sim_missing']}"
+    rows: Table = [["simulated by", "velocity error [m/s]", "yaw rate error [rad/s]", "falls", "verdict"]]
+    for name, figures in result["sim2sim"]["simulations"].items():
+        verdict = result["sim2sim"]["verdict"].get(name)
+        outcome = "" if verdict is None else "passed" if verdict["passed"] else "failed"
+        errors = [f"{figures[key]:.3f}" for key in ("velocity_error", "yaw_rate_error")]
+        rows.append([name, *errors, f"{figures['falls']:.1%}", outcome])
+    note = "Random commands, one for each robot; `python -m ce_gym sim2sim` prints the requirements."
+    return f"{markdown(rows)}\n\n{note}"
+
+
+def short_name(record: dict[str, Any], task: str | None = None) -> str:
+    """Return the name under which a policy is shipped; `task` replaces the name of its task.
+
+    Raises:
+        PolicyError: If robot, task and level of the record do not make the name of a folder.
+    """
+    spec = record["policy_spec"]
+    name = "_".join(str(x) for x in (spec.get("robot"), task or spec.get("task"), record["transmission"]))
+    if not re.fullmatch(r"[\w-]+", name):
+        raise PolicyError(f"policy_spec: robot, task and level {name!r}; expected letters, digits, _ and - only")
+    return name
+
+
+def portable(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record without paths of this machine."""
+    resumed, kwargs = record.get("resumed_from"), dict(record["env_kwargs"])
+    terrain = kwargs.get("terrain")
+    if isinstance(terrain, Mapping) and "file" in terrain:  # a copy is in the folder of the policy
+        kwargs["terrain"] = {**terrain, "file": Path(terrain["file"]).name}
+    own: dict[str, Any] = {"resumed_from": Path(resumed).name if resumed else None, "env_kwargs": kwargs}
+    settings = record.get("settings", {})
+    if "teacher" in settings:
+        own["settings"] = {**settings, "teacher": Path(settings["teacher"]).name}
+    return record | own
+
+
+def write_card(
+    run: str | Path,
+    out: Path | None,
+    ship: bool,
+    task: str | None,
+    episodes: int,
+    robots: int,
+    levels: Sequence[str],
+    env: str | None,
+    env_args: Iterable[tuple[str, Any]],
+) -> tuple[Path, dict[str, Any]]:
+    """Evaluate a policy, write `card.md`, `curve.png` and `policy.npz`, and return the card's path and the results.
+
+    Args:
+        run: Folder of a training run, or the policy in it.
+        out: Folder to write to; that of the policy if None.
+        ship: Whether to write to the folder of shipped policies, as `<robot>_<task>_<level>`.
+        task: See `short_name`.
+        episodes: See `card_results`.
+        robots: See `card_results`.
+        levels: See `card_results`.
+        env: Environment id of the evaluation; None keeps the id of the record.
+        env_args: Arguments of the environment that replace arguments in the record.
+
+    Raises:
+        PolicyError: If the policy cannot be used.
+    """
+    source = locate_policy(run)
+    actor, record = read_actor(source)
+    record, curve = portable(record), read_curve(source.parent / "curve.csv")
+    name = short_name(record, task)
+    folder = shelf() / name if ship else out or source.parent
+    environment = {
+        "env": environment_of(record, env),
+        "env_kwargs": {**record["env_kwargs"], **dict(env_args)},
+    }
+    result = card_results(Policy(actor, record | environment), episodes, robots, levels)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_npz(actor, record, folder / "policy.npz")
+    keep_map(record["env_kwargs"], folder)
+    if curve:
+        draw_curve(curve, name, folder / "curve.png")
+    (folder / "card.md").write_text(card(record, result, curve, name), encoding="utf-8")
+    return folder / "card.md", result

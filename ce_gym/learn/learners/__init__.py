@@ -1,0 +1,1 @@
+"""Learners: PPO, SHAC, distillation, PPO of Stable-Baselines3."""

@@ -1,0 +1,1 @@
+"""Multilayer perceptrons compiled with numba: outputs, gradients, updates."""

@@ -1,0 +1,181 @@
+"""A training run of any learner, and the record of its policy.
+
+A learner is a module with a function `train(job) -> Trained` and a dataclass `Settings`.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+from ce_gym.learn.runs.settings import NETWORK, SettingsError
+
+from ce_gym.policies import PolicyError, load_policy
+
+CHECKPOINTS = 10
+"""Checkpoints per training run."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training run.
+
+    Attributes:
+        algo: Name of the learner.
+        env_id: Registered environment id.
+        settings: Settings of the learner.
+        out: Folder to write to.
+        env_kwargs: Arguments of the environment.
+        seed: Seed of initial weights, exploration and environments.
+        threads: Processor threads, used by physics and learning alternately.
+        resume: Policy from which training continues.
+        seconds: Longest training time [s].
+        logs: Packages for which curves are also written, see `logs.py`.
+        page: Whether a page shows the current policy.
+    """
+
+    algo: str
+    env_id: str
+    settings: Any
+    out: Path
+    env_kwargs: dict[str, Any]
+    seed: int = 0
+    threads: int = 1
+    resume: Path | None = None
+    seconds: float = float("inf")
+    logs: tuple[str, ...] = ()
+    page: bool = False
+
+    def replace(self, **changes: Any) -> Job:
+        """Return the run with other attributes."""
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Result of a training run.
+
+    Attributes:
+        model: The policy, with the method `predict` of Stable-Baselines3.
+        record: Record of the policy.
+        policy: Path of the policy.
+        interrupted: Whether Ctrl-C ended training early.
+    """
+
+    model: Any
+    record: dict[str, Any]
+    policy: Path
+    interrupted: bool
+
+
+class Clock:
+    """Measures time since its creation [s]."""
+
+    def __init__(self) -> None:
+        self._start = self._now()
+
+    def spent(self) -> dict[str, float]:
+        """Return wall-clock time, and processor time of all threads."""
+        wall, processor = (now - start for now, start in zip(self._now(), self._start, strict=True))
+        return {"training_seconds": round(wall, 1), "processor_seconds": round(processor, 1)}
+
+    @staticmethod
+    def _now() -> tuple[float, float]:
+        return time.perf_counter(), time.process_time()
+
+
+def acting_environment(job: Job, native: Any) -> Any:
+    """Return the environment of evaluations, which lacks the arguments of the setting `training`.
+
+    Args:
+        job: The training run.
+        native: The environment of training, unwrapped.
+
+    Raises:
+        SettingsError: If its observations or actions have other spaces than in training.
+    """
+    if not job.settings.training:
+        return native
+    mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
+    acting = gymnasium.make_vec(job.env_id, num_envs=1, vectorization_mode=mode, **job.env_kwargs).unwrapped
+    for space in ("single_observation_space", "single_action_space"):
+        there, here = getattr(acting, space), getattr(native, space)
+        if there != here:
+            raise SettingsError(f"training: {space} is {here}; expected {there}, that of the policy's environment")
+    return acting
+
+
+def basic_record(native: Any, env_id: str, env_kwargs: dict[str, Any], settings: Any) -> dict[str, Any]:
+    """Return the part of a policy's record that all learners write; `native` is the environment of evaluations."""
+    space, action = native.single_observation_space, native.single_action_space.shape
+    observation = space["policy"].shape if isinstance(space, gymnasium.spaces.Dict) else space.shape
+    return {
+        "env": env_id,
+        "transmission": native.model.transmission,
+        "env_kwargs": env_kwargs,
+        "observation_size": observation[0] if observation else 0,
+        "action_size": action[0] if action else 0,
+        "activation": settings.activation,
+        "policy_spec": native.policy_spec(),
+        "settings": asdict(settings),
+    }
+
+
+def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple[str, ...]) -> dict[str, Any]:
+    """Return the record of a policy: the data to use it and to repeat its training.
+
+    Args:
+        job: The training run.
+        native: The environment of evaluations, unwrapped, see `acting_environment`.
+        steps: Environment steps done.
+        clock: Clock created at the start of training.
+        packages: Packages whose versions are recorded, in addition to ce_gym, gymnasium, numpy and Python.
+    """
+    return basic_record(native, job.env_id, job.env_kwargs, job.settings) | {
+        "learner": job.algo,
+        "steps": steps,
+        "seed": job.seed,
+        "resumed_from": str(job.resume) if job.resume else None,
+        **clock.spent(),
+        "date": time.strftime("%Y-%m-%d"),
+        "versions": {name: _version(name) for name in ("ce_gym", "gymnasium", *packages, "numpy")}
+        | {"python": platform.python_version()},
+    }
+
+
+def _version(package: str) -> str:
+    """Return the version of an installed package, or "not installed" for a source tree on the path."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def resumed_record(job: Job) -> dict[str, Any]:
+    """Return the record of the policy from which a training run continues.
+
+    Raises:
+        PolicyError: If its network differs from the settings, or the record lacks the number of steps.
+    """
+    file: Any = job.resume
+    record = load_policy(file).record
+    requested, trained = json.loads(json.dumps(asdict(job.settings))), settings_of(record)
+    for key in NETWORK:
+        if trained.get(key) != requested[key]:
+            both = f"trained with {trained.get(key)}, requested {requested[key]}"
+            raise PolicyError(f"{file}: {key}: {both}; expected the same to continue")
+    if type(record.get("steps")) is not int or record["steps"] < 0:
+        raise PolicyError(f"{file}: steps: {record.get('steps')!r}; expected the steps of its training")
+    return record
+
+
+def settings_of(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings in the record of a policy, as plain data; empty if there are none."""
+    settings = record.get("settings")
+    return settings if isinstance(settings, dict) else {}

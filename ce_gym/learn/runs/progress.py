@@ -1,0 +1,330 @@
+"""Learning curve, log, progress bar, schedules and interruption of training, for all learners."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ce_gym.learn.runs.folder import continue_if_full
+from ce_gym.learn.runs.logs import Writer, numbers_of
+from tqdm import tqdm
+
+from ce_gym.policies import locate_policy
+
+Row = Mapping[str, Any]
+"""Cells of a row of a CSV file by column."""
+
+CURVE = ("steps", "seconds", "reward", "length")
+"""Columns of `curve.csv`."""
+
+STEPS, SECONDS = LOG = "time/total_timesteps", "time/time_elapsed"
+"""Columns of `progress.csv` that every row has."""
+
+
+def episode_means(episodes: Iterable[Mapping[str, float]] | None) -> dict[str, float]:
+    """Return the mean of every entry of recent episodes except the time `t`; empty before the first episode ends."""
+    recent = list(episodes or ())
+    if not recent:
+        return {}
+    return {key: float(np.mean([episode[key] for episode in recent])) for key in recent[-1] if key != "t"}
+
+
+def spread_episodes(native: Any, rng: np.random.Generator) -> None:
+    """Let the first episodes end at different times, if the environments support it.
+
+    Otherwise all robots get new commands in the same step. Then most rollouts contain no change of command, and the
+    policy forgets how to change its gait.
+    """
+    if hasattr(native, "elapsed_steps"):
+        native.elapsed_steps = rng.integers(0, native.max_episode_steps, native.num_envs)
+
+
+class RecentEpisodes:
+    """Statistics of the last episodes.
+
+    Args:
+        count: Number of episodes.
+
+    Attributes:
+        names: Names of the entries: return `r`, length `l`, reward terms, metrics.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count, self.names, self._rows = count, [], np.zeros((0, 0))
+
+    def add(self, done: NDArray[np.bool_], infos: dict[str, Any]) -> None:
+        """Add the episodes that ended in this step, if the environments report them."""
+        if "episode_terms" in infos:
+            terms = dict(infos["episode_terms"])
+            entries = {"r": terms.pop("return"), "l": terms.pop("length"), **terms}
+            self.names, new = list(entries), np.stack([values[done] for values in entries.values()], axis=1)
+            self._rows = np.concatenate([self._rows.reshape(-1, len(entries)), new])[-self.count :]
+
+    def means(self) -> dict[str, float]:
+        """Return the mean of every entry; empty before the first episode ends."""
+        return dict(zip(self.names, self._rows.mean(axis=0).tolist(), strict=True)) if len(self._rows) else {}
+
+    def rows(self) -> NDArray:
+        """Return the entries, one episode per row."""
+        return self._rows
+
+    def restore(self, names: list[str], rows: NDArray) -> None:
+        """Replace names and entries, see `rows`."""
+        self.names, self._rows = names, rows
+
+
+class RowFile:
+    """A CSV file to which rows are added during training.
+
+    Args:
+        file: File to write.
+        earlier: Rows of the training before this run; they are kept.
+    """
+
+    def __init__(self, file: Path, earlier: Sequence[Row]) -> None:
+        self.file, self.rows = file, list(earlier)
+        self.columns = list(dict.fromkeys(name for row in self.rows for name in row))
+        self._write(self.rows, "w")
+
+    def append(self, row: Row) -> None:
+        """Write one row. If the row has new columns, write the whole file again."""
+        self.rows.append(row)
+        new = [name for name in row if name not in self.columns]
+        self.columns += new
+        self._write(self.rows if new else [row], "w" if new else "a")
+
+    def _write(self, rows: Sequence[Row], mode: str) -> None:
+        with continue_if_full(), self.file.open(mode, newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self.columns)
+            if mode == "w" and self.columns:
+                writer.writeheader()
+            writer.writerows(rows)
+
+
+class Curve:
+    """Writes the learning curve as a small CSV file: steps, seconds, mean reward and length of recent episodes.
+
+    Args:
+        file: File to write, one row after every rollout.
+        earlier: Rows of the training before this run, see `earlier_rows`.
+        steps: Steps done so far; earlier rows beyond them are dropped.
+    """
+
+    def __init__(self, file: Path, earlier: Sequence[Row], steps: int = 0) -> None:
+        rows = [row for row in earlier if row["steps"] <= steps]
+        self.started = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
+        self.file = RowFile(file, rows)
+
+    def add(self, steps: int, means: Mapping[str, float]) -> None:
+        """Write one row, or nothing before the first episode ends."""
+        if means:
+            seconds = round(time.perf_counter() - self.started, 2)
+            values = (steps, seconds, round(means["r"], 4), round(means["l"], 2))
+            self.file.append(dict(zip(CURVE, values, strict=True)))
+
+
+class Log:
+    """Writes the statistics of each iteration as a CSV file.
+
+    Args:
+        file: File to write.
+        earlier: Rows of the training before this run, see `earlier_rows`.
+        steps: Steps done so far; earlier rows beyond them are dropped.
+        writers: Receive the numbers of each row as well.
+    """
+
+    def __init__(self, file: Path, earlier: Sequence[Row], steps: int = 0, writers: Sequence[Writer] = ()) -> None:
+        rows = [row for row in earlier if row[STEPS] <= steps]
+        self.writers = writers
+        self.earlier_seconds = rows[-1][SECONDS] if rows else 0
+        self.file = RowFile(file, rows)
+
+    def add(self, row: Row) -> None:
+        """Write one row; its time counts from the start of this run [s]."""
+        row = {**row, SECONDS: round(self.earlier_seconds + row[SECONDS], 3)}
+        self.file.append(row)
+        for writer in self.writers:
+            with continue_if_full():
+                writer.write(numbers_of(row), int(row[STEPS]))
+
+    def close(self) -> None:
+        """End the logs of other programs."""
+        for writer in self.writers:
+            with continue_if_full():
+                writer.close()
+
+
+def log_row(steps: int, seconds: float, means: Row, figures: Row) -> dict[str, float]:
+    """Return a row of `progress.csv`, with the names that Stable-Baselines3 uses.
+
+    Args:
+        steps: Environment steps done.
+        seconds: Time since this run began [s].
+        means: Means of recent episodes, see `RecentEpisodes`.
+        figures: Statistics of the update.
+    """
+    row = {STEPS: steps, SECONDS: seconds, "rollout/ep_rew_mean": means["r"], "rollout/ep_len_mean": means["l"]}
+    return row | {key: mean for key, mean in means.items() if key not in ("r", "l")} | dict(figures)
+
+
+def read_rows(file: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the rows of a CSV file, `columns` as numbers and others as text; no rows if there is no such file.
+
+    Raises:
+        ValueError: If a column is missing, or a number in it.
+    """
+    if not file.exists():
+        return []
+    try:
+        with file.open(newline="", encoding="utf-8") as lines:
+            whole = [row for row in csv.DictReader(lines) if None not in row.values()]  # a killed run cuts its last row
+        return [{**row, **{key: float(row[key]) for key in columns}} for row in whole]
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise ValueError(f"{file}: expected the columns {', '.join(columns)}, numbers in each row") from None
+
+
+def read_curve(file: Path) -> list[dict[str, float]]:
+    """Return the rows of a learning curve; see `read_rows`."""
+    return read_rows(file, CURVE)
+
+
+def earlier_rows(resume: Path | None, name: str, columns: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the rows of the CSV file `name` of the run whose policy is resumed; see `read_rows`."""
+    if resume is None:
+        return []
+    folder = locate_policy(resume).parent
+    return read_rows((folder.parent if folder.name == "checkpoints" else folder) / name, columns)
+
+
+def adapted_rate(rate: float, kl: float, target: float, limits: tuple[float, float] = (1e-5, 1e-2)) -> float:
+    """Return the learning rate that keeps the KL divergence of an update near a target.
+
+    The rule of Schulman et al. 2017 (arXiv:1707.06347, section 4), with the limits usual for legged robots: below half
+    and above twice the target, change the rate by a factor of 1.5.
+
+    Args:
+        rate: Learning rate of the last update.
+        kl: Mean divergence of the last update.
+        target: Desired divergence.
+        limits: Smallest and largest learning rate.
+    """
+    factor = 1 / 1.5 if kl > 2.0 * target else 1.5 if kl < 0.5 * target else 1.0
+    return float(np.clip(rate * factor, *limits))
+
+
+def linear(start: float, end: float, done: float) -> float:
+    """Return a value that changes linearly; `done` is the finished fraction of training."""
+    return start + done * (end - start)
+
+
+def geometric(start: float, end: float, done: float) -> float:
+    """Return a value that changes by the same factor in every step; `done` is the finished fraction of training."""
+    return float(np.exp(linear(np.log(start), np.log(end), done)))
+
+
+def fall_cost(most: float, done: float) -> float:
+    """Return the cost of a fall: 0 until 30 % of training, then linear, and `most` from 60 %.
+
+    A robot that cannot walk yet falls whatever it does. An early cost would teach it to stand still.
+    """
+    return most * float(np.clip((done - 0.3) / 0.3, 0.0, 1.0))
+
+
+class StopInOrder:
+    """Context that ends training between two updates: at a deadline, after Ctrl-C or after SIGTERM.
+
+    A second signal interrupts immediately.
+
+    Args:
+        seconds: Longest time to train [s].
+
+    Attributes:
+        interrupted: Whether a signal ended training.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self, seconds: float = float("inf")) -> None:
+        self.seconds, self.interrupted = seconds, False
+
+    def __enter__(self) -> StopInOrder:
+        self._previous = {number: signal.signal(number, self._on_signal) for number in self.SIGNALS}
+        self._deadline = time.monotonic() + self.seconds
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)
+
+    def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
+        if self.interrupted:
+            raise KeyboardInterrupt
+        self.interrupted = True
+
+    @property
+    def due(self) -> bool:
+        """Whether to stop now."""
+        return self.interrupted or time.monotonic() >= self._deadline
+
+
+class ProgressBar:
+    """Progress bar with steps, speed, remaining time, recent episodes and shares of the time.
+
+    "physics" is time inside the environment, "policy" is the rest of collection, "learning" is all other time.
+
+    Args:
+        total: Steps at which training ends.
+        steps: Steps done so far.
+
+    Attributes:
+        shares: Fractions of the time in physics, policy and learning.
+    """
+
+    def __init__(self, total: int, steps: int = 0) -> None:
+        interval = 0.5 if sys.stderr.isatty() else 10.0  # fewer lines in a log file
+        form = "{percentage:3.0f}% |{bar:20}| {n_fmt}/{total_fmt} steps, {rate_fmt}, {remaining} left {postfix}"
+        self.total = total
+        self.bar = tqdm(
+            total=total, initial=steps, unit=" steps", unit_scale=True, mininterval=interval,
+            bar_format=form, dynamic_ncols=True, smoothing=0.05,
+        )  # fmt: skip
+        self.started, self.shares = time.perf_counter(), dict.fromkeys(("physics", "policy", "learning"), 0.0)
+
+    def advance(self, steps: int) -> None:
+        """Show the number of steps done."""
+        self.bar.update(min(steps, self.total) - self.bar.n)
+
+    def describe(self, means: Mapping[str, float], physics: float, collecting: float) -> None:
+        """Show means of recent episodes and shares of the time.
+
+        Args:
+            means: Means of recent episodes.
+            physics: Time inside the environment [s].
+            collecting: Time of collection, physics included [s].
+        """
+        total = time.perf_counter() - self.started
+        parts = {"physics": physics, "policy": collecting - physics, "learning": total - collecting}
+        self.shares = {name: round(seconds / total, 3) for name, seconds in parts.items()}
+        shares = " ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
+        self.bar.set_postfix_str(f"| {self._figures(means)} | {shares}", refresh=False)
+
+    def close(self) -> None:
+        """End the bar; its last line stays."""
+        self.bar.close()
+
+    def _figures(self, means: Mapping[str, float]) -> str:
+        if not means:
+            return "no episode has ended yet"
+        metrics = [
+            (key.split("/", 1)[1].replace("_", " "), x) for key, x in means.items() if key.startswith("metrics/")
+        ]
+        shown = [("reward", means["r"]), ("length", means["l"]), *metrics[:2]]
+        return ", ".join(f"{name} {value:.3g}" for name, value in shown)

@@ -1,0 +1,126 @@
+"""Train a policy with any learner, from Python: `train("ce_gym/MiniCheetahVelocity-v0")`."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from ce_gym.compile.system import usable_cores
+from ce_gym.learn.runs.folder import make_folder
+from ce_gym.learn.runs.job import Job, Trained, settings_of
+from ce_gym.learn.runs.settings import config_file, load_env_args, load_settings, make_settings, parsed, with_named
+from ce_gym.policies import environment_of, keep_map, load_policy, locate_policy
+
+ALGORITHMS = ("ppo", "shac", "distill", "sb3")
+"""Names of the learners, which are modules of `ce_gym.learn.learners` with `train(job)` and `Settings`."""
+
+
+def train(env_id: str = "", algo: str = "", **options: Any) -> Trained:
+    """Train a policy, save it, and return it. Ctrl-C saves the policy and stops.
+
+    Args:
+        env_id: Registered environment id; may be empty with `resume`.
+        algo: One of `ALGORITHMS`; the learner of the resumed policy, or "ppo", if empty.
+        **options: See `make_job`.
+
+    Raises:
+        SettingsError: If a setting is wrong.
+        PolicyError: If the policy to resume does not fit.
+
+    Examples:
+        >>> train("ce_gym/MiniCheetahVelocity-v0", out="runs/walk", seed=1, overrides=["steps=2e6"])  # doctest: +SKIP
+    """
+    return run_job(make_job(env_id, algo, **options))
+
+
+def make_job(
+    env_id: str = "",
+    algo: str = "",
+    *,
+    out: str | Path | None = None,
+    seed: int = 0,
+    config: str | Path | None = None,
+    overrides: Sequence[str] = (),
+    env_kwargs: Mapping[str, Any] | None = None,
+    resume: str | Path | None = None,
+    threads: int | None = None,
+    seconds: float = float("inf"),
+    logs: Sequence[str] = (),
+    page: bool = False,
+) -> Job:
+    """Return a training run with the settings of a file, of a resumed policy and of the arguments.
+
+    Args:
+        env_id: Registered environment id; may be empty with `resume`.
+        algo: See `train`.
+        out: Folder to write to; by default `runs/`, then the names of settings file, level and learner.
+        seed: Seed of initial weights, exploration and environments.
+        config: Settings file; by default that of the environment in the folder of the learner.
+        overrides: Settings to change, each `KEY=VALUE`.
+        env_kwargs: Arguments of the environment.
+        resume: Policy from which training continues, with its settings unless `config` is given.
+        threads: Processor threads; all usable cores if None.
+        seconds: Longest training time [s].
+        logs: Where curves are also written, see `ce_gym.learn.runs.logs.WRITERS`.
+        page: Whether a page shows the current policy.
+
+    Raises:
+        ValueError: If a setting, an argument or the policy cannot be used.
+    """
+    policy = locate_policy(resume) if resume else None
+    record = load_policy(policy).record if policy else {}
+    if not (env_id or record):
+        raise ValueError("ENV: missing; expected an environment id, or --resume with a policy")
+    env_id, algo = environment_of(record, env_id), algo or learner_of(record)
+    kind = learner(algo).Settings
+    path = Path(config) if config else config_file(env_id, kind.folder)
+    if record and not config:
+        merged = {**asdict(load_settings(path, kind=kind)), **settings_of(record), **parsed(overrides)}
+        settings = make_settings(merged, str(policy), kind)
+    else:
+        settings = load_settings(path, overrides, kind)
+    given = dict(env_kwargs or {})
+    from_file = {} if record and not config else load_env_args(path)  # the record has them already
+    kwargs = {**record.get("env_kwargs", {}), **from_file, **given}
+    level, suffix = given.get("transmission"), "" if algo == ALGORITHMS[0] else algo
+    return Job(
+        algo=algo,
+        env_id=env_id,
+        settings=with_named(settings, given),
+        out=Path(out) if out else Path("runs") / "-".join(filter(None, (path.stem, level, suffix))),
+        env_kwargs=kwargs,
+        seed=seed,
+        threads=threads or usable_cores(),
+        resume=policy,
+        seconds=seconds,
+        logs=tuple(logs),
+        page=page,
+    )
+
+
+def run_job(job: Job) -> Trained:
+    """Make a training run: see `train`."""
+    make_folder(job.out)
+    keep_map(job.env_kwargs, job.out)
+    return learner(job.algo).train(job)
+
+
+def learner(algo: str) -> ModuleType:
+    """Return the module of a learner.
+
+    Raises:
+        ValueError: If there is no learner of this name.
+    """
+    if algo not in ALGORITHMS:
+        raise ValueError(f"--algo: {algo!r}; expected one of {', '.join(ALGORITHMS)}")
+    return importlib.import_module(f"ce_gym.learn.learners.{algo}")
+
+
+def learner_of(record: Mapping[str, Any]) -> str:
+    """Return the name of the learner that wrote a record, or the default learner for an empty record."""
+    name = record.get("learner", "sb3" if record else ALGORITHMS[0])
+    return "ppo" if name == "fast_ppo" else name  # the name in records of version 0.1

@@ -1,0 +1,146 @@
+"""Evaluation of policies: the seed from their weights, suites of commands and pushes, levels of the ground."""
+
+import hashlib
+import json
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+from point_mass import ID, PointMassVectorEnv
+
+import ce_gym
+from ce_gym.learn.evaluate.episodes import EVALUATION_SEED, LEVEL, weights_seed, without_curricula
+from ce_gym.learn.evaluate.evaluation import evaluate, report
+from ce_gym.learn.evaluate.evaluation import main as evaluate_main
+from ce_gym.learn.evaluate.suites import SUITES, Driver, suite_table
+from ce_gym.policies import Actor, Policy, write_npz
+
+RANGES = np.array([[-1.0, 2.0], [-0.5, 0.5], [-0.7, 0.9]])
+DT = 0.02
+
+
+def test_the_seed_is_of_the_weights_and_of_nothing_else():
+    rng = np.random.default_rng(0)
+    layers = tuple((rng.standard_normal((4, 3)).astype("f4"), rng.standard_normal(4).astype("f4")) for _ in range(2))
+    raw = b"".join(array.tobytes() for layer in layers for array in layer)
+    expected = int(hashlib.sha256(raw).hexdigest()[:8], 16)
+    policies = [Policy(Actor(layers, "Tanh"), {"seed": seed}) for seed in (0, 1)]
+    assert [weights_seed(policy) for policy in policies] == [expected, expected]
+    layers[1][1][2] = np.nextafter(layers[1][1][2], np.float32(9))
+    assert weights_seed(policies[0]) != expected
+    assert weights_seed(Policy(lambda rows: rows, {})) == EVALUATION_SEED
+
+
+class Recorder:
+    """Environments that record the calls of a driver."""
+
+    def __init__(self, n):
+        self.num_envs, self.metadata = n, {"render_fps": 1 / DT}
+        self.commands, self.pushes, self.v = [], [], np.zeros((n, 7))
+        self.batch = SimpleNamespace(rows=lambda _: np.zeros((n, 7)), write=self._write)
+
+    def set_command(self, command):
+        self.commands.append(command)
+
+    def _write(self, name, rows):
+        assert name == "v"
+        self.pushes.append(rows)
+
+
+def driven(name, seconds=20.0):
+    native = Recorder(500)
+    drive = Driver(SUITES[name], native, RANGES, seed=1)
+    for step in range(round(seconds / DT)):
+        drive(step)
+    return np.array(native.commands), np.array(native.pushes)
+
+
+def test_suites_ask_for_what_they_say():
+    for name, (low, high) in {
+        "jumping": (RANGES[:, 0], RANGES[:, 1]),
+        "standing": ([0, 0, 0], [0, 0, 0]),
+        "turning": ([0, 0, -0.7], [0, 0, 0.9]),
+        "backwards": ([-1, 0, 0], [-0.5, 0, 0]),
+        "pushes": (RANGES[:, 0], RANGES[:, 1]),
+    }.items():
+        commands, pushes = driven(name)
+        assert len(commands) == (20 if name == "jumping" else 4), name
+        np.testing.assert_allclose(commands.min(axis=(0, 1)), low, atol=0.02, err_msg=name)
+        np.testing.assert_allclose(commands.max(axis=(0, 1)), high, atol=0.02, err_msg=name)
+        assert (commands >= np.array(low) - 1e-12).all(), name
+        assert len(pushes) == (8 if name == "pushes" else 0), name
+    assert np.abs(pushes[..., 3:5]).max() == pytest.approx(0.5, abs=0.01)
+    assert not pushes[..., [0, 1, 2, 5, 6]].any()
+    assert set(SUITES) == {"jumping", "standing", "turning", "backwards", "pushes"}
+
+
+def test_who_is_never_sent_backwards_is_asked_to_stand():
+    drive = Driver(SUITES["backwards"], Recorder(3), np.array([[0.5, 1.0], [0, 0], [0, 0]]), seed=0)
+    assert not drive.low.any()
+    assert not drive.high.any()
+
+
+def test_a_shipped_policy_is_judged_by_suite(capsys):
+    """A robot that is told to stand moves less than one that is told to walk, and one that is pushed more."""
+    assert evaluate_main(["mini_cheetah_velocity", "--episodes", "8", "--suites", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["seed"] == weights_seed(ce_gym.load_policy("mini_cheetah_velocity"))
+    suites = result["suites"]
+    assert list(suites) == list(SUITES)
+    assert all(suites["standing"]["velocity_error"] < suites[name]["velocity_error"] for name in ("jumping", "pushes"))
+    assert suites["jumping"]["velocity_error"] > result["velocity_error"]
+    assert "new commands every second" in suite_table(suites)
+
+
+class OnLevels(PointMassVectorEnv):
+    """Three levels of ground in turn."""
+
+    def _ending(self, done):
+        infos = super()._ending(done)
+        infos["episode_terms"][LEVEL] = (np.arange(self.num_envs) % 3).astype(float)
+        return infos
+
+
+def test_falls_and_errors_are_told_by_level():
+    gymnasium.register("test/OnLevels-v0", vector_entry_point=OnLevels)
+    try:
+        fleeing = Policy(lambda rows: np.float32(np.arange(len(rows)) % 3 == 2)[:, None], {"observation_size": 2})
+        result = evaluate(fleeing, "test/OnLevels-v0", episodes=10)
+    finally:
+        del gymnasium.registry["test/OnLevels-v0"]
+    levels = result["levels"]
+    assert [(row["level"], row["episodes"], row["falls"]) for row in levels] == [(0, 4, 0.0), (1, 3, 0.0), (2, 3, 1.0)]
+    seen = round(result["episode_length"] * 50 * 10) - 10  # the last step of an episode is not
+    steps = [4 * 49, 3 * 49, seen - 7 * 49]
+    assert np.average([row["forward_error"] for row in levels], weights=steps) == pytest.approx(result["forward_error"])
+    assert levels[2]["forward_error"] > levels[0]["forward_error"]
+    assert "| 2     |" in report(result)
+    assert "levels" not in evaluate(fleeing, ID, episodes=2)
+
+
+def test_judging_leaves_curricula_out():
+    env_id = next(iter(ce_gym.environment_ids()))
+    stairs = {"terrain": {"kind": "stairs", "rise": 0.08}, "command_curriculum": 0.3, "history": 2}
+    changed = without_curricula(env_id, stairs)
+    assert changed == stairs | {
+        "terrain": {"kind": "stairs", "rise": 0.08, "curriculum": False},
+        "command_curriculum": 1,
+    }
+    assert without_curricula(env_id, {"terrain": "rough"}) == {"terrain": {"kind": "rough", "curriculum": False}}
+    assert without_curricula(env_id, {"terrain": "flat"}) == {"terrain": "flat"}
+    gymnasium.register("test/Rough-v0", vector_entry_point=PointMassVectorEnv, kwargs={"terrain": "rough"})
+    try:
+        assert without_curricula("test/Rough-v0", {}) == {"terrain": {"kind": "rough", "curriculum": False}}
+    finally:
+        del gymnasium.registry["test/Rough-v0"]
+
+
+def test_a_task_without_commands_has_no_suites(tmp_path, capsys):
+    layers = ((np.zeros((1, 2), "f4"), np.zeros(1, "f4")),)
+    record = {"env": ID, "env_kwargs": {}, "transmission": "exact", "observation_size": 2, "action_size": 1}
+    write_npz(Actor(layers, "Tanh"), record | {"activation": "Tanh", "policy_spec": {}}, tmp_path / "policy.npz")
+    assert evaluate_main([str(tmp_path / "policy.npz"), "--episodes", "2", "--suites"]) == 2
+    error = capsys.readouterr().err
+    assert "has no commanded velocities" in error
+    assert error.count("\n") == 1

@@ -1,0 +1,113 @@
+"""Train on one level, evaluate on all: runs that are trained again, and the figures of the summary."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from point_mass import ID
+
+from ce_gym.learn.evaluate.transfer import interval, main, summary, table
+from ce_gym.learn.learners.sb3 import train as really_train
+from ce_gym.model.mechanism import LEVELS
+from ce_gym.policies import load_policy
+
+SMALL = ["--train", "--env", ID, "--steps", "600", "--seeds", "0", "1", "--threads", "1", "--episodes", "4"]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("transfer")
+    assert main([*SMALL, "--levels", "exact", "none", "--runs", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def trainings(monkeypatch):
+    """The training runs begun during a test: level and seed."""
+    begun = []
+
+    def train(job):
+        begun.append((job.env_kwargs["transmission"], job.seed, job.resume))
+        return really_train(job)
+
+    monkeypatch.setattr("ppo.train", train)
+    return begun
+
+
+def test_every_level_and_seed_is_trained_on_its_own(runs):
+    for level in ("exact", "none"):
+        for seed in (0, 1):
+            record = load_policy(runs / level / f"seed_{seed}").record
+            assert (record["transmission"], record["seed"]) == (level, seed)
+    result = json.loads((runs / "transfer.json").read_text())
+    assert [entry["transmission"] for entry in result["policies"]] == ["exact", "exact", "none", "none"]
+    assert tuple(result["summary"]["none"]) == LEVELS
+    one = [entry["results"]["armature"]["forward_error"] for entry in result["policies"][:2]]
+    assert result["summary"]["exact"]["armature"]["forward_error"]["mean"] == pytest.approx(np.mean(one))
+    assert "| none       | none *" in (runs / "transfer.md").read_text()
+    assert (runs / "transfer.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_second_call_trains_only_what_is_missing(runs, trainings, tmp_path):
+    arguments = [*SMALL, "--levels", "exact", "none", "coupled", "--runs", str(runs), "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    assert trainings == [("coupled", 0, None), ("coupled", 1, None)]
+    assert tuple(json.loads((tmp_path / "transfer.json").read_text())["summary"]) == ("exact", "coupled", "none")
+
+
+def test_an_interrupted_run_is_gone_on_with(runs, trainings, monkeypatch):
+    record = runs / "exact" / "seed_1" / "policy.json"
+    text = record.read_text()
+    record.write_text(json.dumps(json.loads(text) | {"finished": False}))
+    assert main([*SMALL, "--levels", "exact", "--runs", str(runs)]) == 0
+    assert trainings == [("exact", 1, record.with_suffix(".zip"))]
+    assert json.loads(record.read_text())["finished"]
+    monkeypatch.setattr("ppo.train", lambda job: SimpleNamespace(interrupted=True))
+    record.write_text(text.replace('"finished": true', '"finished": false'))
+    assert main([*SMALL, "--levels", "exact", "--runs", str(runs)]) == 130
+    record.write_text(text)
+
+
+def test_a_run_of_another_kind_is_not_overwritten(runs, trainings, capsys):
+    assert main([*SMALL, "--levels", "exact", "--steps", "700", "--runs", str(runs)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "trained with steps = 600, requested 700" in error
+    assert "\n" not in error
+    assert not trainings
+
+
+@pytest.mark.parametrize("argv", [[], ["--train"], ["some", "--train", "--env", ID]])
+def test_bad_command_lines_are_refused(argv):
+    with pytest.raises(SystemExit) as caught:
+        main(argv)
+    assert caught.value.code == 2
+
+
+def test_policies_of_different_tasks_are_not_compared(runs, tmp_path, capsys):
+    record = json.loads((runs / "none" / "seed_0" / "policy.json").read_text())
+    record["policy_spec"] |= {"robot": "another", "task": "velocity"}
+    (tmp_path / "policy.json").write_text(json.dumps(record))
+    (tmp_path / "policy.zip").write_bytes((runs / "none" / "seed_0" / "policy.zip").read_bytes())
+    assert main([str(runs / "exact" / "seed_0"), str(tmp_path), "--episodes", "2"]) == 2
+    assert "expected the robot and task of the others" in capsys.readouterr().err
+
+
+def test_the_interval_covers_the_mean_of_samples_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    for n in (2, 3, 5, 40):
+        found = [interval(x) for x in rng.normal(3.0, 0.7, (4000, n))]
+        covered = np.mean([abs(x["mean"] - 3.0) < x["ci95"] for x in found])
+        assert covered == pytest.approx(0.95, abs=0.012), n
+    assert interval([0.25]) == {"mean": 0.25, "ci95": None, "n": 1}
+
+
+def test_a_single_seed_has_no_interval():
+    figures = dict.fromkeys(("forward_error", "lateral_error", "yaw_rate_error", "velocity_error"), 0.5)
+    figures |= {"falls": 0.25, "episode_length": 2.0, "reward": 1.0}
+    entry = {"transmission": "armature", "results": dict.fromkeys(LEVELS, figures)}
+    text = table(summary([entry]))
+    assert "±" not in text
+    assert "25.0%" in text
+    assert "armature *" in text
+    assert "± 0.000" in table(summary([entry, entry]))
