@@ -104,6 +104,11 @@ class Model:
         return np.array(self.robot.standing_q)
 
     @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The names of the independent joints, in the order of the joint coordinates, see `Robot.joint_name`."""
+        return self.robot.joint_names
+
+    @property
     def joint_links(self) -> tuple[str, ...]:
         """The link that each independent joint moves, in the order of the joint coordinates."""
         return self.robot.commanded

@@ -61,7 +61,7 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
         "robot": robot.name,
         "transmission": program.model.transmission,
         "task": task,
-        "joints": list(joints),
+        "joints": list(robot.joint_names),
         "default_pose": [float(pose.get(name, 0.0)) for name in joints],
         "kp": [float(kp.get(name, 0.0)) for name in joints],
         "kd": [float(kd.get(name, 0.0)) for name in joints],
@@ -84,10 +84,14 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
 
 def _action(program: TaskProgram) -> dict[str, Any]:
     actions, kind = program.actions, program.task.actions
+    targets = [actions.targets[i] for i in actions.moved]
+    of_motors = kind.startswith("motor")
     return {
         "kind": kind,
         "meaning": MEANINGS[kind],
-        "motors" if kind.startswith("motor") else "joints": [actions.targets[i] for i in actions.moved],
+        "motors" if of_motors else "joints": targets
+        if of_motors
+        else list(map(program.model.robot.joint_name, targets)),
         "scale": [float(scale) for scale in actions.scale],
         **({"rest": [float(actions.rest[i]) for i in actions.moved]} if kind == "motor_pd" else {}),
         "low": -1.0,

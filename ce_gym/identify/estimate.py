@@ -83,6 +83,7 @@ def identify(
     if importlib.util.find_spec("scipy") is None:
         raise RobotError("identify needs SciPy; pip install 'ce_gym[identify]'")
     described = robot if isinstance(robot, Robot) else load_robot(robot)
+    log = log.of_links(described.links_by_joint)
     _check_names(described, log)
     model = base_fixed_model(described, [*log.commanded, *(name for _, name in log.measured)], transmission)
     kinds = kinds or default_kinds(model.robot, log.measured)
@@ -198,7 +199,7 @@ def _check_names(robot: Robot, log: Log) -> None:
     rotors = {rotor.name for rotor in robot.rotors()}
     for name in (*log.commanded, *(name for _, name in log.measured)):
         if name not in names:
-            raise unknown_name(str(log.source), "column", name, names, "a joint, by the link that it moves, or a rotor")
+            raise unknown_name(str(log.source), "column", name, names, "a joint or a rotor")
     for (kind, name), column in zip(log.measured, log.values.T, strict=True):
         if kind == "angle" and name not in rotors and (largest := np.abs(column).max()) > LARGEST_ANGLE:
             expected = f"radians, {LARGEST_ANGLE:g} at most"

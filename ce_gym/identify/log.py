@@ -3,7 +3,7 @@
     time, command:HR_hip_rotor, angle:HR_hip_rotor, speed:HR_hip_rotor, ...
 
 `time` [s] is evenly spaced. `command:NAME` holds until the next row. `angle:NAME` [rad or m] and `speed:NAME` are
-readings at the time of the row. `torque:NAME` is ignored. NAME is a joint, by the link that it moves, or a rotor.
+readings at the time of the row. `torque:NAME` is ignored. NAME is a joint, or the link that it moves, or a rotor.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from __future__ import annotations
 import csv
 import math
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,12 @@ class Log:
     measured: tuple[tuple[str, str], ...]
     values: Array
     source: str = "log"
+
+    def of_links(self, links: Mapping[str, str]) -> Log:
+        """Return the log with links as names; `links` has the link that each joint moves, by the joint's name."""
+        commanded = tuple(links.get(name, name) for name in self.commanded)
+        measured = tuple((kind, links.get(name, name)) for kind, name in self.measured)
+        return replace(self, commanded=commanded, measured=measured)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the log to a CSV file; return its path."""

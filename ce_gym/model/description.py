@@ -2,8 +2,9 @@
 
 Every loader returns a `Robot`; every other part of the package starts from one. A robot is a spanning tree of
 bodies, each with one joint to its parent, plus the constraints among joint coordinates
-(gears, belts, differentials, closed loops). A joint has the name of the body it moves:
-"the angle of FL_hip_link" is the coordinate of the joint between FL_hip_link and its parent.
+(gears, belts, differentials, closed loops). A robot's data refers to a joint by the body that it moves:
+"the angle of FL_hip_link" is the coordinate of the joint between FL_hip_link and its parent. Joints also have the names
+of the URDF or MJCF file, see `Robot.joint_name`.
 
 Numbers are plain floats in tuples. Two robots are equal if and only if their numbers are, and a robot
 can be hashed into a cache key. Units are SI and radians.
@@ -64,6 +65,7 @@ class Joint:
         friction: Dry friction at the joint [N m or N].
         stiffness: Stiffness of a spring at the joint [N m/rad or N/m].
         springref: Coordinate of the relaxed spring [rad or m]; the spring of a ball joint is relaxed at no rotation.
+        name: Name in the URDF or MJCF file; "" without a name. See `Robot.joint_name`.
     """
 
     type: Literal["free", "ball", "revolute", "prismatic"]
@@ -75,6 +77,7 @@ class Joint:
     friction: NotNegative = 0.0
     stiffness: NotNegative = 0.0
     springref: Finite = 0.0
+    name: str = ""
 
     @property
     def nq(self) -> int:
@@ -285,6 +288,24 @@ class Robot:
             if body.name == name:
                 return body
         raise KeyError(f"{self.name} has no body {name!r}; it has {listed_names(name, [b.name for b in self.bodies])}")
+
+    def joint_name(self, body: str) -> str:
+        """Return the name of the joint that moves a body.
+
+        That is the name in the robot's file; the name of the body if the file gives none, or one of another body.
+        """
+        name = self.body(body).joint.name
+        return name if name and all(other.name != name for other in self.bodies) else body
+
+    @property
+    def links_by_joint(self) -> dict[str, str]:
+        """The body that each joint moves, by the name of the joint."""
+        return {self.joint_name(body.name): body.name for body in self.bodies}
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The names of the joints in `commanded`, see `joint_name`."""
+        return tuple(map(self.joint_name, self.commanded))
 
     def rotors(self) -> Iterator[Body]:
         """Iterate over the bodies that spin inside transmissions."""

@@ -21,10 +21,10 @@ BASE = CHEETAH.robot.bodies[0].name
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"action_joints": [JOINT, "FL_hip_joint"]}, "action_joints='FL_hip_joint'; .* mean 'FL_hip_link'"),
+        ({"action_joints": [JOINT, "FL_hip_joint"]}, "action_joints='FL_hip_joint'; .* mean 'FL_hip_link_joint'"),
         ({"action_joints": [JOINT, "*_elbow_link"]}, r"action_joints='\*_elbow_link'; expected patterns of joints"),
         ({"action_joints": [JOINT, "fl_knee_link"]}, "action_joints='fl_knee_link'; .* mean 'FL_knee_link'"),
-        ({"action_joints": ["FL_knee_rotor"]}, "action_joints='FL_knee_rotor'; .* mean 'FL_knee_link'"),
+        ({"action_joints": ["FL_knee_rotor"]}, "action_joints='FL_knee_rotor'; .* mean 'FL_knee_link_joint'"),
         ({"action_joints": ["[AB]_knee"], "actions": "motor_pd"}, r"action_joints='\[AB\]_knee'; .*that motors drive"),
         ({"action_joints": [JOINT, JOINT]}, f"action_joints='{JOINT}' is listed twice"),
         ({"action_joints": []}, r"action_joints=\(\); expected patterns of joints among HR"),

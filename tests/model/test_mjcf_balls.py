@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ball_joints import moved, random_state, with_balls
@@ -146,7 +148,8 @@ def test_balls_are_written(tmp_path):
     bias = T.T @ (data.qfrc_bias + M @ coordinates.velocity_product(q, v))
     np.testing.assert_allclose(bias, model.bias_force(q, v), atol=1e-9)
     np.testing.assert_allclose(back.mass_matrix(q), model.mass_matrix(q), atol=1e-9)
-    assert [b.joint for b in back.robot.bodies if b.joint.type == "ball"] == [robot.body("a").joint] * 3
+    balls = [replace(b.joint, name="") for b in back.robot.bodies if b.joint.type == "ball"]
+    assert balls == [robot.body("a").joint] * 3
     twin = MujocoTwin(robot, "armature", 1)
     twin.start(q[None], v[None])
     np.testing.assert_allclose(np.concatenate(twin.state(), axis=1)[0], np.concatenate([q, v]), atol=1e-12)

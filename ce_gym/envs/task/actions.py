@@ -54,10 +54,15 @@ class ActionMap:
             motorised = {name for cluster in clusters for name in cluster.independent}
             joints = tuple(name for name in joints if name in motorised)
             expected = f"patterns of joints that motors drive, for actions={task.actions!r}, among"
-        check_names("action_joints", task.action_joints, joints, expected, patterns=True)
+        named = [robot.joint_name(name) for name in joints]
+        check_names("action_joints", task.action_joints, [*named, *joints], expected, patterns=True)
         if not task.action_joints:
-            raise ValueError(f"action_joints={task.action_joints!r}; expected {expected} {listed_names('', joints)}")
-        acting = {n for n in joints if any(fnmatchcase(n, p) for p in task.action_joints)}
+            raise ValueError(f"action_joints={task.action_joints!r}; expected {expected} {listed_names('', named)}")
+        acting = {
+            link
+            for link, joint in zip(joints, named, strict=True)
+            if any(fnmatchcase(link, pattern) or fnmatchcase(joint, pattern) for pattern in task.action_joints)
+        }
         if self.control.startswith("motor"):
             moving = [cluster for cluster in clusters if acting & set(cluster.independent)]
             acting = {name for cluster in moving for name in cluster.bodies if name in rotors_of_motors}

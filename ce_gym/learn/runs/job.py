@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-from ce_gym.learn.runs.settings import NETWORK, SettingsError
 
+from ce_gym.learn.runs.settings import NETWORK, SettingsError
 from ce_gym.policies import PolicyError, load_policy
 
 CHECKPOINTS = 10

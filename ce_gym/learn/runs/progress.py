@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ce_gym.learn.runs.folder import continue_if_full
-from ce_gym.learn.runs.logs import Writer, numbers_of
 from tqdm import tqdm
 
+from ce_gym.learn.runs.folder import continue_if_full
+from ce_gym.learn.runs.logs import Writer, numbers_of
 from ce_gym.policies import locate_policy
 
 Row = Mapping[str, Any]

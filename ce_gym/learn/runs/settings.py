@@ -14,7 +14,6 @@ from typing import Any, ClassVar
 from ce_gym.policies import ACTIVATIONS, checked_arguments, listed_names, parse_yaml
 
 
-
 def settings_folder() -> Path:
     """Return the folder of settings files: inside an installed package, or `train/config` in a source checkout."""
     learn = Path(__file__).resolve().parents[1]
@@ -45,7 +44,6 @@ NETWORK = ("hidden", "activation")
 
 CONFIG_FOLDER = settings_folder()
 """Settings files of PPO; other learners have subfolders."""
-
 
 
 class SettingsError(ValueError):

@@ -19,12 +19,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from ce_gym.learn.runs.logs import open_writers
-from ce_gym.learn.runs.job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
-from ce_gym.learn.runs.progress import CURVE, LOG, Curve, Log, ProgressBar, StopInOrder, earlier_rows, log_row
-from ce_gym.learn.runs.folder import continue_if_full, make_folder, save_somewhere, write_whole
-from ce_gym.learn.runs.page import Present
 
+from ce_gym.learn.runs.folder import continue_if_full, make_folder, save_somewhere, write_whole
+from ce_gym.learn.runs.job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
+from ce_gym.learn.runs.logs import open_writers
+from ce_gym.learn.runs.page import Present
+from ce_gym.learn.runs.progress import CURVE, LOG, Curve, Log, ProgressBar, StopInOrder, earlier_rows, log_row
 from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -105,10 +105,15 @@ def _problem(error: Exception) -> str:
 
 
 class Section:
-    """A mapping in a file with its path of keys; every value is checked when it is read."""
+    """A mapping in a file with its path of keys; every value is checked when it is read.
 
-    def __init__(self, file: str, path: str, data: object):
-        self.file, self.path = file, path
+    Attributes:
+        aliases: Names that stand for others where names are keys or in lists, such as names of joints for the links
+            that they move.
+    """
+
+    def __init__(self, file: str, path: str, data: object, aliases: Mapping[str, str] | None = None):
+        self.file, self.path, self.aliases = file, path, aliases or {}
         if not isinstance(data, dict):
             raise invalid_value(file, path or "top level", data, "a mapping")
         for key in data:
@@ -151,7 +156,7 @@ class Section:
 
     def section(self, key: str) -> Section:
         """Return the mapping under `key`; an empty one if the key is missing."""
-        return Section(self.file, self.key(key), self.get(key, {}))
+        return Section(self.file, self.key(key), self.get(key, {}), self.aliases)
 
     def sections(self) -> Iterator[tuple[str, Section]]:
         """Iterate over the keys and the mappings under them."""
@@ -184,7 +189,14 @@ class Section:
 
     def numbers(self) -> tuple[tuple[str, float], ...]:
         """Return all pairs of a mapping from names to finite numbers."""
-        return tuple((key, self.number(key)) for key in self.data)
+        return tuple((self.named(key), self.number(key)) for key in self.data)
+
+    def named(self, key: str) -> str:
+        """Return the name that a key stands for, see `aliases`."""
+        name = self.aliases.get(key, key)
+        if name != key and name in self.data:
+            raise self.invalid(key, key, f"each joint once; {name!r} is the link that it moves")
+        return name
 
     def numbers_for(self, names: Collection[str]) -> dict[str, float]:
         """Return a number for each name in a mapping whose keys may be patterns such as "*_hip".
@@ -200,11 +212,12 @@ class Section:
         for key in self:
             if not set(key) & set("*?["):
                 continue
-            matches = [name for name in names if fnmatchcase(name, key)]
+            fitting = [name for alias, name in self.aliases.items() if fnmatchcase(alias, key)]
+            matches = [name for name in names if fnmatchcase(name, key) or name in fitting]
             if not matches:
                 raise self.unknown("", key, names, "a pattern that fits a name")
             keys |= dict.fromkeys(matches, key)
-        return keys | {key: key for key in self if not set(key) & set("*?[")}
+        return keys | {self.named(key): key for key in self if not set(key) & set("*?[")}
 
     def list(self, key: str) -> list[Any]:
         """Return a list, empty if the key is missing."""
@@ -218,7 +231,7 @@ class Section:
         for i, item in enumerate(self.list(key)):
             if not isinstance(item, str):
                 raise invalid_value(self.file, f"{self.key(key)}[{i}]", item, "text")
-        return tuple(self.list(key))
+        return tuple(self.aliases.get(name) or name for name in self.list(key))
 
 
 def finite(file: str, key: str, value: object) -> float:

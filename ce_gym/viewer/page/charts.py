@@ -81,7 +81,8 @@ def charts(run: PosedRollout) -> Charts:
     bodies = [robot.body(name) for name in joints]
     for kind, unit, values in (("torque", "N m", torques), ("speed", "rad/s", v[:, v.shape[1] - len(joints) :])):
         for body, column in zip(bodies, values.T, strict=values.shape[1] > 0):
-            name = f"{kind} of {body.name.removesuffix('_link')} [{unit}]"
+            joint = robot.joint_name(body.name).removesuffix("_joint").removesuffix("_link")
+            name = f"{kind} of {joint} [{unit}]"
             limit = body.joint.torque if kind == "torque" else body.joint.velocity
             signals[name] = column
             limits |= {name: limit} if np.isfinite(limit) else {}

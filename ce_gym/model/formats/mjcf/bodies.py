@@ -165,6 +165,7 @@ def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, fram
         furthest = float(model.jnt_range[j][1]) if model.jnt_limited[j] else np.inf
         pivot = compose(frame, Placement(_pivot(source, j)))
         ball = Joint("ball", position=(-np.inf, furthest), damping=damping, stiffness=float(model.jnt_stiffness[j]))
+        ball = replace(ball, name=source.given_name("joint", j))
         return Body(name, "link", carrier, pivot, ball, nothing)
     limits = model.jnt_range[j] if model.jnt_limited[j] else _UNLIMITED
     joint = Joint(
@@ -175,6 +176,7 @@ def _moved_body(source: MjcfSource, j: int, name: str, carrier: str | None, fram
         friction=float(model.dof_frictionloss[dof]),
         stiffness=float(model.jnt_stiffness[j]),
         springref=float(model.qpos_spring[model.jnt_qposadr[j]]) if model.jnt_stiffness[j] else 0.0,
+        name=source.given_name("joint", j),
     )
     at_zero = compose(frame, _motion(source, j, 0.0))
     pivot = compose(at_zero, Placement(_pivot(source, j)))

@@ -77,7 +77,7 @@ def read_robot(
     Args:
         path: The file.
         gears: Gear ratios for `robot_from_mjcf`.
-        driven: Bodies with rotors in the YAML file; the armature of their joints is ignored.
+        driven: Joints, or bodies that they move, with rotors in the YAML file; the armature of their joints is ignored.
         apart: Names of bodies without joint to keep separate, because they are rotors.
 
     Returns:
@@ -86,6 +86,8 @@ def read_robot(
     source = read_mjcf(path)
     locked = locked_joints(source)
     tree = read_bodies(source, locked, balls_in_loops(source), apart)
+    gears.aliases = Robot("", tuple(tree.bodies)).links_by_joint
+    driven = {gears.aliases.get(name, name) for name in driven}
     equalities = read_constraints(source, tree, locked)
     poses = equality_rows(source, tree)
     constraints = without_repeats(source, equalities, poses)

@@ -74,7 +74,7 @@ def read_urdf(
         base: Whether the root link moves freely or is fixed to the world. By default the root is fixed if it is called
             "world" or has no mass.
         apart: Names of links on fixed joints to keep separate; other names have no effect.
-        tied: Names of links that may move without mass because constraints elsewhere name them.
+        tied: Names of links or joints that may move without mass because constraints elsewhere name them.
 
     Raises:
         RobotError: The file is missing, malformed, or not a tree of rigid bodies; or it is URDF+, whose loops and
@@ -156,7 +156,9 @@ class _Reader:
 
         Left alone: joints that motors, other files or links with mass depend on.
         """
-        joints, heavy = self.graph.joints, {*tied, *(drive.link for drive in self.drives)}
+        joints = self.graph.joints
+        heavy = {*tied, *(joint.child for joint in joints.values() if joint.name in tied)}
+        heavy |= {drive.link for drive in self.drives}
         for link in reversed(self.graph.order):  # children first
             inertial = self.inertials[link]
             if link in heavy or (inertial is not None and (inertial.mass or np.any(inertial.inertia))):
@@ -246,7 +248,7 @@ class _Reader:
         if joint is not None and joint.type != "floating":
             parent, pose = self._attachment(joint, self.frames)
             motion = read.joint(self.file, joint.where, joint.element, joint.type)
-            motion = replace(motion, **self.springs.get(joint.name, {}))
+            motion = replace(motion, name=joint.name, **self.springs.get(joint.name, {}))
         shapes = tuple(shape for part in parts for shape in self._shapes(part, self.frames[part][1]))
         return Body(link, "link", parent, pose, motion, merge_inertials(inertials), shapes)
 

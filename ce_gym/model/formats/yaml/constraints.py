@@ -23,7 +23,7 @@ def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Fr
     """
     names = [body.name for body in bodies]
     for i, data in enumerate(file.list("constraints")):
-        entry = Section(file.file, f"constraints[{i}]", data)
+        entry = Section(file.file, f"constraints[{i}]", data, file.aliases)
         yield READERS[entry.text("type", choices=tuple(READERS))](entry, names, frames)
 
 
@@ -38,7 +38,7 @@ def frame_named(section: Section, key: str, frames: dict[str, Frame]) -> Frame:
 def coefficients(section: Section, names: list[str]) -> tuple[tuple[str, float], ...]:
     """Return pairs of a body and a number other than 0."""
     for body in section:
-        if body not in names:
+        if section.named(body) not in names:
             raise section.unknown("", body, names, "the name of a body")
         if section.number(body) == 0.0:
             raise section.invalid(body, 0.0, "a number other than 0")

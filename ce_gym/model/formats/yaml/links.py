@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ce_gym.model.constraints import LinearConstraint
@@ -30,6 +30,7 @@ class Links:
         collisions: The <collision> elements of each link of a URDF, in the link's frame; None for a mesh.
         drives: Motors in a URDF file.
         driven: Joints with rotors in the YAML file.
+        joints: The link that each joint moves, by the name of the joint, where that differs from the link's.
     """
 
     robot: Robot
@@ -38,6 +39,7 @@ class Links:
     collisions: Mapping[str, tuple[Shape | None, ...]]
     drives: tuple[Drive, ...] = ()
     driven: Collection[str] = ()
+    joints: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_links(path: Path, file: Section) -> Links:
@@ -63,11 +65,18 @@ def read_links(path: Path, file: Section) -> Links:
         tree = read_urdf(path.parent / file.text("urdf"), base, rotors.data, tied)
         independent = _not_tied(tree.bodies, tree.constraints)
         robot = Robot(tree.name, tree.bodies, tree.constraints, independent, notes=tree.notes)
-        return Links(robot, dict(tree.frames), tree.fixed, tree.collisions, tree.drives, driven)
+        joints = joint_aliases(robot)
+        driven = {joints.get(name, name) for name in driven}
+        return Links(robot, dict(tree.frames), tree.fixed, tree.collisions, tree.drives, driven, joints)
     if "base" in file:
         raise file.invalid("base", file.get("base"), "no `base` beside `mjcf`: the MJCF file describes the base")
     robot, frames, fixed = read_robot(path.parent / file.text("mjcf"), file.section("gears"), driven, rotors.data)
-    return Links(robot, frames, fixed, {})
+    return Links(robot, frames, fixed, {}, joints=joint_aliases(robot))
+
+
+def joint_aliases(robot: Robot) -> dict[str, str]:
+    """Return the link that each joint moves, by the name of the joint, where that differs from the link's."""
+    return {joint: link for joint, link in robot.links_by_joint.items() if joint != link}
 
 
 def _words(value: object) -> Iterator[str]:
@@ -81,7 +90,9 @@ def _words(value: object) -> Iterator[str]:
 
 def names_in(section: Section, key: str) -> tuple[str, ...]:
     """Return the names under a key, which are a list or the keys of a mapping."""
-    return section.texts(key) if isinstance(section.get(key, {}), list) else tuple(section.section(key))
+    if isinstance(section.get(key, {}), list):
+        return section.texts(key)
+    return tuple(map(section.named, section.section(key)))
 
 
 def _not_tied(bodies: tuple[Body, ...], constraints: tuple[LinearConstraint, ...]) -> tuple[str, ...]:

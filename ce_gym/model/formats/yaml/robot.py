@@ -2,7 +2,7 @@
 
 The URDF or MJCF file describes the links. The YAML file adds rotors, transmissions, motors, contacts, a pose and gains,
 and goes before the MJCF file where both have one of these. Unknown keys are refused. A key that names a body may also
-name a link that a fixed joint merged into a body.
+name a link that a fixed joint merged into a body. A joint has its name in that file, or the name of the link it moves.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ def robot_from_yaml(path: Path) -> Robot:
         return _identified_robot(path, file.allow("robot", "identified", "notes"))
     file.allow(*_KEYS)
     links = read_links(path, file)
+    file.aliases = links.joints
     file.texts("sources")  # for readers of the file; only its form is checked
     library, motors = read_motors(file)
     notes = list(links.robot.notes)
@@ -109,7 +110,8 @@ def _with_passive_joints(file: Section, bodies: tuple[Body, ...], independent: t
     """Return the bodies with torque limits of 0 at joints that match the patterns under `passive`."""
     passive: set[str] = set()
     for pattern in file.texts("passive"):
-        matches = {name for name in independent if fnmatchcase(name, pattern)}
+        fitting = {name for alias, name in file.aliases.items() if fnmatchcase(alias, pattern)}
+        matches = {name for name in independent if fnmatchcase(name, pattern) or name in fitting}
         if not matches:
             raise file.unknown("passive", pattern, independent, "the name of an independent joint, or a pattern")
         passive |= matches

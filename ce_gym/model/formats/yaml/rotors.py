@@ -151,4 +151,4 @@ def _with_gearbox(rotor: Section, motor: MotorType | None) -> Section:
     if motor is None:
         expected = "a mapping from joints to gear ratios, or a motor of the library under `motors`"
         raise rotor.invalid("ratios", list(joints), expected)
-    return Section(rotor.file, rotor.path, {**rotor.data, "ratios": dict.fromkeys(joints, motor.ratio)})
+    return Section(rotor.file, rotor.path, {**rotor.data, "ratios": dict.fromkeys(joints, motor.ratio)}, rotor.aliases)
