@@ -2,11 +2,11 @@
 """Train a policy with RLlib's PPO: several processes, each with a native batch, on one machine or a cluster.
 
 Needs the extra `ray` in a separate virtual environment, see docs/how-to/learners.md. Settings files are the same as for
-train/ppo.py; `num_envs` counts the environments of all processes together. The policy is written as `policy.onnx` with
-its specification. evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read this file. Uses public names of
-ce_gym only, and no name of a robot or task.
+`python -m ce_gym train`; `num_envs` counts the environments of all processes together. The policy is written as
+`policy.npz`, which `python -m ce_gym evaluate`, `play` and the other commands read.
 
-    python train/rllib.py --env ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --minutes 1
+    python train/rllib.py ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --minutes 1
+    python train/rllib.py ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --resume
 """
 
 from __future__ import annotations
@@ -29,11 +29,14 @@ import ce_gym  # noqa: F401  (registers the environments in this process)
 from ce_gym.__main__ import run
 from ce_gym.console import SEED, THREADS, Parser, above_zero, whole
 from ce_gym.learn.commands.errors import in_one_line
-from ce_gym.learn.export import to_onnx, write
 from ce_gym.learn.runs.folder import make_folder
 from ce_gym.learn.runs.job import basic_record
-from ce_gym.learn.runs.settings import Settings, SettingsError, config_file, load_env_args, load_settings, with_named
-from ce_gym.policies import Actor, add_env_arg, keep_map
+from ce_gym.learn.runs.settings import Settings, SettingsError
+from ce_gym.learn.training import make_job
+from ce_gym.policies import Actor, add_env_arg, keep_map, write_npz
+
+CHECKPOINT_PERIOD = 60.0
+"""Time between two checkpoints [s]."""
 
 
 def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: int = 0, **env_kwargs: Any) -> Algorithm:
@@ -87,6 +90,7 @@ def algorithm(env_id: str, s: Settings, runners: int, learners: int = 0, seed: i
                 log_std_clip_param=float("inf"),
             )
         )
+        .fault_tolerance(restart_failed_env_runners=True)
         .debugging(seed=seed, log_level="ERROR")
     )
     return config.build_algo()
@@ -123,27 +127,39 @@ def actor_of(algo: Algorithm, activation: str) -> Actor:
     return Actor(tuple(layers), activation)
 
 
-def train(algo: Algorithm, steps: float, seconds: float) -> int:
-    """Train for a number of environment steps or a time [s], and return the steps done."""
-    start, done = time.monotonic(), 0
+def train(algo: Algorithm, steps: float, seconds: float, folder: Path | None = None) -> int:
+    """Train for a number of environment steps or a time [s], and return the steps done.
+
+    If an env runner or its node fails, training continues with the others, and with a new one as soon as the cluster
+    has room.
+
+    Args:
+        algo: The algorithm; after a restoration, its earlier steps count.
+        steps: Environment steps.
+        seconds: Longest time [s].
+        folder: Folder of a checkpoint that is written about once a minute; None writes none.
+    """
+    start, saved, done = time.monotonic(), time.monotonic(), 0
     while done < steps and time.monotonic() - start < seconds:
         result = algo.train()
-        figures = result["env_runners"]
+        figures, passed = result["env_runners"], time.monotonic() - start
         done = int(figures["num_env_steps_sampled_lifetime"])
-        passed = time.monotonic() - start
         print(
-            f"{passed:6.0f} s  {done / 1e6:6.2f} M steps  {done / passed / 1e3:5.1f} k steps/s  "
+            f"{passed:6.0f} s  {done / 1e6:6.2f} M steps  {result['fault_tolerance']['num_healthy_workers']} runners  "
             f"reward {figures.get('episode_return_mean', float('nan')):7.2f}  "
             f"length {figures.get('episode_len_mean', float('nan')):6.1f}",
             flush=True,
         )
+        if folder and time.monotonic() - saved > CHECKPOINT_PERIOD:
+            algo.save_to_path(str(folder.resolve()))
+            saved = time.monotonic()
     return done
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(description="Train a policy with RLlib's PPO.")
-    parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
+    parser.add_argument("env", metavar="ENV", help="environment id, such as ce_gym/MiniCheetahStand-v0")
     parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic")
     add_env_arg(parser)
     parser.add_argument(
@@ -161,31 +177,36 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
+    parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in the folder")
     args = parser.parse_args(argv)
     return run(in_one_line(lambda: _work(args)))
 
 
 def _work(args: argparse.Namespace) -> int:
     """Train, write the policy, and print its path."""
-    path = config_file(args.env)
-    kwargs = {"transmission": args.transmission} if args.transmission else {}
-    kwargs |= {**load_env_args(path), **dict(args.env_args), "num_threads": args.threads}
-    s = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
-    s = with_named(s, dict(args.env_args))
-    env = gymnasium.make_vec(args.env, num_envs=1, **kwargs)  # reports errors in one line, and fills the kernel cache
+    overrides = [*args.set, *([f"steps={args.steps}"] if args.steps else [])]
+    level = {"transmission": args.transmission} if args.transmission else {}
+    job = make_job(args.env, overrides=overrides, env_kwargs={**level, **dict(args.env_args)}, seed=args.seed)
+    out = args.out or job.out.with_name(f"{job.out.name}-rllib")
+    checkpoint, s = out / "checkpoint", job.settings
+    if args.resume and not checkpoint.exists():
+        raise SettingsError(f"--resume: {checkpoint}: no such folder; expected the checkpoint of an earlier run")
+    env = gymnasium.make_vec(args.env, num_envs=1, **job.env_kwargs)  # errors in one line; fills the kernel cache
     ray.init(address=args.address, log_to_driver=False, include_dashboard=False)
-    algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **{**kwargs, **s.training})
-    set_initial_std(algo, s.initial_std)
-    steps = train(algo, s.steps, 60.0 * args.minutes)
-    out = args.out or Path("runs") / f"{path.stem}-rllib"
+    options = {**job.env_kwargs, **s.training, "num_threads": args.threads}
+    algo = algorithm(args.env, s, args.env_runners, args.learners, args.seed, **options)
+    if args.resume:
+        algo.restore_from_path(str(checkpoint.resolve()))
+    else:
+        set_initial_std(algo, s.initial_std)
     make_folder(out)
-    keep_map(kwargs, out)
-    algo.save_to_path(str((out / "checkpoint").resolve()))
-    kept = {key: value for key, value in kwargs.items() if key != "num_threads"}
-    record = basic_record(env.unwrapped, args.env, kept, s) | {"steps": steps}
-    write(to_onnx(actor_of(algo, s.activation), record), record, out / "policy.onnx")
+    keep_map(job.env_kwargs, out)
+    steps = train(algo, s.steps, 60.0 * args.minutes, checkpoint)
+    algo.save_to_path(str(checkpoint.resolve()))
+    record = basic_record(env.unwrapped, args.env, job.env_kwargs, s) | {"steps": steps}
+    write_npz(actor_of(algo, s.activation), record, out / "policy.npz")
     algo.stop()
-    print(out / "policy.onnx")
+    print(out / "policy.npz")
     return 0
 
 
