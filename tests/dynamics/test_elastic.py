@@ -12,9 +12,9 @@ import pytest
 from elastic_robots import KINDS, LINK, RATIO, ROTOR, differential, elastic, turntable, untied
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.drives.stretch import mesh_energy
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.plan import MOVED
+from ce_gym.dynamics.laws.drive_meshes import mesh_energy
 from ce_gym.dynamics.laws.scene_parameters import make_scene
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import Robot, load_robot

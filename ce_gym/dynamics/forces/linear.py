@@ -29,6 +29,10 @@ class JointForce:
         """Return the sum of both."""
         return JointForce(self.tau + other.tau, self.slope + other.slope)
 
+    def at(self, ydd: SX) -> SX:
+        """Return the force at an acceleration, shape (n,)."""
+        return self.tau - self.slope @ ydd
+
 
 @dataclass
 class Motion:

@@ -71,10 +71,10 @@ class Saturation:
         The predicted end-of-step torque keeps its violation of a limit as the next guess. It never goes from beyond one
         limit to beyond the other, because the range between has not been tried then.
         """
-        asked = self.asked.tau - self.asked.slope @ ydd
+        asked = self.asked.at(ydd)
         if ca.sparsify(self.high.slope).nnz() or ca.sparsify(self.low.slope).nnz():
-            over = asked - (self.high.tau - self.high.slope @ ydd)
-            under = self.low.tau - self.low.slope @ ydd - asked
+            over = asked - self.high.at(ydd)
+            under = self.low.at(ydd) - asked
             within = ca.fmax(self.low.tau, ca.fmin(self.high.tau, asked))
             asked = ca.if_else(over > 0, self.high.tau + over, ca.if_else(under > 0, self.low.tau - under, within))
         kept = ca.if_else(self.at_low, ca.fmin(asked, self.high.tau), asked)

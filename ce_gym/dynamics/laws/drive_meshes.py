@@ -31,8 +31,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX, solve_positive_definite
-from ce_gym.dynamics.drives.stretch import gap_of, mesh_energy, mesh_parameters, stretching
 from ce_gym.dynamics.forces.linear import JointForce, Motion, is_moment
+from ce_gym.dynamics.forces.scene import Scene
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.parameters import Parameter, unit_factor
 from ce_gym.dynamics.recursion.kinematics import Kinematics
@@ -41,6 +41,41 @@ from ce_gym.model.mechanism import Mechanism
 
 MESH_ITERATIONS = 5
 """How many iterations of a step meshes may need after the first until it is settled which of their sides act."""
+
+
+def stretching(mechanism: Mechanism) -> list[tuple[int, Elasticity]]:
+    """Return the elastic transmissions that stretch, each with the row of its stretch among the joints' coordinates."""
+    robot = mechanism.robot
+    rows = {name: row for row, name in enumerate(robot.independent)}
+    return [(rows[elastic.stretch], elastic) for elastic in robot.elastic if elastic.stretch in rows]
+
+
+def mesh_parameters(scene: Scene, elastic: Elasticity) -> tuple[SX, SX, SX]:
+    """Return stiffness [N m/rad] and damping [N m s/rad] of a side, and backlash [rad].
+
+    A transmission without sides has one spring and damper. A strand has half the stiffness and damping of its belt.
+    """
+    values, share = scene.values, 1.0 if elastic.linear or elastic.backlash else 0.5
+    k, d = share * elastic.stiffness * values["drive_stiffness"], share * elastic.damping * values["drive_damping"]
+    return k, d, elastic.backlash * elastic.play * values["backlash"]
+
+
+def gap_of(elastic: Elasticity, k: SX, backlash: SX) -> SX:
+    """Return the stretch at which a side with stiffness k begins to push [rad]."""
+    return backlash / 2 if elastic.backlash else -elastic.preload / (2 * k)
+
+
+def mesh_energy(scene: Scene, y: SX) -> SX:
+    """Return the elastic energy of all transmissions at positions of joints and stretches (n,) [J]."""
+    total = SX(0)
+    for row, elastic in stretching(scene.mechanism):
+        k, _, backlash = mesh_parameters(scene, elastic)
+        if elastic.linear:
+            total += k * y[row] ** 2 / 2
+            continue
+        gap = gap_of(elastic, k, backlash)
+        total += k * (ca.fmax(y[row] - gap, 0) ** 2 + ca.fmax(-y[row] - gap, 0) ** 2) / 2
+    return total
 
 
 class DriveMeshes(ForceLaw):

@@ -2,6 +2,22 @@
 
 The memory of motors belongs to five effects, each with fields of its own: friction that depends on the load, torque
 that lags behind the command, temperature, the voltage of a battery, and the torques that a sampled controller holds.
+
+The load of a motor is its torque, and the torque of the rest of the robot on its rotor. The rest of the robot acts on
+the coordinates of a cluster with the inertia forces less the torques of the motors,
+
+    external = D ydd - tau,    D = G^T H G of the articulated bodies beyond it, see ce_aba.py:
+
+gravity, contacts, springs and the motion of the carrier, but not the cluster's own inertia. For a pendulum this is
+gravity alone. These forces act on rotors as joint torques do. Where a transmission stretches, the load is the torque of
+its mesh.
+
+Friction under load is computed from mean loads over the last step: over the last part of a step made in parts, over
+the last stage of a step made in stages, and within a step over the stage before. Refused steps leave no load. Further
+iterations use the loads of the last iteration whose active set of the motors was right, because a rotor that is wrongly
+assumed to stick is stopped by a large torque. The load can be late by a step, an error of first order; so methods that
+extrapolate need a second iteration in every stage. Friction always removes energy, whatever its load. Where there was
+no step before, rotors at rest are held in the first iteration, which gives the load.
 """
 
 from __future__ import annotations
@@ -11,9 +27,16 @@ from dataclasses import dataclass
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.drives.load import carried_after, carried_now, motor_work, winding_torques, windings_after
 from ce_gym.dynamics.electric.cogging import cogging_energy
-from ce_gym.dynamics.forces.actuation import MotorState, actuated_clusters, encoder_map, limit_count
+from ce_gym.dynamics.electric.supply import Supply, Work
+from ce_gym.dynamics.forces.actuation import (
+    Actuated,
+    MotorState,
+    actuated_clusters,
+    effort_matrix,
+    encoder_map,
+    limit_count,
+)
 from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.motor_control import MotorControl, motor_springs
 from ce_gym.dynamics.forces.motors import MOTORS, lagging_motors, loaded_motors, supply_of, warm_motors
@@ -107,9 +130,10 @@ class PlacedMotors(PlacedForce):
 
     def linearise(self, iterate: SX) -> MotorForces:
         """Linearise about an iterate."""
-        start, scene = self.start, self.start.scene
-        limits = iterate.numel() - start.state["motor_load"].numel()
-        load = carried_now(start.state["motor_load"], iterate[limits:])
+        start, scene, load = self.start, self.start.scene, self.start.state["motor_load"]
+        limits = iterate.numel() - load.numel()
+        if load.numel():
+            load = ca.if_else(iterate[-1] > 0, iterate[limits:], load)
         before = MotorState.of(scene.mechanism, scene.options, load, start.state)
         motors = MotorControl(scene, start.kinematics, start.y, start.yd, start.target, start.dt, before)
         return MotorForces(start, motors.linearise(iterate[:limits]), load, iterate[limits:])
@@ -154,37 +178,73 @@ class MotorForces(LinearForce):
 
     def advance(self, motion: Motion) -> dict[str, SX]:
         """Return the memory of all effects at the end of the step."""
-        start, scene = self.start, self.start.scene
+        start, scene, robot = self.start, self.start.scene, self.start.scene.mechanism.robot
         warmth, sag = SX(0, 1), SX(0, 1)
         if start.state["motor_warmth"].numel() or start.state["battery_sag"].numel():
-            supply = supply_of(scene.mechanism.robot, scene.options.motors, start.state)
-            clusters = actuated_clusters(scene.mechanism, start.kinematics)
-            work = motor_work(
-                clusters, self.force, supply, scene.values["motor_strength"], start.yd + start.dt * motion.ydd, motion
-            )
-            warmth, sag = supply.after(scene.mechanism.robot.motors, work, start.dt)
+            supply = supply_of(robot, scene.options.motors, start.state)
+            warmth, sag = supply.after(robot.motors, self._work(supply, motion), start.dt)
+        lagging = lagging_motors(robot, scene.options.motors)
         return {
             "motor_load": self._load_after(motion),
-            "lagging_torque": windings_after(scene, self.force, motion),
+            "lagging_torque": ca.vertcat(SX(0, 1), *[self.force.windings[i].at(motion.ydd) for i in lagging]),
             "motor_warmth": warmth,
             "battery_sag": sag,
             "held_torque": self.force.sampled,
         }
 
+    def _work(self, supply: Supply, motion: Motion) -> dict[int, Work]:
+        """Return the work of each motor over the step, by its place."""
+        start, work = self.start, {}
+        yd, strength = start.yd + start.dt * motion.ydd, start.scene.values["motor_strength"]
+        for cluster in actuated_clusters(start.scene.mechanism, start.kinematics):
+            speed = cluster.W @ yd[cluster.rows]
+            for i, (place, motor) in enumerate(zip(cluster.places, cluster.motors, strict=True)):
+                torque, full = self.force.windings[place].at(motion.ydd), strength * supply.line(place, motor)
+                work[place] = Work(torque, speed[i], self.force.on_line.get(place, SX(0)) * full)
+        return work
+
     def _load_after(self, motion: Motion) -> SX:
-        if motion.articulation is None:
+        """Return the field `motor_load` after the step; as it was if the inertias of the recursion are unknown."""
+        scene, articulation = self.start.scene, motion.articulation
+        if articulation is None:
             return self.load
-        return carried_after(self.start.scene, self.start.kinematics, self.force, motion.articulation.inertia, motion)
+        places = loaded_motors(scene.mechanism.robot, scene.options.motors)
+        torques, loads = SX(len(places), 1), SX(len(places), 1)
+        for cluster in actuated_clusters(scene.mechanism, self.start.kinematics) if places else ():
+            external = self._external(cluster, articulation.inertia[cluster.index], motion)
+            for i, place in enumerate(cluster.places):
+                if place in places:
+                    torques[places.index(place)] = self.force.windings[place].at(motion.ydd)
+                    loads[places.index(place)] = external[i]
+        return ca.vertcat(torques, loads, 1) if places else SX(0, 1)
+
+    def _external(self, cluster: Actuated, inertia: SX, motion: Motion) -> SX:
+        """Return the torques of the rest of the robot on the rotors of a cluster [N m], shape (n_motors,).
+
+        Args:
+            cluster: The cluster.
+            inertia: Of the cluster, without what acts on its coordinates, shape (d, d).
+            motion: The acceleration.
+        """
+        rows, d = cluster.rows, len(cluster.joints)
+        ydd = motion.ydd[rows]
+        on_rows = inertia @ ydd - (self.force.tau[rows] - self.force.slope[rows, rows] @ ydd)
+        on_motors = effort_matrix(cluster.W[:, :d]) @ on_rows[:d]
+        for i in range(len(cluster.motors)):
+            stretch = ca.sparsify(cluster.W[i, d:])
+            for column in stretch.sparsity().get_col():
+                on_motors[i] = on_rows[d + column] / stretch[column]
+        return on_motors
 
     def output(self, name: str, motion: Motion, after: State) -> SX:
         """Return an output of the motors, given the state at the end of the step."""
         mechanism, kinematics = self.start.scene.mechanism, self.start.kinematics
         yd, robot = after.v[mechanism.robot.layout.joints_v :], mechanism.robot
-        torque = (self.force.tau - self.force.slope @ motion.ydd)[: len(robot.commanded)]
+        torque = self.force.at(motion.ydd)[: len(robot.commanded)]
         if name == "motor_speed":
             return ca.vertcat(SX(0, 1), *[c.W @ yd[c.rows] for c in actuated_clusters(mechanism, kinematics)])
         if name == "motor_torque":
-            return winding_torques(mechanism, kinematics, self.force, torque, motion)
+            return self._winding_torques(torque, motion)
         if name == "power":
             return torque * (encoder_map(mechanism, kinematics) @ yd)
         if name in ("winding_temperature", "battery_voltage"):
@@ -195,3 +255,14 @@ class MotorForces(LinearForce):
                 else ca.vertcat(SX(0, 1), *supply.temperatures(robot.motors))
             )
         return torque
+
+    def _winding_torques(self, torque: SX, motion: Motion) -> SX:
+        """Return the torque of each motor [N m], shape (n_motors,); of ideal motors the share of the joint torque."""
+        mechanism = self.start.scene.mechanism
+        torques = SX(len(mechanism.robot.motors), 1)
+        for cluster in actuated_clusters(mechanism, self.start.kinematics):
+            shares = effort_matrix(cluster.W[:, : len(cluster.joints)]) @ torque[cluster.joints]
+            for i, place in enumerate(cluster.places):
+                winding = self.force.windings.get(place)
+                torques[place] = shares[i] if winding is None else winding.at(motion.ydd)
+        return torques

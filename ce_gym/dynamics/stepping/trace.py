@@ -10,10 +10,10 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
-from ce_gym.dynamics.drives.stretch import stretching
 from ce_gym.dynamics.forces.scene import StepOptions, target_names
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import AFTER, MOVED, OFF, combined, error_estimate, step_errors
+from ce_gym.dynamics.laws.drive_meshes import stretching
 from ce_gym.dynamics.laws.scene_laws import culled_rows, iterate_size, moment_of, symbolic_state
 from ce_gym.dynamics.laws.scene_parameters import make_scene, parameter_defaults
 from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
