@@ -21,8 +21,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.electric.cogging import cogging
-from ce_gym.dynamics.electric.supply import Supply
+from ce_gym.dynamics.forces.cogging import cogging
 from ce_gym.dynamics.forces.dry_friction import STICK_SPEED, dry_friction, has_dry_friction
 from ce_gym.dynamics.forces.linear import JointForce, is_moment
 from ce_gym.dynamics.forces.motors import (
@@ -36,6 +35,7 @@ from ce_gym.dynamics.forces.motors import (
 )
 from ce_gym.dynamics.forces.saturation import SaturatedForce, Saturation, Stick
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
+from ce_gym.dynamics.forces.supply import Supply
 from ce_gym.dynamics.parameters import with_declared_friction
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.dynamics.state import State

@@ -11,7 +11,7 @@ from typing import Protocol, TypeAlias
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.electric.supply import Supply
+from ce_gym.dynamics.forces.supply import Supply
 from ce_gym.dynamics.state import State
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import DriveFriction, Motor

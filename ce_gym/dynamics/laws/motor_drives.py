@@ -27,8 +27,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.electric.cogging import cogging_energy
-from ce_gym.dynamics.electric.supply import Supply, Work
 from ce_gym.dynamics.forces.actuation import (
     Actuated,
     MotorState,
@@ -37,11 +35,13 @@ from ce_gym.dynamics.forces.actuation import (
     encoder_map,
     limit_count,
 )
+from ce_gym.dynamics.forces.cogging import cogging_energy
 from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.motor_control import MotorControl, motor_springs
 from ce_gym.dynamics.forces.motors import MOTORS, lagging_motors, loaded_motors, supply_of, warm_motors
 from ce_gym.dynamics.forces.saturation import ITERATIONS, SaturatedForce
 from ce_gym.dynamics.forces.scene import target_names
+from ce_gym.dynamics.forces.supply import Supply, Work
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.parameters import Parameter, unit_factor

@@ -30,9 +30,9 @@ def cogging(harmonics: Iterable[Harmonic], angle: SX, speed: SX, dt: SX | float)
         speed: Of its rotor [rad/s].
         dt: Length of the step [s].
     """
-    torque, stiffness, way = SX(0), SX(0), dt * speed
+    torque, stiffness, turn = SX(0), SX(0), dt * speed
     for order, size, phase in harmonics:
-        half, middle = order * way / 2, order * (angle + way / 2) + phase
+        half, middle = order * turn / 2, order * (angle + turn / 2) + phase
         share, slope = _mean(half)
         torque -= size * ca.sin(middle) * share
         stiffness += size * order * (ca.cos(middle) * share + ca.sin(middle) * slope)
