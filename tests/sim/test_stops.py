@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ce_gym
-from ce_gym.dynamics.forces.passive import LIMIT_FREQUENCY, stop_springs
+from ce_gym.dynamics.forces.stops import LIMIT_FREQUENCY, stop_springs
 from ce_gym.model import Body, ContactSphere, Inertial, Joint, LinearConstraint, Placement, Robot
 
 STILL = (0.0, 0.0, 0.0)
