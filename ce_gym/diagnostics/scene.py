@@ -34,7 +34,7 @@ from ce_gym.envs.terms.registry import OWN
 from ce_gym.model.description import Robot
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.model.table import table_text
-from ce_gym.sim.kernels import select_contacts
+from ce_gym.sim.scene import select_contacts
 from ce_gym.sim.substeps import substeps
 
 TERMS = {

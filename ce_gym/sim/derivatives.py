@@ -23,9 +23,8 @@ from ce_gym.dynamics.stepping.halving import PART, subdivide_function
 from ce_gym.dynamics.stepping.linearization import REMEMBERED
 from ce_gym.dynamics.stepping.variables import LEFT, RETRIES, StepVariables
 from ce_gym.sim.derivative_kernels import load_gradient_kernel, load_linearization_kernel
-from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.simulator import Simulator
-from ce_gym.sim.substeps import DT, TIMES
+from ce_gym.sim.substeps import DT, TIMES, load_step_kernel
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
 
 

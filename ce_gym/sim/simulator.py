@@ -27,9 +27,9 @@ from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.ground_clearance import GroundClearance
 from ce_gym.sim.interruptible_runs import longest_run, run_substeps
-from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.scene import resolve_scene
 from ce_gym.sim.schema import Row, Steps, physics_rows
+from ce_gym.sim.substeps import load_step_kernel
 from ce_gym.sim.terrain import Terrain
 
 FAILURES = Row("failures", 0, "host", dtype="int64")

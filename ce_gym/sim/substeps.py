@@ -1,16 +1,18 @@
-"""The sub-steps of a scene as part of a kernel's program: the plan of its method, stage by stage."""
+"""The sub-steps of a scene as a kernel, or part of a kernel's program: the plan of its method, stage by stage."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 
-from ce_gym.compile import Buffer, Call, Lookup, Repeat, Step, While, scratch_buffers
+from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, Step, While, scratch_buffers
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import LOAD
+from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping import halving, step_size
 from ce_gym.dynamics.stepping.broad_phase import has_broad_phase
 from ce_gym.dynamics.stepping.ground_lookup import (
@@ -24,6 +26,8 @@ from ce_gym.dynamics.stepping.trace import NEAR, combination_function, iteration
 from ce_gym.dynamics.stepping.variables import UNFINISHED, StepVariables
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.calls import NONE, assign, call
+from ce_gym.sim.devices import Cpu, Device
+from ce_gym.sim.kernel_key import laws_key, model_key
 
 TIMES = "n_substeps"
 """Name of the run-time integer with the number of sub-steps."""
@@ -37,6 +41,30 @@ ITERATES = NEAR_ITERATE, ITERATE = "near_iterate", "iterate"
 """Names of the iterates of forces with a broad phase, zero between the stages of steps, and of all other forces."""
 UNCONVERGED = "unconverged"
 """Name of the buffer that says whether a robot needs another iteration."""
+
+
+def load_step_kernel(
+    model: Model, options: StepOptions, outputs: tuple[str, ...], dtype: str, device: Device | None = None
+) -> Any:
+    """Compile, or load from the cache, the kernel that repeats a sub-step.
+
+    Args:
+        model: The robot at a transmission level.
+        options: The scene.
+        outputs: Quantities to compute besides the state.
+        dtype: "float64" or "float32".
+        device: Device of the kernel; the CPU if None.
+    """
+
+    def build() -> tuple[Program]:
+        sizes, further, steps = substeps(model.mechanism, options, outputs)
+        joints = sizes.pop("target", 0)
+        buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()]
+        buffers += [Buffer("target", joints, "rows_in")] if joints else []
+        return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
+
+    key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r}"
+    return (device or Cpu()).kernel(key, build, dtype)
 
 
 def substeps(

@@ -9,9 +9,8 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.step_size import control_sizes
 from ce_gym.sim.ground_clearance import GroundClearance
-from ce_gym.sim.kernels import load_step_kernel
 from ce_gym.sim.schema import FIRST
-from ce_gym.sim.substeps import FRAME, HEIGHTS
+from ce_gym.sim.substeps import FRAME, HEIGHTS, load_step_kernel
 from ce_gym.sim.tiles import tiles, write_rows
 
 

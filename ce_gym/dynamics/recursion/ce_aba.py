@@ -37,8 +37,7 @@ from ce_gym.dynamics.algebra.spatial import (
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, solve_turning
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
-from ce_gym.dynamics.recursion.reflected import diagonal_bias
-from ce_gym.dynamics.recursion.rotors import transverse_inertia
+from ce_gym.dynamics.recursion.rotors import diagonal_bias, transverse_inertia
 from ce_gym.dynamics.recursion.stretched import Stretched, stretches
 from ce_gym.model.clusters import Cluster
 from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody, snapped

@@ -14,8 +14,7 @@ from ce_gym.dynamics.algebra.spatial import SX, cross, turning_force
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.recursion.ce_aba import gravity_acceleration
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
-from ce_gym.dynamics.recursion.reflected import diagonal_bias
-from ce_gym.dynamics.recursion.rotors import transverse_inertia
+from ce_gym.dynamics.recursion.rotors import diagonal_bias, transverse_inertia
 from ce_gym.model.mechanism import Mechanism
 
 
@@ -103,7 +102,7 @@ def inward_force_pass(
 def _reflected(mechanism: Mechanism, coordinates: ClusterCoordinates, k: int, qdd: SX) -> SX:
     """Return the torque of the reflected inertia: of the whole block, or its diagonal at the armature level, (d,).
 
-    With closed loops `G_r` varies, which adds velocity terms, see reflected.py.
+    With closed loops `G_r` varies, which adds velocity terms, see rotors.py.
     """
     G, index, cluster = coordinates.G, coordinates.index, mechanism.tree.clusters[k]
     independent = [index[name] for name in cluster.independent]

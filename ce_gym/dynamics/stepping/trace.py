@@ -10,16 +10,16 @@ import casadi as ca
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.closure import closures
-from ce_gym.dynamics.forces.scene import StepOptions, target_names
+from ce_gym.dynamics.forces.scene import Scene, StepOptions, target_names
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import AFTER, MOVED, OFF, combined, error_estimate, step_errors
 from ce_gym.dynamics.laws.drive_meshes import stretching
-from ce_gym.dynamics.laws.scene_laws import culled_rows, iterate_size, moment_of, symbolic_state
+from ce_gym.dynamics.laws.law import Start
+from ce_gym.dynamics.laws.scene_laws import culled_rows, iterate_size, moment_of, scene_laws, symbolic_state
 from ce_gym.dynamics.laws.scene_parameters import make_scene, parameter_defaults
-from ce_gym.dynamics.recursion.derived import loop_gap, loop_state
+from ce_gym.dynamics.recursion.derived import kinetic_and_potential, loop_gap, loop_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.state import State
-from ce_gym.dynamics.stepping.energy import mechanical_energy
 from ce_gym.dynamics.stepping.step import Stepped, iteration, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
 from ce_gym.dynamics.stepping.variables import StepVariables
@@ -209,6 +209,21 @@ def weighted(weights: Mapping[str, float], values: Mapping[str, SX]) -> SX:
     if len(set(weights.values())) == 1:
         return next(iter(weights.values())) * sum((values[name] for name in weights), SX(0))
     return sum((weight * values[name] for name, weight in weights.items()), SX(0))
+
+
+def mechanical_energy(scene: Scene, state: State, target: SX) -> SX:
+    """Return the kinetic and potential energy of the robot, and the energies of all force laws [J].
+
+    Without motors nothing in the scene can give energy to the robot, so this sum must not grow.
+
+    Args:
+        scene: The robot and its surroundings.
+        state: Of the robot.
+        target: Targets or torques in the order of `target_names`, shape (n_targets,).
+    """
+    start = Start(scene, state, target, 0.0)
+    total = sum(kinetic_and_potential(scene.mechanism, state.q, state.v, state.dependent), SX(0))
+    return sum((law.energy(start) for law in scene_laws(scene.mechanism, scene.options)), total)
 
 
 def furthest(mechanism: Mechanism, v: SX, dt: SX | float) -> SX:
