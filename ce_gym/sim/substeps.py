@@ -168,7 +168,7 @@ def look_up(mechanism: Mechanism, options: StepOptions, state: Mapping[str, str]
     touching = touching_function(mechanism, options)
     if touching is not None:
         yield call(touching, {**state, **contacts})
-        yield Lookup(HEIGHTS, FRAME, "touching", "found")
+        yield Lookup(HEIGHTS, FRAME, "touching", "touching_ground")
         yield call(planes_function(mechanism, options), contacts, contacts)
     if options.hulls:
         yield call(hull_places_function(mechanism, options), state)

@@ -61,11 +61,11 @@ def dry_friction(
     slowest = ca.fmin(STICK_SPEED, dt * (STICK_ACCELERATION_ALONE if alone else STICK_ACCELERATION))
     damping = SX(friction) / (STICK_SPEED if is_moment(dt) else ca.if_else(rests, slowest, STICK_SPEED))
     ends = JointForce(SX(friction), still), JointForce(SX(-friction), still)
-    one = Saturation.about(iterate, place, JointForce(-damping * speed, dt * damping * turning), *ends)
+    torque = Saturation.about(iterate, place, JointForce(-damping * speed, dt * damping * turning), *ends)
     if is_moment(dt):
-        return one, rests, damping
-    expected = ca.if_else(iterate[-1] > 0, one.expected, ca.if_else(rests, 0, one.expected))
-    return replace(one, expected=expected), rests, damping
+        return torque, rests, damping
+    expected = ca.if_else(iterate[-1] > 0, torque.expected, ca.if_else(rests, 0, torque.expected))
+    return replace(torque, expected=expected), rests, damping
 
 
 def stand_still(
@@ -86,29 +86,39 @@ def stand_still(
         v: Velocities after the step.
         dt: Length of the step [s].
     """
-    layout, stretches = mechanism.robot.layout, len(mechanism.robot.independent) - len(mechanism.robot.commanded)
+    robot, layout = mechanism.robot, mechanism.robot.layout
     first_q, first_v = layout.joints_q, layout.joints_v
-    for rows in kinematics.rows:
-        rows = [row - first_v for row in rows if row >= first_v]
-        own = [one for one in frictions if ca.sparsify(one.turning[rows]).nnz()] if rows else []
-        whole = SX(0)
-        if len(own) >= len(rows) > 0:
-            ways = [ca.if_else(one.sticks, one.turning[rows] / ca.norm_2(one.turning[rows]), 0) for one in own]
-            whole = ca.det(sum((way.T @ way for way in ways), SX(len(rows), len(rows)))) > INDEPENDENT
-        for one in own:
-            columns = ca.sparsify(one.turning[rows]).sparsity().get_col()
-            held = [rows[columns[0]]] if len(columns) == 1 else []
-            for row in held:
-                q[first_q + row] = ca.if_else(one.sticks, before[first_q + row], q[first_q + row])
-                v[first_v + row] = ca.if_else(ca.logic_and(one.sticks, one.rests), 0, v[first_v + row])
-            stretch = [rows[j] for j in columns if rows[j] >= len(mechanism.robot.commanded)]
-            if stretches and len(stretch) == 1 and len(columns) > 1:
-                row = stretch[0]
-                others = one.turning @ v[first_v:] - one.turning[row] * v[first_v + row]
-                takes = ca.logic_and(one.sticks, one.rests)
-                v[first_v + row] = ca.if_else(takes, -others / one.turning[row], v[first_v + row])
-                q[first_q + row] = ca.if_else(takes, before[first_q + row] + dt * v[first_v + row], q[first_q + row])
-        rest = ca.logic_and(whole, sum((one.sticks * ca.logic_not(one.rests) for one in own), SX(0)) < 0.5)
-        for row in rows if len(own) >= len(rows) else ():
-            q[first_q + row] = ca.if_else(whole, before[first_q + row], q[first_q + row])
-            v[first_v + row] = ca.if_else(rest, 0, v[first_v + row])
+    for rows_of_v in kinematics.rows:
+        rows = [row - first_v for row in rows_of_v if row >= first_v]
+        acting = [friction for friction in frictions if ca.sparsify(friction.turning[rows]).nnz()] if rows else []
+        may_stand = len(acting) >= len(rows) > 0
+        stands = _stands(acting, rows) if may_stand else SX(0)
+        for friction in acting:
+            sticks, rests = friction.sticks, ca.logic_and(friction.sticks, friction.rests)
+            columns = ca.sparsify(friction.turning[rows]).sparsity().get_col()
+            if len(columns) == 1:
+                row = rows[columns[0]]
+                q[first_q + row] = ca.if_else(sticks, before[first_q + row], q[first_q + row])
+                v[first_v + row] = ca.if_else(rests, 0, v[first_v + row])
+            stretch = [rows[column] for column in columns if rows[column] >= len(robot.commanded)]
+            if len(stretch) == 1 and len(columns) > 1:
+                row, ratio = stretch[0], friction.turning[stretch[0]]
+                speed_of_joints = friction.turning @ v[first_v:] - ratio * v[first_v + row]
+                v[first_v + row] = ca.if_else(rests, -speed_of_joints / ratio, v[first_v + row])
+                q[first_q + row] = ca.if_else(rests, before[first_q + row] + dt * v[first_v + row], q[first_q + row])
+        if may_stand:
+            stopping = sum((friction.sticks * ca.logic_not(friction.rests) for friction in acting), SX(0))
+            rest = ca.logic_and(stands, stopping < 0.5)
+            for row in rows:
+                q[first_q + row] = ca.if_else(stands, before[first_q + row], q[first_q + row])
+                v[first_v + row] = ca.if_else(rest, 0, v[first_v + row])
+
+
+def _stands(frictions: list[Stick], rows: list[int]) -> SX:
+    """Return 1 if frictions stick along as many independent directions as there are rows of joints, else 0."""
+    directions = [friction.turning[rows] for friction in frictions]
+    units = [
+        ca.if_else(friction.sticks, direction / ca.norm_2(direction), 0)
+        for friction, direction in zip(frictions, directions, strict=True)
+    ]
+    return ca.det(sum((unit.T @ unit for unit in units), SX(len(rows), len(rows)))) > INDEPENDENT

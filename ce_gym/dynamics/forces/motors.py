@@ -64,19 +64,19 @@ class Ideal:
         return ((limit, SX(0)), (-limit, SX(0))) if math.isfinite(motor.torque) else None
 
     def damping(self, motor: Motor, speed: SX) -> SX:
-        """Return none."""
+        """Return no damping."""
         return SX(0)
 
     def friction(self, motor: Motor) -> float:
-        """Return none."""
+        """Return no friction."""
         return 0.0
 
     def drive_friction(self, motor: Motor) -> None:
-        """Return none."""
+        """Return no friction."""
         return None
 
     def bandwidth(self, motor: Motor) -> float:
-        """Return that it gives torque at once."""
+        """Return an infinite bandwidth."""
         return math.inf
 
 
@@ -114,11 +114,11 @@ class Limited:
         return motor.friction
 
     def drive_friction(self, motor: Motor) -> DriveFriction | None:
-        """Return the motor's own."""
+        """Return the friction of the motor's description."""
         return motor.drive_friction
 
     def bandwidth(self, motor: Motor) -> float:
-        """Return the motor's own."""
+        """Return the bandwidth of the motor's description."""
         return motor.bandwidth
 
 
@@ -160,26 +160,26 @@ def caught_up(bandwidth: float, dt: float) -> SX:
     return SX(dt / (1 / (2 * math.pi * bandwidth) + dt))
 
 
-def most_friction(constant: float | SX, drive: DriveFriction | None, speed: SX, carried: tuple[SX, ...]) -> float | SX:
+def most_friction(constant: float | SX, drive: DriveFriction | None, speed: SX, load: tuple[SX, ...]) -> float | SX:
     """Return the largest dry friction of a motor [N m], see `DriveFriction`.
 
     Args:
         constant: Friction at any speed and load [N m].
         drive: Friction at rest and under load.
         speed: Of the rotor [rad/s].
-        carried: Torque of the motor and torque of all else on the rotor [N m]; empty if no friction depends on them.
+        load: Torque of the motor and torque of all else on the rotor [N m]; empty if no friction depends on them.
     """
     if drive is None:
         return constant
     total, at_rest = SX(0), SX(drive.stribeck)
-    if carried:
-        motor, other = carried
-        total += ca.fabs(drive.load_motor * motor - drive.load_external * other)
-        at_rest += ca.fabs(drive.stribeck_load_motor * motor - drive.stribeck_load_external * other)
+    if load:
+        motor, external = load
+        total += ca.fabs(drive.load_motor * motor - drive.load_external * external)
+        at_rest += ca.fabs(drive.stribeck_load_motor * motor - drive.stribeck_load_external * external)
         losses = 1 / drive.efficiency - 1, 1 - drive.backdriving_efficiency
-        total += _by_direction(motor, other, *[loss * ca.fabs(other) for loss in losses])
-        squares = drive.stribeck_square_external * other**2, drive.stribeck_square_motor * motor**2
-        at_rest += _by_direction(motor, other, *squares)
+        total += _by_direction(motor, external, *[loss * ca.fabs(external) for loss in losses])
+        squares = drive.stribeck_square_external * external**2, drive.stribeck_square_motor * motor**2
+        at_rest += _by_direction(motor, external, *squares)
     if ca.sparsify(at_rest).nnz():
         share = ca.fabs(speed) / drive.stribeck_speed
         if drive.stribeck_exponent < 1:
@@ -188,9 +188,9 @@ def most_friction(constant: float | SX, drive: DriveFriction | None, speed: SX, 
     return constant + drive.factor * total
 
 
-def _by_direction(motor: SX, other: SX, driving: SX, driven: SX) -> SX:
-    """Return one of two where a motor carries something, as it drives or is driven back; else 0."""
+def _by_direction(motor: SX, external: SX, driving: SX, driven: SX) -> SX:
+    """Return `driving` where a motor drives a load, `driven` where the load drives it back, else 0."""
     if not ca.sparsify(ca.vertcat(driving, driven)).nnz():
         return SX(0)
-    ahead = ca.fabs(motor) - ca.fabs(other)
-    return ca.if_else(motor * other <= 0, ca.if_else(ahead > 0, driving, ca.if_else(ahead < 0, driven, 0)), 0)
+    ahead = ca.fabs(motor) - ca.fabs(external)
+    return ca.if_else(motor * external <= 0, ca.if_else(ahead > 0, driving, ca.if_else(ahead < 0, driven, 0)), 0)

@@ -37,8 +37,10 @@ class Saturation:
     @staticmethod
     def about(iterate: SX, place: int, asked: JointForce, high: JointForce, low: JointForce) -> Saturation:
         """Return a torque with its expected value in an iterate; in the first iteration at zero acceleration."""
-        one = Saturation(asked, high, low, asked.tau)
-        return replace(one, expected=ca.if_else(iterate[-1] > 0, iterate[place], asked.tau)) if one.answers else one
+        first = Saturation(asked, high, low, asked.tau)
+        if not first.answers:
+            return first
+        return replace(first, expected=ca.if_else(iterate[-1] > 0, iterate[place], asked.tau))
 
     @property
     def answers(self) -> bool:
@@ -121,19 +123,19 @@ class SaturatedForce(JointForce):
     def check(self, motion: Motion) -> SX:
         """Return 1 if a torque is at another limit than was assumed; else 0."""
         changed = SX(0)
-        for one in self.limited.values():
-            if one.answers:
-                after = one.after(motion.ydd)
-                elsewhere = ca.logic_or(after.at_high != one.at_high, after.at_low != one.at_low)
+        for torque in self.limited.values():
+            if torque.answers:
+                after = torque.after(motion.ydd)
+                elsewhere = ca.logic_or(after.at_high != torque.at_high, after.at_low != torque.at_low)
                 changed = ca.logic_or(changed, elsewhere)
         return changed
 
     def next_iterate(self, motion: Motion) -> SX:
         """Return the iterate for another iteration, shape (size,)."""
         iterate = SX(self.size, 1)
-        for place, one in self.limited.items():
-            if one.answers:
-                iterate[place] = one.after(motion.ydd).expected
+        for place, torque in self.limited.items():
+            if torque.answers:
+                iterate[place] = torque.after(motion.ydd).expected
         if self.size:
             iterate[-1] = self.count
         return iterate

@@ -136,16 +136,16 @@ def pair_between(
         normal: Law of the force.
         dt: Step length [s].
     """
-    axes = [[constant(np.array(end)) for end in (one.start, one.end)] for one in capsules]
+    axes = [[constant(np.array(end)) for end in (capsule.start, capsule.end)] for capsule in capsules]
     placed = [[body.point_position(end) for end in axis] for axis, body in zip(axes, bodies, strict=True)]
-    shares = nearest(*placed[0], *placed[1], long=tuple(one.start != one.end for one in capsules))
+    shares = nearest(*placed[0], *placed[1], long=tuple(capsule.start != capsule.end for capsule in capsules))
     points = [a + share * (b - a) for (a, b), share in zip(axes, shares, strict=True)]
     apart = bodies[0].point_position(points[0]) - bodies[1].point_position(points[1])
     distance = ca.sqrt(ca.sumsqr(apart) + APART**2)
     n = apart / distance
     first, second = (
-        Ends(one.body, body, point, body.R.T @ (way * n))
-        for one, body, point, way in zip(capsules, bodies, points, (1, -1), strict=True)
+        Ends(capsule.body, body, point, body.R.T @ (sign * n))
+        for capsule, body, point, sign in zip(capsules, bodies, points, (1, -1), strict=True)
     )
     closing = first.along(first.body.v) + second.along(second.body.v)
     depth = capsules[0].radius + capsules[1].radius - distance
@@ -234,19 +234,19 @@ def solve_pair_forces(
     """
     n, near = len(pairs), pairs[0].law.near
     left = {k: _apart(u, forces) for k, u in articulation.u.items()}
-    found, acting = SX(n, n + 1), replace(articulation, u={}, stretched={})
+    gains, acting = SX(n, n + 1), replace(articulation, u={}, stretched={})
     for k, (Y, u) in left.items():
         if Y.nnz():
-            own = u - articulation.U[k].T @ _carried(mechanism, kinematics, articulation, k)
-            found += Y.T @ solve_positive_definite(articulation.D[k], ca.horzcat(Y, own))
+            free = u - articulation.U[k].T @ _carried(mechanism, kinematics, articulation, k)
+            gains += Y.T @ solve_positive_definite(articulation.D[k], ca.horzcat(Y, free))
     if articulation.base is not None:
         inertia, (Y, wrench) = articulation.base[0], _apart(articulation.base[1], forces)
         wrenches = ca.horzcat(Y, wrench)
         at_once = momentum is None
         of_base = solve_positive_definite(inertia, wrenches) if at_once else solve_turning(inertia, momentum, wrenches)
-        found += Y.T @ of_base
-    W, gains = found[:, :n], found[:, n]
-    start = [pair.normal_after(_normal(pair.law.dt * gains[i])) for i, pair in enumerate(pairs)]
+        gains += Y.T @ of_base
+    W, free_gains = gains[:, :n], gains[:, n]
+    start = [pair.normal_after(_normal(pair.law.dt * free_gains[i])) for i, pair in enumerate(pairs)]
     slopes = ca.vertcat(*[pair.law.dt * pair.normal_slope for pair in pairs])
     pressed = eliminated(SX.eye(n) + ca.diag(slopes) @ W, ca.vertcat(*start))
     acting.u = {k: where(near, u + Y @ pressed, u) for k, (Y, u) in left.items()}

@@ -104,13 +104,13 @@ def _tied_burdens(mechanism: Mechanism) -> dict[str, _Burden]:
         load, inertia = added(g * x.load for g, x in moved), added(g**2 * x.inertia for g, x in moved)
         burdens[name] = _Burden(load, inertia)
     for name in (name for name in ratios if name not in robot.independent):
-        own = of_tree[name]
+        alone = of_tree[name]
         moving = [
             (max(g, SMALLEST_RATIO), burdens[y]) for y, g in zip(robot.independent, ratios[name], strict=True) if g
         ]
-        load = reduce(_smallest, [x.load / g for g, x in moving], math.inf) if moving else own.load
-        inertia = min((x.inertia / g**2 for g, x in moving), default=own.inertia)
-        burdens[name] = _Burden(_largest(own.load, load), inertia)
+        load = reduce(_smallest, [x.load / g for g, x in moving], math.inf) if moving else alone.load
+        inertia = min((x.inertia / g**2 for g, x in moving), default=alone.inertia)
+        burdens[name] = _Burden(_largest(alone.load, load), inertia)
     return burdens
 
 

@@ -225,11 +225,12 @@ class MeshForces(LinearForce):
 
     def next_iterate(self, motion: Motion, unconverged: SX) -> SX:
         """Return the accelerations of stretches to expect, and 1."""
-        found = motion.articulation
-        if not self.meshes or found is None:
+        articulation = motion.articulation
+        if not self.meshes or articulation is None:
             return self.iterate
         mechanism, kinematics = self.start.scene.mechanism, self.start.kinematics
-        resistances = stretch_resistances(mechanism, kinematics, found.D, found.inertia, self.others.slope)
+        inertias = articulation.D, articulation.inertia
+        resistances = stretch_resistances(mechanism, kinematics, *inertias, self.others.slope)
         expected = [mesh.free_acceleration(motion, resistances[mesh.row]) for mesh in self.meshes]
         return ca.if_else(unconverged, ca.vertcat(*expected, 1), self.iterate)
 
@@ -254,6 +255,7 @@ def stretch_resistances(
     for k, D in whole.items():
         for i, row in enumerate(row - base for row in kinematics.rows[k]):
             if row in with_sides:  # subtracting the slope of a stiff mesh would lose digits
-                own, others = bare[k][i, i] + slope[row, row], [j for j in range(D.shape[0]) if j != i]
-                resistances[row] = own - D[i, others] @ solve_positive_definite(D[others, others], D[others, i])
+                others = [j for j in range(D.shape[0]) if j != i]
+                alone = bare[k][i, i] + slope[row, row]
+                resistances[row] = alone - D[i, others] @ solve_positive_definite(D[others, others], D[others, i])
     return resistances

@@ -106,12 +106,12 @@ class JointFriction(PlacedForce):
         """Return the friction of a cluster and its direction, a unit vector of the independent joints, shape (1, d)."""
         coordinates = self.start.kinematics.coordinates[cluster.index]
         assert coordinates is not None
-        ways = {name: ca.sparsify(coordinates.G[coordinates.index[name], :]) for name in cluster.friction}
+        rows = {name: ca.sparsify(coordinates.G[coordinates.index[name], :]) for name in cluster.friction}
         if len(cluster.rows) == 1:
-            whole = sum((SX(friction) * ca.fabs(ways[name]) for name, friction in cluster.friction.items()), SX(0))
+            whole = sum((SX(friction) * ca.fabs(rows[name]) for name, friction in cluster.friction.items()), SX(0))
             return {self.start.scene.mechanism.robot.independent[cluster.rows[0]]: (whole, SX(1))}
-        lengths = {name: ca.sqrt(ca.sumsqr(way) + TINY) for name, way in ways.items()}
-        return {name: (lengths[name] * f, ways[name] / lengths[name]) for name, f in cluster.friction.items()}
+        lengths = {name: ca.sqrt(ca.sumsqr(row) + TINY) for name, row in rows.items()}
+        return {name: (lengths[name] * f, rows[name] / lengths[name]) for name, f in cluster.friction.items()}
 
 
 @dataclass

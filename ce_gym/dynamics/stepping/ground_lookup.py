@@ -59,27 +59,27 @@ def touching_function(mechanism: Mechanism, options: StepOptions) -> ca.Function
 def _leaning(mechanism: Mechanism, options: StepOptions, slope: SX, round_ones: list[int]) -> tuple[dict[str, SX], SX]:
     """Return symbols of the pose, and x and y from centres to points where spheres touch planes, shape (2, m)."""
     given, kinematics = _posed(mechanism, options)
-    spheres, ways = contact_spheres(mechanism, options), [SX(2, 0)]
+    spheres, offsets = contact_spheres(mechanism, options), [SX(2, 0)]
     for i, column in zip(round_ones, ca.horzsplit(slope), strict=True):
         axis = kinematics.bodies[spheres[i].body].R @ constant(np.array(spheres[i].axis))
         normal = ca.vertcat(-column, 1) / ca.sqrt(1 + ca.sumsqr(column))
-        ways.append(-above_deepest(spheres[i].radius, spheres[i].rim, normal, axis, ca.dot(axis, normal))[:2])
-    return given, ca.horzcat(*ways)
+        offsets.append(-above_deepest(spheres[i].radius, spheres[i].rim, normal, axis, ca.dot(axis, normal))[:2])
+    return given, ca.horzcat(*offsets)
 
 
 def planes_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
     """Trace the contact planes of spheres.
 
     Returns:
-        Function (places, ground, touching, found) -> ground, shape (3 n_contacts,): height of the contact plane under
-        each centre [m] and its slopes. `found` are the height and slopes at `touching`, shape (3 m,).
+        Function (places, ground, touching, touching_ground) -> ground, shape (3 n_contacts,): height of the contact
+        plane under each centre [m] and its slopes. `touching_ground` are height and slopes at `touching`, shape (3 m,).
     """
     _, round_ones, places, ground = _spheres(mechanism, options)
-    touching, found = SX.sym("touching", 2, len(round_ones)), SX.sym("found", 3, len(round_ones))
+    touching, at_touching = SX.sym("touching", 2, len(round_ones)), SX.sym("touching_ground", 3, len(round_ones))
     planes = SX(ground)
-    planes[:, round_ones] = found
-    planes[0, round_ones] += ca.sum1(found[1:, :] * (places[:, round_ones] - touching))
-    given = {"places": places, "ground": ground, "touching": touching, "found": found}
+    planes[:, round_ones] = at_touching
+    planes[0, round_ones] += ca.sum1(at_touching[1:, :] * (places[:, round_ones] - touching))
+    given = {"places": places, "ground": ground, "touching": touching, "touching_ground": at_touching}
     return traced("planes", {name: ca.vec(value) for name, value in given.items()}, {"ground_next": ca.vec(planes)})
 
 
@@ -104,10 +104,10 @@ def hulls_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
     under, region_points = SX.sym("hull_ground", 3, points.shape[1]), []
     places, planes, first = [at], [ground], 0
     for hull in options.hulls:
-        own = slice(first, first + len(hull.points))
-        first = own.stop
+        part = slice(first, first + len(hull.points))
+        first = part.stop
         body = kinematics.bodies[hull.body]
-        for spot, depth, normal in hull_contacts(hull, body.R[2, :].T, points[2, own], under[:, own], ground[0, :]):
+        for spot, depth, normal in hull_contacts(hull, body.R[2, :].T, points[2, part], under[:, part], ground[0, :]):
             place = body.point_position(spot)
             region_points.append(spot)
             places.append(place[:2])
