@@ -16,7 +16,7 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.plan import MOVED
 from ce_gym.dynamics.laws.drive_meshes import mesh_energy
 from ce_gym.dynamics.laws.scene_parameters import make_scene
-from ce_gym.dynamics.stepping.trace import step_function
+from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.mechanism import LEVELS
 
@@ -210,6 +210,46 @@ def test_between_flanks_a_rotor_is_free_however_damped_they_are():
     step = stepper(Model(turntable(40.0, backlash=0.02, damping=1.0), "elastic"), 1e-4)
     assert step([0.0, -0.005], [0.0, 50.0], [0.0])["v_next"] @ [0.0, 1.0] == pytest.approx(50.0, rel=1e-12)
     assert step([0.0, 0.009], [0.0, 50.0], [0.0])["q_next"][1] == pytest.approx(0.01, abs=5e-4)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("damping", [0.0, 0.05])
+@pytest.mark.parametrize("name", ["one drive", "two drives"])
+def test_expected_accelerations_of_stretches_are_those_without_their_meshes(name: str, damping: float, side: int):
+    """A dense solve without the mesh, with the damping of motors and joints at the end of the step."""
+    k, d, gap, dt = 40.0, 0.02, 0.01, 0.004
+    N, inertia, robot = {
+        "one drive": (np.array([[RATIO]]), ROTOR, turntable(k, damping=d, backlash=2 * gap)),
+        "two drives": (
+            np.array([[3.0, 4.0], [3.0, -4.0]]),
+            2e-4,
+            elastic(differential(), k, damping=d, backlash=2 * gap),
+        ),
+    }[name]
+    n = len(N)
+    motors = tuple(replace(motor, damping=damping / (i + 1)) for i, motor in enumerate(robot.motors))
+    bodies = tuple(
+        replace(body, joint=replace(body.joint, damping=0.03 * (body.kind == "link"))) for body in robot.bodies
+    )
+    model = Model(replace(robot, motors=motors, bodies=bodies), "elastic")
+    x, yd, xd = side * np.array([0.012, 0.011])[:n], np.array([0.4, -0.3])[:n], np.array([0.2, -0.1])[:n]
+    tau = -side * N.T @ [2.0, 1.5][:n]  # turns the rotors away from the side at which they are
+    function = iteration_function(model.mechanism, StepOptions(dt, control="torque", motors="limited"))
+    start = {"q": [*np.zeros(n), *x], "v": [*yd, *xd], "diverged": 0.0, "target": tau}
+    result = function(**start, iterate=np.zeros(n + 1))
+    assert float(result["unconverged"])
+
+    J, v = np.hstack([N, np.eye(n)]), np.concatenate([yd, xd])  # speeds of rotors
+    on_links = np.diag([1.0] * n + [0.0] * n)
+    B = J.T @ np.diag([motor.damping for motor in motors]) @ J + 0.03 * on_links
+    A = LINK * on_links + inertia * J.T @ J + dt * B
+    b = np.hstack([np.eye(n), np.linalg.inv(N)]).T @ tau - B @ v
+    for i in range(n):
+        meshes = np.array([float(j != i) for j in range(n)])
+        slopes = np.diag([*np.zeros(n), *(meshes * dt * (dt * k + d))])
+        torques = np.concatenate([np.zeros(n), meshes * (k * (x - side * gap) + (dt * k + d) * xd)])
+        expected = np.linalg.solve(A + slopes, b - torques)[n + i]
+        assert float(result["iterate_next"][i]) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("figures", MESHES.values(), ids=MESHES)
