@@ -7,7 +7,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -52,13 +52,19 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def progress(items: Collection[T], label: str) -> Iterator[T]:
-    """Iterate over items with a progress bar on stderr, if that is a terminal and tqdm is installed."""
+def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+    """Iterate over items with a progress bar on stderr, if that is a terminal and tqdm is installed.
+
+    Args:
+        items: The items.
+        label: Label of the bar.
+        total: Number of items, if `len(items)` does not give it.
+    """
     try:
         from tqdm import tqdm
     except ImportError:
         return iter(items)
-    return iter(tqdm(items, label, leave=False, disable=None, dynamic_ncols=True))
+    return iter(tqdm(items, label, total, leave=False, disable=None, dynamic_ncols=True))
 
 
 def file_error(error: OSError) -> str:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ce_gym.learn.evaluate.crossing import cross, crossing_table, steering_command
+from ce_gym.learn.evaluate.crossing import cross, steering_command
+from ce_gym.learn.evaluate.tables import crossing_table
 from ce_gym.policies import Policy, PolicyError
 
 
@@ -41,7 +42,7 @@ def test_who_stands_neither_crosses_nor_falls():
     assert (result["crossed"], result["fell"], result["episodes"]) == (0.0, 0.0, 8)
     assert "levels" not in result
     assert cross(STAND, 8, 0, distance=-1.0, speed=-1.0)["crossed"] == 1.0  # who has nowhere to go is there
-    assert "| all   | 0.0%" in crossing_table(result)
+    assert "| all   | 0.0%    | 0.0% | 8        |" in crossing_table(result)
 
 
 def test_a_task_without_commands_is_refused():

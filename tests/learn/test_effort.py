@@ -8,9 +8,10 @@ import pytest
 from tripod import TRIPOD
 
 import ce_gym
-from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.learn.evaluate.effort import Drives, effort, largest_power
-from ce_gym.learn.evaluate.pushes import push_envelope, push_table
+from ce_gym.learn.evaluate.episodes import open_environments
+from ce_gym.learn.evaluate.pushes import push_envelope
+from ce_gym.learn.evaluate.tables import push_table
 from ce_gym.model import Elasticity
 from ce_gym.policies import Policy
 
@@ -47,23 +48,23 @@ def test_motors_turn_and_work_as_in_the_simulator(robot, stepped, level):
 
 
 @pytest.mark.parametrize(
-    ("torque", "stall", "velocity"), [(3.0, None, 240.0), (3.0, 5.0, 100.0), (3.0, 30.0, 100.0), (7.0, 2.0, 50.0)]
+    ("torque", "stall", "velocity"), [(3.0, 3.0, 240.0), (3.0, 5.0, 100.0), (3.0, 30.0, 100.0), (7.0, 2.0, 50.0)]
 )
 def test_the_largest_power_is_the_best_point_of_the_torque_speed_line(torque, stall, velocity):
     speed = np.linspace(0, velocity, 100_001)
-    given = np.minimum(torque, (stall or torque) * (1 - speed / velocity))
+    given = np.minimum(torque, stall * (1 - speed / velocity))
     assert largest_power(torque, stall, velocity) == pytest.approx((given * speed).max(), rel=1e-6)
 
 
 def test_an_unknown_motor_has_no_largest_power():
-    assert math.isinf(largest_power(math.inf, None, 10.0))
+    assert math.isinf(largest_power(math.inf, math.inf, 10.0))
 
 
 def policy(target, **kwargs):
     """A policy that holds one action, with the record of an environment."""
-    native = make_sb3_vec_env(WALKING, 1, **kwargs).envs.unwrapped
-    size = native.policy_spec()["observation"]["size"]
-    record = {"env": WALKING, "policy_spec": native.policy_spec(), "observation_size": size}
+    with open_environments(WALKING, 1, 0, **kwargs) as (envs, _):
+        spec = envs.unwrapped.policy_spec()
+    record = {"env": WALKING, "policy_spec": spec, "observation_size": spec["observation"]["size"]}
     return Policy(lambda obs: np.full((len(obs), 12), target, np.float32), record)
 
 
@@ -101,15 +102,15 @@ def test_a_robot_that_stands_costs_little_and_carries_its_weight():
 
 def test_sub_steps_show_peaks_that_control_steps_do_not():
     """Actions that change at every control step: the torque is largest right after a change."""
-    still, native = policy(0.0), make_sb3_vec_env(WALKING, 4, 0, command_period=1e6)
+    still = policy(0.0)
     rng = np.random.default_rng(0)
     restless = Policy(lambda obs: rng.uniform(-0.5, 0.5, (len(obs), 12)).astype(np.float32), still.record)
     found = effort(restless, episodes=4, seconds=1.0)
-    native.reset()
     seen = 0.0
-    for _ in range(50):
-        native.step(restless.predict(np.zeros((4, 48)))[0])
-        seen = max(seen, np.abs(native.envs.unwrapped.batch.rows("torque")).max() / (3.0 * 9.33))
+    with open_environments(WALKING, 4, 0, command_period=1e6) as (envs, _):
+        for _ in range(50):
+            envs.step(restless.predict(np.zeros((4, 48)))[0])
+            seen = max(seen, np.abs(envs.unwrapped.batch.rows("torque")).max() / (3.0 * 9.33))
     assert found["peak_torque"] > 1.05 * seen
 
 
@@ -129,5 +130,5 @@ def test_hard_pushes_throw_a_standing_robot_over():
     assert found["envelope"][1] == 0.2
     assert found["command"] == [0.5, 0.0, 0.0]
     text = push_table(found)
-    assert [line.split()[0] for line in text.splitlines()[1:5]] == ["forward", "left", "back", "right"]
+    assert [line.split()[1] for line in text.splitlines()[2:6]] == ["forward", "left", "back", "right"]
     assert "0.2 m/s" in text

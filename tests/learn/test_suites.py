@@ -10,10 +10,11 @@ import pytest
 from point_mass import ID, PointMassVectorEnv
 
 import ce_gym
+from ce_gym.__main__ import main
 from ce_gym.learn.evaluate.episodes import EVALUATION_SEED, LEVEL, weights_seed, without_curricula
 from ce_gym.learn.evaluate.evaluation import evaluate, report
-from ce_gym.learn.evaluate.evaluation import main as evaluate_main
-from ce_gym.learn.evaluate.suites import SUITES, Driver, suite_table
+from ce_gym.learn.evaluate.suites import SUITES, driver
+from ce_gym.learn.evaluate.tables import suite_table
 from ce_gym.policies import Actor, Policy, write_npz
 
 RANGES = np.array([[-1.0, 2.0], [-0.5, 0.5], [-0.7, 0.9]])
@@ -50,7 +51,7 @@ class Recorder:
 
 def driven(name, seconds=20.0):
     native = Recorder(500)
-    drive = Driver(SUITES[name], native, RANGES, seed=1)
+    drive = driver(SUITES[name], native, RANGES, seed=1)
     for step in range(round(seconds / DT)):
         drive(step)
     return np.array(native.commands), np.array(native.pushes)
@@ -76,14 +77,14 @@ def test_suites_ask_for_what_they_say():
 
 
 def test_who_is_never_sent_backwards_is_asked_to_stand():
-    drive = Driver(SUITES["backwards"], Recorder(3), np.array([[0.5, 1.0], [0, 0], [0, 0]]), seed=0)
-    assert not drive.low.any()
-    assert not drive.high.any()
+    native = Recorder(3)
+    driver(SUITES["backwards"], native, np.array([[0.5, 1.0], [0, 0], [0, 0]]), seed=0)(0)
+    assert not np.array(native.commands).any()
 
 
 def test_a_shipped_policy_is_judged_by_suite(capsys):
     """A robot that is told to stand moves less than one that is told to walk, and one that is pushed more."""
-    assert evaluate_main(["mini_cheetah_velocity", "--episodes", "8", "--suites", "--json"]) == 0
+    assert main(["evaluate", "mini_cheetah_velocity", "--episodes", "8", "--suites", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["seed"] == weights_seed(ce_gym.load_policy("mini_cheetah_velocity"))
     suites = result["suites"]
@@ -140,7 +141,7 @@ def test_a_task_without_commands_has_no_suites(tmp_path, capsys):
     layers = ((np.zeros((1, 2), "f4"), np.zeros(1, "f4")),)
     record = {"env": ID, "env_kwargs": {}, "transmission": "exact", "observation_size": 2, "action_size": 1}
     write_npz(Actor(layers, "Tanh"), record | {"activation": "Tanh", "policy_spec": {}}, tmp_path / "policy.npz")
-    assert evaluate_main([str(tmp_path / "policy.npz"), "--episodes", "2", "--suites"]) == 2
+    assert main(["evaluate", str(tmp_path / "policy.npz"), "--episodes", "2", "--suites"]) == 2
     error = capsys.readouterr().err
     assert "has no commanded velocities" in error
     assert error.count("\n") == 1

@@ -62,13 +62,13 @@ def evaluate(args: argparse.Namespace) -> int:
     """Evaluate, and print the results."""
     from ce_gym.learn.evaluate.crossing import cross
     from ce_gym.learn.evaluate.effort import effort
-    from ce_gym.learn.evaluate.evaluation import env_kwargs, load, report
+    from ce_gym.learn.evaluate.evaluation import load, report
     from ce_gym.learn.evaluate.evaluation import evaluate as evaluate_policy
     from ce_gym.learn.evaluate.pushes import push_envelope
     from ce_gym.learn.evaluate.suites import evaluate_suites
 
     policy = load(args.policy, args.env, args.transmission, args.env_args)
-    kwargs = env_kwargs(policy.record, args.transmission)
+    kwargs = policy.record["env_kwargs"]
     result = evaluate_policy(policy, policy.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
     seed = result["seed"]
     if motors := effort(policy, episodes=min(args.episodes, 32), seed=seed, **kwargs):
@@ -162,11 +162,11 @@ def add_sim2sim_command(subparsers: Any) -> None:
 def sim2sim(args: argparse.Namespace) -> int:
     """Compare, print, and return 0 if the policy passed."""
     from ce_gym.learn.evaluate.evaluation import load
-    from ce_gym.learn.evaluate.sim2sim import compare, table
+    from ce_gym.learn.evaluate.sim2sim import compare, comparison_table
 
     policy = load(args.policy, args.env, env_args=args.env_args)
     result = compare(policy, episodes=args.episodes, seconds=args.seconds, every=args.every, seed=args.seed)
-    print_result(result, table(result), args.json)
+    print_result(result, comparison_table(result), args.json)
     return 0 if result["passed"] else 1
 
 

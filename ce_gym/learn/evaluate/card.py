@@ -14,13 +14,15 @@ from typing import Any
 import gymnasium
 
 from ce_gym.console import Table, markdown
-from ce_gym.learn.evaluate.crossing import cross, crossing_table
+from ce_gym.learn.evaluate.crossing import cross
 from ce_gym.learn.evaluate.effort import effort
 from ce_gym.learn.evaluate.episodes import weights_seed
-from ce_gym.learn.evaluate.evaluation import evaluate, metrics
+from ce_gym.learn.evaluate.evaluation import evaluate
 from ce_gym.learn.evaluate.pictures import draw_curve
-from ce_gym.learn.evaluate.pushes import direction_name, push_envelope
-from ce_gym.learn.evaluate.suites import evaluate_suites, level_table, suite_table
+from ce_gym.learn.evaluate.pushes import push_envelope
+from ce_gym.learn.evaluate.sim2sim import compare, comparison_table
+from ce_gym.learn.evaluate.suites import evaluate_suites
+from ce_gym.learn.evaluate.tables import metrics, sections, table
 from ce_gym.learn.runs.progress import read_curve
 from ce_gym.learn.runs.settings import config_file, load_settings
 from ce_gym.learn.training import learner, learner_of
@@ -79,8 +81,6 @@ def card_results(policy: Policy, episodes: int, sim2sim_robots: int, levels: Seq
     if not sim2sim_robots:
         return result | {"sim2sim_missing": "not requested"}
     try:
-        from ce_gym.learn.evaluate.sim2sim import compare
-
         return result | {"sim2sim": compare(policy, episodes=sim2sim_robots, seed=seed)}
     except ImportError:
         return result | {"sim2sim_missing": "MuJoCo is not installed: pip install ce_gym[mjcf]"}
@@ -146,16 +146,14 @@ def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, f
         ["versions", versions],
     ]
     settings: Table = [["setting", "value"], *([key, str(value)] for key, value in record["settings"].items())]
+    trained = result["levels"].get(record["transmission"], {})
     parts = [
         f"# {name}",
-        f"{markdown(facts)}\n\n{_how_to_repeat(record)}",
+        markdown(facts),
+        _how_to_repeat(record),
         *(["![Learning curve](curve.png)"] if curve else []),
         f"## On transmission levels\n\n{_levels(record, result)}",
-        *_on_terrain(record, result["levels"]),
-        *_crossing(result),
-        *_suites(result),
-        *([f"## Motors\n\n{_motors(result['effort'])}"] if result["effort"] else []),
-        *([f"## Pushes\n\n{_pushes(result['pushes'])}"] if "pushes" in result else []),
+        *sections({**result, "levels": trained.get("levels")}),
         f"## In MuJoCo\n\n{_sim2sim(result)}",
         f"## Settings\n\n{markdown(settings)}",
     ]
@@ -170,80 +168,25 @@ def _how_to_repeat(record: dict[str, Any]) -> str:
 
 
 def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:
-    level, spec = record["transmission"], record["policy_spec"]
+    level, spec, finer = record["transmission"], record["policy_spec"], result["finer"]
     results = {f"`{name}`" + " (trained)" * (name == level): each for name, each in result["levels"].items()}
-    results[f"`{level}`, sub-steps of {1e3 * _shorter(spec)['dt']:g} ms"] = result["finer"]
-    rows: Table = []
-    for name, figures in results.items():
-        shown = _errors(figures) if figures["commanded"] else metrics(figures)
-        rows = rows or [["evaluated at", *shown, "falls", "reward"]]
-        last = (f"{figures['falls']:.1%}", f"{figures['reward']:.2f}")
-        rows.append([name, *(f"{figure:.3f}" for figure in shown.values()), *last])
-    count, length = figures["episodes"], spec["control_dt"]
-    note = "Mean absolute errors over every step" if figures["commanded"] else "Means, in SI units,"
-    note = f"{note} of {count} episodes of the mean action; a step is {length:g} s"
-    note = f"{note}, of sub-steps of {spec['physics_dt'] * 1e3:g} ms."
-    return f"{markdown(rows)}\n\n{note} Seed {result['seed']}: the first 32 bits of the SHA-256 of the weights."
-
-
-def _errors(figures: dict[str, Any]) -> dict[str, float]:
-    titles = {"forward [m/s]": "forward_error", "sideways [m/s]": "lateral_error", "yaw rate [rad/s]": "yaw_rate_error"}
-    return {title: figures[key] for title, key in titles.items()}
-
-
-def _suites(result: dict[str, Any]) -> list[str]:
-    """Return the section on suites of commands, if they were evaluated."""
-    if "suites" not in result:
-        return []
-    return [f"## With special commands\n\n{suite_table(result['suites'])}\n\nOn the level of training."]
-
-
-def _on_terrain(record: dict[str, Any], levels: dict[str, dict[str, Any]]) -> list[str]:
-    """Return the section on terrain levels, if the ground has levels."""
-    rows = levels.get(record["transmission"], {}).get("levels")
-    return [f"## On every level of the ground\n\n{level_table(rows)}"] if rows else []
-
-
-def _crossing(result: dict[str, Any]) -> list[str]:
-    """Return the section on crossing the ground, if it was evaluated."""
-    if "crossing" not in result:
-        return []
-    note = "Fraction of robots that walk this distance straight ahead without a fall, with the mean action"
-    table = crossing_table(result["crossing"])
-    return [f"## Across the ground\n\n{table}\n\n{note}; see `ce_gym.learn.evaluate.crossing`."]
-
-
-def _motors(effort: dict[str, Any]) -> str:
-    rows: Table = [["", ""], ["mean speed", f"{effort['speed']:.2f} m/s"], ["power", f"{effort['power']:.0f} W"]]
-    if effort["cost_of_transport"] is not None:
-        rows.append(["cost of transport", f"{effort['cost_of_transport']:.2f}"])
-        rows.append(["the same, braking recovered", f"{effort['cost_of_transport_net']:.2f}"])
-    for what in ("torque", "power"):
-        if effort[f"mean_{what}"] is not None:
-            peak = f"{effort[f'peak_{what}']:.0%} of its limit (`{effort[f'peak_{what}_at']}`)"
-            rows += [[f"mean {what} of a motor", f"{effort[f'mean_{what}']:.0%} of its limit"], [f"peak {what}", peak]]
-    return f"{markdown(rows)}\n\nMechanical, at the rotors, measured at every sub-step."
-
-
-def _pushes(pushes: dict[str, Any]) -> str:
-    rows: Table = [["pushed towards", *(f"{speed:g} m/s" for speed in pushes["speeds"])]]
-    for angle, row in zip(pushes["directions"], pushes["survived"], strict=True):
-        rows.append([direction_name(angle), *(f"{share:.0%}" for share in row)])
-    walking = f"{pushes['command'][0]:g} m/s forward"
-    return f"{markdown(rows)}\n\nShare on its feet after a sudden change of velocity, at {walking}."
+    results[f"`{level}`, sub-steps of {1e3 * _shorter(spec)['dt']:g} ms"] = finer
+    keys = ("forward_error", "lateral_error", "yaw_rate_error") if finer["commanded"] else tuple(metrics(finer))
+    rows = {name: each | metrics(each) for name, each in results.items()}
+    what = "Mean absolute errors over every step" if finer["commanded"] else "Means, in SI units,"
+    notes = (
+        f"{what} of {finer['episodes']} episodes of the mean action.",
+        f"A step is {spec['control_dt']:g} s, of sub-steps of {spec['physics_dt'] * 1e3:g} ms.",
+        f"Seed {result['seed']}: the first 32 bits of the SHA-256 of the weights.",
+        f"Other results are at level `{level}` unless named otherwise.",
+    )
+    return f"{table('evaluated at', rows, *keys, 'falls', 'reward')}\n\n{' '.join(notes)}"
 
 
 def _sim2sim(result: dict[str, Any]) -> str:
     if "sim2sim" not in result:
         return f"Not evaluated: {result['sim2sim_missing']}"
-    rows: Table = [["simulated by", "velocity error [m/s]", "yaw rate error [rad/s]", "falls", "verdict"]]
-    for name, figures in result["sim2sim"]["simulations"].items():
-        verdict = result["sim2sim"]["verdict"].get(name)
-        outcome = "" if verdict is None else "passed" if verdict["passed"] else "failed"
-        errors = [f"{figures[key]:.3f}" for key in ("velocity_error", "yaw_rate_error")]
-        rows.append([name, *errors, f"{figures['falls']:.1%}", outcome])
-    note = "Random commands, one for each robot; `python -m ce_gym sim2sim` prints the requirements."
-    return f"{markdown(rows)}\n\n{note}"
+    return f"{comparison_table(result['sim2sim'])} Commands are random, one for each robot."
 
 
 def short_name(record: dict[str, Any], task: str | None = None) -> str:

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import closing
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.adapters.sb3 import make_sb3_vec_env
-from ce_gym.console import Table, markdown
-from ce_gym.learn.evaluate.episodes import UNDISTURBED, run_policy, without_curricula
+from ce_gym.learn.evaluate.episodes import UNDISTURBED, open_environments, run_policy, without_curricula
 from ce_gym.policies import Policy, PolicyError
 
 Array = NDArray[np.float64]
@@ -53,42 +50,36 @@ def cross(
     Raises:
         PolicyError: If the task of the policy has no commands.
     """
-    record = policy.record
-    if "command" not in record["policy_spec"]:
-        raise PolicyError(f"crossing: {record['env']} has no commanded velocities; expected a task with them")
-    steps = math.ceil(PATIENCE * distance / speed / record["policy_spec"]["control_dt"])
-    arguments = without_curricula(record["env"], kwargs) | UNDISTURBED | {"max_episode_steps": steps + 1}
-    with closing(make_sb3_vec_env(record["env"], episodes, seed, **arguments)) as envs:
-        crossed, fell, level = _walk(policy, envs, steps, distance, speed, _middle(arguments.get("terrain")))
-    result = {**_shares(crossed, fell), "distance": distance, "speed": speed}
-    if level.size:
-        groups = [(number, level == number) for number in np.unique(level).tolist()]
-        result["levels"] = [{"level": number, **_shares(crossed[on], fell[on])} for number, on in groups]
+    env_id, spec = policy.record["env"], policy.record["policy_spec"]
+    if "command" not in spec:
+        raise PolicyError(f"crossing: {env_id} has no commanded velocities; expected a task with them")
+    steps = math.ceil(PATIENCE * distance / speed / spec["control_dt"])
+    arguments = without_curricula(env_id, kwargs) | UNDISTURBED | {"max_episode_steps": steps + 1}
+    with open_environments(env_id, episodes, seed, **arguments) as (envs, obs):
+        native: Any = envs.unwrapped
+        start = native.batch.rows("q")[:, :2].astype(float)
+        side = np.where(start[:, 1] > _middle(arguments.get("terrain")), -1.0, 1.0)
+        level = np.rint(native.batch.rows("level")[:, 0]).astype(int) if "level" in native.batch.schema else None
+        crossed, fell = np.zeros((2, episodes), bool)
+
+        def steer(_step: int) -> None:
+            q = native.batch.rows("q").astype(float)
+            crossed[:] |= ~fell & (side * (q[:, 1] - start[:, 1]) >= distance)
+            native.set_command(steering_command(q, start[:, 0], side, speed))
+
+        for step in run_policy(policy, envs, obs, steer, steps, "crossing"):
+            fell |= step.done & ~crossed
+            if (crossed | fell).all():
+                break
+
+    def shares(robots: Any = slice(None)) -> dict[str, Any]:
+        counts = {"crossed": float(crossed[robots].mean()), "fell": float(fell[robots].mean())}
+        return {**counts, "episodes": len(crossed[robots])}
+
+    result = {**shares(), "distance": distance, "speed": speed}
+    if level is not None:
+        result["levels"] = [{"level": number, **shares(level == number)} for number in np.unique(level).tolist()]
     return result
-
-
-def _walk(policy: Policy, envs: Any, steps: int, distance: float, speed: float, middle: float) -> tuple[NDArray, ...]:
-    """Return which robots crossed, which fell, and the level of each from 0, or no levels if the ground has none."""
-    native: Any = envs.envs.unwrapped
-    obs: Any = envs.reset()
-    start = native.batch.rows("q")[:, :2].astype(float)
-    side = np.where(start[:, 1] > middle, -1.0, 1.0)
-    level = np.empty(0, int)
-    if "level" in native.batch.schema:
-        level = np.rint(native.batch.rows("level")[:, 0]).astype(int)
-    crossed, fell = np.zeros(envs.num_envs, bool), np.zeros(envs.num_envs, bool)
-
-    def steer(_step: int) -> None:
-        nonlocal crossed
-        q = native.batch.rows("q").astype(float)
-        crossed |= ~fell & (side * (q[:, 1] - start[:, 1]) >= distance)
-        native.set_command(steering_command(q, start[:, 0], side, speed))
-
-    for dones, _ in run_policy(policy, envs, obs, steer, steps):
-        fell |= dones & ~crossed
-        if (crossed | fell).all():
-            break
-    return crossed, fell, level
 
 
 def steering_command(q: Array, line: Array, side: Array, speed: float) -> Array:
@@ -111,15 +102,3 @@ def _middle(terrain: Any) -> float:
     """Return y of the middle of a field of tiles [m]; 0 for other ground."""
     terrain = terrain if isinstance(terrain, Mapping) else {}
     return terrain.get("size", 8.0) * terrain.get("columns", 4) / 2 if terrain.get("kind") not in (None, "map") else 0.0
-
-
-def _shares(crossed: NDArray, fell: NDArray) -> dict[str, Any]:
-    return {"crossed": float(crossed.mean()), "fell": float(fell.mean()), "episodes": len(crossed)}
-
-
-def crossing_table(result: Mapping[str, Any]) -> str:
-    """Return a Markdown table with one line per terrain level and one line for all levels."""
-    rows: Table = [["level", f"crossed {result['distance']:g} m at {result['speed']:g} m/s", "fell", "robots"]]
-    for row in [*result.get("levels", ()), {"level": "all", **result}]:
-        rows.append([str(row["level"]), f"{row['crossed']:.1%}", f"{row['fell']:.1%}", str(row["episodes"])])
-    return markdown(rows)

@@ -8,7 +8,6 @@ way at every level.
 from __future__ import annotations
 
 import math
-from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +15,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.adapters.sb3 import make_sb3_vec_env
 from ce_gym.dynamics.model import Model
-from ce_gym.learn.evaluate.episodes import run_policy
+from ce_gym.learn.evaluate.episodes import UNLIMITED, open_environments, run_policy
 from ce_gym.policies import Policy
 
 Array = NDArray[np.float64]
@@ -60,21 +58,20 @@ class Drives:
         if not limits:
             joints = [(name, robot.body(name).joint) for name in robot.driven]
             limits = [(name, joint.torque, None, joint.velocity) for name, joint in joints]
-        names = tuple(name for name, *_ in limits)
+        names, torques, stalls, velocities = zip(*limits, strict=True)
+        stalls = [torque if stall is None else stall for torque, stall in zip(torques, stalls, strict=True)]
         function = exact.casadi_function("spanning")
         symbols = [ca.SX.sym(function.name_in(i), function.size1_in(i)) for i in range(function.n_in())]
-        spun = function.call(symbols)[1]
         rows = [6 + exact.spanning_names.index(name) for name in names]
-        W = ca.densify(ca.jacobian(spun[rows], symbols[1])[:, 6:])
-        same = not ca.depends_on(W, symbols[0])
+        W = ca.densify(ca.jacobian(function.call(symbols)[1][rows], symbols[1])[:, 6:])
         return cls(
             names=names,
-            torque=np.array([torque for _, torque, _, _ in limits]),
-            stall=np.array([torque if stall is None else stall for _, torque, stall, _ in limits]),
-            velocity=np.array([speed for *_, speed in limits]),
-            power=np.array([largest_power(torque, stall, speed) for _, torque, stall, speed in limits]),
+            torque=np.array(torques),
+            stall=np.array(stalls),
+            velocity=np.array(velocities),
+            power=np.array([largest_power(*limit) for limit in zip(torques, stalls, velocities, strict=True)]),
             speeds=ca.Function("W", [symbols[0], *symbols[2:]], [ca.vec(W)]),
-            constant=ca.evalf(W).full() if same else None,
+            constant=None if ca.depends_on(W, symbols[0]) else ca.evalf(W).full(),
         )
 
     def at_motors(self, model: Model, q: Array, yd: Array, tau: Array) -> tuple[Array, Array]:
@@ -86,20 +83,16 @@ class Drives:
             yd: Velocities of joints, then of elastic stretches [rad/s], shape (n, n_joints + n_stretches).
             tau: Torques of the motors at the joints [N m], shape (n, n_joints).
         """
-        (joints, stretched), own = np.split(yd, [tau.shape[1]], axis=1), self.own_speeds(model)
+        joints, stretches = np.split(yd, [tau.shape[1]], axis=1)
+        rotors = {elastic.stretch: elastic.rotor for elastic in model.robot.elastic}
+        stretched = np.array([rotors[name] for name in model.robot.independent if name in rotors], object)
+        relative = stretches @ (stretched[:, None] == np.array(self.names, object))
         if self.constant is not None:
-            return tau @ np.linalg.pinv(self.constant), joints @ self.constant.T + stretched @ own
+            return tau @ np.linalg.pinv(self.constant), joints @ self.constant.T + relative
         guess = [model.dependent_guess(q).T] if self.speeds.n_in() == 2 else []
         columns = ca.DM(self.speeds(q[:, : self.speeds.size1_in(0)].T, *guess)).full()
         W = columns.reshape(joints.shape[1], len(self.names), len(q)).transpose(2, 1, 0)
-        speed = np.einsum("nmj,nj->nm", W, joints) + stretched @ own
-        return np.einsum("nj,njm->nm", tau, np.linalg.pinv(W)), speed
-
-    def own_speeds(self, model: Model) -> NDArray[np.bool_]:
-        """Return which motor each elastic stretch belongs to, shape (n_stretches, n_motors)."""
-        rotors = {elastic.stretch: elastic.rotor for elastic in model.robot.elastic}
-        turned = [rotors[name] for name in model.robot.independent if name in rotors]
-        return np.array(turned, object)[:, None] == np.array(self.names, object)
+        return np.einsum("nj,njm->nm", tau, np.linalg.pinv(W)), np.einsum("nmj,nj->nm", W, joints) + relative
 
     def beyond(self, tau: Array, speed: Array, last_speed: Array) -> NDArray[np.bool_]:
         """Return which motors exceed their torque-speed limits in a sub-step, shape (n, n_motors).
@@ -117,58 +110,20 @@ class Drives:
         return np.abs(tau) > allowed + TOLERANCE * self.torque
 
 
-def largest_power(torque: float, stall: float | None, velocity: float) -> float:
+def largest_power(torque: float, stall: float, velocity: float) -> float:
     """Return the largest mechanical power of a motor [W] with torque limit and torque-speed line.
 
     The maximum is at half the no-load speed, or where the line meets the torque limit if that speed is higher.
 
     Args:
         torque: Torque limit [N m].
-        stall: Stall torque of the line [N m]; the torque limit if None.
+        stall: Stall torque of the line [N m].
         velocity: No-load speed of the line [rad/s].
     """
-    stall = torque if stall is None else stall
     if not math.isfinite(stall * velocity):
         return math.inf
     speed = max(velocity / 2, velocity * (1 - torque / stall))
     return min(torque, stall * (1 - speed / velocity)) * speed
-
-
-@dataclass
-class Sums:
-    """Sums over all sub-steps of all robots that have not fallen; arrays have one entry per motor.
-
-    Attributes:
-        count: Number of sub-steps.
-        distance: Horizontal distance travelled by the bases [m].
-        torque: Sum of torque magnitudes [N m].
-        driving: Sum of positive powers [W].
-        net: Sum of all powers, negative when braking [W].
-        peak_torque: Largest torque magnitude [N m].
-        peak_power: Largest positive power [W].
-        beyond: Number of sub-steps beyond the torque-speed limits.
-    """
-
-    count: int
-    distance: float
-    torque: Array
-    driving: Array
-    net: Array
-    peak_torque: Array
-    peak_power: Array
-    beyond: Array
-
-    def add(self, tau: Array, speed: Array, travelled: Array, beyond: NDArray[np.bool_]) -> None:
-        """Add one sub-step: torques, speeds and violations of limits (n, n_motors), and distances (n,)."""
-        power = tau * speed
-        self.count += len(tau)
-        self.distance += float(travelled.sum())
-        self.torque += np.abs(tau).sum(0)
-        self.driving += np.maximum(power, 0).sum(0)
-        self.net += power.sum(0)
-        self.peak_torque = np.maximum(self.peak_torque, np.abs(tau).max(0, initial=0.0))
-        self.peak_power = np.maximum(self.peak_power, power.max(0, initial=0.0))
-        self.beyond += beyond.sum(0)
 
 
 def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: int = 0, **kwargs: Any) -> dict:
@@ -202,26 +157,62 @@ def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: i
     dt, control_dt = kwargs.get("dt", spec["physics_dt"]), spec["control_dt"]
     held = HeldActions(policy, round(control_dt / dt), spec["observation"]["history"])
     kwargs = {k: x for k, x in kwargs.items() if k not in ("critic", "obs_mode")}
-    kwargs |= {"n_substeps": 1, "latency": (0, 0), "history": 1, "max_episode_steps": 10**9}
-    with closing(make_sb3_vec_env(policy.record["env"], episodes, seed, **kwargs)) as envs:
-        native: Any = envs.envs.unwrapped
+    kwargs |= {"n_substeps": 1, "latency": (0, 0), "history": 1, "max_episode_steps": UNLIMITED}
+    with open_environments(policy.record["env"], episodes, seed, **kwargs) as (envs, obs):
+        native: Any = envs.unwrapped
         model, drives = native.model, Drives.of(native.model)
-        sums = Sums(0, 0.0, *(np.zeros(len(drives.names)) for _ in range(6)))
-        obs: Any = envs.reset()
+        steps, distance = 0, 0.0
+        sums = {name: np.zeros(len(drives.names)) for name in ("torque", "driving", "net", "beyond")}
+        peaks = {name: np.zeros(len(drives.names)) for name in ("torque", "power")}
         q, v, tau = (native.batch.rows(name) for name in ("q", "v", "torque"))
         _, last_speed = drives.at_motors(model, q, v[:, 6:], tau)
         running = np.ones(episodes, bool)
-        for dones, _ in run_policy(held, envs, obs, steps=round(seconds / control_dt) * held.hold):
-            running &= ~dones
+        for step in run_policy(held, envs, obs, steps=round(seconds / control_dt) * held.hold, label="motors"):
+            running &= ~step.done
             if not running.any():
                 break
             last_q, q = q, native.batch.rows("q")
             v, tau = (native.batch.rows(name)[running] for name in ("v", "torque"))
-            travelled = np.hypot(*(q[running, :2] - last_q[running, :2]).T)
             torque, speed = drives.at_motors(model, q[running], v[:, 6:], tau)
-            sums.add(torque, speed, travelled, drives.beyond(torque, speed, last_speed[running]))
+            power = torque * speed
+            steps += len(power)
+            distance += float(np.hypot(*(q[running, :2] - last_q[running, :2]).T).sum())
+            sums["torque"] += np.abs(torque).sum(0)
+            sums["driving"] += np.maximum(power, 0).sum(0)
+            sums["net"] += power.sum(0)
+            sums["beyond"] += drives.beyond(torque, speed, last_speed[running]).sum(0)
+            peaks["torque"] = np.maximum(peaks["torque"], np.abs(torque).max(0))
+            peaks["power"] = np.maximum(peaks["power"], power.max(0))
             last_speed[running] = speed
-        return _result(sums, drives, model.total_mass, dt)
+    count, weight_distance = max(steps, 1), model.total_mass * GRAVITY * distance
+    result: dict[str, Any] = {
+        "cost_of_transport": float(sums["driving"].sum() * dt / weight_distance) if distance else None,
+        "cost_of_transport_net": float(sums["net"].sum() * dt / weight_distance) if distance else None,
+        "seconds": steps * dt,
+        "speed": distance / (count * dt),
+        "power": float(sums["driving"].sum() / count),
+    }
+    torques = _shares(drives, "torque", sums["torque"] / count, peaks["torque"], drives.torque)
+    powers = _shares(drives, "power", sums["driving"] / count, peaks["power"], drives.power)
+    motors = {name: torques.pop(name) | powers.pop(name) for name in drives.names}
+    beyond = float(sums["beyond"].mean() / count) if np.isfinite(drives.power).all() else None
+    return {**result, **torques, **powers, "beyond_limits": beyond, "motors": motors}
+
+
+def _shares(drives: Drives, quantity: str, means: Array, peaks: Array, limits: Array) -> dict[str, Any]:
+    """Return mean and peak of torques or powers as fractions of their limits, and the values of each motor by name."""
+    known = np.isfinite(limits)
+    result: dict[str, Any] = {f"mean_{quantity}": None, f"peak_{quantity}": None, f"peak_{quantity}_at": None}
+    if known.all():
+        largest = int((peaks / limits).argmax())
+        result[f"mean_{quantity}"] = float((means / limits).mean())
+        result[f"peak_{quantity}"] = float(peaks[largest] / limits[largest])
+        result[f"peak_{quantity}_at"] = drives.names[largest]
+    for i, name in enumerate(drives.names):
+        limit = float(limits[i]) if known[i] else None
+        figures = {"mean": float(means[i]), "peak": float(peaks[i])}
+        result[name] = {f"{kind}_{quantity}": x for kind, x in figures.items()} | {f"{quantity}_limit": limit}
+    return result
 
 
 class HeldActions:
@@ -247,36 +238,3 @@ class HeldActions:
             self.action, _ = self.policy.predict(self.observation, deterministic=deterministic)
         self.step += 1
         return self.action, None
-
-
-def _result(sums: Sums, drives: Drives, mass: float, dt: float) -> dict[str, Any]:
-    """Return means and fractions of limits from the sums; see `effort`."""
-    count, weight_distance = max(sums.count, 1), mass * GRAVITY * sums.distance
-    per_motor = {
-        "mean_torque": sums.torque / count,
-        "mean_power": sums.driving / count,
-        "peak_torque": sums.peak_torque,
-        "peak_power": sums.peak_power,
-    }
-    limits = {"torque": drives.torque, "power": drives.power}
-    shares = {name: values / limits[name.split("_")[1]] for name, values in per_motor.items()}
-    known = {name: bool(np.isfinite(limits[name.split("_")[1]]).all()) for name in shares}
-    result: dict[str, Any] = {
-        "cost_of_transport": float(sums.driving.sum() * dt / weight_distance) if weight_distance else None,
-        "cost_of_transport_net": float(sums.net.sum() * dt / weight_distance) if weight_distance else None,
-        "seconds": sums.count * dt,
-        "speed": sums.distance / (count * dt),
-        "power": float(sums.driving.sum() / count),
-    }
-    for name, share in shares.items():
-        peak = name.startswith("peak")
-        result[name] = (float(share.max()) if peak else float(share.mean())) if known[name] else None
-        if peak:
-            result[f"{name}_at"] = drives.names[int(share.argmax())] if known[name] else None
-    result["beyond_limits"] = float(sums.beyond.mean() / count) if known["peak_power"] else None
-    result["motors"] = {
-        name: {key: float(values[i]) for key, values in per_motor.items()}
-        | {f"{key}_limit": float(x[i]) if np.isfinite(x[i]) else None for key, x in limits.items()}
-        for i, name in enumerate(drives.names)
-    }
-    return result

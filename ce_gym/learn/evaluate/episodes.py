@@ -9,13 +9,15 @@ import hashlib
 import importlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Protocol
+from contextlib import closing, contextmanager
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from ce_gym.adapters.sb3 import SB3VecEnv
+from ce_gym.console import progress
 from ce_gym.policies import Actor
 
 Array = NDArray[np.float64]
@@ -26,20 +28,13 @@ EVALUATION_SEED = 1_000_000
 UNDISTURBED: dict[str, Any] = {"push_period": 0.0, "command_period": 1e6, "heading": False}
 """Arguments of an environment without pushes and new commands of its own."""
 
+UNLIMITED = 10**9
+"""`max_episode_steps` of an environment without time limit."""
+
 LEVEL = "metrics/terrain_level"
 """Entry of an episode's statistics: the terrain level of the episode."""
 
 ERRORS = ("forward_error", "lateral_error", "yaw_rate_error", "velocity_error")
-
-COLUMNS = (
-    ("forward [m/s]", "forward_error", ".3f"),
-    ("lateral [m/s]", "lateral_error", ".3f"),
-    ("yaw [rad/s]", "yaw_rate_error", ".3f"),
-    ("velocity [m/s]", "velocity_error", ".3f"),
-    ("falls", "falls", ".1%"),
-    ("length [s]", "episode_length", ".1f"),
-)
-"""Columns of result tables: title, key in the results, format."""
 
 
 class Predicts(Protocol):
@@ -78,114 +73,135 @@ def without_curricula(env_id: str, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     return {**kwargs, **changed}
 
 
+@contextmanager
+def open_environments(env_id: str, num_envs: int, seed: int, **kwargs: Any) -> Iterator[tuple[VectorEnv, Any]]:
+    """Yield a vector environment after its reset, and its first observations; close it at the end.
+
+    Args:
+        env_id: Registered environment id.
+        num_envs: Number of environments.
+        seed: Seed of the first environment; environment i gets `seed + i`.
+        **kwargs: Arguments of the environment, such as `transmission`.
+
+    Raises:
+        gymnasium.error.Error: If the id is unknown or has no native vector environment.
+        ValueError: If an argument is wrong.
+    """
+    options = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
+    try:
+        envs = gymnasium.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **options)
+    except (TypeError, ImportError) as error:  # an unknown argument or module
+        raise ValueError(f"environment {env_id!r}: {error}") from error
+    with closing(envs):
+        yield envs, envs.reset(seed=seed)[0]
+
+
+class Step(NamedTuple):
+    """Result of a control step: whether each episode has ended, and whether at its time limit, shape (n,) each."""
+
+    done: NDArray[np.bool_]
+    timed_out: NDArray[np.bool_]
+    infos: dict[str, Any]
+
+
 def run_policy(
     policy: Predicts,
-    envs: SB3VecEnv,
+    envs: VectorEnv,
     obs: Any,
     before_step: Callable[[int], None] | None = None,
     steps: int | None = None,
-) -> Iterator[tuple[NDArray[np.bool_], list[dict[str, Any]]]]:
-    """Let a policy act with its mean action, and yield `dones` and `infos` after each step.
+    label: str = "episodes",
+) -> Iterator[Step]:
+    """Let a policy act with its mean action, and yield the result of each step.
 
     Args:
         policy: The policy.
-        envs: The environments.
-        obs: First observations, the result of `envs.reset()`.
+        envs: The environments; one that is done has the state of its next episode.
+        obs: Their first observations.
         before_step: Called before each step with its number, to set commands or apply pushes.
         steps: Number of steps; unlimited if None.
+        label: Label of the progress bar.
     """
-    for step in itertools.count() if steps is None else range(steps):
+    numbers = itertools.count() if steps is None else range(steps)
+    longest = getattr(envs.unwrapped, "max_episode_steps", None)
+    for number in progress(numbers, label, longest if steps is None else steps):
         action, _ = policy.predict(obs, deterministic=True)
         if before_step:
-            before_step(step)
-        obs, _, dones, infos = envs.step(action)
-        yield dones, infos
+            before_step(number)
+        obs, _, terminated, truncated, infos = envs.step(action)
+        yield Step(terminated | truncated, truncated & ~terminated, infos)
 
 
-def play(policy: Predicts, envs: SB3VecEnv, before_step: Callable[[int], None] | None = None) -> dict[str, Any]:
-    """Play one episode in each environment and return statistics.
+class TrackingErrors:
+    """Magnitudes of forward, lateral, yaw rate and horizontal velocity errors, summed over the steps of each robot."""
 
-    Args:
-        policy: The policy.
-        envs: The environments, seeded.
-        before_step: See `run_policy`.
+    def __init__(self, num_envs: int) -> None:
+        self.sums, self.counts = np.zeros((num_envs, 4)), np.zeros(num_envs, int)
 
-    Returns:
-        See `evaluate.evaluate`; `levels` only if the terrain has several.
+    def add(self, v: Array, command: Array, counted: NDArray[np.bool_]) -> None:
+        """Add a step of the robots in `counted` (n,), from velocities `v` (n, nv) and commands (n, 3)."""
+        errors = (np.stack([v[:, 3], v[:, 4], v[:, 2]], axis=1) - command)[counted]
+        self.sums[counted] += np.column_stack([np.abs(errors), np.hypot(errors[:, 0], errors[:, 1])])
+        self.counts += counted
+
+    def means(self, robots: Any = slice(None)) -> dict[str, float]:
+        """Return the means over all steps of some robots by name; NaN if there are no steps."""
+        count = int(self.counts[robots].sum())
+        means = self.sums[robots].sum(axis=0) / count if count else np.full(4, np.nan)
+        return dict(zip(ERRORS, means.tolist(), strict=True))
+
+
+def play(
+    policy: Predicts,
+    envs: VectorEnv,
+    obs: Any,
+    before_step: Callable[[int], None] | None = None,
+    label: str = "episodes",
+) -> dict[str, Any]:
+    """Play one episode in each environment and return statistics, see `evaluation.evaluate`.
+
+    For the arguments, see `run_policy`.
     """
-    native: Any = envs.envs.unwrapped
-    n = envs.num_envs
-    sums, counts, running = np.zeros((n, 4)), np.zeros(n, int), np.ones(n, bool)
-    last_infos: dict[int, dict[str, Any]] = {}
-    obs = envs.reset()
+    native: Any = envs.unwrapped
+    errors, running = TrackingErrors(envs.num_envs), np.ones(envs.num_envs, bool)
+    statistics: dict[str, Array] = {}
     command = native.state()["command"]
-    for dones, infos in run_policy(policy, envs, obs, before_step):
-        state = native.state()
-        continuing = running & ~dones  # an environment that is done has the state of its next episode
-        sums[continuing] += magnitudes((planar_velocity(state["v"]) - command)[continuing])
-        counts += continuing
-        last_infos |= {i: infos[i] for i in np.flatnonzero(running & dones).tolist()}
-        running &= ~dones
+    for step in run_policy(policy, envs, obs, before_step, label=label):
+        state, ended = native.state(), running & step.done
+        running &= ~ended
+        errors.add(state["v"], command, running)
+        if ended.any():
+            for key, values in _episode_statistics(step).items():
+                statistics.setdefault(key, np.zeros(envs.num_envs))[ended] = values[ended]
         if not running.any():
             break
         command = state["command"]  # shown in the next observation
-    return _summary(sums, counts, [last_infos[i] for i in range(n)], 1.0 / native.metadata["render_fps"])
+    return _summary(errors, statistics, 1.0 / native.metadata["render_fps"])
 
 
-def planar_velocity(v: Array) -> Array:
-    """Return forward and lateral speed [m/s] and yaw rate [rad/s] of the base, shape (n, 3), from `v` (n, nv)."""
-    return np.stack([v[:, 3], v[:, 4], v[:, 2]], axis=1)
+def _episode_statistics(step: Step) -> dict[str, NDArray]:
+    """Return statistics of episodes by name, shape (n,) each, valid where `done`.
 
-
-def magnitudes(errors: Array) -> Array:
-    """Return absolute velocity errors (n, 3) and the horizontal length of each error, shape (n, 4)."""
-    return np.column_stack([np.abs(errors), np.hypot(errors[:, 0], errors[:, 1])])
-
-
-def tracking(errors: Array) -> dict[str, float]:
-    """Return mean magnitudes of velocity errors (n, 3) by name; NaN if n is 0."""
-    return _by_name(magnitudes(errors).sum(axis=0), len(errors))
-
-
-def _by_name(sums: Array, count: int) -> dict[str, float]:
-    means = (sums / count if count else np.full(4, np.nan)).tolist()
-    return dict(zip(ERRORS, means, strict=True))
-
-
-def _summary(sums: Array, counts: NDArray, infos: list[dict[str, Any]], period: float) -> dict[str, Any]:
-    """Return errors as means over steps, and all other statistics as means over episodes.
-
-    Args:
-        sums: Sums of magnitudes of errors, shape (n, 4).
-        counts: Number of summed steps, shape (n,).
-        infos: Information of the last step of each episode.
-        period: Length of a control step [s].
+    Environments of ce_gym report `episode_terms`; others report `episode`, by Gymnasium's `RecordEpisodeStatistics`.
     """
-    episodes = [info["episode"] for info in infos]
-    mean = {key: float(np.mean([episode[key] for episode in episodes])) for key in episodes[0] if key != "t"}
-    timed_out = np.array([info["TimeLimit.truncated"] for info in infos])
-    diverged = np.array([info["diverged"] for info in infos])
-    falls = ~timed_out & ~diverged
-    result = {
-        **_by_name(sums.sum(axis=0), int(counts.sum())),
-        "falls": float(np.mean(falls)),
-        "timed_out": float(np.mean(timed_out & ~diverged)),
-        "diverged": float(np.mean(diverged)),
-        "episode_length": mean.pop("l") * period,
-        "reward": mean.pop("r"),
-        "episodes": len(infos),
-        **mean,
-    }
-    if LEVEL in mean:
-        result["levels"] = _by_level(np.array([round(e[LEVEL]) for e in episodes]), sums, counts, falls)
+    diverged = step.infos.get("diverged", np.zeros(len(step.done), bool))
+    flags = {"falls": ~step.timed_out & ~diverged, "timed_out": step.timed_out & ~diverged, "diverged": diverged}
+    if "episode_terms" in step.infos:
+        return flags | step.infos["episode_terms"]
+    episode = step.infos["episode"]
+    return {**flags, "return": episode["r"], "length": episode["l"]}
+
+
+def _summary(errors: TrackingErrors, statistics: dict[str, Array], period: float) -> dict[str, Any]:
+    """Return errors as means over steps of `period` [s], and statistics (n,) of episodes as means over episodes."""
+    mean = {key: float(values.mean()) for key, values in statistics.items()}
+    totals = {"episode_length": mean.pop("length") * period, "reward": mean.pop("return")}
+    result = {**errors.means(), **totals, "episodes": len(errors.counts), **mean}
+    if LEVEL in statistics:
+        level, falls = np.rint(statistics[LEVEL]).astype(int), statistics["falls"]
+        groups = [(number, level == number) for number in np.unique(level).tolist()]
+        result["levels"] = [
+            {"level": number, **errors.means(on), "falls": float(falls[on].mean()), "episodes": int(on.sum())}
+            for number, on in groups
+        ]
     return result
-
-
-def _by_level(level: NDArray, sums: Array, counts: NDArray, falls: NDArray) -> list[dict[str, Any]]:
-    """Return errors and falls of the episodes on each terrain level, the lowest level first."""
-    rows = []
-    for number in np.unique(level).tolist():
-        on = level == number
-        errors = _by_name(sums[on].sum(axis=0), int(counts[on].sum()))
-        rows.append({"level": number, **errors, "falls": float(falls[on].mean()), "episodes": int(on.sum())})
-    return rows

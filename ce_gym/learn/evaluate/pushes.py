@@ -7,13 +7,11 @@ same direction and speed are pushed at different phases of their gait.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from typing import Any
 
 import numpy as np
 
-from ce_gym.adapters.sb3 import make_sb3_vec_env
-from ce_gym.learn.evaluate.episodes import UNDISTURBED, run_policy
+from ce_gym.learn.evaluate.episodes import UNDISTURBED, UNLIMITED, open_environments, run_policy
 from ce_gym.policies import Policy
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
@@ -58,9 +56,9 @@ def push_envelope(
     when = np.round((SETTLE + SPREAD * repeat / repeats) / dt).astype(int)
     push = speed[:, None] * np.stack([np.cos(np.radians(angle)), np.sin(np.radians(angle))], axis=1)
     command = [spec["command"]["range"][0][1] / 2, 0.0, 0.0]
-    arguments = {**kwargs, **UNDISTURBED, "max_episode_steps": 10**9}
-    with closing(make_sb3_vec_env(policy.record["env"], len(angle), seed, **arguments)) as envs:
-        native: Any = envs.envs.unwrapped
+    arguments = {**kwargs, **UNDISTURBED, "max_episode_steps": UNLIMITED}
+    with open_environments(policy.record["env"], len(angle), seed, **arguments) as (envs, obs):
+        native: Any = envs.unwrapped
         standing = np.ones(len(angle), bool)
 
         def apply_pushes(step: int) -> None:
@@ -72,9 +70,9 @@ def push_envelope(
                 native.batch.write("v", v, due)
 
         wait = round(WAIT / dt)
-        outcomes = run_policy(policy, envs, envs.reset(), apply_pushes, int(when.max()) + wait)
-        for step, (dones, _) in enumerate(outcomes):
-            standing &= ~(dones & (step < when + wait))
+        outcomes = run_policy(policy, envs, obs, apply_pushes, int(when.max()) + wait, "pushes")
+        for number, step in enumerate(outcomes):
+            standing &= ~(step.done & (number < when + wait))
     survived = standing.reshape(directions, len(speeds), repeats).mean(axis=2)
     return {
         "command": command,
@@ -89,22 +87,3 @@ def _largest(speeds: Sequence[float], survived: Any) -> float | None:
     """Return the largest speed below the first speed at which too few robots survive."""
     safe = [float(speed) for speed, ok in zip(speeds, np.logical_and.accumulate(survived >= SAFE), strict=True) if ok]
     return safe[-1] if safe else None
-
-
-def push_table(result: dict[str, Any]) -> str:
-    """Return one line per direction: the fraction that stays on its feet, by the change of velocity."""
-    lines = ["pushed towards" + "".join(f"{speed:>8.1f}" for speed in result["speeds"]) + "  m/s     survives"]
-    for angle, row, largest in zip(result["directions"], result["survived"], result["envelope"], strict=True):
-        limit = "nothing" if largest is None else f"{largest:.1f} m/s"
-        lines.append(f"{direction_name(angle):<14}" + "".join(f"{x:>8.0%}" for x in row) + f"{limit:>17}")
-    walking = result["command"][0]
-    return "\n".join(
-        [*lines, f"share on its feet {WAIT:g} s after a push, walking at {walking:g} m/s; survives: >= {SAFE:.0%}"]
-    )
-
-
-def direction_name(angle: float) -> str:
-    """Return a direction in words, or in degrees if it has no name."""
-    names = {0: "forward", 45: "forward left", 90: "left", 135: "back left", 180: "back", 225: "back right"}
-    names |= {270: "right", 315: "forward right"}
-    return names.get(round(angle), f"{angle:.0f} deg")

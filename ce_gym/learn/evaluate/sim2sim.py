@@ -4,26 +4,30 @@ The robot is exported as MJCF at two levels: with armature, and with each rotor 
 and ce_gym use the same initial states, gains, limits and random commands. The observation terms of the task compute
 observations from MuJoCo's state. A policy passes if nearly all robots stay on their feet in MuJoCo and its errors are
 not much larger than at the same level of ce_gym. Needs MuJoCo (extra `mjcf`).
-
-    python train/sim2sim.py runs/mini_cheetah_velocity
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from ce_gym.adapters.sb3 import SB3VecEnv, make_sb3_vec_env
-from ce_gym.learn.evaluate.episodes import COLUMNS, UNDISTURBED, planar_velocity, tracking, weights_seed
-from ce_gym.learn.evaluate.evaluation import env_kwargs
+from ce_gym.learn.evaluate.episodes import (
+    UNDISTURBED,
+    UNLIMITED,
+    TrackingErrors,
+    open_environments,
+    run_policy,
+    weights_seed,
+)
+from ce_gym.learn.evaluate.tables import table
 from ce_gym.model import RobotError
 from ce_gym.policies import Policy, PolicyError
 
-STEADY = {**UNDISTURBED, "randomise": {}, "latency": (0, 0)}
+STEADY = {**UNDISTURBED, "randomise": {}, "latency": (0, 0), "max_episode_steps": UNLIMITED}
 """Arguments of an environment without features that MuJoCo lacks; this file sets the commands."""
 
 STANDING_FRACTION = 0.1
@@ -32,50 +36,21 @@ STANDING_FRACTION = 0.1
 ON_FEET, WORSE = 0.95, 1.5
 """Requirements in MuJoCo: smallest fraction without a fall; largest ratio of errors, MuJoCo to ce_gym."""
 
-TWINS = {"armature": ("MuJoCo, armature", "armature"), "exact": ("MuJoCo, rotors as bodies", "exact")}
-"""For each level of `MujocoTwin`: its name, and the level of ce_gym with the same physics."""
+TWINS = {"armature": "MuJoCo, armature", "exact": "MuJoCo, rotors as bodies"}
+"""Name of the simulation for each level of `MujocoTwin`."""
 
 
-class World(Protocol):
-    """A simulation in which a policy acts."""
-
-    def step(self, action: NDArray, command: NDArray) -> tuple[Any, NDArray, NDArray]:
-        """Make one control step.
-
-        Args:
-            action: Actions, shape (n, n_actions).
-            command: Commands of the next observation, shape (n, 3).
-
-        Returns:
-            The next observations; velocities v (n, nv); whether each robot has fallen (n,).
-        """
-        ...
-
-
-class OurWorld:
-    """The environment, simulated by ce_gym."""
-
-    def __init__(self, envs: SB3VecEnv) -> None:
-        self.envs = envs
-        self.native: Any = envs.envs.unwrapped
-
-    def step(self, action: NDArray, command: NDArray) -> tuple[Any, NDArray, NDArray]:
-        """Step the environment; see `World`. A robot that has fallen starts another episode."""
-        self.native.set_command(command)
-        obs, _, dones, _ = self.envs.step(action)
-        return obs, self.native.state()["v"], dones
-
-
-class MujocoWorld:
-    """The same robots in MuJoCo, with observations by the terms of the environment.
+class MujocoEnvs(VectorEnv):
+    """The robots of environments in MuJoCo, with observations by the terms of the environments.
 
     Args:
-        native: The environment after its reset.
-        obs: First observations of the environment.
+        native: The environments after their reset.
+        obs: First observations of the environments.
         level: A level of `MujocoTwin`.
 
     Raises:
         PolicyError: If actions are not joint targets.
+        RobotError: If MuJoCo cannot express the robot at that level.
     """
 
     def __init__(self, native: Any, obs: Any, level: str) -> None:
@@ -85,45 +60,46 @@ class MujocoWorld:
         action = self.policy_spec["action"]
         if action["kind"] != "joint_pd":
             raise PolicyError(f"actions={action['kind']!r}; expected 'joint_pd': the MuJoCo model has position control")
+        if level == "exact":
+            _check_ratios(native.model.robot)
         joints = self.policy_spec["joints"]
         self.columns = [joints.index(name) for name in action["joints"]]
         self.scale = np.array(action["scale"])
         state = native.state()
-        self.twin = MujocoTwin(native.model.robot, level, len(state["q"]))
+        self.num_envs, self.command = len(state["q"]), state["command"]
+        self.twin = MujocoTwin(native.model.robot, level, self.num_envs)
         self.twin.start(state["q"], state["v"])
         self.obs = np.array(obs["policy"] if isinstance(obs, dict) else obs)
         self.clock = 0
 
-    def step(self, action: NDArray, command: NDArray) -> tuple[Any, NDArray, NDArray]:
-        """Step MuJoCo and compute observations; see `World`."""
-        action = np.clip(action, -1.0, 1.0)
+    def step(self, actions: NDArray) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
+        """Make a control step; observations have the command that was set last."""
+        action = np.clip(actions, -1.0, 1.0)
         target = np.tile(self.policy_spec["default_pose"], (len(action), 1))
         target[:, self.columns] += self.scale * action
         self.twin.step(target, self.policy_spec["control_dt"])
         self.clock += 1
-        q, v = self.twin.state()
-        clock = np.full((len(q), 1), self.clock)
-        frame, failed = self.native.look({"q": q, "v": v, "action": action, "command": command, "clock": clock})
+        clock = np.full((self.num_envs, 1), self.clock)
+        frame, failed = self.native.look({**self.state(), "action": action, "clock": clock})
         kept = self.obs.shape[1] - frame.shape[1]  # size of the history that stays; the newest frame is first
         self.obs = np.hstack([frame, self.obs[:, :kept]])
-        return self.obs, v, failed | self.twin.diverged
+        return self.obs, np.zeros(self.num_envs), failed, self.twin.diverged, {}
+
+    def state(self) -> dict[str, NDArray]:
+        """Return `q` (n, nq), `v` (n, nv) and `command` (n, 3)."""
+        q, v = self.twin.state()
+        return {"q": q, "v": v, "command": self.command}
+
+    def set_command(self, command: NDArray) -> None:
+        """Set the commanded velocities, shape (n, 3)."""
+        self.command = command
 
 
-@dataclass(frozen=True)
-class Course:
-    """Commands of an evaluation.
+def random_commands(policy_spec: dict[str, Any], first: NDArray, seconds: float, every: float, seed: int) -> NDArray:
+    """Return commands for `seconds` [s], shape (n_steps + 1, n, 3), after `first` (n, 3).
 
-    Attributes:
-        commands: Forward, lateral [m/s], yaw rate [rad/s] at each control step, shape (n_steps + 1, n, 3).
-        control_dt: Length of a control step [s].
+    New commands are random in the task's range, and change `every` [s].
     """
-
-    commands: NDArray
-    control_dt: float
-
-
-def random_course(policy_spec: dict[str, Any], first: NDArray, seconds: float, every: float, seed: int) -> Course:
-    """Return random commands from the task's range that change `every` [s], after the given first commands (n, 3)."""
     dt, rng = policy_spec["control_dt"], np.random.default_rng(seed)
     steps = round(seconds / dt)
     period = min(max(round(min(every, seconds + dt) / dt), 1), steps + 1)
@@ -132,30 +108,33 @@ def random_course(policy_spec: dict[str, Any], first: NDArray, seconds: float, e
     for _ in range(steps // period):
         standing = rng.random((len(first), 1)) < STANDING_FRACTION
         commands.append(np.where(standing, 0.0, rng.uniform(low, high, first.shape)))
-    return Course(np.repeat(commands, period, axis=0)[: steps + 1], dt)
+    return np.repeat(commands, period, axis=0)[: steps + 1]
 
 
-def play(policy: Policy, world: World, obs: Any, course: Course) -> dict[str, float]:
-    """Let a policy act until the commands end, and evaluate each robot until its first fall.
+def play(
+    policy: Policy, envs: VectorEnv, obs: Any, commands: NDArray, control_dt: float, label: str = ""
+) -> dict[str, float]:
+    """Let a policy act until its commands (n_steps + 1, n, 3) end, and evaluate each robot until its first fall.
+
+    The commands are those at each control step of length `control_dt` [s]. For other arguments, see `run_policy`.
 
     Returns:
-        Errors, see `episodes.tracking`. falls: fraction of robots. episode_length [s]: mean.
+        Errors, see `evaluation.evaluate`. falls: fraction of robots. episode_length [s]: mean.
     """
-    running = np.ones(course.commands.shape[1], bool)
-    errors, steps = [np.zeros((0, 3))], 0
-    for command, following in zip(course.commands[:-1], course.commands[1:], strict=True):
-        action, _ = policy.predict(obs)
-        obs, v, failed = world.step(action, following)
-        running &= ~failed
-        errors.append((planar_velocity(v) - command)[running])
-        steps += int(running.sum())
+    native: Any = envs.unwrapped
+    steps, n, _ = commands.shape
+    errors, running = TrackingErrors(n), np.ones(n, bool)
+
+    def set_next_command(number: int) -> None:
+        native.set_command(commands[number + 1])
+
+    for number, step in enumerate(run_policy(policy, envs, obs, set_next_command, steps - 1, label)):
+        running &= ~step.done
+        errors.add(native.state()["v"], commands[number], running)
         if not running.any():
             break
-    return {
-        **tracking(np.concatenate(errors)),
-        "falls": float(np.mean(~running)),
-        "episode_length": steps * course.control_dt / len(running),
-    }
+    length = float(errors.counts.sum()) * control_dt / n
+    return {**errors.means(), "falls": float(np.mean(~running)), "episode_length": length}
 
 
 def compare(
@@ -183,39 +162,40 @@ def compare(
     """
     import ce_gym.export.mujoco_twin  # noqa: F401  # fails at the start if MuJoCo is missing
 
-    record, results = policy.record, {}
+    record, results, missing = policy.record, {}, []
+    spec, trained = record["policy_spec"], record["transmission"]
+    arguments = STEADY | {"noise": {block["name"]: 0.0 for block in spec["observation"]["blocks"]}}
     seed = weights_seed(policy) if seed is None else seed
-    for level in dict.fromkeys((record["transmission"], "exact", "armature")):
-        envs, obs, course = _environment(record, level, episodes, seconds, every, seed)
-        results[_ours(level)] = play(policy, OurWorld(envs), obs, course)
-        envs.close()
-    for level, (name, _) in TWINS.items():
-        envs, obs, course = _environment(record, record["transmission"], episodes, seconds, every, seed)
-        native: Any = envs.envs.unwrapped
-        try:
-            if level == "exact" and (reason := _without_ratios(native.model.robot)):
-                print(f"{name}: not evaluated: {reason}", file=sys.stderr)
+    ours = {_ours(level): (level, "") for level in (trained, "exact", "armature")}
+    for name, (level, twin) in (ours | {name: (trained, level) for level, name in TWINS.items()}).items():
+        kwargs = {**record["env_kwargs"], "transmission": level, **arguments}
+        with open_environments(record["env"], episodes, seed, **kwargs) as (envs, obs):
+            native: Any = envs.unwrapped
+            spec = native.policy_spec()
+            commands = random_commands(spec, native.state()["command"], seconds, every, seed)
+            try:
+                world = MujocoEnvs(native, obs, twin) if twin else envs
+            except RobotError as error:
+                missing.append(f"{name}: not evaluated: {error}")
+                print(missing[-1], file=sys.stderr)
                 continue
-            results[name] = play(policy, MujocoWorld(native, obs, level), obs, course)
-        except RobotError as error:  # MJCF has no armature that varies with the pose, as loops need
-            if level == "exact":
-                raise
-            print(f"{name}: not evaluated: {error}", file=sys.stderr)
-        finally:
-            envs.close()
+            results[name] = play(policy, world, obs, commands, spec["control_dt"], name)
     verdict = verdicts(results)
     if not verdict:
-        raise RobotError("MuJoCo has neither level of this robot: nothing was compared")
+        raise RobotError("; ".join(missing))
     return {"simulations": results, "verdict": verdict, "passed": all(each["passed"] for each in verdict.values())}
 
 
-def _without_ratios(robot: Any) -> str:
-    """Return why rotors cannot be bodies in MuJoCo (unknown ratios give rotors no inertia), or an empty string."""
-    rotors = robot.unknown_ratios
-    if not rotors:
-        return ""
-    names = ", ".join(rotors[:3]) + (f" and {len(rotors) - 3} more" if len(rotors) > 3 else "")
-    return f"the file of {robot.name} gives no gear ratio for {names}; `gears:` in a YAML file gives it"
+def _check_ratios(robot: Any) -> None:
+    """Refuse a robot whose rotors cannot be bodies in MuJoCo, because unknown ratios give rotors no inertia.
+
+    Raises:
+        RobotError: If a gear ratio is unknown.
+    """
+    if rotors := robot.unknown_ratios:
+        names = ", ".join(rotors[:3]) + (f" and {len(rotors) - 3} more" if len(rotors) > 3 else "")
+        reason = f"the file of {robot.name} gives no gear ratio for {names}"
+        raise RobotError(f"{reason}; `gears:` in a YAML file gives it")
 
 
 def _ours(level: str) -> str:
@@ -230,7 +210,7 @@ def verdicts(results: dict[str, dict[str, float]]) -> dict[str, dict[str, Any]]:
         rate error divided by the error in ce_gym; passed, whether these satisfy `ON_FEET` and `WORSE`.
     """
     result = {}
-    for name, level in TWINS.values():
+    for level, name in TWINS.items():
         if name not in results:
             continue
         theirs, ours = results[name], results[_ours(level)]
@@ -241,26 +221,13 @@ def verdicts(results: dict[str, dict[str, float]]) -> dict[str, dict[str, Any]]:
     return result
 
 
-def _environment(
-    record: dict[str, Any], level: str, n: int, seconds: float, every: float, seed: int
-) -> tuple[SB3VecEnv, Any, Course]:
-    """Return an environment after its reset, observations, and commands; commands are the same at all levels."""
-    clear = {block["name"]: 0.0 for block in record["policy_spec"]["observation"]["blocks"]}
-    kwargs = {**env_kwargs(record, level), **STEADY, "noise": clear, "max_episode_steps": 10**9}
-    envs = make_sb3_vec_env(record["env"], n, seed, **kwargs)
-    obs = envs.reset()
-    native: Any = envs.envs.unwrapped
-    return envs, obs, random_course(native.policy_spec(), native.state()["command"], seconds, every, seed)
-
-
-def table(result: dict[str, Any]) -> str:
-    """Return one line per simulation, then one per verdict."""
-    lines = [f"{'simulated by':<26}" + "".join(f"{title:>15}" for title, _, _ in COLUMNS)]
-    for name, figures in result["simulations"].items():
-        lines.append(f"{name:<26}" + "".join(f"{figures[key]:>15{form}}" for _, key, form in COLUMNS))
-    lines += ["errors are means over every step until a robot falls", ""]
+def comparison_table(result: dict[str, Any]) -> str:
+    """Return a Markdown table with one line per simulation, and the requirements."""
+    rows = {name: {**figures, "verdict": ""} for name, figures in result["simulations"].items()}
     for name, verdict in result["verdict"].items():
-        errors = f"velocity error {verdict['error_ratio']:.2f} and yaw rate error {verdict['yaw_ratio']:.2f} times ours"
-        outcome = "passed" if verdict["passed"] else "FAILED"
-        lines.append(f"{name:<26} {verdict['on_feet']:.0%} without a fall, {errors}: {outcome}")
-    return "\n".join([*lines, f"required: at least {ON_FEET:.0%} without a fall, errors at most {WORSE:g} times ours"])
+        ratios = f"{verdict['error_ratio']:.2f} and {verdict['yaw_ratio']:.2f} times the errors"
+        rows[name]["verdict"] = f"{'passed' if verdict['passed'] else 'FAILED'}: {ratios}"
+    keys = ("forward_error", "lateral_error", "yaw_rate_error", "velocity_error", "falls", "episode_length", "verdict")
+    bars = f"at least {ON_FEET:.0%} without a fall, and at most {WORSE:g} times the errors"
+    note = f"Required in MuJoCo: {bars} of ce_gym at the same level, in velocity and yaw rate."
+    return f"{table('simulated by', rows, *keys)}\n\n{note}"

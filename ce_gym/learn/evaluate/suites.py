@@ -5,16 +5,13 @@ All suites use one kernel, because this file sets commands and pushes from outsi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import closing
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ce_gym.adapters.sb3 import make_sb3_vec_env
-from ce_gym.console import Table, markdown
-from ce_gym.learn.evaluate.episodes import UNDISTURBED, play, without_curricula
+from ce_gym.learn.evaluate.episodes import UNDISTURBED, open_environments, play, without_curricula
 from ce_gym.policies import Policy, PolicyError
 
 SETTLE = 1.0
@@ -70,13 +67,14 @@ def evaluate_suites(policy: Policy, episodes: int, seed: int, **kwargs: Any) -> 
     arguments = without_curricula(env_id, kwargs) | UNDISTURBED
     result = {}
     for name, suite in SUITES.items():
-        with closing(make_sb3_vec_env(env_id, episodes, seed, **arguments)) as envs:
-            result[name] = play(policy, envs, Driver(suite, envs.envs.unwrapped, np.array(ranges), seed))
+        with open_environments(env_id, episodes, seed, **arguments) as (envs, obs):
+            drive = driver(suite, envs.unwrapped, np.array(ranges), seed)
+            result[name] = play(policy, envs, obs, drive, name)
     return result
 
 
-class Driver:
-    """Sets the commands of a suite and applies its pushes.
+def driver(suite: Suite, native: Any, ranges: np.ndarray, seed: int) -> Callable[[int], None]:
+    """Return a function that sets the command of a step and applies its push, if they are due.
 
     Args:
         suite: The suite.
@@ -84,39 +82,18 @@ class Driver:
         ranges: Lower and upper bound of forward [m/s], sideways [m/s] and turning [rad/s] commands, shape (3, 2).
         seed: Seed of commands and pushes.
     """
+    n, rate, rng = native.num_envs, native.metadata["render_fps"], np.random.default_rng(seed)
+    ranges = ranges * np.array(suite.moving)[:, None]
+    if suite.backwards:
+        ranges[0] = np.minimum(ranges[0, 0] * np.array([1.0, 0.5]), 0.0)
 
-    def __init__(self, suite: Suite, native: Any, ranges: np.ndarray, seed: int) -> None:
-        self.suite, self.native, self.rng = suite, native, np.random.default_rng(seed)
-        ranges = ranges * np.array(suite.moving)[:, None]
-        if suite.backwards:
-            ranges[0] = np.minimum(ranges[0, 0] * np.array([1.0, 0.5]), 0.0)
-        self.low, self.high = ranges.T
+    def drive(step: int) -> None:
+        if step % round(suite.period * rate) == 0:
+            native.set_command(rng.uniform(ranges[:, 0], ranges[:, 1], (n, 3)))
+        since = step - round(SETTLE * rate)
+        if suite.push and since >= 0 and since % round(suite.push_period * rate) == 0:
+            v = native.batch.rows("v")
+            v[:, 3:5] += rng.uniform(-suite.push, suite.push, (n, 2))
+            native.batch.write("v", v)
 
-    def __call__(self, step: int) -> None:
-        """Set the command and apply the push of a step, if one is due."""
-        n, dt = self.native.num_envs, self.native.metadata["render_fps"] ** -1
-        if step % round(self.suite.period / dt) == 0:
-            self.native.set_command(self.rng.uniform(self.low, self.high, (n, 3)))
-        since = step - round(SETTLE / dt)
-        if self.suite.push and since >= 0 and since % round(self.suite.push_period / dt) == 0:
-            v = self.native.batch.rows("v")
-            v[:, 3:5] += self.rng.uniform(-self.suite.push, self.suite.push, (n, 2))
-            self.native.batch.write("v", v)
-
-
-def suite_table(result: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a Markdown table with one line per suite."""
-    keys = (("forward_error", ".3f"), ("lateral_error", ".3f"), ("yaw_rate_error", ".3f"), ("falls", ".1%"))
-    rows: Table = [["suite", "forward [m/s]", "sideways [m/s]", "yaw rate [rad/s]", "falls"]]
-    for name, figures in result.items():
-        rows.append([f"{name}: {SUITES[name].about}", *(f"{figures[key]:{form}}" for key, form in keys)])
-    return markdown(rows)
-
-
-def level_table(levels: list[dict[str, Any]]) -> str:
-    """Return a Markdown table with one line per terrain level."""
-    rows: Table = [["level", "forward [m/s]", "velocity [m/s]", "falls", "episodes"]]
-    for row in levels:
-        figures = (f"{row['forward_error']:.3f}", f"{row['velocity_error']:.3f}", f"{row['falls']:.1%}")
-        rows.append([str(row["level"]), *figures, str(row["episodes"])])
-    return markdown(rows)
+    return drive

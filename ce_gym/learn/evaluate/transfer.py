@@ -2,9 +2,6 @@
 
 The policies are arguments, or are trained first: each level with several seeds. Means over the policies of one level
 have 95 % confidence intervals.
-
-    python train/transfer.py runs/mini_cheetah_velocity
-    python train/transfer.py --env ce_gym/MiniCheetahVelocity-v0 --train --seeds 0 1 2
 """
 
 from __future__ import annotations
@@ -18,13 +15,15 @@ from typing import Any
 import numpy as np
 
 from ce_gym.console import Table, markdown
-from ce_gym.learn.evaluate.episodes import COLUMNS, Predicts
-from ce_gym.learn.evaluate.evaluation import env_kwargs, evaluate, load
+from ce_gym.learn.evaluate.episodes import ERRORS, Predicts
+from ce_gym.learn.evaluate.evaluation import evaluate, load
+from ce_gym.learn.evaluate.pictures import draw_transfer
+from ce_gym.learn.evaluate.tables import COLUMNS
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.policies import PolicyError
 
-SHOWN = (*COLUMNS, ("reward", "reward", ".2f"))
-"""Columns of the table: title, key in the results, format."""
+SHOWN = (*ERRORS, "falls", "episode_length", "reward")
+"""Keys of the results in the table."""
 
 STUDENT = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131, 2.120,
@@ -38,8 +37,9 @@ Results = dict[str, dict[str, float]]
 
 def transfer(model: Predicts, record: dict[str, Any], *, episodes: int = 256, seed: int | None = None) -> Results:
     """Evaluate a policy at every level with the same seeds (see `evaluate`), and return the results by level."""
+    env_id, kwargs = record["env"], record["env_kwargs"]
     return {
-        level: evaluate(model, record["env"], episodes=episodes, seed=seed, **env_kwargs(record, level))
+        level: evaluate(model, env_id, episodes=episodes, seed=seed, **{**kwargs, "transmission": level})
         for level in LEVELS
     }
 
@@ -70,29 +70,27 @@ def summary(evaluations: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, 
         group = [entry["results"] for entry in evaluations if entry["transmission"] == trained]
         if group:
             summaries[trained] = {
-                level: {key: interval(results[level][key] for results in group) for _, key, _ in SHOWN}
-                for level in LEVELS
+                level: {key: interval(results[level][key] for results in group) for key in SHOWN} for level in LEVELS
             }
     return summaries
 
 
 def table(summaries: dict[str, Any]) -> str:
     """Return a Markdown table with one line per pair of levels; a star marks the training level."""
-    several = max(cell["falls"]["n"] for row in summaries.values() for cell in row.values()) > 1
-    rows: Table = [["trained at", "evaluated at", *(title for title, _, _ in SHOWN)]]
+    seeds = {trained: next(iter(row.values()))["falls"]["n"] for trained, row in summaries.items()}
+    rows: Table = [["trained at", "evaluated at", *(COLUMNS[key][0] for key in SHOWN)]]
     for trained, row in summaries.items():
-        for level, cell in row.items():
+        for level, cells in row.items():
             name = level + (" *" if level == trained else "")
-            rows.append([trained, name, *(shown(cell[key], form) for _, key, form in SHOWN)])
-    counts = ", ".join(f"{trained} {next(iter(row.values()))['falls']['n']}" for trained, row in summaries.items())
+            rows.append([trained, name, *(_cell(cells[key], COLUMNS[key][1]) for key in SHOWN)])
     note = "`*`: trained at this level; errors are mean absolute, over every step"
-    if several:
+    if max(seeds.values()) > 1:
+        counts = ", ".join(f"{trained} {count}" for trained, count in seeds.items())
         note += f"; mean over seeds with its 95 % confidence interval (seeds: {counts})"
     return f"{markdown(rows)}\n\n{note}"
 
 
-def shown(figure: dict[str, Any], form: str) -> str:
-    """Return a mean as text, with its interval if there is one."""
+def _cell(figure: dict[str, Any], form: str) -> str:
     return f"{figure['mean']:{form}}" + ("" if figure["ci95"] is None else f" ± {figure['ci95']:{form}}")
 
 
@@ -115,27 +113,20 @@ def evaluate_policies(
     for path in policies:
         model = load(path, env, env_args=env_args)
         record = model.record
-        tasks.add(_task(record))
+        # Ids are not compared, because ids of one task may name different levels.
+        tasks.add(tuple(record["policy_spec"].get(key, record["env"]) for key in ("robot", "task")))
         if len(tasks) > 1:
             raise PolicyError(f"{path}: is for {record['env']}; expected the robot and task of the others")
         print(f"evaluating {path}", file=sys.stderr)
         entry = {"policy": str(path), "env": record["env"], "transmission": record["transmission"]}
         entry |= {key: record.get(key) for key in ("seed", "steps")}
         evaluations.append(entry | {"results": transfer(model, record, episodes=episodes, seed=seed)})
-    return {
-        "env": evaluations[0]["env"], "episodes": episodes, "policies": evaluations, "summary": summary(evaluations),
-    }  # fmt: skip
-
-
-def _task(record: dict[str, Any]) -> tuple[Any, ...]:
-    """Return robot and task of a policy. Ids are not compared, because ids of one task may name different levels."""
-    return tuple(record["policy_spec"].get(key, record["env"]) for key in ("robot", "task"))
+    task = {"env": evaluations[0]["env"], "episodes": episodes}
+    return {**task, "policies": evaluations, "summary": summary(evaluations)}
 
 
 def write_report(result: dict[str, Any], folder: Path) -> list[Path]:
     """Write `transfer.json`, `transfer.md` and the picture `transfer.png` into a folder."""
-    from ce_gym.learn.evaluate.pictures import draw_transfer
-
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"transfer.{kind}" for kind in ("json", "md", "png")]
     files[0].write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
