@@ -57,8 +57,8 @@ def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterat
 
     Args:
         items: The items.
-        label: Label of the bar.
-        total: Number of items, if `len(items)` does not give it.
+        label: Text before the bar.
+        total: Largest number of items; None takes their length.
     """
     try:
         from tqdm import tqdm

@@ -94,7 +94,16 @@ def test_a_card_says_what_was_measured(run):
     result |= {"suites": suites, "finer": figures | {"forward_error": 0.234}}
     curve = [{"steps": 1, "seconds": 98.7, "reward": 1.0, "length": 1.0}]
     text = card(record, result, curve, short_name(record))
-    measured = ("0.123", "`exact`, sub-steps of 1 ms | 0.234", "45.6%", "78.9%", "98765", "25%", "2.0%", "passed: 1.10 and 1.20 times")
+    measured = (
+        "0.123",
+        "`exact`, sub-steps of 1 ms | 0.234",
+        "45.6%",
+        "78.9%",
+        "98765",
+        "25%",
+        "2.0%",
+        "passed: 1.10 and 1.20 times",
+    )
     for words in (*measured, "99 s", ROBOT_ENV, "[32, 16]", "curve.png"):
         assert words in text, words
     assert "## Motors" not in text

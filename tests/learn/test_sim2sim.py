@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,31 +13,42 @@ import mujoco
 from tripod import TRIPOD
 
 import ce_gym
-from ce_gym.adapters.sb3 import make_sb3_vec_env
+from ce_gym.__main__ import main
 from ce_gym.export.mujoco_twin import MujocoTwin
-from ce_gym.learn.evaluate import sim2sim
-from ce_gym.learn.evaluate.sim2sim import MujocoWorld, OurWorld, main, play, random_course, table, verdicts
-from ce_gym.learn.learners.sb3 import train
-from ce_gym.learn.runs.job import Job
-from ce_gym.learn.runs.settings import config_file, load_settings
-from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot
+from ce_gym.learn.evaluate.episodes import UNLIMITED, open_environments
+from ce_gym.learn.evaluate.sim2sim import (
+    MujocoEnvs,
+    _check_ratios,
+    comparison_table,
+    play,
+    random_commands,
+    verdicts,
+)
+from ce_gym.learn.training import train
+from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot, RobotError
 from ce_gym.policies import Policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
-NEVER = 10**9
 
 
-def world(level, n=3, seed=0, **kwargs):
-    envs = make_sb3_vec_env(ROBOT_ENV, n, seed, command_period=1e6, max_episode_steps=NEVER, **kwargs)
-    obs = envs.reset()
-    return MujocoWorld(envs.envs.unwrapped, obs, level), envs, obs
+@pytest.fixture
+def twins():
+    """A function that returns the same robots in MuJoCo and in ce_gym, and their first observations."""
+    with ExitStack() as stack:
+
+        def make(level, n=3, seed=0, **kwargs):
+            kwargs |= {"command_period": 1e6, "max_episode_steps": UNLIMITED}
+            envs, obs = stack.enter_context(open_environments(ROBOT_ENV, n, seed, **kwargs))
+            return MujocoEnvs(envs.unwrapped, obs, level), envs.unwrapped, obs
+
+        yield make
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["armature", "exact"])
-def test_robots_start_in_the_same_state(level):
-    made, envs, obs = world(level)
-    state = envs.envs.unwrapped.state()
+def test_robots_start_in_the_same_state(level, twins):
+    made, native, obs = twins(level)
+    state = native.state()
     q, v = made.twin.state()
     np.testing.assert_allclose(q, state["q"], atol=1e-12)
     np.testing.assert_allclose(v, state["v"], atol=1e-12)
@@ -121,15 +133,12 @@ def test_rotors_of_unknown_ratio_are_no_bodies(tmp_path):
     (tmp_path / "looped.xml").write_text(LOOP)
     robot = ce_gym.load_robot(tmp_path / "looped.xml")
     assert robot.unknown_ratios == ("thigh_rotor", "crank_rotor")
-    reason = sim2sim._without_ratios(robot)
-    assert (
-        reason
-        == "the file of looped gives no gear ratio for thigh_rotor, crank_rotor; `gears:` in a YAML file gives it"
-    )
+    with pytest.raises(RobotError, match="looped gives no gear ratio for thigh_rotor, crank_rotor; `gears:` in a YAML"):
+        _check_ratios(robot)
     (tmp_path / "looped.yaml").write_text("mjcf: looped.xml\ngears: {thigh: 9, crank: 2000}\n")
     known = ce_gym.load_robot(tmp_path / "looped.yaml")
     assert known.unknown_ratios == ()
-    assert not sim2sim._without_ratios(known)
+    _check_ratios(known)
     assert not any(ce_gym.load_robot(name).unknown_ratios for name in ce_gym.robots())
 
 
@@ -184,20 +193,20 @@ def test_a_step_on_the_ground_is_one_of_ours():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["armature", "exact"])
-def test_both_fly_alike(level):
+def test_both_fly_alike(level, twins):
     """High above the ground, where there are no contacts to differ in, and at small steps."""
-    made, envs, _ = world(level, transmission=level, dt=0.0005, n_substeps=40)
+    made, native, _ = twins(level, transmission=level, dt=0.0005, n_substeps=40)
     made.twin.model.opt.timestep = 0.0005
-    native = envs.envs.unwrapped
     state = native.state()
     state["q"][:, 2] += 5.0
     native.batch.write("q", state["q"])
     made.twin.start(state["q"], state["v"])
-    rng, ours = np.random.default_rng(0), OurWorld(envs)
+    rng = np.random.default_rng(0)
     for _ in range(5):
         action = rng.uniform(-0.5, 0.5, (3, 12)).astype(np.float32)
-        theirs, v, failed = made.step(action, state["command"])
-        obs, v_ours, fallen = ours.step(action, state["command"])
+        theirs, _, failed, _, _ = made.step(action)
+        obs, _, fallen, _, _ = native.step(action)
+    v, v_ours = made.state()["v"], native.state()["v"]
     assert not failed.any()
     assert not fallen.any()
     assert np.abs(v_ours[:, 6:]).max() > 5.0  # joints have moved fast
@@ -207,12 +216,12 @@ def test_both_fly_alike(level):
 
 
 @pytest.mark.slow
-def test_a_history_is_kept_newest_first():
-    made, _, obs = world("armature", robot=TRIPOD, history=3)
+def test_a_history_is_kept_newest_first(twins):
+    made, _, obs = twins("armature", robot=TRIPOD, history=3)
     size = obs.shape[1] // 3
-    first = made.step(np.zeros((3, 2), np.float32), np.zeros((3, 3)))[0]
+    first = made.step(np.zeros((3, 2), np.float32))[0]
     np.testing.assert_array_equal(first[:, size:], obs[:, : 2 * size])
-    second = made.step(np.zeros((3, 2), np.float32), np.zeros((3, 3)))[0]
+    second = made.step(np.zeros((3, 2), np.float32))[0]
     np.testing.assert_array_equal(second[:, size : 2 * size], first[:, :size])
     np.testing.assert_array_equal(second[:, 2 * size :], obs[:, :size])
 
@@ -220,8 +229,8 @@ def test_a_history_is_kept_newest_first():
 def test_commands_last_a_period_and_stay_in_range():
     policy_spec = {"control_dt": 0.02, "command": {"range": [[-1, 1], [0, 0.5], [2, 2]]}}
     first = np.full((200, 3), 9.0)
-    assert (random_course(policy_spec, first, 0.5, every=np.inf, seed=1).commands == first).all()
-    drawn = random_course(policy_spec, first, 0.5, every=0.1, seed=1).commands
+    assert (random_commands(policy_spec, first, 0.5, every=np.inf, seed=1) == first).all()
+    drawn = random_commands(policy_spec, first, 0.5, every=0.1, seed=1)
     assert drawn.shape == (26, 200, 3)
     assert (drawn[:5] == first).all()
     assert (drawn[5:10] == drawn[5]).all()
@@ -234,17 +243,17 @@ def test_commands_last_a_period_and_stay_in_range():
 
 def test_judgement_ends_with_a_fall():
     """Robot 1 falls at the third step; later steps do not count."""
-    step = iter(range(100))
+    v, taken, no = np.zeros((2, 7)), iter(range(100)), np.zeros(2, bool)
 
-    def stepped(action, command):
-        k = next(step)
-        v = np.zeros((2, 7))
-        v[0, 3], v[1, 3] = 0.5, 100.0 if k >= 2 else 0.5
-        return np.zeros((2, 1), np.float32), v, np.array([False, k == 2])
+    def step(action):
+        k = next(taken)
+        v[:, 3] = 0.5, 100.0 if k >= 2 else 0.5
+        return np.zeros((2, 1), np.float32), np.zeros(2), np.array([False, k == 2]), no, {}
 
+    native = SimpleNamespace(set_command=lambda command: None, state=lambda: {"v": v})
     policy = Policy(lambda obs: obs, {"observation_size": 1})
-    given = SimpleNamespace(commands=np.ones((11, 2, 3)), control_dt=0.1)
-    result = play(policy, SimpleNamespace(step=stepped), np.zeros((2, 1), np.float32), given)
+    envs = SimpleNamespace(step=step, unwrapped=native)
+    result = play(policy, envs, np.zeros((2, 1), np.float32), np.ones((11, 2, 3)), control_dt=0.1)
     assert result["falls"] == 0.5
     assert result["episode_length"] == pytest.approx(0.5 * (1.0 + 0.2))
     assert result["forward_error"] == pytest.approx(0.5)
@@ -252,14 +261,15 @@ def test_judgement_ends_with_a_fall():
     assert result["velocity_error"] == pytest.approx(np.hypot(0.5, 1.0))
 
 
-def test_standing_robots_stand_and_tilted_ones_fall():
+def test_standing_robots_stand_and_tilted_ones_fall(twins):
     stand = Policy(lambda obs: np.zeros((len(obs), 12), np.float32), {"observation_size": 48})
-    made, envs, obs = world("armature", n=2)
-    state = envs.envs.unwrapped.state()
+    made, native, obs = twins("armature", n=2)
+    state = native.state()
     state["q"][1, 3:7] = (np.cos(0.6), np.sin(0.6), 0.0, 0.0)  # rolled by 69 degrees
     assert not made.native.look({**state, "action": np.zeros((2, 12))})[1].any()
     made.twin.start(state["q"], state["v"])
-    result = play(stand, made, obs, random_course(made.policy_spec, np.zeros((2, 3)), 1.0, every=1.0, seed=0))
+    commands = random_commands(made.policy_spec, np.zeros((2, 3)), 1.0, every=1.0, seed=0)
+    result = play(stand, made, obs, commands, control_dt=0.02)
     assert result["falls"] == 0.5
 
 
@@ -291,7 +301,9 @@ def test_the_verdict_compares_like_with_like(theirs, passes):
     assert found["MuJoCo, rotors as bodies"]["passed"] is passes
     assert not found["MuJoCo, armature"]["passed"]  # nobody is on its feet
     assert found["MuJoCo, armature"]["error_ratio"] == 1.0
-    text = table({"simulations": simulations | {n: x | BLANK for n, x in simulations.items()}, "verdict": found})
+    text = comparison_table(
+        {"simulations": simulations | {n: x | BLANK for n, x in simulations.items()}, "verdict": found}
+    )
     assert ("passed" in text) is passes
     assert "FAILED" in text
 
@@ -302,14 +314,13 @@ BLANK = {"forward_error": 0.0, "lateral_error": 0.0, "episode_length": 1.0}
 @pytest.mark.slow
 def test_the_program_compares_four_simulations(tmp_path, capsys):
     small = ["num_envs=16", "rollout=8", "steps=300", "minibatches=2", "training={}"]
-    settings = load_settings(config_file(ROBOT_ENV), small)
-    policy = train(Job(ROBOT_ENV, settings, tmp_path, env_kwargs={}, tensorboard=False)).policy
+    policy = train(ROBOT_ENV, out=tmp_path, overrides=small).policy
     capsys.readouterr()
-    arguments = [str(policy), "--episodes", "2", "--seconds", "0.2", "--json"]
+    arguments = ["sim2sim", str(policy), "--episodes", "2", "--seconds", "0.2", "--json"]
     code = main(arguments)
     result = json.loads(capsys.readouterr().out)
     assert main([*arguments, str(tmp_path / "result.json")]) == code
-    assert "required: at least" in capsys.readouterr().out
+    assert "Required in MuJoCo: at least" in capsys.readouterr().out
     assert result == json.loads((tmp_path / "result.json").read_text())
     simulations = result["simulations"]
     assert list(simulations) == ["ce_gym, exact", "ce_gym, armature", "MuJoCo, armature", "MuJoCo, rotors as bodies"]
@@ -318,13 +329,13 @@ def test_the_program_compares_four_simulations(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_mistakes_are_one_line(tmp_path, capsys):
-    assert main([str(tmp_path / "missing.zip")]) == 2
+def test_mistakes_are_one_line(tmp_path, capsys, twins):
+    assert main(["sim2sim", str(tmp_path / "missing.zip")]) == 2
     assert "\n" not in capsys.readouterr().err.strip()
     with pytest.raises(ValueError, match="expected one of armature, exact"):
         MujocoTwin(ce_gym.load_robot("mini_cheetah"), "none", 1)
     with pytest.raises(ValueError, match="expected 'joint_pd'"):
-        world("armature", robot=TRIPOD, actions="joint_torque")
+        twins("armature", robot=TRIPOD, actions="joint_torque")
 
 
 def test_without_mujoco_it_says_what_to_install(monkeypatch, capsys):
@@ -334,5 +345,5 @@ def test_without_mujoco_it_says_what_to_install(monkeypatch, capsys):
     ):
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    assert main(["mini_cheetah_velocity"]) == 2
-    assert capsys.readouterr().err == ('sim2sim.py: needs mujoco, which is not installed: pip install "ce_gym[mjcf]"\n')
+    assert main(["sim2sim", "mini_cheetah_velocity"]) == 2
+    assert capsys.readouterr().err == 'ce_gym: needs mujoco, which is not installed: pip install "ce_gym[mjcf]"\n'

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from point_mass import ID
 
-from ce_gym.learn.evaluate.transfer import interval, main, summary, table
-from ce_gym.learn.learners.sb3 import train as really_train
+from ce_gym.__main__ import main
+from ce_gym.learn import study
+from ce_gym.learn.evaluate.transfer import interval, summary, table
 from ce_gym.model.mechanism import LEVELS
-from ce_gym.policies import load_policy
+from ce_gym.policies import load_policy, read_actor, write_npz
 
-SMALL = ["--train", "--env", ID, "--steps", "600", "--seeds", "0", "1", "--threads", "1", "--episodes", "4"]
+SMALL = ["transfer", "--train", "--env", ID, "--steps", "600", "--seeds", "0", "1", "--threads", "1", "--episodes", "4"]
 
 
 @pytest.fixture(scope="module")
@@ -27,12 +28,20 @@ def trainings(monkeypatch):
     """The training runs begun during a test: level and seed."""
     begun = []
 
+    run_job = study.run_job
+
     def train(job):
         begun.append((job.env_kwargs["transmission"], job.seed, job.resume))
-        return really_train(job)
+        return run_job(job)
 
-    monkeypatch.setattr("ppo.train", train)
+    monkeypatch.setattr(study, "run_job", train)
     return begun
+
+
+def write_finished(policy, finished):
+    """Write into the record of a policy whether its training has finished."""
+    actor, record = read_actor(policy)
+    write_npz(actor, record | {"finished": finished}, policy)
 
 
 def test_every_level_and_seed_is_trained_on_its_own(runs):
@@ -57,16 +66,15 @@ def test_a_second_call_trains_only_what_is_missing(runs, trainings, tmp_path):
 
 
 def test_an_interrupted_run_is_gone_on_with(runs, trainings, monkeypatch):
-    record = runs / "exact" / "seed_1" / "policy.json"
-    text = record.read_text()
-    record.write_text(json.dumps(json.loads(text) | {"finished": False}))
+    policy = runs / "exact" / "seed_1" / "policy.npz"
+    write_finished(policy, False)
     assert main([*SMALL, "--levels", "exact", "--runs", str(runs)]) == 0
-    assert trainings == [("exact", 1, record.with_suffix(".zip"))]
-    assert json.loads(record.read_text())["finished"]
-    monkeypatch.setattr("ppo.train", lambda job: SimpleNamespace(interrupted=True))
-    record.write_text(text.replace('"finished": true', '"finished": false'))
+    assert trainings == [("exact", 1, policy)]
+    assert load_policy(policy).record["finished"]
+    monkeypatch.setattr(study, "run_job", lambda job: SimpleNamespace(interrupted=True))
+    write_finished(policy, False)
     assert main([*SMALL, "--levels", "exact", "--runs", str(runs)]) == 130
-    record.write_text(text)
+    write_finished(policy, True)
 
 
 def test_a_run_of_another_kind_is_not_overwritten(runs, trainings, capsys):
@@ -80,16 +88,15 @@ def test_a_run_of_another_kind_is_not_overwritten(runs, trainings, capsys):
 @pytest.mark.parametrize("argv", [[], ["--train"], ["some", "--train", "--env", ID]])
 def test_bad_command_lines_are_refused(argv):
     with pytest.raises(SystemExit) as caught:
-        main(argv)
+        main(["transfer", *argv])
     assert caught.value.code == 2
 
 
 def test_policies_of_different_tasks_are_not_compared(runs, tmp_path, capsys):
-    record = json.loads((runs / "none" / "seed_0" / "policy.json").read_text())
+    actor, record = read_actor(runs / "none" / "seed_0" / "policy.npz")
     record["policy_spec"] |= {"robot": "another", "task": "velocity"}
-    (tmp_path / "policy.json").write_text(json.dumps(record))
-    (tmp_path / "policy.zip").write_bytes((runs / "none" / "seed_0" / "policy.zip").read_bytes())
-    assert main([str(runs / "exact" / "seed_0"), str(tmp_path), "--episodes", "2"]) == 2
+    write_npz(actor, record, tmp_path / "policy.npz")
+    assert main(["transfer", str(runs / "exact" / "seed_0"), str(tmp_path), "--episodes", "2"]) == 2
     assert "expected the robot and task of the others" in capsys.readouterr().err
 
 

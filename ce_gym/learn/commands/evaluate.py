@@ -178,7 +178,7 @@ def add_card_command(subparsers: Any) -> None:
         description="Evaluate the policy of a training run and write card.md, curve.png and policy.npz.",
         epilog=examples("card runs/mini_cheetah_velocity", "card runs/stairs --task stairs --out shelf/stairs"),
     )
-    parser.add_argument("run", metavar="RUN", help="folder of a training run, or the policy in it")
+    parser.add_argument("policy", metavar="RUN", help="folder of a training run, or the policy in it")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--out", type=Path, metavar="FOLDER", help="where to write (default: the run's folder)")
     where.add_argument("--ship", action="store_true", help="write to assets/policies/<robot>_<task>_<level>")
@@ -208,7 +208,7 @@ def card(args: argparse.Namespace) -> int:
     from ce_gym.learn.evaluate.card import write_card
 
     file, result = write_card(
-        args.run, args.out, args.ship, args.task, args.episodes, args.robots, args.levels, args.env, args.env_args
+        args.policy, args.out, args.ship, args.task, args.episodes, args.robots, args.levels, args.env, args.env_args
     )
     print_result(result, str(file), args.json)
     return 0
