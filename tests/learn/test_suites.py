@@ -2,16 +2,27 @@
 
 import hashlib
 import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from point_mass import ID, PointMassVectorEnv
 
 import ce_gym
 from ce_gym.__main__ import main
-from ce_gym.learn.evaluate.episodes import EVALUATION_SEED, LEVEL, weights_seed, without_curricula
+from ce_gym.learn.evaluate.episodes import (
+    EVALUATION_SEED,
+    LEVEL,
+    open_environments,
+    play,
+    run_policy,
+    weights_seed,
+    without_curricula,
+)
 from ce_gym.learn.evaluate.evaluation import evaluate, report
 from ce_gym.learn.evaluate.suites import SUITES, driver
 from ce_gym.learn.evaluate.tables import suite_table
@@ -19,6 +30,7 @@ from ce_gym.policies import Actor, Policy, write_npz
 
 RANGES = np.array([[-1.0, 2.0], [-0.5, 0.5], [-0.7, 0.9]])
 DT = 0.02
+RESTING = Policy(lambda rows: np.zeros((len(rows), 1), "f4"), {"observation_size": 2})
 
 
 def test_the_seed_is_of_the_weights_and_of_nothing_else():
@@ -118,6 +130,84 @@ def test_falls_and_errors_are_told_by_level():
     assert levels[2]["forward_error"] > levels[0]["forward_error"]
     assert "| 2     |" in report(result)
     assert "levels" not in evaluate(fleeing, ID, episodes=2)
+
+
+def test_environments_of_other_packages_are_evaluated():
+    """They have no statistics but those of Gymnasium's wrapper; time-outs and falls are told apart all the same."""
+    gymnasium.register(
+        "test/Recorded-v0",
+        vector_entry_point=lambda **kwargs: RecordEpisodeStatistics(PointMassVectorEnv(standard=True, **kwargs)),
+    )
+    try:
+        fleeing = Policy(lambda rows: np.float32(np.arange(len(rows)) % 4 == 3)[:, None], {"observation_size": 2})
+        result = evaluate(fleeing, "test/Recorded-v0", episodes=8, seed=3)
+    finally:
+        del gymnasium.registry["test/Recorded-v0"]
+    own = evaluate(fleeing, ID, episodes=8, seed=3)
+    assert (result["falls"], result["timed_out"], result["episodes"]) == (0.25, 0.75, 8)
+    assert result["episode_length"] == pytest.approx(
+        (6 * 50 + 2 * 15) / 8 / 50, abs=2 / 8 / 50
+    )  # 15 or 16 steps of 0.2
+    for key in ("forward_error", "episode_length", "falls"):
+        assert result[key] == own[key], key
+    assert result["reward"] == pytest.approx(own["reward"], rel=1e-5)
+
+
+def test_a_robot_at_rest_has_the_error_of_its_command():
+    with open_environments(ID, 5, 7) as (envs, _):
+        commands = np.abs(envs.unwrapped.command)
+    result = evaluate(RESTING, ID, episodes=5, seed=7)
+    assert result["forward_error"] == pytest.approx(commands.mean())
+    assert result["velocity_error"] == pytest.approx(commands.mean())
+    assert result["lateral_error"] == result["yaw_rate_error"] == result["falls"] == 0.0
+    assert result["reward"] == pytest.approx(50 * (1 - commands**2).mean(), rel=1e-5)
+    assert result["episode_length"] == 1.0
+
+
+def test_each_environment_counts_for_one_episode():
+    """Environment 0 falls after 15 or 16 steps of 0.2 m/s, and then again after 30 or 31 steps of 0.1 m/s."""
+    step = iter(range(100))
+
+    def push(rows):
+        force = np.zeros((len(rows), 1), "f4")
+        force[0] = 1.0 if next(step) < 16 else 0.5
+        return force
+
+    result = evaluate(Policy(push, {"observation_size": 2}), ID, episodes=2)
+    assert result["falls"] == 0.5
+    assert result["episode_length"] in (65 / 2 / 50, 66 / 2 / 50)
+
+
+def test_errors_refer_to_the_command_that_the_policy_has_seen():
+    """The command before step k is k - 1, and the robot rests; the last of 50 steps does not count."""
+    with open_environments(ID, 3, 0) as (envs, obs):
+        native, first = envs.unwrapped, np.abs(obs[:, 1]).mean()
+
+        def command(step):
+            native.batch.write("command", np.full((3, 3), step))
+
+        result = play(RESTING, envs, obs, command)
+    assert result["forward_error"] == pytest.approx((first + sum(range(48))) / 49)
+
+
+def test_progress_is_counted_in_steps_of_the_longest_episode(monkeypatch):
+    bars = []
+
+    def progress(items, label, total):
+        bars.append((label, total))
+        return iter(items)
+
+    monkeypatch.setattr("ce_gym.learn.evaluate.episodes.progress", progress)
+    evaluate(RESTING, ID, episodes=2, horizon=30)
+    with open_environments(ID, 2, 0) as (envs, obs):
+        assert len(list(run_policy(RESTING, envs, obs, steps=7, label="short"))) == 7
+    assert bars == [("episodes", 30), ("short", 7)]
+
+
+def test_evaluation_needs_neither_torch_nor_stable_baselines3():
+    code = "import sys; sys.modules.update(torch=None, stable_baselines3=None); from ce_gym.__main__ import main; "
+    code += "sys.exit(main(['evaluate', 'mini_cheetah_velocity', '--episodes', '2']))"
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
 def test_judging_leaves_curricula_out():

@@ -13,11 +13,11 @@ from typing import Any
 
 import gymnasium
 
-from ce_gym.console import Table, markdown
+from ce_gym.console import markdown
 from ce_gym.learn.evaluate.crossing import cross
 from ce_gym.learn.evaluate.effort import effort
 from ce_gym.learn.evaluate.episodes import weights_seed
-from ce_gym.learn.evaluate.evaluation import evaluate
+from ce_gym.learn.evaluate.evaluation import evaluate, load
 from ce_gym.learn.evaluate.pictures import draw_curve
 from ce_gym.learn.evaluate.pushes import push_envelope
 from ce_gym.learn.evaluate.sim2sim import compare, comparison_table
@@ -27,16 +27,7 @@ from ce_gym.learn.runs.progress import read_curve
 from ce_gym.learn.runs.settings import config_file, load_settings
 from ce_gym.learn.training import learner, learner_of
 from ce_gym.model.mechanism import LEVELS
-from ce_gym.policies import (
-    Policy,
-    PolicyError,
-    environment_of,
-    keep_map,
-    locate_policy,
-    read_actor,
-    shelf,
-    write_npz,
-)
+from ce_gym.policies import Policy, PolicyError, keep_map, locate_policy, read_actor, shelf, write_npz
 
 FINER = 5
 """Ratio of sub-step lengths of a second evaluation, because a policy may rely on the length of its training."""
@@ -61,23 +52,26 @@ def card_results(policy: Policy, episodes: int, sim2sim_robots: int, levels: Seq
 
         Policies without commands have no suites, crossing, pushes and sim2sim.
     """
-    record, kwargs, seed = policy.record, policy.record["env_kwargs"], weights_seed(policy)
+    record, seed = policy.record, weights_seed(policy)
+    env_id, kwargs, spec, trained = (record[key] for key in ("env", "env_kwargs", "policy_spec", "transmission"))
+    common = {"episodes": episodes, "seed": seed}
     by_level = {
-        level: evaluate(policy, record["env"], episodes=episodes, seed=seed, **{**kwargs, "transmission": level})
-        for level in dict.fromkeys((*levels, record["transmission"]))
+        level: evaluate(policy, env_id, **common, **{**kwargs, "transmission": level})
+        for level in dict.fromkeys((*levels, trained))
     }
-    longest = gymnasium.spec(record["env"]).max_episode_steps or math.inf
-    seconds = min(10.0, longest * record["policy_spec"]["control_dt"])
-    result: dict[str, Any] = {"seed": seed, "levels": by_level}
-    shorter = {**kwargs, **_shorter(record["policy_spec"])}
-    result["finer"] = evaluate(policy, record["env"], episodes=episodes, seed=seed, **shorter)
-    result["effort"] = effort(policy, seconds=seconds, seed=seed, **kwargs)
-    if not by_level[record["transmission"]]["commanded"]:
+    longest = gymnasium.spec(env_id).max_episode_steps or math.inf
+    result: dict[str, Any] = {
+        "seed": seed,
+        "levels": by_level,
+        "finer": evaluate(policy, env_id, **common, **{**kwargs, **_shorter(spec)}),
+        "effort": effort(policy, seconds=min(10.0, longest * spec["control_dt"]), seed=seed, **kwargs),
+    }
+    if not by_level[trained]["commanded"]:
         return result | {"sim2sim_missing": "the policy has no commands, which the comparison needs"}
-    result["suites"] = evaluate_suites(policy, episodes, seed, **kwargs)
+    result["suites"] = evaluate_suites(policy, **common, **kwargs)
     result["pushes"] = push_envelope(policy, seed=seed, **kwargs)
-    if by_level[record["transmission"]].get("levels"):
-        result["crossing"] = cross(policy, episodes, seed, **kwargs)
+    if "levels" in by_level[trained]:
+        result["crossing"] = cross(policy, **common, **kwargs)
     if not sim2sim_robots:
         return result | {"sim2sim_missing": "not requested"}
     try:
@@ -131,40 +125,41 @@ def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, f
         curve: Rows of the learning curve.
         name: Name of the policy.
     """
-    versions = ", ".join(f"{package} {number}" for package, number in record["versions"].items())
     seconds = max([record["training_seconds"], *(row["seconds"] for row in curve)])
-    facts: Table = [
-        ["what", ""],
-        ["environment", f"`{record['env']}`"],
-        ["trained on", f"`{record['transmission']}` transmissions"],
-        ["seed", str(record["seed"])],
-        ["steps", f"{record['steps']:,}"],
-        ["wall-clock time", f"{seconds:.0f} s"],
-        *([["processor time", f"{spent:.0f} s"]] if (spent := record.get("processor_seconds")) else []),
-        ["observation, action", f"{record['observation_size']} numbers, {record['action_size']} numbers"],
-        ["date", record["date"]],
-        ["versions", versions],
-    ]
-    settings: Table = [["setting", "value"], *([key, str(value)] for key, value in record["settings"].items())]
+    facts = {
+        "environment": f"`{record['env']}`",
+        "trained on": f"`{record['transmission']}` transmissions",
+        "seed": record["seed"],
+        "steps": f"{record['steps']:,}",
+        "wall-clock time": f"{seconds:.0f} s",
+        "processor time": f"{spent:.0f} s" if (spent := record.get("processor_seconds")) else "unknown",
+        "observation, action": f"{record['observation_size']} numbers, {record['action_size']} numbers",
+        "date": record["date"],
+        "versions": ", ".join(f"{package} {number}" for package, number in record["versions"].items()),
+    }
+    try:
+        repeat = f"Trained by\n\n```sh\n{command(record)}\n```"
+    except PolicyError as error:
+        repeat = f"No single command repeats it: {error}"
+    in_mujoco = f"Not evaluated: {result.get('sim2sim_missing')}"
+    if "sim2sim" in result:
+        in_mujoco = f"{comparison_table(result['sim2sim'])} Commands are random, one for each robot."
     trained = result["levels"].get(record["transmission"], {})
     parts = [
         f"# {name}",
-        markdown(facts),
-        _how_to_repeat(record),
+        _pairs("what", "", facts),
+        repeat,
         *(["![Learning curve](curve.png)"] if curve else []),
         f"## On transmission levels\n\n{_levels(record, result)}",
         *sections({**result, "levels": trained.get("levels")}),
-        f"## In MuJoCo\n\n{_sim2sim(result)}",
-        f"## Settings\n\n{markdown(settings)}",
+        f"## In MuJoCo\n\n{in_mujoco}",
+        f"## Settings\n\n{_pairs('setting', 'value', record['settings'])}",
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _how_to_repeat(record: dict[str, Any]) -> str:
-    try:
-        return f"Trained by\n\n```sh\n{command(record)}\n```"
-    except PolicyError as error:
-        return f"No single command repeats it: {error}"
+def _pairs(key: str, value: str, pairs: Mapping[str, Any]) -> str:
+    return markdown([[key, value], *([name, str(entry)] for name, entry in pairs.items())])
 
 
 def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:
@@ -181,12 +176,6 @@ def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:
         f"Other results are at level `{level}` unless named otherwise.",
     )
     return f"{table('evaluated at', rows, *keys, 'falls', 'reward')}\n\n{' '.join(notes)}"
-
-
-def _sim2sim(result: dict[str, Any]) -> str:
-    if "sim2sim" not in result:
-        return f"Not evaluated: {result['sim2sim_missing']}"
-    return f"{comparison_table(result['sim2sim'])} Commands are random, one for each robot."
 
 
 def short_name(record: dict[str, Any], task: str | None = None) -> str:
@@ -208,11 +197,11 @@ def portable(record: dict[str, Any]) -> dict[str, Any]:
     terrain = kwargs.get("terrain")
     if isinstance(terrain, Mapping) and "file" in terrain:  # a copy is in the folder of the policy
         kwargs["terrain"] = {**terrain, "file": Path(terrain["file"]).name}
-    own: dict[str, Any] = {"resumed_from": Path(resumed).name if resumed else None, "env_kwargs": kwargs}
     settings = record.get("settings", {})
     if "teacher" in settings:
-        own["settings"] = {**settings, "teacher": Path(settings["teacher"]).name}
-    return record | own
+        settings = {**settings, "teacher": Path(settings["teacher"]).name}
+    changed = {"resumed_from": Path(resumed).name if resumed else None, "env_kwargs": kwargs, "settings": settings}
+    return record | changed
 
 
 def write_card(
@@ -228,16 +217,9 @@ def write_card(
 ) -> tuple[Path, dict[str, Any]]:
     """Evaluate a policy, write `card.md`, `curve.png` and `policy.npz`, and return the card's path and the results.
 
-    Args:
-        run: Folder of a training run, or the policy in it.
-        out: Folder to write to; that of the policy if None.
-        ship: Whether to write to the folder of shipped policies, as `<robot>_<task>_<level>`.
-        task: See `short_name`.
-        episodes: See `card_results`.
-        robots: See `card_results`.
-        levels: See `card_results`.
-        env: Environment id of the evaluation; None keeps the id of the record.
-        env_args: Arguments of the environment that replace arguments in the record.
+    The files are written to `out`, to the folder of shipped policies if `ship` is true, and to the folder of the policy
+    otherwise. For `task`, see `short_name`; for `episodes`, `robots` and `levels`, `card_results`; for `env` and
+    `env_args`, `evaluation.load`.
 
     Raises:
         PolicyError: If the policy cannot be used.
@@ -247,14 +229,11 @@ def write_card(
     record, curve = portable(record), read_curve(source.parent / "curve.csv")
     name = short_name(record, task)
     folder = shelf() / name if ship else out or source.parent
-    environment = {
-        "env": environment_of(record, env),
-        "env_kwargs": {**record["env_kwargs"], **dict(env_args)},
-    }
-    result = card_results(Policy(actor, record | environment), episodes, robots, levels)
+    evaluated = load(source, env, env_args=env_args)
+    result = card_results(Policy(actor, evaluated.record), episodes, robots, levels)
     folder.mkdir(parents=True, exist_ok=True)
     write_npz(actor, record, folder / "policy.npz")
-    keep_map(record["env_kwargs"], folder)
+    keep_map(evaluated.record["env_kwargs"], folder)
     if curve:
         draw_curve(curve, name, folder / "curve.png")
     (folder / "card.md").write_text(card(record, result, curve, name), encoding="utf-8")

@@ -34,10 +34,9 @@ class Drives:
 
     Attributes:
         names: Names of the motors' rotors, or of the joints.
-        torque: Largest torque [N m], infinite if unknown, shape (n,).
-        stall, velocity: Stall torque [N m] and no-load speed [rad/s] of the torque-speed line, infinite if unknown,
-            shape (n,).
-        power: Largest mechanical power within torque limit and torque-speed line [W], shape (n,).
+        torque, stall, velocity: Largest torque [N m], and stall torque [N m] and no-load speed [rad/s] of the
+            torque-speed line, infinite if unknown, shape (n_motors,) each.
+        power: Largest mechanical power within these limits [W], shape (n_motors,).
         speeds: Function from positions (nq, n) to `W` (n_motors, n_joints), stacked column by column.
         constant: `W` if it does not depend on positions, otherwise None.
     """
@@ -95,15 +94,10 @@ class Drives:
         return np.einsum("nj,njm->nm", tau, np.linalg.pinv(W)), np.einsum("nmj,nj->nm", W, joints) + relative
 
     def beyond(self, tau: Array, speed: Array, last_speed: Array) -> NDArray[np.bool_]:
-        """Return which motors exceed their torque-speed limits in a sub-step, shape (n, n_motors).
+        """Return which motors exceed their torque-speed limits in a sub-step, shape (n, n_motors) as all arguments.
 
-        Torques are means over a sub-step, in which an impact may reverse a motor. So a torque is allowed if the limit
-        at the start or at the end of the sub-step allows it.
-
-        Args:
-            tau: Torques [N m], shape (n, n_motors).
-            speed: Speeds at the end of the sub-step [rad/s], shape (n, n_motors).
-            last_speed: Speeds at the start of the sub-step [rad/s], shape (n, n_motors).
+        Torques [N m] are means over a sub-step, in which an impact may reverse a motor. So a torque is allowed if the
+        limit at `last_speed` [rad/s], at the start of the sub-step, or at `speed`, at its end, allows it.
         """
         slowest = np.minimum(np.sign(tau) * speed, np.sign(tau) * last_speed)
         allowed = np.clip(self.stall * (1 - slowest / self.velocity), 0, self.torque)
@@ -111,14 +105,9 @@ class Drives:
 
 
 def largest_power(torque: float, stall: float, velocity: float) -> float:
-    """Return the largest mechanical power of a motor [W] with torque limit and torque-speed line.
+    """Return the largest mechanical power of a motor [W] with limits as in `Drives`.
 
     The maximum is at half the no-load speed, or where the line meets the torque limit if that speed is higher.
-
-    Args:
-        torque: Torque limit [N m].
-        stall: Stall torque of the line [N m].
-        velocity: No-load speed of the line [rad/s].
     """
     if not math.isfinite(stall * velocity):
         return math.inf
@@ -192,49 +181,39 @@ def effort(policy: Policy, *, episodes: int = 32, seconds: float = 10.0, seed: i
         "speed": distance / (count * dt),
         "power": float(sums["driving"].sum() / count),
     }
-    torques = _shares(drives, "torque", sums["torque"] / count, peaks["torque"], drives.torque)
-    powers = _shares(drives, "power", sums["driving"] / count, peaks["power"], drives.power)
-    motors = {name: torques.pop(name) | powers.pop(name) for name in drives.names}
-    beyond = float(sums["beyond"].mean() / count) if np.isfinite(drives.power).all() else None
-    return {**result, **torques, **powers, "beyond_limits": beyond, "motors": motors}
-
-
-def _shares(drives: Drives, quantity: str, means: Array, peaks: Array, limits: Array) -> dict[str, Any]:
-    """Return mean and peak of torques or powers as fractions of their limits, and the values of each motor by name."""
-    known = np.isfinite(limits)
-    result: dict[str, Any] = {f"mean_{quantity}": None, f"peak_{quantity}": None, f"peak_{quantity}_at": None}
-    if known.all():
-        largest = int((peaks / limits).argmax())
-        result[f"mean_{quantity}"] = float((means / limits).mean())
-        result[f"peak_{quantity}"] = float(peaks[largest] / limits[largest])
-        result[f"peak_{quantity}_at"] = drives.names[largest]
-    for i, name in enumerate(drives.names):
-        limit = float(limits[i]) if known[i] else None
-        figures = {"mean": float(means[i]), "peak": float(peaks[i])}
-        result[name] = {f"{kind}_{quantity}": x for kind, x in figures.items()} | {f"{quantity}_limit": limit}
-    return result
+    motors: dict[str, dict[str, Any]] = {name: {} for name in drives.names}
+    measured = {
+        "torque": (sums["torque"] / count, peaks["torque"], drives.torque),
+        "power": (sums["driving"] / count, peaks["power"], drives.power),
+    }
+    for quantity, (means, highest, limits) in measured.items():
+        known, largest = np.isfinite(limits), int((highest / limits).argmax())
+        result[f"mean_{quantity}"] = float((means / limits).mean()) if known.all() else None
+        result[f"peak_{quantity}"] = float(highest[largest] / limits[largest]) if known.all() else None
+        result[f"peak_{quantity}_at"] = drives.names[largest] if known.all() else None
+        for i, name in enumerate(drives.names):
+            motors[name][f"mean_{quantity}"] = float(means[i])
+            motors[name][f"peak_{quantity}"] = float(highest[i])
+            motors[name][f"{quantity}_limit"] = float(limits[i]) if known[i] else None
+    result["beyond_limits"] = float(sums["beyond"].mean() / count) if np.isfinite(drives.power).all() else None
+    return result | {"motors": motors}
 
 
 class HeldActions:
-    """A policy that is called at every sub-step and changes its action at every control step.
+    """A policy that is called at every sub-step and changes its action after `hold` sub-steps.
 
-    Args:
-        policy: The policy.
-        hold: Sub-steps in a control step.
-        history: Number of frames in an observation of the policy.
+    Its observations consist of the last `history` frames, the newest first.
     """
 
     def __init__(self, policy: Policy, hold: int, history: int) -> None:
         self.policy, self.hold, self.history = policy, hold, history
-        self.step = 0
+        self.step, self.observation = 0, np.zeros((0, 0))
 
     def predict(self, frame: NDArray, /, *, deterministic: bool = True) -> tuple[NDArray, None]:
         """Return the action of the current control step; `frame` (n, size) is the newest part of the observation."""
-        if self.step == 0:
-            self.observation = np.tile(frame, self.history)
-        elif self.step % self.hold == 0:
-            self.observation = np.hstack([frame, self.observation[:, : -frame.shape[1]]])
         if self.step % self.hold == 0:
+            earlier = self.observation[:, : -frame.shape[1]] if self.step else np.tile(frame, self.history - 1)
+            self.observation = np.hstack([frame, earlier])
             self.action, _ = self.policy.predict(self.observation, deterministic=deterministic)
         self.step += 1
         return self.action, None
