@@ -13,7 +13,6 @@ from typing import Any
 
 import gymnasium
 
-from ce_gym.console import markdown
 from ce_gym.learn.evaluate.crossing import cross
 from ce_gym.learn.evaluate.effort import effort
 from ce_gym.learn.evaluate.episodes import weights_seed
@@ -22,7 +21,7 @@ from ce_gym.learn.evaluate.pictures import draw_curve
 from ce_gym.learn.evaluate.pushes import push_envelope
 from ce_gym.learn.evaluate.sim2sim import compare, comparison_table
 from ce_gym.learn.evaluate.suites import evaluate_suites
-from ce_gym.learn.evaluate.tables import metrics, sections, table
+from ce_gym.learn.evaluate.tables import metrics, sections, table, two_columns
 from ce_gym.learn.runs.progress import read_curve
 from ce_gym.learn.runs.settings import config_file, load_settings
 from ce_gym.learn.training import learner, learner_of
@@ -147,19 +146,15 @@ def card(record: dict[str, Any], result: dict[str, Any], curve: list[dict[str, f
     trained = result["levels"].get(record["transmission"], {})
     parts = [
         f"# {name}",
-        _pairs("what", "", facts),
+        two_columns("what", "", facts),
         repeat,
         *(["![Learning curve](curve.png)"] if curve else []),
         f"## On transmission levels\n\n{_levels(record, result)}",
         *sections({**result, "levels": trained.get("levels")}),
         f"## In MuJoCo\n\n{in_mujoco}",
-        f"## Settings\n\n{_pairs('setting', 'value', record['settings'])}",
+        f"## Settings\n\n{two_columns('setting', 'value', record['settings'])}",
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _pairs(key: str, value: str, pairs: Mapping[str, Any]) -> str:
-    return markdown([[key, value], *([name, str(entry)] for name, entry in pairs.items())])
 
 
 def _levels(record: dict[str, Any], result: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ce_gym.learn.evaluate.episodes import Predicts, open_environments, play, weights_seed, without_curricula
-from ce_gym.learn.evaluate.tables import metrics, sections
+from ce_gym.learn.evaluate.tables import metrics, sections, two_columns
 from ce_gym.policies import Policy, environment_of, load_policy
 
 
@@ -74,23 +74,17 @@ def evaluate(
 
 
 def report(result: dict[str, Any]) -> str:
-    """Return the main results as text, one per line, and tables of the other results."""
+    """Return a result of `evaluate` as Markdown tables, with the other results in it."""
+    figures = {name: f"{value:.3f}" for name, value in metrics(result).items()}
     if result["commanded"]:
-        rows = [
-            ("forward speed error", f"{result['forward_error']:.3f} m/s", "mean absolute, over every step"),
-            ("lateral speed error", f"{result['lateral_error']:.3f} m/s", ""),
-            ("yaw rate error", f"{result['yaw_rate_error']:.3f} rad/s", ""),
-            ("velocity error", f"{result['velocity_error']:.3f} m/s", "horizontal, mean length"),
-        ]
-    else:
-        rows = [(name, f"{figure:.3f}", "mean over episodes") for name, figure in metrics(result).items()]
-    rows += [
-        ("falls", f"{result['falls']:.1%}", f"of {result['episodes']} episodes, seed {result['seed']}"),
-        ("time-outs", f"{result['timed_out']:.1%}", "on its feet to the end" if result["commanded"] else ""),
-        ("episode length", f"{result['episode_length']:.1f} s", "mean"),
-        ("reward per episode", f"{result['reward']:.2f}", ""),
-    ]
-    if result["diverged"]:
-        rows.append(("diverged", f"{result['diverged']:.1%}", "stopped because the state was not finite"))
-    lines = [f"{name:<20} {figure:<12} {note}".rstrip() for name, figure, note in rows]
-    return "\n\n".join(["\n".join(lines), *sections(result)])
+        figures = {
+            "forward speed error": f"{result['forward_error']:.3f} m/s",
+            "sideways speed error": f"{result['lateral_error']:.3f} m/s",
+            "yaw rate error": f"{result['yaw_rate_error']:.3f} rad/s",
+            "velocity error": f"{result['velocity_error']:.3f} m/s",
+        }
+    figures |= {name.replace("_", " "): f"{result[name]:.1%}" for name in ("falls", "timed_out", "diverged")}
+    figures |= {"episode length": f"{result['episode_length']:.1f} s", "reward": f"{result['reward']:.2f}"}
+    errors = ", of absolute errors over every step" if result["commanded"] else ""
+    note = f"Means over {result['episodes']} episodes{errors}. Seed {result['seed']}."
+    return "\n\n".join([two_columns("result", "", figures), note, *sections(result)])

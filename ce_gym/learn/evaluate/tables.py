@@ -46,6 +46,11 @@ def table(heading: str, results: Mapping[Any, Mapping[str, Any]], *keys: str) ->
     return markdown(rows)
 
 
+def two_columns(name: str, value: str, entries: Mapping[str, Any]) -> str:
+    """Return entries by name as a Markdown table; `name` and `value` are its headings."""
+    return markdown([[name, value], *([key, str(entry)] for key, entry in entries.items())])
+
+
 def metrics(result: Mapping[str, Any]) -> dict[str, float]:
     """Return the metrics of the task, by name with spaces."""
     values = {key: x for key, x in result.items() if key.startswith("metrics/")}
@@ -72,16 +77,16 @@ def suite_table(suites: Mapping[str, Mapping[str, Any]]) -> str:
 
 def motor_table(effort: Mapping[str, Any]) -> str:
     """Return a Markdown table of powers and torques; lines of unknown results are left out."""
-    rows: Table = [["", ""], ["mean speed", f"{effort['speed']:.2f} m/s"], ["power", f"{effort['power']:.0f} W"]]
+    rows = {"mean speed": f"{effort['speed']:.2f} m/s", "power": f"{effort['power']:.0f} W"}
     if effort["cost_of_transport"] is not None:
-        rows.append(["cost of transport", f"{effort['cost_of_transport']:.2f}"])
-        rows.append(["the same, braking recovered", f"{effort['cost_of_transport_net']:.2f}"])
+        rows["cost of transport"] = f"{effort['cost_of_transport']:.2f}"
+        rows["the same, braking recovered"] = f"{effort['cost_of_transport_net']:.2f}"
     for name in ("torque", "power"):
         if effort[f"mean_{name}"] is not None:
-            rows.append([f"mean {name} of a motor", f"{effort[f'mean_{name}']:.0%} of its limit"])
             peak, motor = effort[f"peak_{name}"], effort[f"peak_{name}_at"]
-            rows.append([f"peak {name}", f"{peak:.0%} of its limit (`{motor}`)"])
-    return f"{markdown(rows)}\n\nMechanical, at the rotors, measured at every sub-step."
+            rows[f"mean {name} of a motor"] = f"{effort[f'mean_{name}']:.0%} of its limit"
+            rows[f"peak {name}"] = f"{peak:.0%} of its limit (`{motor}`)"
+    return f"{two_columns('', '', rows)}\n\nMechanical, at the rotors, measured at every sub-step."
 
 
 def push_table(pushes: Mapping[str, Any]) -> str:
@@ -92,8 +97,9 @@ def push_table(pushes: Mapping[str, Any]) -> str:
         limit = "nothing" if largest is None else f"{largest:g} m/s"
         rows.append([name, *(f"{share:.0%}" for share in shares), limit])
     walking = f"{pushes['command'][0]:g} m/s forward"
-    note = f"Share on its feet {WAIT:g} s after a sudden change of velocity, at {walking}; survives: >= {SAFE:.0%}."
-    return f"{markdown(rows)}\n\n{note}"
+    note = f"Share on its feet {WAIT:g} s after a sudden change of velocity, at {walking}."
+    best = f"`survives`: the largest push up to which at least {SAFE:.0%} stay on their feet."
+    return f"{markdown(rows)}\n\n{note} {best}"
 
 
 SECTIONS = (
