@@ -9,9 +9,10 @@ from point_mass import ID
 
 from ce_gym.__main__ import main
 from ce_gym.learn import study
-from ce_gym.learn.evaluate.transfer import interval, summary, table
+from ce_gym.learn.evaluate.episodes import ERRORS
+from ce_gym.learn.evaluate.transfer import interval, summary, table, transfer
 from ce_gym.model.mechanism import LEVELS
-from ce_gym.policies import load_policy, read_actor, write_npz
+from ce_gym.policies import Policy, load_policy, read_actor, write_npz
 
 SMALL = ["transfer", "--train", "--env", ID, "--steps", "600", "--seeds", "0", "1", "--threads", "1", "--episodes", "4"]
 
@@ -107,6 +108,19 @@ def test_the_interval_covers_the_mean_of_samples_as_often_as_it_says():
         covered = np.mean([abs(x["mean"] - 3.0) < x["ci95"] for x in found])
         assert covered == pytest.approx(0.95, abs=0.012), n
     assert interval([0.25]) == {"mean": 0.25, "ci95": None, "n": 1}
+
+
+def test_a_policy_of_the_elastic_level_is_evaluated_there_too(monkeypatch):
+    monkeypatch.setattr(
+        "ce_gym.learn.evaluate.transfer.evaluate",
+        lambda *_, transmission, **__: dict.fromkeys((*ERRORS, "falls", "episode_length", "reward"), len(transmission)),
+    )
+    record = {"env": ID, "env_kwargs": {"transmission": "exact"}, "transmission": "elastic"}
+    results = transfer(Policy(lambda rows: rows, record), record)
+    assert tuple(results) == (*LEVELS, "elastic")
+    text = table(summary([{"transmission": "elastic", "results": results}]))
+    assert "| elastic    | elastic *    | 7.000" in text
+    assert "| elastic    | none         | 4.000" in text
 
 
 def test_a_single_seed_has_no_interval():

@@ -19,7 +19,7 @@ from ce_gym.learn.evaluate.episodes import ERRORS, Predicts
 from ce_gym.learn.evaluate.evaluation import evaluate, load
 from ce_gym.learn.evaluate.pictures import draw_transfer
 from ce_gym.learn.evaluate.tables import COLUMNS
-from ce_gym.model.mechanism import LEVELS
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import PolicyError
 
 SHOWN = (*ERRORS, "falls", "episode_length", "reward")
@@ -35,12 +35,19 @@ Results = dict[str, dict[str, float]]
 """Results of `evaluate` for one policy, by level."""
 
 
-def transfer(model: Predicts, record: dict[str, Any], *, episodes: int = 256, seed: int | None = None) -> Results:
-    """Evaluate a policy at every level with the same seeds (see `evaluate`), and return the results by level."""
+def transfer(
+    model: Predicts,
+    record: dict[str, Any],
+    *,
+    episodes: int = 256,
+    seed: int | None = None,
+    levels: Iterable[str] = LEVELS,
+) -> Results:
+    """Evaluate a policy at its training level and other levels with the same seeds, and return the results by level."""
     env_id, kwargs = record["env"], record["env_kwargs"]
     return {
         level: evaluate(model, env_id, episodes=episodes, seed=seed, **{**kwargs, "transmission": level})
-        for level in LEVELS
+        for level in dict.fromkeys((*levels, record["transmission"]))
     }
 
 
@@ -66,12 +73,11 @@ def summary(evaluations: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, 
         `interval` of every result, by training level, evaluation level and key of the result.
     """
     summaries: dict[str, Any] = {}
-    for trained in LEVELS:
+    for trained in sorted({entry["transmission"] for entry in evaluations}, key=(*LEVELS, ELASTIC).index):
         group = [entry["results"] for entry in evaluations if entry["transmission"] == trained]
-        if group:
-            summaries[trained] = {
-                level: {key: interval(results[level][key] for results in group) for key in SHOWN} for level in LEVELS
-            }
+        summaries[trained] = {
+            level: {key: interval(results[level][key] for results in group) for key in SHOWN} for level in group[0]
+        }
     return summaries
 
 
@@ -109,18 +115,20 @@ def evaluate_policies(
     Raises:
         PolicyError: If the policies are for different robots or tasks.
     """
+    models = {str(path): load(path, env, env_args=env_args) for path in policies}
+    levels = (*LEVELS, *(model.record["transmission"] for model in models.values()))
     evaluations, tasks = [], set()
-    for path in policies:
-        model = load(path, env, env_args=env_args)
+    for path, model in models.items():
         record = model.record
         # Ids are not compared, because ids of one task may name different levels.
         tasks.add(tuple(record["policy_spec"].get(key, record["env"]) for key in ("robot", "task")))
         if len(tasks) > 1:
             raise PolicyError(f"{path}: is for {record['env']}; expected the robot and task of the others")
         print(f"evaluating {path}", file=sys.stderr)
-        entry = {"policy": str(path), "env": record["env"], "transmission": record["transmission"]}
+        entry = {"policy": path, "env": record["env"], "transmission": record["transmission"]}
         entry |= {key: record.get(key) for key in ("seed", "steps")}
-        evaluations.append(entry | {"results": transfer(model, record, episodes=episodes, seed=seed)})
+        results = transfer(model, record, episodes=episodes, seed=seed, levels=levels)
+        evaluations.append(entry | {"results": results})
     task = {"env": evaluations[0]["env"], "episodes": episodes}
     return {**task, "policies": evaluations, "summary": summary(evaluations)}
 
