@@ -133,7 +133,7 @@ def test_falls_and_errors_are_told_by_level():
 
 
 def test_environments_of_other_packages_are_evaluated():
-    """They have no statistics but those of Gymnasium's wrapper; time-outs and falls are told apart all the same."""
+    """Gymnasium's wrapper reports only return, length and time; time-outs and falls are distinguished all the same."""
     gymnasium.register(
         "test/Recorded-v0",
         vector_entry_point=lambda **kwargs: RecordEpisodeStatistics(PointMassVectorEnv(standard=True, **kwargs)),

@@ -26,7 +26,7 @@ def load(
     Args:
         path: See `ce_gym.load_policy`.
         env: Environment id from the command line; None keeps the id of the record.
-        transmission: Transmission level of the environment; None keeps that of the record.
+        transmission: Transmission level of the environment; None keeps the level in the record.
         env_args: Arguments of the environment that replace arguments in the record.
 
     Raises:
