@@ -62,8 +62,8 @@ def evaluate(args: argparse.Namespace) -> int:
     """Evaluate, and print the results."""
     from ce_gym.learn.evaluate.crossing import cross
     from ce_gym.learn.evaluate.effort import effort
-    from ce_gym.learn.evaluate.evaluation import load, report
     from ce_gym.learn.evaluate.evaluation import evaluate as evaluate_policy
+    from ce_gym.learn.evaluate.evaluation import load, report
     from ce_gym.learn.evaluate.pushes import push_envelope
     from ce_gym.learn.evaluate.suites import evaluate_suites
 
