@@ -23,13 +23,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.dynamics.algebra.spatial import SX, quaternion_product, quaternion_to_rotation
+from ce_gym.dynamics.algebra.integration import tangent_basis
+from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
-from ce_gym.dynamics.functions import FUNCTIONS
+from ce_gym.dynamics.functions import trace
 from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
 from ce_gym.dynamics.parameters import with_parameters
 from ce_gym.model.coordinates import Layout
-from ce_gym.model.errors import check_names, listed_names
+from ce_gym.model.errors import check_names
 from ce_gym.model.mechanism import Mechanism
 
 Array = NDArray[np.float64]
@@ -110,19 +111,6 @@ class Derivatives:
         return {name: result[..., 0] for name, result in zip(self.wrt, results, strict=True)}
 
 
-def tangent_basis(q: SX, layout: Layout) -> SX:
-    """Return the derivative of positions (nq,) by their tangent, shape (nq, nv)."""
-    turning = [_turning(q[i : i + 4]) for i, _ in layout.turns]
-    if layout.floating:
-        turning[0] = ca.blockcat([[SX(3, 3), quaternion_to_rotation(q[3:7])], [turning[0], SX(4, 3)]])
-    return ca.diagcat(*turning, SX.eye(layout.joints))
-
-
-def _turning(quaternion: SX) -> SX:
-    """Return the derivative of a quaternion by a rotation about the axes of its body, shape (4, 3)."""
-    return ca.horzcat(*[quaternion_product(quaternion, ca.vertcat(0, SX.eye(3)[:, i])) / 2 for i in range(3)])
-
-
 @dataclass(frozen=True)
 class Quantity:
     """A quantity as expressions of its inputs and of parameters of the mechanism.
@@ -158,15 +146,16 @@ def make_quantity(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> Quan
 
     Args:
         mechanism: The mechanism.
-        name: Name of the quantity, one of `FUNCTIONS`.
+        name: Name of the quantity, see `trace`.
         wrt: Names of inputs of the quantity and of parameters of the mechanism.
 
     Raises:
         ValueError: If there is no such quantity, input or parameter.
     """
-    if name not in FUNCTIONS:
-        raise ValueError(f"derivatives of {name!r}; expected one of {listed_names(name, FUNCTIONS)}")
-    arguments = [x for x in FUNCTIONS[name](mechanism).name_in() if x != "guess"]
+    try:
+        arguments = [x for x in trace(mechanism, name).name_in() if x != "guess"]
+    except KeyError as error:
+        raise ValueError(f"derivatives: {error.args[0]}") from None
     parameters = tuple(x for x in wrt if x not in arguments)
     links = [body.name for body in mechanism.robot.bodies if body.kind == "link"]
     known = {*ROBOT_PARAMETERS, *(f"{parameter}:{link}" for parameter in LINK_PARAMETERS for link in links)}
@@ -176,7 +165,7 @@ def make_quantity(mechanism: Mechanism, name: str, wrt: tuple[str, ...]) -> Quan
     defaults = parameter_defaults(mechanism.robot, mechanism.robot.material, parameters)
     symbols = {x: SX.sym("parameter", len(value)) for x, value in defaults.items()}
     named = with_parameters(mechanism, symbols) if symbols else mechanism
-    function = FUNCTIONS[name](named)
+    function = trace(named, name)
     inputs = {x: SX.sym(x, function.numel_in(i)) for i, x in enumerate(function.name_in())}
     outputs = dict(zip(function.name_out(), function.call(list(inputs.values())), strict=True))
     return Quantity(inputs, {x: (symbols[x], defaults[x]) for x in symbols}, outputs, mechanism.robot.layout)
@@ -226,7 +215,7 @@ def _jacobians(quantity: Quantity, wrt: tuple[str, ...]) -> list[SX]:
 
 
 def _forward_dynamics_jacobian(mechanism: Mechanism, wrt: tuple[str, ...]) -> ca.Function:
-    forward = FUNCTIONS["forward_dynamics"](mechanism)
+    forward = trace(mechanism, "forward_dynamics")
     inputs = {name: SX.sym(name, forward.numel_in(i)) for i, name in enumerate(forward.name_in())}
     vdot = forward(*inputs.values())
     to_acceleration = ca.triu2symm(ca.triu(ca.densify(ca.jacobian(vdot, inputs["tau"]))))  # M^-1, symmetric

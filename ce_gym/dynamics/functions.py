@@ -6,15 +6,20 @@ sub-expressions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
 
-from ce_gym.dynamics.algebra.spatial import SX, axis_rotation, cross
+from ce_gym.dynamics.algebra.integration import difference, integrate
+from ce_gym.dynamics.algebra.spatial import SX, cross
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.assembly import linear_rows, nonlinear_rows
-from ce_gym.dynamics.constraints.closure import closures, reference_guess
+from ce_gym.dynamics.constraints.closure import closures
+from ce_gym.dynamics.quantities.forces import FORCE_FUNCTIONS
+from ce_gym.dynamics.quantities.frames import CONTACT_FUNCTIONS, FRAME_FUNCTIONS, body_motion, frames_of
+from ce_gym.dynamics.quantities.inputs import function_of_state, state_symbols
+from ce_gym.dynamics.quantities.momentum import MOMENTUM_FUNCTIONS
 from ce_gym.dynamics.recursion.ce_aba import (
     JointTerms,
     gravity_acceleration,
@@ -31,19 +36,8 @@ from ce_gym.dynamics.recursion.derived import (
     spanning_coordinates,
 )
 from ce_gym.dynamics.recursion.kinematics import constant, outward_velocity_pass
+from ce_gym.model.errors import listed_names
 from ce_gym.model.mechanism import Mechanism
-
-
-def state_symbols(mechanism: Mechanism) -> tuple[SX, SX, SX]:
-    """Return fresh symbols for positions (nq,), velocities (nv,) and guesses of dependent positions (n_guess,)."""
-    layout = mechanism.robot.layout
-    q, v = SX.sym("q", layout.nq), SX.sym("v", layout.nv)
-    return q, v, SX.sym("guess", len(reference_guess(mechanism)))
-
-
-def _function(name: str, guess: SX, inputs: dict[str, SX], outputs: dict[str, SX]) -> ca.Function:
-    """Trace a function that has an input `guess` only if the robot needs one."""
-    return traced(name, inputs | ({"guess": guess} if guess.numel() else {}), outputs)
 
 
 def _base(x: SX, count: int) -> list[SX]:
@@ -57,7 +51,7 @@ def _forward_dynamics(mechanism: Mechanism) -> ca.Function:
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
     articulation = inward_inertia_pass(mechanism, kinematics, JointTerms(tau, SX(tau.numel(), tau.numel())), {})
     vdot, _ = outward_acceleration_pass(mechanism, kinematics, articulation)
-    return _function("forward_dynamics", guess, {"q": q, "v": v, "tau": tau}, {"vdot": vdot})
+    return function_of_state("forward_dynamics", guess, {"q": q, "v": v, "tau": tau}, {"vdot": vdot})
 
 
 def _forward_dynamics_with_wrenches(mechanism: Mechanism) -> ca.Function:
@@ -69,14 +63,14 @@ def _forward_dynamics_with_wrenches(mechanism: Mechanism) -> ca.Function:
     articulation = inward_inertia_pass(mechanism, kinematics, joints, on_bodies)
     vdot, _ = outward_acceleration_pass(mechanism, kinematics, articulation)
     inputs = {"q": q, "v": v, "tau": tau, "wrenches": wrenches}
-    return _function("forward_dynamics_with_wrenches", guess, inputs, {"vdot": vdot})
+    return function_of_state("forward_dynamics_with_wrenches", guess, inputs, {"vdot": vdot})
 
 
 def _inverse_dynamics(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     vdot = SX.sym("vdot", v.shape[0])
     tau = inverse_dynamics(mechanism, outward_velocity_pass(mechanism, q, v, guess), vdot)
-    return _function("inverse_dynamics", guess, {"q": q, "v": v, "vdot": vdot}, {"tau": tau})
+    return function_of_state("inverse_dynamics", guess, {"q": q, "v": v, "vdot": vdot}, {"tau": tau})
 
 
 def _mass_matrix(mechanism: Mechanism) -> ca.Function:
@@ -84,13 +78,13 @@ def _mass_matrix(mechanism: Mechanism) -> ca.Function:
     vdot = SX.sym("vdot", v.shape[0])
     at_rest = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
     M = ca.jacobian(inverse_dynamics(mechanism, at_rest, vdot), vdot)  # tau = M vdot + bias is linear in vdot
-    return _function("mass_matrix", guess, {"q": q}, {"M": M})
+    return function_of_state("mass_matrix", guess, {"q": q}, {"M": M})
 
 
 def _bias_force(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     tau = inverse_dynamics(mechanism, outward_velocity_pass(mechanism, q, v, guess), SX(*v.shape))
-    return _function("bias_force", guess, {"q": q, "v": v}, {"tau": tau})
+    return function_of_state("bias_force", guess, {"q": q, "v": v}, {"tau": tau})
 
 
 def _spanning(mechanism: Mechanism) -> ca.Function:
@@ -100,7 +94,7 @@ def _spanning(mechanism: Mechanism) -> ca.Function:
     robot = mechanism.robot
     q_span = ca.vertcat(*_base(q, robot.layout.base_nq), *[positions[name] for name in robot.joints])
     v_span = ca.vertcat(*_base(v, robot.layout.base_nv), *[velocities[name] for name in robot.joints])
-    return _function("spanning", guess, {"q": q, "v": v}, {"q_span": q_span, "v_span": v_span})
+    return function_of_state("spanning", guess, {"q": q, "v": v}, {"q_span": q_span, "v_span": v_span})
 
 
 def _spanning_acceleration(mechanism: Mechanism) -> ca.Function:
@@ -114,7 +108,7 @@ def _spanning_acceleration(mechanism: Mechanism) -> ca.Function:
             accelerations |= {name: qdd[i] for name, i in coordinates.index.items()}
     robot = mechanism.robot
     spanning = ca.vertcat(*_base(vdot, robot.layout.base_nv), *[accelerations[name] for name in robot.joints])
-    return _function("spanning_acceleration", guess, {"q": q, "v": v, "vdot": vdot}, {"vdot_span": spanning})
+    return function_of_state("spanning_acceleration", guess, {"q": q, "v": v, "vdot": vdot}, {"vdot_span": spanning})
 
 
 def _spanning_jacobian(mechanism: Mechanism) -> ca.Function:
@@ -122,7 +116,7 @@ def _spanning_jacobian(mechanism: Mechanism) -> ca.Function:
     _, velocities = spanning_coordinates(mechanism, outward_velocity_pass(mechanism, q, v, guess))
     robot = mechanism.robot
     G = ca.jacobian(ca.vertcat(*_base(v, robot.layout.base_nv), *[velocities[name] for name in robot.joints]), v)
-    return _function("spanning_jacobian", guess, {"q": q}, {"G": G})
+    return function_of_state("spanning_jacobian", guess, {"q": q}, {"G": G})
 
 
 def _implicit_constraint(mechanism: Mechanism) -> ca.Function:
@@ -148,7 +142,7 @@ def _implicit_constraint(mechanism: Mechanism) -> ca.Function:
         jacobians.append(spread)
         biases.append(bias)
     outputs = {"K": ca.vertcat(*jacobians), "k": ca.vertcat(*biases)}
-    return _function("implicit_constraint", guess, {"q": q, "v": v}, outputs)
+    return function_of_state("implicit_constraint", guess, {"q": q, "v": v}, outputs)
 
 
 def _loops(mechanism: Mechanism) -> ca.Function:
@@ -157,26 +151,15 @@ def _loops(mechanism: Mechanism) -> ca.Function:
     _, nearness = loop_state(kinematics)
     dependent = guessed_coordinates(kinematics, SX(*v.shape), 0.0)
     outputs = {"dependent": dependent, "gap": loop_gap(mechanism, kinematics), "nearness": nearness}
-    return _function("loops", guess, {"q": q}, outputs)
+    return function_of_state("loops", guess, {"q": q}, outputs)
 
 
 def _body_poses(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinematics = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
-    angles, _ = spanning_coordinates(mechanism, kinematics)
-    positions, rotations = [], []
-    for body in mechanism.robot.bodies:
-        if body.name in kinematics.bodies:
-            p, R = kinematics.bodies[body.name].p, kinematics.bodies[body.name].R
-        else:  # an eliminated rotor still has a pose
-            parent = kinematics.bodies[body.parent] if body.parent is not None else None
-            R_parent, p_parent = (parent.R, parent.p) if parent is not None else (SX.eye(3), SX(3, 1))
-            p = p_parent + R_parent @ constant(np.array(body.placement.position))
-            R = R_parent @ constant(np.array(body.placement.rotation)) @ turned(body.joint.axis, angles[body.name])
-        positions.append(p)
-        rotations.append(R)
-    outputs = {"positions": ca.horzcat(*positions), "rotations": ca.horzcat(*rotations)}
-    return _function("body_poses", guess, {"q": q}, outputs)
+    motions = [body_motion(mechanism, kinematics, body.name) for body in mechanism.robot.bodies]
+    positions, rotations = ca.horzcat(*[motion.p for motion in motions]), ca.horzcat(*[motion.R for motion in motions])
+    return function_of_state("body_poses", guess, {"q": q}, {"positions": positions, "rotations": rotations})
 
 
 def _contact_points(mechanism: Mechanism) -> ca.Function:
@@ -188,29 +171,18 @@ def _contact_points(mechanism: Mechanism) -> ca.Function:
         positions.append(body.point_position(r))
         velocities.append(body.R @ body.point_velocity(r))
     outputs = {"positions": ca.horzcat(*positions), "velocities": ca.horzcat(*velocities)}
-    return _function("contact_points", guess, {"q": q, "v": v}, outputs)
+    return function_of_state("contact_points", guess, {"q": q, "v": v}, outputs)
 
 
 def _body_velocities(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    _, rates = spanning_coordinates(mechanism, kinematics)
-    angular, linear = [], []
-    for body in mechanism.robot.bodies:
-        if body.name in kinematics.bodies:
-            state = kinematics.bodies[body.name]
-            w, origin = state.R @ state.v[:3], state.R @ state.v[3:]
-        else:  # an eliminated rotor turns about an axis of its carrier
-            axis = constant(np.array(body.placement.rotation) @ np.array(body.joint.axis)) * rates[body.name]
-            w, origin = axis, SX(3, 1)
-            if body.parent is not None:
-                carrier = kinematics.bodies[body.parent]
-                w = carrier.R @ (carrier.v[:3] + axis)
-                origin = carrier.R @ carrier.point_velocity(constant(np.array(body.placement.position)))
-        angular.append(w)
-        linear.append(origin)
-    outputs = {"angular": ca.horzcat(*angular), "linear": ca.horzcat(*linear)}
-    return _function("body_velocities", guess, {"q": q, "v": v}, outputs)
+    motions = [body_motion(mechanism, kinematics, body.name) for body in mechanism.robot.bodies]
+    outputs = {
+        "angular": ca.horzcat(*[motion.w for motion in motions]),
+        "linear": ca.horzcat(*[motion.v for motion in motions]),
+    }
+    return function_of_state("body_velocities", guess, {"q": q, "v": v}, outputs)
 
 
 def _contact_accelerations(mechanism: Mechanism) -> ca.Function:
@@ -224,18 +196,24 @@ def _contact_accelerations(mechanism: Mechanism) -> ca.Function:
         in_body_axes = a[3:] + cross(a[:3], r) + cross(body.v[:3], cross(body.v[:3], r))
         accelerations.append(body.R @ in_body_axes + gravity)
     outputs = {"accelerations": ca.horzcat(*accelerations)}
-    return _function("contact_accelerations", guess, {"q": q, "v": v, "vdot": vdot}, outputs)
+    return function_of_state("contact_accelerations", guess, {"q": q, "v": v, "vdot": vdot}, outputs)
 
 
 def _energy(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinetic, potential = kinetic_and_potential(mechanism, q, v, guess)
-    return _function("energy", guess, {"q": q, "v": v}, {"kinetic": kinetic, "potential": potential})
+    return function_of_state("energy", guess, {"q": q, "v": v}, {"kinetic": kinetic, "potential": potential})
 
 
-def turned(axis: Sequence[float], angle: SX) -> SX:
-    """Return the rotation, child to parent, of a revolute joint at an angle."""
-    return axis_rotation(constant(np.array(axis)), angle).T
+def _integrate(mechanism: Mechanism) -> ca.Function:
+    q, v, _ = state_symbols(mechanism)
+    return traced("integrate", {"q": q, "dv": v}, {"q": integrate(q, v, mechanism.robot.layout)})
+
+
+def _difference(mechanism: Mechanism) -> ca.Function:
+    q, _, _ = state_symbols(mechanism)
+    q1 = SX.sym("q1", *q.shape)
+    return traced("difference", {"q": q, "q1": q1}, {"dv": difference(q, q1, mechanism.robot.layout)})
 
 
 FUNCTIONS: dict[str, Callable[[Mechanism], ca.Function]] = {
@@ -254,4 +232,26 @@ FUNCTIONS: dict[str, Callable[[Mechanism], ca.Function]] = {
     "contact_points": _contact_points,
     "contact_accelerations": _contact_accelerations,
     "energy": _energy,
+    "integrate": _integrate,
+    "difference": _difference,
+    **CONTACT_FUNCTIONS,
+    **MOMENTUM_FUNCTIONS,
+    **FORCE_FUNCTIONS,
 }
+
+
+def trace(mechanism: Mechanism, name: str) -> ca.Function:
+    """Trace a quantity: one of `FUNCTIONS`, or one of a frame, `"frame_jacobian:FRAME"`.
+
+    Raises:
+        KeyError: If there is no such quantity or frame.
+    """
+    kind, _, frame = name.partition(":")
+    if kind in FRAME_FUNCTIONS:
+        if frame not in (frames := frames_of(mechanism)):
+            raise KeyError(f"no frame {frame!r} for {kind!r}; expected one of {listed_names(frame, frames)}")
+        return FRAME_FUNCTIONS[kind](mechanism, frame)
+    if name not in FUNCTIONS:
+        known = [*FUNCTIONS, *(f"{kind}:FRAME" for kind in FRAME_FUNCTIONS)]
+        raise KeyError(f"no function {name!r}; expected one of {listed_names(name, known)}")
+    return FUNCTIONS[name](mechanism)

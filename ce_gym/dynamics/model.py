@@ -18,16 +18,22 @@ from ce_gym.dynamics.algebra.batched import call_on_batch
 from ce_gym.dynamics.constraints.closure import closures, loop_report, reference_guess
 from ce_gym.dynamics.constraints.continuation import follow
 from ce_gym.dynamics.derivatives import Derivatives
-from ce_gym.dynamics.functions import FUNCTIONS
+from ce_gym.dynamics.functions import trace
+from ce_gym.dynamics.quantities.configurations import neutral_positions, random_positions
+from ce_gym.dynamics.quantities.forces import inertial_parameters
+from ce_gym.dynamics.quantities.frames import frames_of
 from ce_gym.dynamics.standing import check_standing
 from ce_gym.model import Robot, load_robot
 from ce_gym.model.clusters import ClusterTree
 from ce_gym.model.coordinates import unit_quaternions
-from ce_gym.model.errors import check_names, listed_names
+from ce_gym.model.errors import check_names
 from ce_gym.model.frames import added
 from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
+
+REDUNDANT = 1e-10
+"""Relative size of eigenvalues of `J M^-1 J^T` that count as zero: redundant constraints, and impossible motions."""
 
 
 class Model:
@@ -156,6 +162,14 @@ class Model:
                 - "contact_points": (q, v) -> positions (3, n), velocities (3, n).
                 - "contact_accelerations": (q, v, vdot) -> accelerations (3, n).
                 - "energy": (q, v) -> kinetic, potential.
+                - "frame_pose:FRAME", "frame_jacobian:FRAME": q -> position, rotation; J.
+                - "frame_velocity:FRAME", "frame_bias_acceleration:FRAME": (q, v) -> the method's result.
+                - "contact_jacobian", "center_of_mass", "center_of_mass_jacobian", "centroidal_momentum_matrix",
+                  "gravity_force": q -> the method's result.
+                - "center_of_mass_velocity", "center_of_mass_bias_acceleration", "centroidal_momentum",
+                  "centroidal_momentum_bias", "coriolis_matrix": (q, v) -> the method's result.
+                - "inertial_regressor": (q, v, vdot) -> Y.
+                - "integrate", "difference": (q, dv) -> q; (q, q1) -> dv.
 
         Robots with loops that no formula closes have one more input, see `dependent_guess`. Quaternions in `q` must
         have unit length: a traced function neither checks nor scales them.
@@ -164,9 +178,7 @@ class Model:
             KeyError: If there is no such quantity.
         """
         if name not in self._functions:
-            if name not in FUNCTIONS:
-                raise KeyError(f"no function {name!r}; expected one of {listed_names(name, FUNCTIONS)}")
-            self._functions[name] = FUNCTIONS[name](self.mechanism)
+            self._functions[name] = trace(self.mechanism, name)
         return self._functions[name]
 
     def n_instructions(self, name: str) -> int:
@@ -374,6 +386,230 @@ class Model:
         """Return kinetic and potential energy [J], each shape (...)."""
         kinetic, potential = self.evaluate("energy", q, v)
         return kinetic[..., 0, 0], potential[..., 0, 0]
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """All frames: bodies, rotors included, frames of the robot's file such as links on fixed joints, and contacts.
+
+        A body's frame is at its joint. A contact's frame is at the centre of its sphere, with the axes of its body.
+        """
+        return tuple(frames_of(self.mechanism))
+
+    def frame_pose(self, q: ArrayLike, frame: str) -> tuple[Array, Array]:
+        """Return where a frame is.
+
+        Args:
+            q: Positions, shape (..., nq).
+            frame: Name of the frame, one of `frame_names`.
+
+        Returns:
+            Origin in the world [m], shape (..., 3), and rotation frame to world, shape (..., 3, 3).
+
+        Raises:
+            ValueError: If a shape is wrong, the frame does not exist, or a loop does not close at `q`.
+
+        Examples:
+            >>> model = ce_gym.Model("go1")
+            >>> position, rotation = model.frame_pose(model.standing_q, "imu_link")
+            >>> velocity = model.frame_jacobian(model.standing_q, "FL_foot") @ np.ones(model.nv)
+        """
+        position, rotation = self.evaluate(self._of_frame("frame_pose", frame), q)
+        return position[..., 0], rotation
+
+    def frame_velocity(self, q: ArrayLike, v: ArrayLike, frame: str) -> Array:
+        """Return the velocity of a frame, [angular [rad/s]; linear [m/s]], shape (..., 6).
+
+        Linear is the velocity of the frame's origin. Both are in the axes of the world, as with
+        `LOCAL_WORLD_ALIGNED` in Pinocchio.
+        """
+        return self.evaluate(self._of_frame("frame_velocity", frame), q, v)[0][..., 0]
+
+    def frame_jacobian(self, q: ArrayLike, frame: str) -> Array:
+        """Return the Jacobian of a frame, `frame_velocity = J v`, shape (..., 6, nv).
+
+        Rows are [angular; linear], at the frame's origin in the axes of the world. `J^T` takes a wrench [moment; force]
+        at the frame's origin, in the axes of the world, to generalised forces.
+        """
+        return self.evaluate(self._of_frame("frame_jacobian", frame), q)[0]
+
+    def frame_bias_acceleration(self, q: ArrayLike, v: ArrayLike, frame: str) -> Array:
+        """Return the acceleration of a frame for `vdot = 0`, `Jdot v`, shape (..., 6).
+
+        `frame_jacobian @ vdot + frame_bias_acceleration` is the time derivative of `frame_velocity`: [angular
+        [rad/s^2]; second derivative of the origin's position [m/s^2]], in the axes of the world, without gravity.
+        """
+        return self.evaluate(self._of_frame("frame_bias_acceleration", frame), q, v)[0][..., 0]
+
+    def _of_frame(self, quantity: str, frame: str) -> str:
+        check_names("frame", [frame], self.frame_names, f"a frame of {self.robot.name}:")
+        return f"{quantity}:{frame}"
+
+    def contact_jacobian(self, q: ArrayLike) -> Array:
+        """Return the Jacobians of the centres of the contact spheres, shape (..., n, 3, nv).
+
+        `J v` are the velocities that `contact_points` returns, in the axes of the world.
+        """
+        J = self.evaluate("contact_jacobian", q)[0]
+        return J.reshape(*J.shape[:-2], len(self.contact_names), 3, self.nv)
+
+    def contact_bias_acceleration(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the accelerations of the centres of the contact spheres for `vdot = 0`, shape (..., n, 3) [m/s^2]."""
+        return self.contact_accelerations(q, v, np.zeros(self.nv))
+
+    def center_of_mass(self, q: ArrayLike) -> Array:
+        """Return the centre of mass of the robot in the world [m], shape (..., 3)."""
+        return self.evaluate("center_of_mass", q)[0][..., 0]
+
+    def center_of_mass_velocity(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the velocity of the centre of mass, world axes [m/s], shape (..., 3)."""
+        return self.evaluate("center_of_mass_velocity", q, v)[0][..., 0]
+
+    def center_of_mass_jacobian(self, q: ArrayLike) -> Array:
+        """Return the Jacobian of the centre of mass, `center_of_mass_velocity = J v`, shape (..., 3, nv)."""
+        return self.evaluate("center_of_mass_jacobian", q)[0]
+
+    def center_of_mass_bias_acceleration(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the acceleration of the centre of mass for `vdot = 0`, world axes [m/s^2], shape (..., 3)."""
+        return self.evaluate("center_of_mass_bias_acceleration", q, v)[0][..., 0]
+
+    def centroidal_momentum(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the momentum [angular [kg m^2/s]; linear [kg m/s]], shape (..., 6).
+
+        Angular is about the centre of mass, both are in the axes of the world. Spinning rotors contribute at the levels
+        whose equations of motion contain their coupling to the carrier, "exact" and "elastic".
+        """
+        return self.evaluate("centroidal_momentum", q, v)[0][..., 0]
+
+    def centroidal_momentum_matrix(self, q: ArrayLike) -> Array:
+        """Return the matrix `A` of `centroidal_momentum = A v`, shape (..., 6, nv)."""
+        return self.evaluate("centroidal_momentum_matrix", q)[0]
+
+    def centroidal_momentum_bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the time derivative of `centroidal_momentum` for `vdot = 0`, `Adot v`, shape (..., 6)."""
+        return self.evaluate("centroidal_momentum_bias", q, v)[0][..., 0]
+
+    def coriolis_matrix(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the matrix `C` of `M vdot + C v + g = tau`, shape (..., nv, nv); `Mdot - 2 C` is skew-symmetric.
+
+        The factorisation is that of Christoffel's symbols, extended to the base and to ball joints.
+        """
+        return self.evaluate("coriolis_matrix", q, v)[0]
+
+    def gravity_force(self, q: ArrayLike) -> Array:
+        """Return the generalised force `g` that holds the robot still, `M vdot + C v + g = tau`, shape (..., nv).
+
+        Drake's gravity forces have the opposite sign.
+        """
+        return self.evaluate("gravity_force", q)[0][..., 0]
+
+    def operational_space_inertia(self, q: ArrayLike, frame: str) -> Array:
+        """Return the inertia of the robot at a frame, `(J M^-1 J^T)^-1`, shape (..., 6, 6).
+
+        `J` is `frame_jacobian`: axes of the world, angular part first.
+
+        Raises:
+            ValueError: If a shape is wrong, the frame does not exist or cannot move in all six directions at `q`.
+
+        Source: Khatib, "A unified approach for motion and force control of robot manipulators: the operational space
+        formulation", IEEE J. Robotics and Automation 3, 1987.
+        """
+        J = self.frame_jacobian(q, frame)
+        inverse = J @ np.linalg.solve(self.mass_matrix(q), np.swapaxes(J, -1, -2))
+        if (np.linalg.matrix_rank(inverse, REDUNDANT, hermitian=True) < 6).any():
+            raise ValueError(f"frame={frame!r} cannot move in all six directions at this q; expected a frame that can")
+        return np.asarray(np.linalg.inv(inverse), dtype=float)
+
+    def constrained_forward_dynamics(
+        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, frames: Sequence[str]
+    ) -> tuple[Array, Array]:
+        """Return the acceleration of a robot whose frames are held, and the forces that hold them.
+
+        Solves `M vdot + h = tau + J^T f`, `J vdot + Jdot v = 0`: the origins of the frames do not accelerate, whatever
+        the direction of the forces, so contacts neither slip nor lift off. Of redundant constraints, such as four
+        corners of a sole, the forces with the smallest norm are returned.
+
+        Args:
+            q: Positions, shape (..., nq).
+            v: Velocities, shape (..., nv).
+            tau: Generalised forces [N m or N], shape (..., nv).
+            frames: Names of the frames, contacts for example.
+
+        Returns:
+            `vdot`, shape (..., nv), and the force on each frame's origin in the axes of the world [N], shape
+            (..., n, 3).
+
+        Raises:
+            ValueError: If a shape is wrong, a frame does not exist, or a loop does not close at `q`.
+        """
+        check_names("frames", frames, self.frame_names, f"a frame of {self.robot.name}:")
+        free = self.forward_dynamics(q, v, tau)
+        batch = free.shape[:-1]
+        if not frames:
+            return free, np.zeros((*batch, 0, 3))
+        J = np.concatenate([self.frame_jacobian(q, frame)[..., 3:, :] for frame in frames], axis=-2)
+        bias = np.concatenate([self.frame_bias_acceleration(q, v, frame)[..., 3:] for frame in frames], axis=-1)
+        response = np.linalg.solve(self.mass_matrix(q), np.swapaxes(J, -1, -2))  # M^-1 J^T
+        acceleration = (J @ free[..., None])[..., 0] + bias
+        force = -(np.linalg.pinv(J @ response, REDUNDANT, hermitian=True) @ acceleration[..., None])
+        return free + (response @ force)[..., 0], force.reshape(*batch, len(frames), 3)
+
+    def integrate(self, q: ArrayLike, dv: ArrayLike) -> Array:
+        """Return the positions after unit time at the constant velocity `dv` (..., nv) from `q`, shape (..., nq).
+
+        A floating base moves along a screw, because its velocity is constant in its axes: as in Pinocchio. MuJoCo's
+        `mj_integratePos` moves it along a straight line.
+        """
+        return self.evaluate("integrate", q, dv)[0][..., 0]
+
+    def difference(self, q0: ArrayLike, q1: ArrayLike) -> Array:
+        """Return the velocity, shape (..., nv), that moves `q0` to `q1` in unit time: `integrate(q0, dv) = q1`.
+
+        Rotations are at most half a turn.
+        """
+        return self.evaluate("difference", q0, self.unit(np.asarray(q1, dtype=float)))[0][..., 0]
+
+    def neutral(self) -> Array:
+        """Return positions with all joints at zero and no rotation of base and ball joints, shape (nq,).
+
+        Closed loops need not close there; they do in `standing_q`.
+        """
+        return neutral_positions(self.robot.layout)
+
+    def random_configuration(self, rng: np.random.Generator) -> Array:
+        """Return random positions within the limits of the independent joints, with closed loops, shape (nq,).
+
+        Joints are uniform between their limits; without a limit, up to half a turn or 1 m beyond the standing pose. The
+        base is within 1 m of the origin along each axis, with a uniform orientation. Ball joints turn about random
+        axes. If loops do not close, the joints are moved towards the standing pose until the loops close.
+        """
+        q, first = random_positions(self.robot, rng), self.robot.layout.joints_q
+        drawn, standing = q[first:].copy(), self.standing_q[first:]
+        for distance in 0.9 ** np.arange(100):
+            if self._closes(q):
+                break
+            q[first:] = standing + distance * (drawn - standing)
+        return q
+
+    def _closes(self, q: Array) -> bool:
+        """Whether the loops close at positions (nq,)."""
+        try:
+            _, gap, nearness = self.evaluate("loops", q)
+        except ValueError:
+            return False
+        return bool(gap < 1e-9) and bool(nearness > 0.0)
+
+    @property
+    def inertial_parameters(self) -> Array:
+        """Ten parameters of each body, rotors included, in the order of `body_names`, shape (10 n_bodies,).
+
+        Mass, mass times centre of mass (3), and xx, xy, yy, xz, yz, zz of the inertia about the body's origin, in its
+        axes: the order of Pinocchio's `Inertia.toDynamicParameters`.
+        """
+        return inertial_parameters(self.robot)
+
+    def inertial_regressor(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
+        """Return the matrix `Y` of `inverse_dynamics = Y inertial_parameters`, shape (..., nv, 10 n_bodies)."""
+        return self.evaluate("inertial_regressor", q, v, vdot)[0]
 
     def derivatives(self, name: str, wrt: Sequence[str]) -> Derivatives:
         """Return the derivatives of a quantity, traced on first use.

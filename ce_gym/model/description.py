@@ -145,6 +145,21 @@ class Body:
 
 
 @dataclass(frozen=True)
+class Frame:
+    """A named frame on a body, such as a link on a fixed joint, or a site of MJCF.
+
+    Attributes:
+        name: Unique among frames and bodies.
+        body: Name of the body with the frame; None for the world.
+        placement: Pose of the frame in the body frame.
+    """
+
+    name: str
+    body: str | None
+    placement: Placement = ORIGIN
+
+
+@dataclass(frozen=True)
 class ContactSphere:
     """A sphere on a body that may touch the ground: fixed, or moving around a rim to the lowest point.
 
@@ -257,6 +272,7 @@ class Robot:
             choose the branch on which closed loops are assembled. Other joints are near zero.
         gravity: Acceleration of free fall in the world frame [m/s^2].
         tasks: For each task with other settings on this robot, pairs (name of a setting, value).
+        frames: Named frames on bodies; every body is a frame, too, and not listed here.
         kept_inertia: Patterns of names of bodies whose published inertia violates the triangle inequality and is kept.
         source: The robot's file, for messages.
         notes: Facts a user should know, such as repaired values.
@@ -278,6 +294,7 @@ class Robot:
     assembly: tuple[tuple[str, float], ...] = ()
     gravity: Vec3 = (0.0, 0.0, -9.81)
     tasks: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()
+    frames: tuple[Frame, ...] = ()
     kept_inertia: tuple[str, ...] = field(default=(), compare=False)
     source: str = field(default="", compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)

@@ -104,6 +104,7 @@ class Mechanism:
         eliminated_rotors: For each cluster, its rotors that are no bodies of the recursion.
         gravity: Acceleration of free fall in the world [m/s^2], shape (3,).
         ratio: Factor on all gear ratios; None for the robot's own ratios.
+        locked_rotors: Whether approximated rotors leave their mass and inertia at rest with their carrier.
     """
 
     robot: Robot
@@ -113,6 +114,7 @@ class Mechanism:
     eliminated_rotors: tuple[tuple[EliminatedRotor, ...], ...]
     gravity: Array
     ratio: float | None = None
+    locked_rotors: bool = True
 
     @property
     def exact(self) -> bool:
@@ -166,7 +168,7 @@ def build_mechanism(
         tuple(_eliminated_rotor(robot.body(name), merged[name]) for name in cluster.bodies if name in merged)
         for cluster in tree.clusters
     )
-    return Mechanism(robot, level, tree, bodies, rotors, np.array(robot.gravity))
+    return Mechanism(robot, level, tree, bodies, rotors, np.array(robot.gravity), locked_rotors=locked_rotors)
 
 
 def with_stretches(robot: Robot) -> Robot:

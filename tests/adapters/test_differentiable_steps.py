@@ -19,7 +19,7 @@ def test_gradients_of_coordinates_are_those_of_the_tangent_space():
     import casadi as ca
 
     from ce_gym.adapters.pure_steps import from_tangent, to_tangent
-    from ce_gym.dynamics.derivatives import tangent_basis
+    from ce_gym.dynamics.algebra.integration import tangent_basis
     from ce_gym.model.coordinates import Layout
 
     layout = Layout(floating=True, balls=1, joints=2)

@@ -26,9 +26,58 @@ def advance(q: SX, v: SX, vdot: SX, dt: float, layout: Layout) -> tuple[SX, SX]:
     return ca.vertcat(q[:3] + dt * u_world, *turned, y_next), v_next
 
 
+def integrate(q: SX, tangent: SX, layout: Layout) -> SX:
+    """Return positions (nq,) after unit time at the constant velocity `tangent` (nv,): the exponential map of SE(3).
+
+    The base moves by `R (u + b w x u + c w x (w x u))`, with `b = (1 - cos t) / t^2`, `c = (t - sin t) / t^3` and the
+    angle `t = |w|`.
+    """
+    turned = [rotate_quaternion(q[i : i + 4], tangent[j : j + 3]) for i, j in layout.turns]
+    joints = q[layout.joints_q :] + tangent[layout.joints_v :]
+    if not layout.floating:
+        return ca.vertcat(*turned, joints)
+    w, u = tangent[:3], tangent[3:6]
+    angle = _length(w)
+    b, c = 2 * (ca.sin(angle / 2) / angle) ** 2, (angle - ca.sin(angle)) / angle**3
+    moved = u + b * cross(w, u) + c * cross(w, cross(w, u))
+    return ca.vertcat(q[:3] + quaternion_to_rotation(q[3:7]) @ moved, *turned, joints)
+
+
+def difference(q: SX, q_end: SX, layout: Layout) -> SX:
+    """Return the velocity (nv,) that moves `q` to `q_end` in unit time, the inverse of `integrate`."""
+    ends = zip(*[[x[i : i + 4] for i, _ in layout.turns] for x in (q, q_end)], strict=True)
+    turns = [rotation_vector(quaternion_product(ca.vertcat(a[0], -a[1:]), b)) for a, b in ends]
+    joints = q_end[layout.joints_q :] - q[layout.joints_q :]
+    if not layout.floating:
+        return ca.vertcat(*turns, joints)
+    w, moved = turns[0], quaternion_to_rotation(q[3:7]).T @ (q_end[:3] - q[:3])
+    half = _length(w) / 2
+    d = (1 - half * ca.cos(half) / ca.sin(half)) / (4 * half**2)
+    u = moved - cross(w, moved) / 2 + d * cross(w, cross(w, moved))
+    return ca.vertcat(w, u, *turns[1:], joints)
+
+
+def _length(x: SX) -> SX:
+    """Return the norm of a vector, never zero, so that quotients stay finite."""
+    return ca.sqrt(ca.sumsqr(x) + 1e-24)
+
+
+def tangent_basis(q: SX, layout: Layout) -> SX:
+    """Return the derivative of positions (nq,) by their tangent, shape (nq, nv)."""
+    turning = [_turning(q[i : i + 4]) for i, _ in layout.turns]
+    if layout.floating:
+        turning[0] = ca.blockcat([[SX(3, 3), quaternion_to_rotation(q[3:7])], [turning[0], SX(4, 3)]])
+    return ca.diagcat(*turning, SX.eye(layout.joints))
+
+
+def _turning(quaternion: SX) -> SX:
+    """Return the derivative of a quaternion by a rotation about the axes of its body, shape (4, 3)."""
+    return ca.horzcat(*[quaternion_product(quaternion, ca.vertcat(0, SX.eye(3)[:, i])) / 2 for i in range(3)])
+
+
 def rotate_quaternion(quaternion: SX, rotation: SX) -> SX:
     """Return a unit quaternion turned by a rotation vector [rad] in body axes, by the exponential map."""
-    angle = ca.sqrt(ca.sumsqr(rotation) + 1e-24)  # never zero, so that sin(angle / 2) / angle stays finite
+    angle = _length(rotation)
     half_turn = ca.vertcat(ca.cos(angle / 2), ca.sin(angle / 2) / angle * rotation)
     product = quaternion_product(quaternion, half_turn)
     return product / ca.sqrt(ca.sumsqr(product))
@@ -48,5 +97,5 @@ def rotation_between(a: SX, b: SX) -> SX:
 def rotation_vector(quaternion: SX) -> SX:
     """Return the rotation vector [rad] of a unit quaternion, at most half a turn long; shape (3,)."""
     w, u = quaternion[0], quaternion[1:]
-    sine = ca.sqrt(ca.sumsqr(u) + 1e-24)  # never zero, so that the quotient stays finite
+    sine = _length(u)
     return 2 * ca.atan2(sine, ca.fabs(w)) / sine * ca.if_else(w < 0, -1, 1) * u

@@ -12,9 +12,9 @@ from itertools import accumulate
 
 import casadi as ca
 
+from ce_gym.dynamics.algebra.integration import tangent_basis
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import output_names, traced
-from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.scene_laws import iterate_size, iterations_needed

@@ -16,8 +16,8 @@ from typing import TypeAlias
 
 import casadi as ca
 
+from ce_gym.dynamics.algebra.integration import tangent_basis
 from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_to_rotation, skew
-from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.forces.contact import LinearContact
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.laws.contacts import with_contacts

@@ -15,9 +15,9 @@ from itertools import accumulate, pairwise
 import casadi as ca
 
 from ce_gym.compile import Buffer, Call, Program, Step, calls_of, scratch_buffers
+from ce_gym.dynamics.algebra.integration import tangent_basis
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
-from ce_gym.dynamics.derivatives import tangent_basis
 from ce_gym.dynamics.stepping.derivatives import adjoint_function, iterations_of, primal_function, state_parts
 from ce_gym.dynamics.stepping.variables import Variables
 from ce_gym.envs.runtime.program import TaskProgram

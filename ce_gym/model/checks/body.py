@@ -10,6 +10,7 @@ import numpy as np
 from ce_gym.model.coordinates import SIZES
 from ce_gym.model.description import SCREWS, Body, Joint
 from ce_gym.model.errors import invalid_value
+from ce_gym.model.frames import Placement
 from ce_gym.model.ranges import LARGEST_FIGURE, check_fields
 
 RELATIVE_TOLERANCE = 1e-9
@@ -28,10 +29,7 @@ def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
     check_finite(file, f"{where} mass", (mass,))
     check_finite(file, f"{where} centre of mass", body.inertial.com)
     _check_inertia(file, f"{where} inertia", np.array(body.inertial.inertia))
-    check_finite(file, f"{where} position", body.placement.position)
-    rotation = np.array(body.placement.rotation)
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0.0:
-        raise invalid_value(file, f"{where} rotation", body.placement.rotation, "a rotation matrix")
+    check_placement(file, f"{where} ", body.placement)
     if body.joint.type != "free":
         _check_joint(file, where, body.joint)
 
@@ -49,6 +47,14 @@ def _check_joint(file: str, where: str, joint: Joint) -> None:
     if not lower <= upper:
         raise invalid_value(file, f"{where} joint limits", joint.position, "a lower limit that is not above the upper")
     check_fields(joint, file, f"{where} joint ")
+
+
+def check_placement(file: str, key: str, placement: Placement) -> None:
+    """Check that a pose is finite and its rotation is a rotation matrix."""
+    check_finite(file, f"{key}position", placement.position)
+    rotation = np.array(placement.rotation)
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0.0:
+        raise invalid_value(file, f"{key}rotation", placement.rotation, "a rotation matrix")
 
 
 def check_finite(file: str, key: str, values: Iterable[float]) -> None:

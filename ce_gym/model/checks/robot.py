@@ -16,6 +16,7 @@ from ce_gym.model.checks.body import (
     check_axis,
     check_body,
     check_finite,
+    check_placement,
     check_unique,
     moves_inertia,
     violates_triangle_inequality,
@@ -57,6 +58,7 @@ def check_robot(robot: Robot) -> None:
     _check_constraints(robot, file)
     _check_independent(robot, file)
     _check_something_moves(robot, file)
+    _check_frames(robot, file)
     _check_contacts(robot, file)
     check_motors(robot, file)
     check_elastic(robot, file)
@@ -72,6 +74,7 @@ def _check_names(robot: Robot, file: str) -> None:
     names |= {f"{kind} name": [body.name for body in robot.bodies if body.kind == kind] for kind in ("link", "rotor")}
     names["constraint name"] = [constraint.name for constraint in robot.constraints]
     names["contact name"] = [contact.name for contact in robot.contacts]
+    names["frame name"] = [frame.name for frame in robot.frames]
     names["contact group"] = [contact.group for contact in robot.contacts]
     for key, listed in names.items():
         for name in listed:
@@ -164,6 +167,16 @@ def _check_something_moves(robot: Robot, file: str) -> None:
         if body.name not in tied | {other.parent for other in robot.bodies} and not moves_inertia(body):
             expected = "a mass or an inertia that its joint moves"
             raise invalid_value(file, f"{body.kind} {body.name!r} inertia", body.inertial.inertia, expected)
+
+
+def _check_frames(robot: Robot, file: str) -> None:
+    bodies = [body.name for body in robot.bodies]
+    check_unique(file, "frame name", [*bodies, *(frame.name for frame in robot.frames)])
+    for frame in robot.frames:
+        key = f"frames.{frame.name}"
+        if frame.body is not None and frame.body not in bodies:
+            raise unknown_name(file, f"{key}.body", frame.body, bodies, "the name of a body")
+        check_placement(file, f"{key} ", frame.placement)
 
 
 def _check_contacts(robot: Robot, file: str) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from ce_gym.model.description import Inertial
+from ce_gym.model.description import Body, Frame, Inertial
 from ce_gym.model.frames import IDENTITY, Mat3, Placement, Vec3, added
 
 # Entries this close to 0 or 1 come from a rounded right angle. They are made exact because the compiler of the
@@ -41,6 +41,12 @@ def compose(outer: Placement, inner: Placement) -> Placement:
     """Return the pose of `inner`, given in the frame `outer`, in the parent of `outer`."""
     rotation = np.array(outer.rotation) @ np.array(inner.rotation)
     return Placement(transform_point(outer, inner.position), exact_right_angles(rotation))
+
+
+def named_frames(frames: Mapping[str, tuple[str | None, Placement]], bodies: Iterable[Body]) -> tuple[Frame, ...]:
+    """Return the frames that are no bodies, given the body and the pose of each by name."""
+    names = {body.name for body in bodies}
+    return tuple(Frame(name, *place) for name, place in frames.items() if name not in names)
 
 
 def transform_point(frame: Placement, point: Vec3) -> Vec3:

@@ -247,6 +247,19 @@ def _report_forces(source: MjcfSource) -> None:
             source.leave_out("motion capture of body {}", source.name("body", i))
 
 
+def read_sites(source: MjcfSource, tree: MjcfTree) -> dict[str, tuple[str | None, Placement]]:
+    """Return body and pose of each site with a name; a site with the name of a body gains a number."""
+    model = source.model
+    taken = {source.name("body", i) for i in range(model.nbody)} | {body.name for body in tree.bodies}
+    sites: dict[str, tuple[str | None, Placement]] = {}
+    for i in range(model.nsite):
+        if name := source.given_name("site", i):
+            body, frame = tree.frames[model.site_bodyid[i]]
+            pose = compose(frame, placement(model.site_pos[i], model.site_quat[i]))
+            sites[_fresh(name, taken | sites.keys())] = body, pose
+    return sites
+
+
 def shapes(source: MjcfSource, tree: MjcfTree) -> Iterator[tuple[str, Shape]]:
     """Iterate over primitives to draw, each with the body that carries it."""
     model, kinds = source.model, source.mujoco.mjtGeom

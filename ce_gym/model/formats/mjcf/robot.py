@@ -28,18 +28,18 @@ from ce_gym.model.description import Pose, Robot
 from ce_gym.model.errors import LossyImportWarning
 from ce_gym.model.formats.mjcf.actuators import read_actuators
 from ce_gym.model.formats.mjcf.balls import balls_in_loops
-from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, shapes
+from ce_gym.model.formats.mjcf.bodies import MjcfTree, read_bodies, read_sites, shapes
 from ce_gym.model.formats.mjcf.contacts import read_contacts
 from ce_gym.model.formats.mjcf.equalities import locked_joints, read_constraints
 from ce_gym.model.formats.mjcf.independent import choose_independent, equality_rows, without_repeats
 from ce_gym.model.formats.mjcf.rotors import add_rotors
 from ce_gym.model.formats.mjcf.source import MjcfSource, quaternion, read_mjcf, rotation, summary
 from ce_gym.model.formats.mjcf.unmodelled import report_unmodelled
-from ce_gym.model.formats.placement import vec3
+from ce_gym.model.formats.placement import named_frames, vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.rotor_rule import with_rotors
-from ce_gym.model.formats.urdf.tree import Frame
+from ce_gym.model.formats.urdf.tree import Attachment
 from ce_gym.model.frames import Placement
 
 Angles = tuple[tuple[str, float], ...]  # pairs (body, joint coordinate [rad or m])
@@ -71,7 +71,7 @@ def robot_from_mjcf(path: Path, gear_ratios: Mapping[str, float] | None = None) 
 
 def read_robot(
     path: Path, gears: Section, driven: Collection[str] = (), apart: Collection[str] = ()
-) -> tuple[Robot, dict[str, Frame], Mapping[str, FixedLink]]:
+) -> tuple[Robot, dict[str, Attachment], Mapping[str, FixedLink]]:
     """Read an MJCF file that a YAML file may add to; nothing is checked yet.
 
     Args:
@@ -103,6 +103,7 @@ def read_robot(
     ties = add_rotors(source, tree, _ratios(gears, tree, driven), driven)
     pose, assembly = _pose(source, tree, independent, lowest)
     report_unmodelled(source)
+    frames = {source.name("body", i): frame for i, frame in enumerate(tree.frames)}
     robot = Robot(
         name=_name(source, path),
         bodies=tuple(tree.bodies),
@@ -114,12 +115,12 @@ def read_robot(
         assembly=assembly,
         gains=gains,
         gravity=vec3(source.model.opt.gravity) if source.enabled("GRAVITY") else (0.0, 0.0, 0.0),
+        frames=named_frames({**frames, **read_sites(source, tree)}, tree.bodies),
         source=str(path),
         notes=(*(f"left out: {what.format(name)}" for what, name in source.left_out), *source.notes),
     )
     if source.left_out:
         warnings.warn(f"{path}: left out: {summary(source.left_out)}", LossyImportWarning, stacklevel=4)
-    frames = {source.name("body", i): frame for i, frame in enumerate(tree.frames)}
     return robot, {**frames, **{body.name: (body.name, Placement()) for body in tree.bodies}}, tree.fixed
 
 

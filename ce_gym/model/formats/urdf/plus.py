@@ -24,13 +24,13 @@ from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.constraints import LinearConstraint, LoopConstraint
 from ce_gym.model.description import Body, Pose, Robot
 from ce_gym.model.errors import invalid_value, unknown_name
-from ce_gym.model.formats.placement import compose
+from ce_gym.model.formats.placement import compose, named_frames
 from ce_gym.model.formats.pose import complete_pose
 from ce_gym.model.formats.rotor_rule import with_rotors
 from ce_gym.model.formats.urdf import elements as read
 from ce_gym.model.formats.urdf.drives import add_rotors
 from ce_gym.model.formats.urdf.graph import UrdfGraph
-from ce_gym.model.formats.urdf.tree import Base, Frame, UrdfTree, read_tree, warn_of_held_joints
+from ce_gym.model.formats.urdf.tree import Attachment, Base, UrdfTree, read_tree, warn_of_held_joints
 
 _LOOP_TYPES: dict[str, Literal["revolute", "ball"]] = {
     "revolute": "revolute",
@@ -64,7 +64,16 @@ def robot_from_graph(graph: UrdfGraph, base: Base | None = None) -> Robot:
     bodies, gears = add_rotors(bodies, tree.drives, (), notes)
     constraints = (*constraints, *gears)
     pose = Pose(joints=complete_pose((), bodies, independent))
-    robot = Robot(tree.name, bodies, constraints, independent, pose=pose, source=graph.file, notes=tuple(notes))
+    robot = Robot(
+        name=tree.name,
+        bodies=bodies,
+        constraints=constraints,
+        independent=independent,
+        pose=pose,
+        frames=named_frames(tree.frames, bodies),
+        source=graph.file,
+        notes=tuple(notes),
+    )
     check_robot(robot)
     return robot
 
@@ -137,7 +146,9 @@ def _loops(graph: UrdfGraph, tree: UrdfTree) -> Iterator[LoopConstraint]:
         )
 
 
-def _ends(graph: UrdfGraph, where: str, element: Element, frames: dict[str, Frame]) -> tuple[Frame, Frame]:
+def _ends(
+    graph: UrdfGraph, where: str, element: Element, frames: dict[str, Attachment]
+) -> tuple[Attachment, Attachment]:
     """Return the bodies at both ends of a loop with the poses of the loop's joint in them.
 
     A <loop_joint> (RigidBodyDynamics.jl, Isaac Sim) has <link1> and <link2>, which carry `xyz` and `rpy` themselves.
@@ -156,13 +167,13 @@ def _ends(graph: UrdfGraph, where: str, element: Element, frames: dict[str, Fram
     return first, second
 
 
-def _end(file: str, where: str, element: Element, tag: str, frames: dict[str, Frame]) -> Frame:
+def _end(file: str, where: str, element: Element, tag: str, frames: dict[str, Attachment]) -> Attachment:
     """Return the body at one end of a loop or coupling, and the pose of the end's <origin> in it."""
     end = read.required(file, where, element, tag)
     return _frame(file, where, end, end.find("origin"), frames)
 
 
-def _frame(file: str, where: str, end: Element, origin: Element | None, frames: dict[str, Frame]) -> Frame:
+def _frame(file: str, where: str, end: Element, origin: Element | None, frames: dict[str, Attachment]) -> Attachment:
     """Return the body that a link belongs to, and a pose given in the link's frame in the body's."""
     link = read.name_of(file, end, "link", where)
     if link not in frames:

@@ -30,7 +30,7 @@ from ce_gym.model.formats.urdf.vocabulary import SPRINGS, unread_words
 from ce_gym.model.frames import ZERO, Placement, added
 
 Base = Literal["floating", "fixed"]
-Frame = tuple[str | None, Placement]  # the body (None: the world) that carries a frame, and the frame's pose in it
+Attachment = tuple[str | None, Placement]  # the body (None: the world) that carries a frame, its pose in it
 
 WORLD = "world"
 ROUNDING = 1e-12
@@ -55,7 +55,7 @@ class UrdfTree:
 
     name: str
     bodies: tuple[Body, ...]
-    frames: dict[str, Frame]
+    frames: dict[str, Attachment]
     constraints: tuple[LinearConstraint, ...]
     notes: tuple[str, ...]
     fixed: Mapping[str, FixedLink]
@@ -204,8 +204,8 @@ class _Reader:
     def _moves(self, link: str) -> bool:
         return not self.root_is_world if link == self.graph.root else self.joints[link].type != "fixed"
 
-    def _frames(self) -> dict[str, Frame]:
-        frames: dict[str, Frame] = {}
+    def _frames(self) -> dict[str, Attachment]:
+        frames: dict[str, Attachment] = {}
         for link in self.graph.order:
             if self._moves(link):
                 frames[link] = (link, Placement())
@@ -215,7 +215,7 @@ class _Reader:
                 frames[link] = self._attachment(self.joints[link], frames)
         return frames
 
-    def _attachment(self, joint: UrdfJoint, frames: dict[str, Frame]) -> Frame:
+    def _attachment(self, joint: UrdfJoint, frames: dict[str, Attachment]) -> Attachment:
         carrier, pose = frames[joint.parent]
         pose = compose(pose, read.placement(self.file, joint.where, joint.element))
         return carrier, compose(pose, read.moved(self.file, joint.where, joint.element, joint.offset))

@@ -9,11 +9,11 @@ from ce_gym.model.description import Body
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, transform_point, vec3
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.urdf.elements import unit_axis
-from ce_gym.model.formats.urdf.tree import WORLD, Frame
+from ce_gym.model.formats.urdf.tree import WORLD, Attachment
 from ce_gym.model.frames import ZERO, Placement
 
 
-def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Frame]) -> Iterator[Constraint]:
+def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Attachment]) -> Iterator[Constraint]:
     """Iterate over the entries of the list `constraints`.
 
     Args:
@@ -27,7 +27,7 @@ def read_constraints(file: Section, bodies: Iterable[Body], frames: dict[str, Fr
         yield READERS[entry.text("type", choices=tuple(READERS))](entry, names, frames)
 
 
-def frame_named(section: Section, key: str, frames: dict[str, Frame]) -> Frame:
+def frame_named(section: Section, key: str, frames: dict[str, Attachment]) -> Attachment:
     """Return the body that carries the frame named under `key`, and the frame's pose in that body."""
     name = section.text(key)
     if name not in frames and name != WORLD:
@@ -45,13 +45,13 @@ def coefficients(section: Section, names: list[str]) -> tuple[tuple[str, float],
     return section.numbers()
 
 
-def _linear(entry: Section, names: list[str], frames: dict[str, Frame]) -> LinearConstraint:
+def _linear(entry: Section, names: list[str], frames: dict[str, Attachment]) -> LinearConstraint:
     entry.allow("name", "type", "coefficients", "offset")
     pairs = coefficients(entry.section("coefficients"), names)
     return LinearConstraint(entry.text("name"), pairs, entry.number("offset", 0.0))
 
 
-def _loop(entry: Section, names: list[str], frames: dict[str, Frame]) -> LoopConstraint:
+def _loop(entry: Section, names: list[str], frames: dict[str, Attachment]) -> LoopConstraint:
     entry.allow("name", "type", "joint", "axis", "first", "second")
     joint = entry.text("joint", choices=("revolute", "ball"))
     if joint == "ball" and "axis" in entry:
@@ -62,14 +62,14 @@ def _loop(entry: Section, names: list[str], frames: dict[str, Frame]) -> LoopCon
     return LoopConstraint(name, joint, first, second, frame_1, frame_2, axis)  # type: ignore[arg-type]
 
 
-def _loop_end(entry: Section, end: str, frames: dict[str, Frame]) -> Frame:
+def _loop_end(entry: Section, end: str, frames: dict[str, Attachment]) -> Attachment:
     section = entry.section(end).allow("body", "xyz", "rpy")
     body, pose = frame_named(section, "body", frames)
     rotation = rotation_from_rpy(*section.vector("rpy", 3, ZERO))
     return body, compose(pose, Placement(vec3(section.vector("xyz", 3, ZERO)), rotation))
 
 
-def _rod(entry: Section, names: list[str], frames: dict[str, Frame]) -> RodConstraint:
+def _rod(entry: Section, names: list[str], frames: dict[str, Attachment]) -> RodConstraint:
     entry.allow("name", "type", "length", "first", "second")
     ends = []
     for end in ("first", "second"):
@@ -80,14 +80,14 @@ def _rod(entry: Section, names: list[str], frames: dict[str, Frame]) -> RodConst
     return RodConstraint(entry.text("name"), first, second, first_point, second_point, entry.number("length"))
 
 
-def _function(entry: Section, names: list[str], frames: dict[str, Frame]) -> FunctionConstraint:
+def _function(entry: Section, names: list[str], frames: dict[str, Attachment]) -> FunctionConstraint:
     entry.allow("name", "type", "function", "arguments", "dependent")
     return FunctionConstraint(
         entry.text("name"), entry.text("function"), entry.texts("arguments"), entry.texts("dependent")
     )
 
 
-READERS: dict[str, Callable[[Section, list[str], dict[str, Frame]], Constraint]] = {
+READERS: dict[str, Callable[[Section, list[str], dict[str, Attachment]], Constraint]] = {
     "linear": _linear,
     "loop": _loop,
     "rod": _rod,

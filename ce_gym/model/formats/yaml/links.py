@@ -10,10 +10,11 @@ from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Robot, Shape
 from ce_gym.model.errors import invalid_value
 from ce_gym.model.formats.mjcf.robot import read_robot
+from ce_gym.model.formats.placement import named_frames
 from ce_gym.model.formats.reading import Section
 from ce_gym.model.formats.rotor_links import FixedLink
 from ce_gym.model.formats.urdf.drives import Drive
-from ce_gym.model.formats.urdf.tree import Base, Frame, read_urdf
+from ce_gym.model.formats.urdf.tree import Attachment, Base, read_urdf
 
 _TIES = ("rotors", "constraints", "independent")
 """Keys that name links which move although they have no mass in the URDF file."""
@@ -34,7 +35,7 @@ class Links:
     """
 
     robot: Robot
-    frames: dict[str, Frame]
+    frames: dict[str, Attachment]
     fixed: Mapping[str, FixedLink]
     collisions: Mapping[str, tuple[Shape | None, ...]]
     drives: tuple[Drive, ...] = ()
@@ -64,7 +65,8 @@ def read_links(path: Path, file: Section) -> Links:
         tied = {word for key in _TIES for word in _words(file.data.get(key))}
         tree = read_urdf(path.parent / file.text("urdf"), base, rotors.data, tied)
         independent = _not_tied(tree.bodies, tree.constraints)
-        robot = Robot(tree.name, tree.bodies, tree.constraints, independent, notes=tree.notes)
+        frames = named_frames(tree.frames, tree.bodies)
+        robot = Robot(tree.name, tree.bodies, tree.constraints, independent, frames=frames, notes=tree.notes)
         joints = joint_aliases(robot)
         driven = {joints.get(name, name) for name in driven}
         return Links(robot, dict(tree.frames), tree.fixed, tree.collisions, tree.drives, driven, joints)

@@ -14,17 +14,18 @@ from pathlib import Path
 from ce_gym.model.assets import assets_folder, robots
 from ce_gym.model.checks.robot import check_robot
 from ce_gym.model.constraints import Constraint
-from ce_gym.model.description import Body, ContactMaterial, Gains, Pose, Robot
+from ce_gym.model.description import Body, ContactMaterial, Frame, Gains, Pose, Robot
 from ce_gym.model.formats.identified import with_identified
-from ce_gym.model.formats.placement import vec3
+from ce_gym.model.formats.placement import compose, rotation_from_rpy, vec3
 from ce_gym.model.formats.pose import complete_pose
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
 from ce_gym.model.formats.urdf import drives
-from ce_gym.model.formats.yaml.constraints import read_constraints
+from ce_gym.model.formats.yaml.constraints import frame_named, read_constraints
 from ce_gym.model.formats.yaml.contacts import read_capsules, read_contacts, read_pairs
-from ce_gym.model.formats.yaml.links import read_links
+from ce_gym.model.formats.yaml.links import Links, read_links
 from ce_gym.model.formats.yaml.motors import read_battery, read_motors
 from ce_gym.model.formats.yaml.rotors import add_rotors, read_elastic
+from ce_gym.model.frames import ZERO, Placement
 
 Pairs = tuple[tuple[str, float], ...]
 
@@ -32,7 +33,7 @@ _JOINT_PARAMETERS = {"joint_friction": "friction", "joint_stiffness": "stiffness
 _KEYS = (
     *("name", "urdf", "mjcf", "base", "sources", "notes", "kept_inertia", "gravity", "gears"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
-    *("capsules", "self_collisions", "elastic", "battery", "passive"),
+    *("capsules", "self_collisions", "elastic", "battery", "passive", "frames"),
     *_JOINT_PARAMETERS,
 )
 
@@ -71,6 +72,7 @@ def robot_from_yaml(path: Path) -> Robot:
         assembly=_assembly(file, links.robot, independent),
         gravity=vec3(file.vector("gravity", 3, links.robot.gravity)),
         tasks=tuple((name, frozen(task.data)) for name, task in file.section("tasks").sections()),
+        frames=_frames(file.section("frames"), links, bodies),
         kept_inertia=file.texts("kept_inertia"),
         source=str(path),
         notes=(*notes, *file.texts("notes")),
@@ -120,6 +122,18 @@ def _with_passive_joints(file: Section, bodies: tuple[Body, ...], independent: t
     return tuple(
         replace(body, joint=replace(body.joint, torque=0.0)) if body.name in passive else body for body in bodies
     )
+
+
+def _frames(section: Section, links: Links, bodies: tuple[Body, ...]) -> tuple[Frame, ...]:
+    """Return the frames of the URDF or MJCF file, without those that became rotors, and the frames of the section."""
+    names = {body.name for body in bodies}
+    frames = [frame for frame in links.robot.frames if frame.name not in names]
+    for name, entry in section.sections():
+        entry.allow("body", "xyz", "rpy")
+        body, pose = frame_named(entry, "body", links.frames)
+        placement = Placement(vec3(entry.vector("xyz", 3, ZERO)), rotation_from_rpy(*entry.vector("rpy", 3, ZERO)))
+        frames.append(Frame(name, body, compose(pose, placement)))
+    return tuple(frames)
 
 
 def _independent(file: Section, links: Robot, ties: tuple[Constraint, ...]) -> tuple[str, ...]:

@@ -1,0 +1,1 @@
+"""Frames, momentum and further quantities for controllers as traced functions; each file exports some by name."""
