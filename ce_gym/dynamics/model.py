@@ -389,9 +389,11 @@ class Model:
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """All frames: bodies, rotors included, frames of the robot's file such as links on fixed joints, and contacts.
+        """Names of all frames.
 
-        A body's frame is at its joint. A contact's frame is at the centre of its sphere, with the axes of its body.
+        Bodies, rotors included; frames of the robot's file, such as links on fixed joints and sites of MJCF; contacts,
+        if no other frame has the name. The frame of a body is at its joint. The frame of a contact is at the centre of
+        the sphere and has the axes of the body.
         """
         return tuple(frames_of(self.mechanism))
 
@@ -526,7 +528,8 @@ class Model:
 
         Solves `M vdot + h = tau + J^T f`, `J vdot + Jdot v = 0`: the origins of the frames do not accelerate, whatever
         the direction of the forces, so contacts neither slip nor lift off. Of redundant constraints, such as four
-        corners of a sole, the forces with the smallest norm are returned.
+        corners of a sole, the forces with the smallest norm are returned. Constraints that contradict each other are
+        met as closely as possible.
 
         Args:
             q: Positions, shape (..., nq).

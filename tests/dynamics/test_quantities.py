@@ -90,13 +90,14 @@ def test_frames(case: Case):
     for name in case.frames:
         position, rotation = model.frame_pose(q, name)
         velocity = model.frame_velocity(q, v, name)
+        h = 0.01 / max(10.0, np.abs(velocity).max())  # rotors turn fast
         assert position.shape == (STATES, 3)
         assert_close(times(model.frame_jacobian(q, name), v), velocity)
-        assert_close(velocity[:, 3:], case.rate(lambda x, name=name: model.frame_pose(x, name)[0]), 1e-7)
-        turning = case.rate(lambda x, name=name: model.frame_pose(x, name)[1]) @ np.swapaxes(rotation, -1, -2)
+        assert_close(velocity[:, 3:], case.rate(lambda x, name=name: model.frame_pose(x, name)[0], h), 1e-7)
+        turning = case.rate(lambda x, name=name: model.frame_pose(x, name)[1], h) @ np.swapaxes(rotation, -1, -2)
         assert_close(velocity[:, :3], turning[:, (2, 0, 1), (1, 2, 0)], 1e-7)
         bias = model.frame_bias_acceleration(q, v, name)
-        assert_close(bias, case.rate(lambda x, name=name: model.frame_velocity(x, v, name)), 1e-7)
+        assert_close(bias, case.rate(lambda x, name=name: model.frame_velocity(x, v, name), h), 1e-7)
     assert_close(model.frame_pose(q, "marker")[0], np.broadcast_to([0.1, -0.2, 0.3], (STATES, 3)), 0.0)
 
 
@@ -229,3 +230,73 @@ def test_constrained_forward_dynamics(case: Case):
     for frame in frames if possible else ():
         moved_by = times(model.frame_jacobian(q, frame), vdot) + model.frame_bias_acceleration(q, v, frame)
         assert np.abs(moved_by[:, 3:]).max() < 1e-9 * scale
+
+
+def test_derivatives_of_frames_are_jacobians(case: Case):
+    """Through loops, too: of a pose the frame's velocity, of a momentum the rows of its matrix."""
+    model, q, v = case.model, case.q, case.v
+    changes = model.derivatives("frame_pose:sensor", ["q"]).product(q, directions={"q": v})
+    assert_close(changes["position"], model.frame_velocity(q, v, "sensor")[:, 3:])
+    weights = {"momentum": np.eye(6)[1]}
+    gradient = model.derivatives("centroidal_momentum", ["v"]).gradient(q, v, weights=weights)["v"]
+    assert_close(gradient, model.centroidal_momentum_matrix(q)[:, 1])
+
+
+def test_redundant_contacts():
+    """Of four corners of a sole, three determine the motion; the smallest forces of all that do are returned."""
+    model = Model("t1")
+    q = model.standing_q
+    body = next(contact.body for contact in model.robot.contacts if contact.group == "foot")
+    corners = [contact.name for contact in model.robot.contacts if contact.body == body][:4]
+    J = np.concatenate([model.contact_jacobian(q)[model.contact_names.index(name)] for name in corners])
+    v, tau = np.random.default_rng(0).normal(size=(2, model.nv))
+    v = v - np.linalg.pinv(J) @ J @ v  # the sole rests
+    vdot, forces = model.constrained_forward_dynamics(q, v, tau, corners)
+    assert_close(vdot, model.constrained_forward_dynamics(q, v, tau, corners[:3])[0], 1e-8)
+    assert np.linalg.matrix_rank(J) == 6
+    needed = model.mass_matrix(q) @ vdot + model.bias_force(q, v) - tau
+    assert_close(forces.ravel(), np.linalg.lstsq(J.T, needed, rcond=1e-9)[0], 1e-8)
+
+
+@pytest.mark.parametrize("robot", ["mini_cheetah", "four_bar"])
+def test_batches(robot: str):
+    model, rng = Model(robot), np.random.default_rng(0)
+    q = np.array([model.random_configuration(rng) for _ in range(6)])
+    v, frame = rng.normal(size=(6, model.nv)), model.body_names[-1]
+    for quantity in (
+        lambda q, v: model.frame_pose(q, frame)[1],
+        lambda q, v: model.frame_bias_acceleration(q, v, frame),
+        lambda q, v: model.contact_jacobian(q),
+        lambda q, v: model.center_of_mass(q),
+        model.centroidal_momentum,
+        model.coriolis_matrix,
+        model.integrate,
+        lambda q, v: model.difference(q, q[..., ::-1] if robot == "four_bar" else q),
+        lambda q, v: model.constrained_forward_dynamics(q, v, v, [frame])[1],
+        lambda q, v: model.constrained_forward_dynamics(q, v, v, [])[1],
+        lambda q, v: model.inertial_regressor(q, v, v),
+    ):
+        flat = quantity(q, v)
+        np.testing.assert_allclose(quantity(q.reshape(2, 3, -1), v.reshape(2, 3, -1)).reshape(flat.shape), flat)
+        np.testing.assert_allclose(quantity(q[0], v[0]), flat[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mini_cheetah", "tello", "dr_legs", "spatial", "balls"])
+def test_random_configurations(name: str):
+    model = Model(BUILT[name]() if name in BUILT else load_robot(name))
+    rng, layout = np.random.default_rng(3), model.robot.layout
+    drawn = np.array([model.random_configuration(rng) for _ in range(20)])
+    assert_close(model.unit(drawn), drawn, 1e-15)
+    assert np.abs(model.loop_gap(drawn)).max() < 1e-9
+    assert np.abs(drawn[:, layout.joints_q :] - model.standing_q[layout.joints_q :]).max(initial=0.0) > 0.1
+    for i, joint in enumerate(model.robot.independent, start=layout.joints_q):
+        lower, upper = model.robot.body(joint).joint.position
+        assert (lower <= drawn[:, i]).all()
+        assert (drawn[:, i] <= upper).all()
+    again = np.random.default_rng(3)
+    np.testing.assert_array_equal(model.random_configuration(again), drawn[0])
+
+
+def test_neutral():
+    q = Model(with_balls(True)).neutral()
+    np.testing.assert_array_equal(q, [0, 0, 0, *[1, 0, 0, 0] * 4, 0, 0])
