@@ -181,7 +181,7 @@ class _Coordinates:
 class Pinocchio(_Coordinates):
     """Coordinates of Pinocchio: quaternions (x, y, z, w), base velocity [linear; angular] in the base frame.
 
-    A joint is found by the link that it moves, or by its name in a model without links.
+    A joint is found by the link that it moves, else by its name.
 
     Args:
         model: The model.
@@ -200,7 +200,7 @@ class Pinocchio(_Coordinates):
             if i == 0:
                 continue  # the universe
             q = range(joint.idx_q, joint.idx_q + joint.nq)
-            name = links[i] if i in links else str(pinocchio_model.names[i])
+            name = _body_moved(model, links.get(i, ""), str(pinocchio_model.names[i]))
             joints.append(_Joint(name, q, range(joint.idx_v, joint.idx_v + joint.nv)))
             if joint.nq == 2:
                 neutral[q[0]] = 1.0  # cosine
@@ -212,7 +212,7 @@ class Pinocchio(_Coordinates):
 class MuJoCo(_Coordinates):
     """Coordinates of MuJoCo: base velocity [linear in the world; angular in the base frame].
 
-    A joint is found by the body that it moves. If a body has several joints, the others have their own names.
+    A joint is found by the body that it moves, else by its name. Of several joints of a body, the last moves the body.
 
     Args:
         model: The model.
@@ -226,7 +226,7 @@ class MuJoCo(_Coordinates):
         for j in range(mujoco_model.njnt):
             body = mujoco_model.body(mujoco_model.jnt_bodyid[j])
             is_last = j == body.jntadr[0] + body.jntnum[0] - 1
-            name = str(body.name if is_last else mujoco_model.joint(j).name)
+            name = _body_moved(model, body.name if is_last else "", mujoco_model.joint(j).name)
             nq, nv = {0: (7, 6), 1: (4, 3)}.get(int(mujoco_model.jnt_type[j]), (1, 1))
             q, v = int(mujoco_model.jnt_qposadr[j]), int(mujoco_model.jnt_dofadr[j])
             joints.append(_Joint(name, range(q, q + nq), range(v, v + nv)))
@@ -240,7 +240,8 @@ class JointOrder(_Coordinates):
 
     Args:
         model: The model.
-        joints: All joints in their order, by the links that they move; dependent joints may be among them.
+        joints: All joints in their order, by their names or by the links that they move; dependent joints may be among
+            them.
 
     Raises:
         ValueError: If a joint does not exist or is listed twice, or an independent joint is missing.
@@ -249,10 +250,11 @@ class JointOrder(_Coordinates):
     _LINEAR_FIRST: ClassVar[bool] = False
 
     def __init__(self, model: Model, joints: Sequence[str]) -> None:
-        check_names("joints", joints, model.spanning_names, f"a joint of {model.robot.name}:")
+        links = {**{link: link for link in model.spanning_names}, **model.robot.links_by_joint}
+        check_names("joints", joints, links, f"a joint of {model.robot.name}:", listed=", ".join(model.joint_names))
         base = [model.robot.bodies[0].name] if model.robot.floating else []
         placed, first_q, first_v = [], 0, 0
-        for name in (*base, *joints):
+        for name in (*base, *(links[joint] for joint in joints)):
             nq, nv = sizes(model.robot.body(name).joint.type)
             placed.append(_Joint(name, range(first_q, first_q + nq), range(first_v, first_v + nv)))
             first_q, first_v = first_q + nq, first_v + nv
@@ -264,3 +266,8 @@ def _rotated(quaternion: Array, x: Array) -> Array:
     w, u = quaternion[..., :1], quaternion[..., 1:]
     across = np.cross(u, x)
     return x + 2.0 * (w * across + np.cross(u, across))
+
+
+def _body_moved(model: Model, link: str, joint: str) -> str:
+    """Return the body of the model that a joint of another program moves; another name if the model has none."""
+    return link if link in model.body_names else model.robot.links_by_joint.get(joint, joint)

@@ -128,10 +128,11 @@ def test_mujoco_s_bias_forces(robot: str):
     np.testing.assert_allclose(bias, model.inverse_dynamics(q, v, vdot), atol=1e-9 * np.abs(bias).max())
 
 
-def test_another_order():
-    model = Model("mini_cheetah")
+@pytest.mark.parametrize("names", ["joint_names", "joint_links"])
+def test_another_order(names: str):
+    model = Model("go1")
     q, v, tau = state(model)
-    q_file, v_file, tau_file = JointOrder(model, model.joint_links[::-1]).from_model(q, v, tau)
+    q_file, v_file, tau_file = JointOrder(model, getattr(model, names)[::-1]).from_model(q, v, tau)
     for ours, other, base in ((q, q_file, 7), (v, v_file, 6), (tau, tau_file, 6)):
         np.testing.assert_array_equal(other, [*ours[:base], *ours[base:][::-1]])
 
