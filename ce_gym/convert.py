@@ -65,7 +65,7 @@ class _Coordinates:
 
     def __init__(self, model: Model, joints: Sequence[_Joint], neutral: Array, nv: int) -> None:
         self.model, self.neutral, self.nv = model, neutral, nv
-        self.joints = {joint.name: joint for joint in joints if joint.name in model.body_names}
+        self.joints = {joint.name: joint for joint in joints if joint.name in model.body_names and len(joint.v)}
         program = type(self).__name__
         for name in model.robot.rows:
             if name not in self.joints:
@@ -94,7 +94,7 @@ class _Coordinates:
         if v is not None:
             result.append(self._velocities(q, v_span))
         if tau is not None:
-            tau = np.asarray(tau, dtype=float)
+            tau = _of_size("tau", tau, self.model.nv)
             on_joints = np.zeros((*tau.shape[:-1], v_span.shape[-1]))
             for name, (_, rows) in self.model.robot.rows.items():
                 on_joints[..., self.model.robot.spanning_rows[name][1]] = tau[..., rows]
@@ -112,18 +112,19 @@ class _Coordinates:
             v: Velocities, shape (..., its nv).
             tau: Generalised forces, shape (..., its nv).
         """
-        q = np.asarray(q, dtype=float)
+        q = _of_size("q", q, len(self.neutral))
         positions = np.zeros((*q.shape[:-1], self.model.nq))
         for name, (rows, _) in self.model.robot.rows.items():
             positions[..., rows] = self._model_position(self.joints[name], q)
-        result = [self.model.unit(positions)]
+        positions = self.model.unit(positions)
+        result = [positions]
         if v is not None:
-            v_span = self._model_velocities(positions, np.asarray(v, dtype=float))
+            v_span = self._model_velocities(positions, _of_size("v", v, self.nv))
             rows = [row for name in self.model.robot.rows for row in self.model.robot.spanning_rows[name][1]]
             result.append(v_span[..., rows])
         if tau is not None:
             G = self.model.explicit_constraint(positions, np.zeros(self.model.nv))[0]
-            on_joints = self._model_velocities(positions, np.asarray(tau, dtype=float))
+            on_joints = self._model_velocities(positions, _of_size("tau", tau, self.nv))
             result.append(np.einsum("...ij,...i->...j", G, on_joints))
         return tuple(result)
 
@@ -271,3 +272,11 @@ def _rotated(quaternion: Array, x: Array) -> Array:
 def _body_moved(model: Model, link: str, joint: str) -> str:
     """Return the body of the model that a joint of another program moves; another name if the model has none."""
     return link if link in model.body_names else model.robot.links_by_joint.get(joint, joint)
+
+
+def _of_size(name: str, x: ArrayLike, size: int) -> Array:
+    """Return an array, which must have shape (..., size)."""
+    array = np.asarray(x, dtype=float)
+    if array.ndim == 0 or array.shape[-1] != size:
+        raise ValueError(f"{name} has shape {array.shape}; expected (..., {size})")
+    return array

@@ -68,14 +68,15 @@ def test_there_and_back(robot: str, batch: tuple[int, ...]):
         np.testing.assert_allclose(power, np.einsum("...i,...i->...", v, tau), atol=1e-12)
 
 
+@pytest.mark.parametrize("mimic", [True, False])
 @pytest.mark.parametrize("floating", [True, False])
-def test_pinocchio_reads_the_same_file(tmp_path: Path, floating: bool):
+def test_pinocchio_reads_the_same_file(tmp_path: Path, floating: bool, mimic: bool):
     """Links are where Pinocchio puts them, and bias forces agree: a continuous joint, one without mass, a <mimic>."""
     pin = pytest.importorskip("pinocchio")
     (tmp_path / "cart.urdf").write_text(CART)
     model = Model(load_robot(tmp_path / "cart.urdf", floating=floating))
     roots = [pin.JointModelFreeFlyer()] if floating else []
-    peer = pin.buildModelFromUrdf(str(tmp_path / "cart.urdf"), *roots)
+    peer = pin.buildModelFromUrdf(str(tmp_path / "cart.urdf"), *roots, mimic=mimic)
     coordinates, data = Pinocchio(model, peer), peer.createData()
     q, v, _ = state(model)
     q_pin, v_pin = coordinates.from_model(q, v)
@@ -87,6 +88,9 @@ def test_pinocchio_reads_the_same_file(tmp_path: Path, floating: bool):
         np.testing.assert_allclose(model.frame_pose(q, name)[1], data.oMf[peer.getFrameId(name)].rotation, atol=1e-12)
     bias = coordinates.to_model(q_pin, tau=pin.nonLinearEffects(peer, data, q_pin, v_pin))[1]
     np.testing.assert_allclose(bias, model.bias_force(q, v), atol=1e-12)
+    for name, size in (("q", peer.nq), ("v", peer.nv), ("tau", peer.nv)):
+        with pytest.raises(ValueError, match=rf"{name} has shape \(99,\); expected \(\.\.\., {size}\)"):
+            coordinates.to_model(**{"q": q_pin, name: np.zeros(99)})
 
 
 def test_pinocchio_and_a_quadruped():
