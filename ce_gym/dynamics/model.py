@@ -387,7 +387,7 @@ class Model:
         kinetic, potential = self.evaluate("energy", q, v)
         return kinetic[..., 0, 0], potential[..., 0, 0]
 
-    @property
+    @cached_property
     def frame_names(self) -> tuple[str, ...]:
         """Names of all frames.
 
@@ -443,7 +443,9 @@ class Model:
         return self.evaluate(self._of_frame("frame_bias_acceleration", frame), q, v)[0][..., 0]
 
     def _of_frame(self, quantity: str, frame: str) -> str:
-        check_names("frame", [frame], self.frame_names, f"a frame of {self.robot.name}:")
+        """Return the name of the traced function of a quantity of a frame."""
+        if frame not in self.frame_names:
+            check_names("frame", [frame], self.frame_names, f"a frame of {self.robot.name}:")
         return f"{quantity}:{frame}"
 
     def contact_jacobian(self, q: ArrayLike) -> Array:
