@@ -24,8 +24,7 @@ CART = f"""<robot name="cart">
 <link name="base">{INERTIAL}</link><link name="wheel">{INERTIAL}</link><link name="slide">{INERTIAL}</link>
 <link name="twin">{INERTIAL}</link><link name="lidar"/>
 <joint name="spin" type="continuous"><parent link="base"/><child link="wheel"/><origin xyz="0 .1 .2"/></joint>
-<joint name="idle" type="revolute"><parent link="base"/><child link="lidar"/>
-  <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="idle" type="continuous"><parent link="base"/><child link="lidar"/></joint>
 <joint name="push" type="prismatic"><parent link="wheel"/><child link="slide"/><axis xyz="0 1 0"/>
   <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
 <joint name="follow" type="prismatic"><parent link="slide"/><child link="twin"/><axis xyz="0 0 1"/>
