@@ -597,11 +597,13 @@ class Model:
 
     def _closes(self, q: Array) -> bool:
         """Whether the loops close at positions (nq,)."""
+        loops = self.casadi_function("loops")
         try:
-            _, gap, nearness = self.evaluate("loops", q)
+            guess = [self.dependent_guess(q)] if "guess" in loops.name_in() else []
         except ValueError:
             return False
-        return bool(gap < 1e-9) and bool(nearness > 0.0)
+        _, gap, nearness = loops(q, *guess)
+        return float(gap) < 1e-9 and float(nearness) > 0.0
 
     @property
     def inertial_parameters(self) -> Array:
