@@ -32,8 +32,8 @@ from ce_gym.model.mechanism import build_mechanism
 
 Array = NDArray[np.float64]
 
-REDUNDANT = 1e-10
-"""Relative size of eigenvalues of `J M^-1 J^T` that count as zero: redundant constraints, and impossible motions."""
+REDUNDANT = {"float64": 1e-10, "float32": 1e-5}
+"""Relative size of eigenvalues of `J M^-1 J^T` that count as zero, by type of numbers [-]."""
 
 
 class Model:
@@ -495,7 +495,7 @@ class Model:
     def coriolis_matrix(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return the matrix `C` of `M vdot + C v + g = tau`, shape (..., nv, nv); `Mdot - 2 C` is skew-symmetric.
 
-        The factorisation is that of Christoffel's symbols, extended to the base and to ball joints.
+        The factorisation is that of Christoffel's symbols, extended to the base and to ball joints, as in Pinocchio.
         """
         return self.evaluate("coriolis_matrix", q, v)[0]
 
@@ -519,9 +519,10 @@ class Model:
         """
         J = self.frame_jacobian(q, frame)
         inverse = J @ np.linalg.solve(self.mass_matrix(q), np.swapaxes(J, -1, -2))
-        if (np.linalg.matrix_rank(inverse, REDUNDANT, hermitian=True) < 6).any():
+        values = np.linalg.eigvalsh(inverse)
+        if (values[..., 0] <= REDUNDANT[inverse.dtype.name] * values[..., -1]).any():
             raise ValueError(f"frame={frame!r} cannot move in all six directions at this q; expected a frame that can")
-        return np.asarray(np.linalg.inv(inverse), dtype=float)
+        return np.linalg.inv(inverse).astype(J.dtype)
 
     def constrained_forward_dynamics(
         self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, frames: Sequence[str]
@@ -555,7 +556,8 @@ class Model:
         bias = np.concatenate([self.frame_bias_acceleration(q, v, frame)[..., 3:] for frame in frames], axis=-1)
         response = np.linalg.solve(self.mass_matrix(q), np.swapaxes(J, -1, -2))  # M^-1 J^T
         acceleration = (J @ free[..., None])[..., 0] + bias
-        force = -(np.linalg.pinv(J @ response, REDUNDANT, hermitian=True) @ acceleration[..., None])
+        inverse = np.linalg.pinv(J @ response, REDUNDANT[J.dtype.name], hermitian=True)
+        force = -inverse @ acceleration[..., None]
         return free + (response @ force)[..., 0], force.reshape(*batch, len(frames), 3)
 
     def integrate(self, q: ArrayLike, dv: ArrayLike) -> Array:
