@@ -113,10 +113,10 @@ def test_pinocchio_and_a_quadruped():
 def test_mujoco_s_bias_forces(robot: str):
     """MuJoCo's bias is at zero acceleration in the world; ours adds the turning of the base's axes."""
     mujoco = pytest.importorskip("mujoco")
-    description = with_balls(True) if robot == "balls" else load_robot(robot)
-    model = Model(description)
     from ce_gym.export.mujoco_model import load
 
+    description = with_balls(True) if robot == "balls" else load_robot(robot)
+    model = Model(description)
     peer = load(description, "exact")
     peer.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     coordinates, data, (q, v, _) = MuJoCo(model, peer), mujoco.MjData(peer), state(model)
@@ -129,6 +129,33 @@ def test_mujoco_s_bias_forces(robot: str):
         vdot[3:6] = -np.cross(v[:3], v[3:6])
     bias = coordinates.to_model(data.qpos, tau=data.qfrc_bias)[1]
     np.testing.assert_allclose(bias, model.inverse_dynamics(q, v, vdot), atol=1e-9 * np.abs(bias).max())
+
+
+@pytest.mark.parametrize("robot", ["mini_cheetah", "balls"])
+def test_mujoco_s_momentum(robot: str):
+    """Centre of mass, momentum, and their Jacobians; the rotors are bodies in MuJoCo."""
+    mujoco = pytest.importorskip("mujoco")
+    from ce_gym.export.mujoco_model import load
+
+    description = with_balls(True) if robot == "balls" else load_robot(robot)
+    model, peer = Model(description), load(description, "exact")
+    coordinates, data, (q, v, _) = MuJoCo(model, peer), mujoco.MjData(peer), state(model)
+    data.qpos[:], data.qvel[:] = coordinates.from_model(q, v)
+    mujoco.mj_forward(peer, data)
+    mujoco.mj_subtreeVel(peer, data)
+    to_qvel = np.array([coordinates.from_model(q, unit)[1] for unit in np.eye(model.nv)]).T
+    angular, center = np.zeros((2, 3, peer.nv))
+    mujoco.mj_angmomMat(peer, data, angular, 1)
+    mujoco.mj_jacSubtreeCom(peer, data, center, 1)
+    momentum = np.concatenate([data.subtree_angmom[1], peer.body_mass.sum() * data.subtree_linvel[1]])
+    assert_same(
+        (model.center_of_mass(q), model.center_of_mass_velocity(q, v), model.centroidal_momentum(q, v)),
+        (data.subtree_com[1], data.subtree_linvel[1], momentum),
+    )
+    assert_same(
+        (model.centroidal_momentum_matrix(q)[:3], model.center_of_mass_jacobian(q)),
+        (angular @ to_qvel, center @ to_qvel),
+    )
 
 
 @pytest.mark.parametrize("names", ["joint_names", "joint_links"])

@@ -29,8 +29,7 @@ QUICK = ("mini_cheetah", "tello", "mit_humanoid_leg", "planar_leg_linkage")
 APPROXIMATED = ("mini_cheetah", "tello", "mit_humanoid_leg", "awkward", "four_bar")
 CASES = [(name, "exact") for name in (*BUILT, *QUICK)]
 CASES += [(name, level) for name in APPROXIMATED for level in LEVELS[1:]] + [("mini_cheetah", "elastic")]
-SLOW = [(name, "exact") for name in robots() if name not in QUICK]
-SLOW += [(name, "coupled") for name in robots() if name not in (*QUICK, *APPROXIMATED)]
+SLOW = [(name, level) for name in robots() for level in LEVELS if (name, level) not in CASES]
 STATES = 3
 NARROW = {"dr_legs": 0.05}
 
