@@ -45,6 +45,24 @@ def examples(*lines: str) -> str:
     return "\n".join(["examples:", *(f"  python -m ce_gym {line}" for line in lines)])
 
 
+def add_command(
+    subparsers: Any, work: Callable[[argparse.Namespace], int], text: str, description: str, *lines: str
+) -> Any:
+    """Add a subcommand and return its parser.
+
+    Args:
+        subparsers: Subcommands of an argument parser.
+        work: Function of the command, which has its name.
+        text: Help in the list of commands.
+        description: Help of the command.
+        *lines: Example commands.
+    """
+    name = work.__name__
+    parser = subparsers.add_parser(name, help=text, description=description, epilog=examples(*lines))
+    parser.set_defaults(run=work)
+    return parser
+
+
 def has_display() -> bool:
     """Return whether a browser could open a window here."""
     if sys.platform in ("win32", "darwin"):
@@ -73,16 +91,16 @@ def file_error(error: OSError) -> str:
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
-    """Return a function that reads a whole number within limits from the command line."""
+    """Return a function that reads a whole number within limits, such as 6 or 6e6, from the command line."""
 
     def read(text: str) -> int:
         try:
-            number = int(text)
+            number = float(text)
         except ValueError:
-            number = low - 1
-        if not low <= number <= high:
+            number = float("nan")
+        if not (low <= number <= high and number.is_integer()):
             raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number from {low} to {high}")
-        return number
+        return int(number)
 
     return read
 
@@ -109,6 +127,17 @@ THREADS = whole(1, 1024)
 
 EPISODES = whole(1, 1_000_000)
 """Type of `--episodes`."""
+
+STEPS = whole(1, 10**12)
+"""Type of `--steps`."""
+
+NUM_ENVS = whole(1, 2**20)
+"""Type of `--num-envs`."""
+
+
+def add_threads_argument(parser: Any) -> None:
+    """Add `--threads`; None stands for all cores."""
+    parser.add_argument("--threads", type=THREADS, metavar="N", help="processor threads (default: all cores)")
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:

@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ce_gym import usable_cores
 from ce_gym.__main__ import run
-from ce_gym.console import EPISODES, SEED, THREADS, Parser, above_zero
+from ce_gym.console import EPISODES, SEED, STEPS, Parser, above_zero, add_threads_argument
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.learn.evaluate.episodes import EVALUATION_SEED
 from ce_gym.learn.evaluate.evaluation import report
@@ -32,7 +31,7 @@ ENV = "ce_gym/MiniCheetahVelocity-v0"
 def obtain_policy(args: argparse.Namespace) -> Path:
     """Return the policy in the output folder, trained now if necessary, and print which."""
     job = make_job(
-        args.env, out=args.out, seed=args.seed, overrides=[f"steps={args.steps}"] if args.steps else [],
+        args.env, out=args.out, seed=args.seed, settings={"steps": args.steps} if args.steps else {},
         env_kwargs=dict(args.env_args), threads=args.threads, seconds=60.0 * args.minutes,
     )  # fmt: skip
     policy = args.out / "policy.npz"
@@ -64,11 +63,11 @@ def main(argv: list[str] | None = None) -> int:
     add_env_arg(parser)
     parser.add_argument("--fresh", action="store_true", help="train a new policy even if an earlier run left one")
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
-    parser.add_argument("--steps", metavar="N", help="environment steps (default: as in the settings file)")
+    parser.add_argument("--steps", type=STEPS, metavar="N", help="environment steps (default: as in the settings file)")
     parser.add_argument(
         "--minutes", type=above_zero, default=4.0, metavar="M", help="longest training time [min] (default 4)"
     )
-    parser.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all CPUs")
+    add_threads_argument(parser)
     parser.add_argument(
         "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation (default 256)"
     )

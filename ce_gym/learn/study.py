@@ -24,7 +24,7 @@ class Study:
         env_id: Registered environment id.
         levels: Transmission levels.
         seeds: Seeds of each level.
-        overrides: Settings to change, each `KEY=VALUE`.
+        settings: Settings that replace those of the settings file, by name.
         env_kwargs: Arguments of the environment.
         folder: The folder; by default `runs/transfer/`, then the name of the settings file.
     """
@@ -32,7 +32,7 @@ class Study:
     env_id: str
     levels: Sequence[str]
     seeds: Sequence[int]
-    overrides: Sequence[str] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     folder: Path | None = None
 
@@ -42,7 +42,7 @@ class Study:
         for level in self.levels:
             for seed in self.seeds:
                 kwargs = {**self.env_kwargs, "transmission": level}
-                job = make_job(self.env_id, overrides=self.overrides, env_kwargs=kwargs, seed=seed, threads=threads)
+                job = make_job(self.env_id, settings=self.settings, env_kwargs=kwargs, seed=seed, threads=threads)
                 folder = self.folder or Path("runs") / "transfer" / job.out.name.removesuffix(f"-{level}")
                 jobs.append(job.replace(out=folder / level / f"seed_{seed}"))
         return jobs

@@ -1,10 +1,9 @@
-"""Train a policy with any learner, from Python: `train("ce_gym/MiniCheetahVelocity-v0")`."""
+"""Make a training run from an environment, a settings file, a policy and arguments, and run its learner."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,39 +11,29 @@ from typing import Any
 from ce_gym.compile.system import usable_cores
 from ce_gym.learn.runs.folder import make_folder
 from ce_gym.learn.runs.job import Job, Trained, settings_of
-from ce_gym.learn.runs.settings import config_file, load_env_args, load_settings, make_settings, parsed, with_named
+from ce_gym.learn.runs.settings import (
+    GIVEN,
+    by_name,
+    config_file,
+    load_env_args,
+    make_settings,
+    read_settings,
+    with_named,
+)
 from ce_gym.policies import environment_of, keep_map, load_policy, locate_policy
 
 ALGORITHMS = ("ppo", "shac", "distill", "sb3")
 """Names of the learners, which are modules of `ce_gym.learn.learners` with `train(job)` and `Settings`."""
 
 
-def train(env_id: str = "", algo: str = "", **options: Any) -> Trained:
-    """Train a policy, save it, and return it. Ctrl-C saves the policy and stops.
-
-    Args:
-        env_id: Registered environment id; may be empty with `resume`.
-        algo: One of `ALGORITHMS`; the learner of the resumed policy, or "ppo", if empty.
-        **options: See `make_job`.
-
-    Raises:
-        SettingsError: If a setting is wrong.
-        PolicyError: If the policy to resume does not fit.
-
-    Examples:
-        >>> train("ce_gym/MiniCheetahVelocity-v0", out="runs/walk", seed=1, overrides=["steps=2e6"])  # doctest: +SKIP
-    """
-    return run_job(make_job(env_id, algo, **options))
-
-
 def make_job(
     env_id: str = "",
     algo: str = "",
     *,
+    settings: Mapping[str, Any] | Iterable[str] = (),
     out: str | Path | None = None,
     seed: int = 0,
     config: str | Path | None = None,
-    overrides: Sequence[str] = (),
     env_kwargs: Mapping[str, Any] | None = None,
     resume: str | Path | None = None,
     threads: int | None = None,
@@ -52,24 +41,24 @@ def make_job(
     logs: Sequence[str] = (),
     page: bool = False,
 ) -> Job:
-    """Return a training run with the settings of a file, of a resumed policy and of the arguments.
+    """Return a training run.
 
     Args:
         env_id: Registered environment id; may be empty with `resume`.
-        algo: See `train`.
+        algo: One of `ALGORITHMS`; if empty, the learner of the resumed policy, or "ppo".
+        settings: Settings that replace those of the file, by name or each as text `KEY=VALUE`.
         out: Folder to write to; by default `runs/`, then the names of settings file, level and learner.
         seed: Seed of initial weights, exploration and environments.
         config: Settings file; by default that of the environment in the folder of the learner.
-        overrides: Settings to change, each `KEY=VALUE`.
         env_kwargs: Arguments of the environment.
         resume: Policy from which training continues, with its settings unless `config` is given.
         threads: Processor threads; all usable cores if None.
         seconds: Longest training time [s].
-        logs: Where curves are also written, see `ce_gym.learn.runs.logs.WRITERS`.
-        page: Whether a page shows the current policy.
+        logs: Packages to which curves are also written: "tensorboard", "wandb", "trackio".
+        page: Whether the current policy is written every 5 s, for a page that shows it.
 
     Raises:
-        ValueError: If a setting, an argument or the policy cannot be used.
+        ValueError: If a setting, an argument or the policy cannot be used; one line.
     """
     policy = locate_policy(resume) if resume else None
     record = load_policy(policy).record if policy else {}
@@ -78,21 +67,17 @@ def make_job(
     env_id, algo = environment_of(record, env_id), algo or learner_of(record)
     kind = learner(algo).Settings
     path = Path(config) if config else config_file(env_id, kind.folder)
-    if record and not config:
-        merged = {**asdict(load_settings(path, kind=kind)), **settings_of(record), **parsed(overrides)}
-        settings = make_settings(merged, str(policy), kind)
-    else:
-        settings = load_settings(path, overrides, kind)
+    continued = {} if config else {str(policy): settings_of(record)}
+    sources = {str(path): read_settings(path), **continued, GIVEN: by_name(settings)}
     given = dict(env_kwargs or {})
     from_file = {} if record and not config else load_env_args(path)  # the record has them already
-    kwargs = {**record.get("env_kwargs", {}), **from_file, **given}
     level, suffix = given.get("transmission"), "" if algo == ALGORITHMS[0] else algo
     return Job(
         algo=algo,
         env_id=env_id,
-        settings=with_named(settings, given),
+        settings=with_named(make_settings(kind, sources), given),
         out=Path(out) if out else Path("runs") / "-".join(filter(None, (path.stem, level, suffix))),
-        env_kwargs=kwargs,
+        env_kwargs={**record.get("env_kwargs", {}), **from_file, **given},
         seed=seed,
         threads=threads or usable_cores(),
         resume=policy,
@@ -103,7 +88,7 @@ def make_job(
 
 
 def run_job(job: Job) -> Trained:
-    """Make a training run: see `train`."""
+    """Make a training run, and return its policy; Ctrl-C saves the policy and stops."""
     make_folder(job.out)
     keep_map(job.env_kwargs, job.out)
     return learner(job.algo).train(job)
@@ -116,7 +101,7 @@ def learner(algo: str) -> ModuleType:
         ValueError: If there is no learner of this name.
     """
     if algo not in ALGORITHMS:
-        raise ValueError(f"--algo: {algo!r}; expected one of {', '.join(ALGORITHMS)}")
+        raise ValueError(f"algo={algo!r}; expected one of {', '.join(ALGORITHMS)}")
     return importlib.import_module(f"ce_gym.learn.learners.{algo}")
 
 

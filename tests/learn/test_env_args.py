@@ -10,22 +10,20 @@ import gymnasium
 import pytest
 import yaml
 from point_mass import ID
+from toy import jobs
 
 import ce_gym
-from ce_gym.__main__ import main as ce_gym_main
-from ce_gym.learn.evaluate.evaluation import main as evaluate_main
-from ce_gym.learn.learners.sb3 import main
-from ce_gym.learn.runs.job import jobs, parser
+from ce_gym.__main__ import main
 from ce_gym.learn.runs.settings import CONFIG_FOLDER, SettingsError, load_env_args, load_settings
 from ce_gym.policies import load_policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
-SMALL = ["--num-envs", "8", "--steps", "64", "--threads", "1", "--episodes", "2", "--no-tensorboard"]
+SMALL = ["--num-envs", "8", "--steps", "64", "--threads", "1", "--episodes", "2", "--log"]
 SMALL += ["--set", "rollout=8", "minibatches=1", "epochs=1", "hidden=[8]", "training={}"]
 
 
 def arguments_of(*words):
-    (job,) = jobs(parser().parse_args(["--env", ID, *words]))
+    (job,) = jobs(ID, *words)
     return job.env_kwargs
 
 
@@ -33,7 +31,7 @@ def test_arguments_of_the_command_line_hold_while_training():
     """Mappings are merged with the settings file by key; other values replace its values."""
     words = ["--set", "training={rewards: {near: 2.0, gait: 1.0}, push_period: 2.0, latency: [0, 1]}"]
     words += ["--env-arg", "rewards={near: 0.5}", "--env-arg", "push_period=0"]
-    (job,) = jobs(parser().parse_args(["--env", ID, *words]))
+    (job,) = jobs(ID, *words)
     acting = {**job.env_kwargs, **job.settings.training}
     assert acting == {"rewards": {"near": 0.5, "gait": 1.0}, "push_period": 0, "latency": [0, 1]}
 
@@ -93,7 +91,7 @@ def test_a_wrong_mapping_in_a_file_is_one_line(given, words, tmp_path):
     ("text", "words"),
     [
         ("terrain", "'terrain'; expected KEY=VALUE"),
-        ("=3", "expected KEY=VALUE"),
+        ("=3", "'=3'; expected KEY=VALUE"),
         ("seed=3", "seed: expected an argument of the environment alone"),
         ("noise={a: ", "noise: line 1"),
         ("dt=.inf", "dt: inf; expected finite numbers"),
@@ -102,39 +100,39 @@ def test_a_wrong_mapping_in_a_file_is_one_line(given, words, tmp_path):
     ],
 )
 def test_a_wrong_argument_is_one_line(text, words, capsys):
-    for run in (main, evaluate_main):
+    for words_before in (["train", ID], ["evaluate", "x"]):
         with pytest.raises(SystemExit):
-            run(["--env", ID, "--env-arg", text])
+            main([*words_before, "--env-arg", text])
         error = capsys.readouterr().err
         assert error.count("\n") == 1
-        assert re.search(words, error)
+        assert re.search(f"argument --env-arg: .*{words}", error)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("terain=stairs", "unexpected keyword argument 'terain'; expected one of rewards,"),
-        ("dt=-1", "dt=-1; expected a positive number"),
-        ("randomise={friction: 3}", "randomise['friction']=3; expected a list"),
+        ("terain=stairs", "--env-arg terain: unexpected keyword argument 'terain'; expected one of rewards,"),
+        ("dt=-1", "--env-arg dt=-1; expected a positive number"),
+        ("randomise={friction: 3}", "--env-arg randomise['friction']=3; expected a list"),
     ],
 )
 def test_what_an_environment_does_not_take_is_one_line(text, words, tmp_path, capsys):
-    assert main(["--env", ROBOT_ENV, "--env-arg", text, "--out", str(tmp_path), *SMALL]) == 2
+    assert main(["train", ROBOT_ENV, "--env-arg", text, "--out", str(tmp_path), *SMALL]) == 2
     error = capsys.readouterr().err
     assert words in error
     assert error.count("\n") == 1
 
 
 def test_a_policy_acts_in_the_environment_that_it_was_trained_in(tmp_path, capsys):
-    assert main(["--env", ID, "--env-arg", "horizon=20", "--out", str(tmp_path), *SMALL]) == 0
+    assert main(["train", ID, "--env-arg", "horizon=20", "--out", str(tmp_path), *SMALL]) == 0
     assert load_policy(tmp_path).record["env_kwargs"] == {"horizon": 20}
     for words, seconds in (([], 0.4), (["--env-arg", "horizon=10"], 0.2)):
         capsys.readouterr()
-        assert evaluate_main([str(tmp_path), "--episodes", "2", "--json", *words]) == 0
+        assert main(["evaluate", str(tmp_path), "--episodes", "2", "--json", *words]) == 0
         assert json.loads(capsys.readouterr().out)["episode_length"] == pytest.approx(seconds)
-    (job,) = jobs(parser().parse_args(["--resume", str(tmp_path)]))
+    (job,) = jobs("--resume", str(tmp_path))
     assert job.env_kwargs == {"horizon": 20}
-    (job,) = jobs(parser().parse_args(["--resume", str(tmp_path), "--env-arg", "horizon=30"]))
+    (job,) = jobs("--resume", str(tmp_path), "--env-arg", "horizon=30")
     assert job.env_kwargs == {"horizon": 30}
 
 
@@ -152,21 +150,21 @@ def test_an_id_of_a_module_outside_the_package_trains_plays_and_is_judged(tmp_pa
         for name in [name for name in gymnasium.registry if "MyWalker" in name]:
             del gymnasium.registry[name]
 
-    env = ["--env", "my_walkers:ce_gym/MyWalkerVelocity-v0"]
+    env = "my_walkers:ce_gym/MyWalkerVelocity-v0"
     try:
-        assert main([*env, "--env-arg", "max_episode_steps=5", "--out", "run", *SMALL]) == 0
-        for run, words in (
-            (evaluate_main, ["run", "--episodes", "2", "--json"]),
-            (ce_gym_main, ["play", "run", "--command", "0.1", "0", "0", "0"]),
-            (ce_gym_main, ["view", "run"]),
+        assert main(["train", env, "--env-arg", "max_episode_steps=5", "--out", "run", *SMALL]) == 0
+        for words in (
+            ["evaluate", "run", "--episodes", "2", "--json"],
+            ["play", "run", "--command", "0.1", "0", "0", "0"],
+            ["view", "run"],
         ):
             forget()
             capsys.readouterr()
-            assert run(words) == 2
-            assert f"name it yourself: {' '.join(env)}" in capsys.readouterr().err
+            assert main(words) == 2
+            assert f"name it yourself: --env {env}" in capsys.readouterr().err
             assert "my_walkers" not in sys.modules
-            assert run([*words, *env]) == 0
-            if run is evaluate_main:
+            assert main([*words, "--env", env]) == 0
+            if words[0] == "evaluate":
                 assert json.loads(capsys.readouterr().out)["episode_length"] <= 0.1 + 1e-9
     finally:
         forget()

@@ -11,9 +11,7 @@ import gymnasium
 import pytest
 
 from ce_gym.__main__ import main
-from ce_gym.learn.evaluate import evaluation as evaluate
-from ce_gym.learn.evaluate import sim2sim, transfer
-from ce_gym.learn.learners import ppo as fast_ppo
+from ce_gym.learn.evaluate import transfer
 from ce_gym.model import load_robot
 from ce_gym.viewer.live.runner import Runner
 from ce_gym.viewer.live.setup import named
@@ -62,13 +60,13 @@ def test_everything_takes_it(write, name, seen, tmp_path: Path, monkeypatch: pyt
     before, env = set(gymnasium.registry), f"{module}:ce_gym/{name}Velocity-v0"
     try:
         small = ["hidden=[8]", "rollout=16", "epochs=1", "minibatches=1"]
-        train = ["--env", env, "--steps", "1024", "--num-envs", "32", "--threads", "1", "--out", "run", "--set", *small]
-        assert fast_ppo.main([*train, "--episodes", "4"]) == 0
+        train = ["train", env, "--steps", "1024", "--num-envs", "32", "--threads", "1", "--out", "run", "--set", *small]
+        assert main([*train, "--episodes", "4"]) == 0
         judged = ["run", "--env", env, "--episodes", "2"]
-        assert evaluate.main([*judged, "--json", "evaluation.json"]) == 0
+        assert main(["evaluate", *judged, "--json", "evaluation.json"]) == 0
         assert json.loads(Path("evaluation.json").read_text())["episode_length"] > 0
-        assert transfer.main(judged) == 0
-        assert sim2sim.main([*judged, "--seconds", "1", "--json", "sim2sim.json"]) in (0, 1)  # it has hardly learned
+        assert main(["transfer", *judged]) == 0
+        assert main(["sim2sim", *judged, "--seconds", "1", "--json", "sim2sim.json"]) in (0, 1)  # it has hardly learned
         assert Path("sim2sim.json").exists()
         assert main(["inspect", str(file), "--no-errors"]) == 0
         assert main(["inspect", env]) == 0

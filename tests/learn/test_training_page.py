@@ -1,4 +1,4 @@
-"""`--page` of the training scripts: a process that ends with training, and a policy that it can show meanwhile."""
+"""`--page` of `train`: a process that ends with training, and a policy that it can show meanwhile."""
 
 import socket
 import time
@@ -8,7 +8,7 @@ import pytest
 from point_mass import ID
 from toy import FAST, job
 
-from ce_gym.learn.learners.ppo import main
+from ce_gym.__main__ import main
 from ce_gym.learn.learners.ppo import train as fast_train
 from ce_gym.learn.learners.sb3 import train as reference_train
 from ce_gym.learn.runs import page as training_page
@@ -62,9 +62,11 @@ def test_the_page_ends_with_training_and_leaves_nothing(tmp_path, capfd):
 
 def test_the_command_line_asks_for_it(monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr("job.TrainingPage.__enter__", lambda page: asked.append((page._folders, page._env_id)))
-    monkeypatch.setattr("job.TrainingPage.__exit__", lambda *_: None)
-    command = ["--env", ID, "--steps", "1000", "--out", str(tmp_path), *FAST]
+    monkeypatch.setattr(
+        "ce_gym.learn.runs.page.TrainingPage.__enter__", lambda page: asked.append((page._folders, page._env_id))
+    )
+    monkeypatch.setattr("ce_gym.learn.runs.page.TrainingPage.__exit__", lambda *_: None)
+    command = ["train", ID, "--steps", "1000", "--out", str(tmp_path), *FAST]
     assert main([*command, "--page"]) == 0
     assert asked == [([tmp_path], ID)]
     assert (tmp_path / PRESENT / "policy.npz").exists()

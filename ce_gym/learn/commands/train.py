@@ -7,26 +7,26 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-from ce_gym.compile.system import usable_cores
-from ce_gym.console import EPISODES, SEED, THREADS, above_zero, examples
+from ce_gym.console import EPISODES, NUM_ENVS, SEED, STEPS, above_zero, add_command, add_threads_argument
 from ce_gym.learn.commands.errors import in_one_line
+from ce_gym.learn.runs.job import Job
 from ce_gym.learn.runs.logs import LOGS, default_logs
 from ce_gym.learn.training import ALGORITHMS, make_job, run_job
+from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import add_env_arg, load_policy
 
 
 def add_train_command(subparsers: Any) -> None:
     """Add `train` to the subcommands of an argument parser."""
-    parser = subparsers.add_parser(
-        "train",
-        help="train a policy",
-        description="Train a policy, evaluate it and print its path. Ctrl-C and SIGTERM save the policy and stop; "
-        "--resume continues.\nSettings not named here are in the settings file; --set KEY=VALUE changes any of them.",
-        epilog=examples(
-            "train ce_gym/MiniCheetahVelocity-v0",
-            "train ce_gym/TelloVelocity-v0 --transmission armature --seeds 0 1 2 --set steps=20e6 hidden=[128,128]",
-            "train --resume runs/mini_cheetah_velocity --steps 20e6",
-        ),
+    parser = add_command(
+        subparsers,
+        train,
+        "train a policy",
+        "Train a policy, evaluate it and print its path. Ctrl-C and SIGTERM save the policy and stop; --resume "
+        "continues.\nSettings not named here are in the settings file; --set KEY=VALUE changes any of them.",
+        "train ce_gym/MiniCheetahVelocity-v0",
+        "train ce_gym/TelloVelocity-v0 --transmission armature --seeds 0 1 2 --set steps=20e6 hidden=[128,128]",
+        "train --resume runs/mini_cheetah_velocity --steps 20e6",
     )
     what = parser.add_argument_group("what to train")
     what.add_argument("env", nargs="?", default="", metavar="ENV", help="id, such as ce_gym/MiniCheetahVelocity-v0")
@@ -37,11 +37,7 @@ def add_train_command(subparsers: Any) -> None:
         help="ppo (default); shac: gradients through physics; distill: imitation of a teacher; sb3: PPO of "
         "Stable-Baselines3",
     )
-    what.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic")
-    what.add_argument(
-        "--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees, such as base_height"
-    )
-    add_env_arg(what)
+    add_environment_arguments(what)
     what.add_argument(
         "--resume",
         type=Path,
@@ -56,27 +52,42 @@ def add_train_command(subparsers: Any) -> None:
     how.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="settings, such as gamma=0.98"
     )
-    how.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
-    how.add_argument("--num-envs", metavar="N", help="environments stepped in parallel")
+    how.add_argument("--steps", type=STEPS, metavar="N", help="environment steps in all, such as 6e6")
+    how.add_argument("--num-envs", type=NUM_ENVS, metavar="N", help="environments stepped in parallel")
     how.add_argument(
         "--minutes", type=above_zero, default=float("inf"), metavar="M", help="longest training time [min]"
     )
-    how.add_argument("--threads", type=THREADS, default=usable_cores(), metavar="N", help="default: all cores")
+    add_threads_argument(how)
     where = parser.add_argument_group("output")
     where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")
     where.add_argument(
         "--log",
         nargs="*",
         choices=LOGS,
-        default=None,
         metavar="PACKAGE",
         help=f"also write curves for {', '.join(LOGS)} (default: tensorboard if it is installed)",
     )
     where.add_argument("--page", action="store_true", help="show curves and the current policy in a browser")
     where.add_argument(
-        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation at the end"
+        "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation (default 256)"
     )
-    parser.set_defaults(run=train)
+
+
+def add_environment_arguments(parser: Any) -> None:
+    """Add `--transmission`, `--critic` and `--env-arg`, see `env_kwargs_of`."""
+    levels = (*LEVELS, ELASTIC)
+    parser.add_argument("--transmission", choices=levels, metavar="LEVEL", help=f"one of {', '.join(levels)}")
+    parser.add_argument(
+        "--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees, such as base_height"
+    )
+    add_env_arg(parser)
+
+
+def env_kwargs_of(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of the environment in a command line."""
+    kwargs = {"transmission": args.transmission} if args.transmission else {}
+    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
+    return kwargs | dict(args.env_args)
 
 
 @in_one_line
@@ -92,21 +103,19 @@ def train(args: argparse.Namespace) -> int:
             trained = run_job(job)
             print(f"saved {trained.policy} after {trained.record['steps']:,} steps", flush=True)
             if trained.interrupted:
-                print(f"interrupted; continue with: python -m ce_gym train --resume {trained.policy}")
+                print(f"interrupted; continue with: python -m ce_gym train --resume {trained.policy} --out {job.out}")
                 return 130
             result = evaluate(load_policy(trained.policy), job.env_id, episodes=args.episodes, **job.env_kwargs)
             print(report(result), flush=True)
     return 0
 
 
-def make_jobs(args: argparse.Namespace) -> list[Any]:
+def make_jobs(args: argparse.Namespace) -> list[Job]:
     """Return the training runs of a command line, one per seed."""
-    overrides = [*args.set]
-    overrides += [f"steps={args.steps}"] if args.steps else []
-    overrides += [f"num_envs={args.num_envs}"] if args.num_envs else []
+    numbers = {"steps": args.steps, "num_envs": args.num_envs}
     options = {
+        "settings": [*args.set, *(f"{name}={number}" for name, number in numbers.items() if number)],
         "config": args.config,
-        "overrides": overrides,
         "env_kwargs": env_kwargs_of(args),
         "resume": args.resume,
         "threads": args.threads,
@@ -116,10 +125,3 @@ def make_jobs(args: argparse.Namespace) -> list[Any]:
     }
     jobs = [make_job(args.env, args.algo, out=args.out, seed=seed, **options) for seed in args.seeds or [args.seed]]
     return [job.replace(out=job.out / f"seed_{job.seed}") for job in jobs] if len(jobs) > 1 else jobs
-
-
-def env_kwargs_of(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments of the environment in a command line."""
-    kwargs = {"transmission": args.transmission} if args.transmission else {}
-    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
-    return kwargs | dict(args.env_args)

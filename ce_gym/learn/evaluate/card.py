@@ -22,7 +22,7 @@ from ce_gym.learn.evaluate.pushes import push_envelope
 from ce_gym.learn.evaluate.sim2sim import compare, comparison_table
 from ce_gym.learn.evaluate.suites import evaluate_suites
 from ce_gym.learn.evaluate.tables import metrics, sections, table, two_columns
-from ce_gym.learn.runs.progress import read_curve
+from ce_gym.learn.runs.progress import LOG, read_curve
 from ce_gym.learn.runs.settings import config_file, load_settings
 from ce_gym.learn.training import learner, learner_of
 from ce_gym.model.mechanism import LEVELS
@@ -221,7 +221,7 @@ def write_card(
     """
     source = locate_policy(run)
     actor, record = read_actor(source)
-    record, curve = portable(record), read_curve(source.parent / "curve.csv")
+    record, curve = portable(record), read_curve(source.parent / LOG)
     name = short_name(record, task)
     folder = shelf() / name if ship else out or source.parent
     evaluated = load(source, env, env_args=env_args)

@@ -62,7 +62,7 @@ def draw_curve(rows: list[dict[str, float]], title: str, file: Path) -> None:
     """Draw reward and length of episodes over the steps of training.
 
     Args:
-        rows: Rows of `curve.csv`.
+        rows: Rows of the learning curve.
         title: Heading.
         file: PNG file to write.
     """

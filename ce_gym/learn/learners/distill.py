@@ -28,15 +28,23 @@ from ce_gym.learn.networks.regression import squared_error_gradient
 from ce_gym.learn.networks.updates import adam
 from ce_gym.learn.runs.job import Job, Trained
 from ce_gym.learn.runs.progress import RecentEpisodes, geometric, linear, spread_episodes
-from ce_gym.learn.runs.settings import CONFIG_FOLDER, Activation
+from ce_gym.learn.runs.settings import CONFIG_FOLDER, CommonSettings
 from ce_gym.learn.runs.training import run_learner
+from ce_gym.model.arguments import check
+from ce_gym.model.options import option
 from ce_gym.policies import Actor, Policy, PolicyError, load_policy
 
 F = np.float32
 
 
+def _text(name: str, value: Any) -> str:
+    """Check a name or a path."""
+    check(name, value, isinstance(value, str) and value, "a name or a path")
+    return value
+
+
 @dataclass(frozen=True)
-class Settings:
+class Settings(CommonSettings):
     """Settings of distillation.
 
     Attributes:
@@ -48,19 +56,7 @@ class Settings:
 
     folder: ClassVar[Path] = CONFIG_FOLDER / "distill"
 
-    teacher: str
-    steps: int
-    num_envs: int
-    rollout: int
-    minibatches: int
-    epochs: int
-    hidden: tuple[int, ...]
-    activation: Activation
-    initial_std: float
-    final_std: float
-    learning_rate: float
-    max_grad_norm: float
-    training: Mapping[str, Any]
+    teacher: str = option(_text)
 
 
 SENSOR_ERRORS = ("drift", "shift", "dropout", "delay")

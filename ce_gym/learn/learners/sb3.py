@@ -1,7 +1,7 @@
 """Train a policy with PPO of Stable-Baselines3: any registered environment, any transmission level.
 
-Writes to the output folder: `policy.zip` (Stable-Baselines3), `policy.json` (the record), `progress.csv`, `curve.csv`
-(reward and length of episodes since the first step), TensorBoard logs and `checkpoints/`.
+Writes to the output folder: `policy.zip` (Stable-Baselines3), `policy.json` (the record), `progress.csv`, and
+`checkpoints/`.
 
     python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0
     python train/ppo.py --env ce_gym/MiniCheetahVelocity-v0 --transmission armature --seeds 0 1 2
@@ -36,14 +36,13 @@ from ce_gym.learn.learners.sb3_callbacks import (
     ShowProgress,
     SpreadEpisodes,
     Stop,
-    WriteCurve,
     WriteLog,
 )
 from ce_gym.learn.runs.folder import continue_if_full, make_folder, save_somewhere, write_whole
 from ce_gym.learn.runs.job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record, resumed_record
 from ce_gym.learn.runs.logs import open_writers
 from ce_gym.learn.runs.page import Present
-from ce_gym.learn.runs.progress import CURVE, LOG, Log, StopInOrder, earlier_rows
+from ce_gym.learn.runs.progress import Log, StopInOrder
 from ce_gym.learn.runs.settings import Settings as Settings  # of this learner
 from ce_gym.policies import PolicyError, read_weights
 
@@ -71,14 +70,8 @@ def train(job: Job) -> Trained:
 def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
     settings, steps_before = job.settings, model.num_timesteps
-    log = Log(
-        job.out / "progress.csv",
-        earlier_rows(job.resume, "progress.csv", LOG),
-        steps_before,
-        open_writers(job.logs, job.out, settings.as_dict()),
-    )
+    log = Log(job.out, job.resume, steps_before, open_writers(job.logs, job.out, settings.as_dict()))
     model.set_logger(Logger(str(job.out), [WriteLog(log)]))
-    earlier = earlier_rows(job.resume, "curve.csv", CURVE)
     progress = ShowProgress(settings.steps)
     native, clock = acting_environment(job, envs.envs.unwrapped), Clock()
 
@@ -95,7 +88,7 @@ def _learn(model: PPO, envs: SB3VecEnv, job: Job) -> Trained:
 
     with StopInOrder(job.seconds) as stop:
         callbacks = [Stop(stop), Checkpoints(checkpoint, settings.steps // CHECKPOINTS), EpisodeLog(), SpreadEpisodes()]
-        callbacks += [WriteCurve(job.out / "curve.csv", earlier), progress, KeepPresent(present)]
+        callbacks += [progress, KeepPresent(present)]
         callbacks.append(EntropySchedule(settings.entropy, settings.final_entropy, settings.steps))
         if settings.fall_cost:
             callbacks.append(FallCost(settings.fall_cost, settings.steps))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from stable_baselines3.common.utils import FloatSchedule
 from ce_gym.learn.runs.folder import continue_if_full
 from ce_gym.learn.runs.page import Present
 from ce_gym.learn.runs.progress import (
-    Curve,
     Log,
     ProgressBar,
     StopInOrder,
@@ -43,20 +41,6 @@ class EpisodeLog(_Quiet):
         for key, value in episode_means(self.model.ep_info_buffer).items():
             if key not in ("r", "l"):  # Stable-Baselines3 logs these two itself
                 self.logger.record(key, value)
-
-
-class WriteCurve(_Quiet):
-    """Writes the learning curve; see `Curve` for the arguments."""
-
-    def __init__(self, file: Path, earlier: list[dict[str, float]]) -> None:
-        super().__init__()
-        self.file, self.earlier = file, earlier
-
-    def _on_training_start(self) -> None:
-        self.curve = Curve(self.file, self.earlier, self.num_timesteps)
-
-    def _on_rollout_end(self) -> None:
-        self.curve.add(self.num_timesteps, episode_means(self.model.ep_info_buffer))
 
 
 class SpreadEpisodes(_Quiet):

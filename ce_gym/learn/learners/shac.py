@@ -35,15 +35,16 @@ from ce_gym.learn.networks.perceptron import (
 from ce_gym.learn.networks.updates import adam, estimate_advantages
 from ce_gym.learn.runs.job import Job, Trained
 from ce_gym.learn.runs.progress import RecentEpisodes, fall_cost, geometric, spread_episodes
-from ce_gym.learn.runs.settings import CONFIG_FOLDER, CommonSettings
+from ce_gym.learn.runs.settings import CONFIG_FOLDER, ActorCriticSettings
 from ce_gym.learn.runs.training import run_learner
+from ce_gym.model.options import number, option, positive
 from ce_gym.policies import Actor
 
 F = np.float32
 
 
 @dataclass(frozen=True)
-class Settings(CommonSettings):
+class Settings(ActorCriticSettings):
     """Settings of SHAC.
 
     A rollout is a window that is differentiated as a whole. Minibatches and epochs belong to updates of the critic.
@@ -58,9 +59,9 @@ class Settings(CommonSettings):
 
     folder: ClassVar[Path] = CONFIG_FOLDER / "shac"
 
-    decay: float
-    target_memory: float
-    max_adjoint: float
+    decay: float = option(number(1e-3, 1))
+    target_memory: float = option(number(0, 1))
+    max_adjoint: float = option(positive())
 
 
 class SHAC:

@@ -1,4 +1,4 @@
-"""Learning curve, log, progress bar, schedules and interruption of training, for all learners."""
+"""Statistics, schedules, progress bar and interruption of training, for all learners."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ from ce_gym.learn.runs.folder import continue_if_full
 from ce_gym.learn.runs.logs import Writer, numbers_of
 from ce_gym.policies import locate_policy
 
-Row = Mapping[str, Any]
-"""Cells of a row of a CSV file by column."""
+LOG = "progress.csv"
+"""Name of the file of statistics in the folder of a run."""
 
-CURVE = ("steps", "seconds", "reward", "length")
-"""Columns of `curve.csv`."""
-
-STEPS, SECONDS = LOG = "time/total_timesteps", "time/time_elapsed"
-"""Columns of `progress.csv` that every row has."""
+STEPS, SECONDS, REWARD, LENGTH = (
+    "time/total_timesteps", "time/time_elapsed", "rollout/ep_rew_mean", "rollout/ep_len_mean",
+)  # fmt: skip
+"""Columns of the learning curve, with the names that Stable-Baselines3 uses."""
 
 
 def episode_means(episodes: Iterable[Mapping[str, float]] | None) -> dict[str, float]:
@@ -81,76 +80,32 @@ class RecentEpisodes:
         self.names, self._rows = names, rows
 
 
-class RowFile:
-    """A CSV file to which rows are added during training.
-
-    Args:
-        file: File to write.
-        earlier: Rows of the training before this run; they are kept.
-    """
-
-    def __init__(self, file: Path, earlier: Sequence[Row]) -> None:
-        self.file, self.rows = file, list(earlier)
-        self.columns = list(dict.fromkeys(name for row in self.rows for name in row))
-        self._write(self.rows, "w")
-
-    def append(self, row: Row) -> None:
-        """Write one row. If the row has new columns, write the whole file again."""
-        self.rows.append(row)
-        new = [name for name in row if name not in self.columns]
-        self.columns += new
-        self._write(self.rows if new else [row], "w" if new else "a")
-
-    def _write(self, rows: Sequence[Row], mode: str) -> None:
-        with continue_if_full(), self.file.open(mode, newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self.columns)
-            if mode == "w" and self.columns:
-                writer.writeheader()
-            writer.writerows(rows)
-
-
-class Curve:
-    """Writes the learning curve as a small CSV file: steps, seconds, mean reward and length of recent episodes.
-
-    Args:
-        file: File to write, one row after every rollout.
-        earlier: Rows of the training before this run, see `earlier_rows`.
-        steps: Steps done so far; earlier rows beyond them are dropped.
-    """
-
-    def __init__(self, file: Path, earlier: Sequence[Row], steps: int = 0) -> None:
-        rows = [row for row in earlier if row["steps"] <= steps]
-        self.started = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
-        self.file = RowFile(file, rows)
-
-    def add(self, steps: int, means: Mapping[str, float]) -> None:
-        """Write one row, or nothing before the first episode ends."""
-        if means:
-            seconds = round(time.perf_counter() - self.started, 2)
-            values = (steps, seconds, round(means["r"], 4), round(means["l"], 2))
-            self.file.append(dict(zip(CURVE, values, strict=True)))
-
-
 class Log:
-    """Writes the statistics of each iteration as a CSV file.
+    """Writes the statistics of each iteration to `progress.csv`, and to other programs.
 
     Args:
-        file: File to write.
-        earlier: Rows of the training before this run, see `earlier_rows`.
+        folder: Folder of the run.
+        resume: Policy from which training continues; the rows of its run are kept.
         steps: Steps done so far; earlier rows beyond them are dropped.
         writers: Receive the numbers of each row as well.
     """
 
-    def __init__(self, file: Path, earlier: Sequence[Row], steps: int = 0, writers: Sequence[Writer] = ()) -> None:
-        rows = [row for row in earlier if row[STEPS] <= steps]
-        self.writers = writers
-        self.earlier_seconds = rows[-1][SECONDS] if rows else 0
-        self.file = RowFile(file, rows)
+    def __init__(
+        self, folder: Path, resume: Path | None = None, steps: int = 0, writers: Sequence[Writer] = ()
+    ) -> None:
+        self.file, self.writers = folder / LOG, writers
+        self.rows: list[Mapping[str, Any]] = [row for row in _earlier_rows(resume) if row[STEPS] <= steps]
+        self.columns = list(dict.fromkeys(name for row in self.rows for name in row))
+        self.started = time.perf_counter() - (self.rows[-1][SECONDS] if self.rows else 0.0)
+        self._write(self.rows, "w")
 
-    def add(self, row: Row) -> None:
-        """Write one row; its time counts from the start of this run [s]."""
-        row = {**row, SECONDS: round(self.earlier_seconds + row[SECONDS], 3)}
-        self.file.append(row)
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Write one row with its time. If the row has new columns, write the whole file again."""
+        row = {**row, SECONDS: round(time.perf_counter() - self.started, 3)}
+        self.rows.append(row)
+        new = [name for name in row if name not in self.columns]
+        self.columns += new
+        self._write(self.rows if new else [row], "w" if new else "a")
         for writer in self.writers:
             with continue_if_full():
                 writer.write(numbers_of(row), int(row[STEPS]))
@@ -161,22 +116,28 @@ class Log:
             with continue_if_full():
                 writer.close()
 
+    def _write(self, rows: Sequence[Mapping[str, Any]], mode: str) -> None:
+        with continue_if_full(), self.file.open(mode, newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self.columns)
+            if mode == "w" and self.columns:
+                writer.writeheader()
+            writer.writerows(rows)
 
-def log_row(steps: int, seconds: float, means: Row, figures: Row) -> dict[str, float]:
-    """Return a row of `progress.csv`, with the names that Stable-Baselines3 uses.
+
+def log_row(steps: int, means: Mapping[str, float], figures: Mapping[str, float]) -> dict[str, float]:
+    """Return a row of `progress.csv`.
 
     Args:
         steps: Environment steps done.
-        seconds: Time since this run began [s].
         means: Means of recent episodes, see `RecentEpisodes`.
         figures: Statistics of the update.
     """
-    row = {STEPS: steps, SECONDS: seconds, "rollout/ep_rew_mean": means["r"], "rollout/ep_len_mean": means["l"]}
-    return row | {key: mean for key, mean in means.items() if key not in ("r", "l")} | dict(figures)
+    names = {"r": REWARD, "l": LENGTH}
+    return {STEPS: steps} | {names.get(key, key): mean for key, mean in means.items()} | dict(figures)
 
 
-def read_rows(file: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the rows of a CSV file, `columns` as numbers and others as text; no rows if there is no such file.
+def read_rows(file: Path) -> list[dict[str, Any]]:
+    """Return the rows of a log, with steps and seconds as numbers; no rows if there is no such file.
 
     Raises:
         ValueError: If a column is missing, or a number in it.
@@ -186,22 +147,23 @@ def read_rows(file: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
     try:
         with file.open(newline="", encoding="utf-8") as lines:
             whole = [row for row in csv.DictReader(lines) if None not in row.values()]  # a killed run cuts its last row
-        return [{**row, **{key: float(row[key]) for key in columns}} for row in whole]
+        return [{**row, STEPS: float(row[STEPS]), SECONDS: float(row[SECONDS])} for row in whole]
     except (KeyError, TypeError, ValueError, csv.Error):
-        raise ValueError(f"{file}: expected the columns {', '.join(columns)}, numbers in each row") from None
+        raise ValueError(f"{file}: expected the columns {STEPS} and {SECONDS}, numbers in each row") from None
 
 
 def read_curve(file: Path) -> list[dict[str, float]]:
-    """Return the rows of a learning curve; see `read_rows`."""
-    return read_rows(file, CURVE)
+    """Return the learning curve in a log: steps, seconds, mean reward and length of recent episodes by row."""
+    names = {"steps": STEPS, "seconds": SECONDS, "reward": REWARD, "length": LENGTH}
+    return [{name: float(row[key]) for name, key in names.items()} for row in read_rows(file) if row.get(REWARD)]
 
 
-def earlier_rows(resume: Path | None, name: str, columns: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the rows of the CSV file `name` of the run whose policy is resumed; see `read_rows`."""
+def _earlier_rows(resume: Path | None) -> list[dict[str, Any]]:
+    """Return the rows of the run whose policy is resumed; see `read_rows`."""
     if resume is None:
         return []
     folder = locate_policy(resume).parent
-    return read_rows((folder.parent if folder.name == "checkpoints" else folder) / name, columns)
+    return read_rows((folder.parent if folder.name == "checkpoints" else folder) / LOG)
 
 
 def adapted_rate(rate: float, kl: float, target: float, limits: tuple[float, float] = (1e-5, 1e-2)) -> float:

@@ -1,37 +1,20 @@
-"""Settings of learners, and their values from a YAML file and the command line.
+"""Settings of learners, and their values from a YAML file, a policy and the user.
 
 `config/` has one file per robot and task, found by the name of the environment. Each file contains all settings.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+from ce_gym.model.arguments import check, is_number
+from ce_gym.model.options import Check, Options, number, one_of, option, positive
 from ce_gym.policies import ACTIVATIONS, checked_arguments, listed_names, parse_yaml
-
-
-def settings_folder() -> Path:
-    """Return the folder of settings files: inside an installed package, or `train/config` in a source checkout."""
-    learn = Path(__file__).resolve().parents[1]
-    installed = learn / "config"
-    return installed if installed.is_dir() else learn.parents[1] / "train" / "config"
-
-
-Activation = str
-"""Name of an activation function in `ce_gym.policies.ACTIVATIONS`."""
-
-LIMITS = {
-    "steps": 1e12, "num_envs": 2**20, "rollout": 10_000, "minibatches": 10_000, "epochs": 1000, "hidden": 2**13,
-    "initial_std": (1e-6, 100), "final_std": (0, 100), "learning_rate": (0, 1), "target_kl": (0, 10), "gamma": (0, 1),
-    "gae_lambda": (0, 1), "clip": (1e-6, 10), "entropy": (0, 10), "final_entropy": (0, 10), "value": (0, 1000),
-    "fall_cost": (0, 1e6), "max_grad_norm": (1e-6, 1e9),
-    "decay": (1e-3, 1), "target_memory": (0, 1), "max_adjoint": (1e-9, 1e30),
-}  # fmt: skip
-"""Largest value of whole numbers, whose smallest value is 1; smallest and largest value of other numbers."""
 
 MOST_SAMPLES = 10**8
 """Largest number of steps between two updates, over all environments, because of memory."""
@@ -42,16 +25,52 @@ ENV_ARGS = "env_args"
 NETWORK = ("hidden", "activation")
 """Settings that cannot change when training continues."""
 
-CONFIG_FOLDER = settings_folder()
-"""Settings files of PPO; other learners have subfolders."""
+GIVEN = "settings"
+"""Beginning of errors about settings that are given by hand; `commands.errors` replaces it by `--set`."""
 
 
 class SettingsError(ValueError):
     """A settings file or override cannot be used; the message is one line for the user."""
 
 
+def _settings_folder() -> Path:
+    """Return the folder of settings files: inside an installed package, or `train/config` in a source checkout."""
+    learn = Path(__file__).resolve().parents[1]
+    installed = learn / "config"
+    return installed if installed.is_dir() else learn.parents[1] / "train" / "config"
+
+
+CONFIG_FOLDER = _settings_folder()
+"""Settings files of PPO; other learners have subfolders."""
+
+
+def count(most: float) -> Check:
+    """Return a check for a whole number from 1 to `most`, which may be written as 6e6."""
+
+    def checked(name: str, value: Any) -> int:
+        whole = is_number(value) and value == int(value)
+        check(name, value, whole and 1 <= value <= most, f"a whole number from 1 to {most:g}")
+        return int(value)
+
+    return checked
+
+
+def _layer_sizes(name: str, value: Any) -> tuple[int, ...]:
+    """Check the sizes of hidden layers."""
+    check(name, value, isinstance(value, list | tuple) and len(value) <= 100, "a list of layer sizes")
+    return tuple(count(2**13)(name, size) for size in value)
+
+
+def _env_arguments(name: str, value: Any) -> dict[str, Any]:
+    """Check arguments of an environment."""
+    try:
+        return checked_arguments(value)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
 @dataclass(frozen=True)
-class CommonSettings:
+class CommonSettings(Options):
     """Settings of every learner.
 
     Attributes:
@@ -65,29 +84,35 @@ class CommonSettings:
         initial_std: Standard deviation of the actions at the start; actions lie in -1..1.
         final_std: Standard deviation of the actions at the end, geometric in between.
         learning_rate: Learning rate of Adam at the start.
-        gamma: Discount per step.
-        gae_lambda: Lambda of generalised advantage estimation (PPO), or of the critic's TD(lambda) targets (SHAC).
-        fall_cost: Final cost that is subtracted from the last reward of an episode that ends as a failure; see
-            `progress.fall_cost`. Reported rewards do not contain it.
         max_grad_norm: Gradients of the networks are clipped to this norm.
         training: Arguments of the environment for training only. Arguments that belong to the policy are in `env_args`.
+
+    Raises:
+        ValueError: If a value is wrong; one line.
     """
 
-    steps: int
-    num_envs: int
-    rollout: int
-    minibatches: int
-    epochs: int
-    hidden: tuple[int, ...]
-    activation: Activation
-    initial_std: float
-    final_std: float
-    learning_rate: float
-    gamma: float
-    gae_lambda: float
-    fall_cost: float
-    max_grad_norm: float
-    training: Mapping[str, Any]
+    steps: int = option(count(1e12))
+    num_envs: int = option(count(2**20))
+    rollout: int = option(count(10_000))
+    minibatches: int = option(count(10_000))
+    epochs: int = option(count(1000))
+    hidden: tuple[int, ...] = option(_layer_sizes)
+    activation: str = option(one_of(ACTIVATIONS))
+    initial_std: float = option(positive(100))
+    final_std: float = option(number(0, 100))
+    learning_rate: float = option(number(0, 1))
+    max_grad_norm: float = option(positive(1e9))
+    training: Mapping[str, Any] = option(_env_arguments)
+
+    def __post_init__(self) -> None:
+        """Check values, and that each minibatch has two samples, because the variance of one sample is 0 / 0."""
+        super().__post_init__()
+        samples = self.num_envs * self.rollout
+        if samples > MOST_SAMPLES:
+            raise ValueError(f"num_envs * rollout = {samples}; expected at most {MOST_SAMPLES} samples of an update")
+        size = -(-samples // self.minibatches)
+        if size < 2 or samples % size == 1:
+            raise ValueError(f"minibatches={self.minibatches} of {samples} samples; expected 2 samples or more in each")
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as plain data, for the record of a policy."""
@@ -95,7 +120,23 @@ class CommonSettings:
 
 
 @dataclass(frozen=True)
-class Settings(CommonSettings):
+class ActorCriticSettings(CommonSettings):
+    """Settings of learners with a value function.
+
+    Attributes:
+        gamma: Discount per step.
+        gae_lambda: Lambda of generalised advantage estimation (PPO), or of the critic's TD(lambda) targets (SHAC).
+        fall_cost: Final cost that is subtracted from the last reward of an episode that ends as a failure. The cost is
+            0 until 30 % of training and grows until 60 %. Reported rewards do not contain it.
+    """
+
+    gamma: float = option(number(0, 1))
+    gae_lambda: float = option(number(0, 1))
+    fall_cost: float = option(number(0, 1e6))
+
+
+@dataclass(frozen=True)
+class Settings(ActorCriticSettings):
     """Settings of PPO.
 
     Attributes:
@@ -110,11 +151,11 @@ class Settings(CommonSettings):
 
     folder: ClassVar[Path] = CONFIG_FOLDER
 
-    target_kl: float
-    clip: float
-    entropy: float
-    final_entropy: float
-    value: float
+    target_kl: float = option(number(0, 10))
+    clip: float = option(positive(10))
+    entropy: float = option(number(0, 10))
+    final_entropy: float = option(number(0, 10))
+    value: float = option(number(0, 1000))
 
 
 def config_file(env_id: str, folder: Path = CONFIG_FOLDER) -> Path:
@@ -131,14 +172,18 @@ def config_file(env_id: str, folder: Path = CONFIG_FOLDER) -> Path:
     return folder / "default.yaml"
 
 
-def load_settings(path: Path, overrides: Iterable[str] = (), kind: type = Settings) -> Any:
-    """Return the settings in a file, with `KEY=VALUE` overrides; `kind` is the learner's dataclass of settings.
+def load_settings(path: Path, given: Mapping[str, Any] | Iterable[str] = (), kind: type = Settings) -> Any:
+    """Return the settings in a file.
+
+    Args:
+        path: The file.
+        given: Settings that replace those in the file, by name or each as text `KEY=VALUE`.
+        kind: The learner's dataclass of settings.
 
     Raises:
         SettingsError: If the file cannot be read, a key is missing or unknown, or a value is wrong.
     """
-    data = {key: value for key, value in _read(path).items() if key != ENV_ARGS}
-    return make_settings(data | parsed(overrides), str(path), kind)
+    return make_settings(kind, {str(path): read_settings(path), GIVEN: by_name(given)})
 
 
 def load_env_args(path: Path) -> dict[str, Any]:
@@ -147,16 +192,11 @@ def load_env_args(path: Path) -> dict[str, Any]:
     Raises:
         SettingsError: If the file cannot be read, or the arguments are not plain data by name.
     """
-    try:
-        return checked_arguments(_read(path).get(ENV_ARGS, {}))
-    except SettingsError:
-        raise
-    except ValueError as error:
-        raise SettingsError(f"{path}: {ENV_ARGS}: {error}") from None
+    return _read(path).get(ENV_ARGS, {})
 
 
 def with_named(settings: Any, env_args: Mapping[str, Any]) -> Any:
-    """Return settings whose `training` does not override arguments of the command line; mappings are merged."""
+    """Return settings whose `training` does not override arguments of the environment; mappings are merged."""
     training = dict(settings.training)
     for name, value in env_args.items():
         if isinstance(value, Mapping) and isinstance(training.get(name), Mapping):
@@ -166,111 +206,84 @@ def with_named(settings: Any, env_args: Mapping[str, Any]) -> Any:
     return replace(settings, training=training)
 
 
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return the settings in a file, unchecked.
+
+    Raises:
+        SettingsError: If the file cannot be read.
+    """
+    return {key: value for key, value in _read(path).items() if key != ENV_ARGS}
+
+
 def _read(path: Path) -> dict[str, Any]:
-    """Return the content of a settings file, unchecked."""
+    """Return the content of a settings file: unchecked settings, checked arguments of the environment."""
     try:
         data = parse_yaml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise SettingsError(f"{path}: cannot be read as YAML: {reason}") from None
+        raise SettingsError(f"{path}: cannot be read as YAML: {_reason(error)}") from None
     if not isinstance(data, dict):
         raise SettingsError(f"{path}: expected one `key: value` per line, got {type(data).__name__}")
-    return data
+    with _errors_of(str(path)):
+        return data | ({ENV_ARGS: _env_arguments(ENV_ARGS, data[ENV_ARGS])} if ENV_ARGS in data else {})
 
 
-def make_settings(data: Mapping[str, Any], source: str, kind: type = Settings) -> Any:
-    """Check plain data and return it as settings.
+def make_settings(kind: type, sources: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return the settings of several sources.
 
     Args:
-        data: Values by key.
-        source: Name of the data in errors, such as the path of a file.
         kind: The learner's dataclass of settings.
+        sources: Values by name of setting, by name of the source; later sources replace values of earlier ones.
 
     Raises:
         SettingsError: If a key is missing or unknown, or a value is wrong.
     """
-    known = {field.name: str(field.type) for field in fields(kind)}
-    for key in data:
-        if key not in known:
-            raise SettingsError(f"{source}: {key}: unknown setting; expected one of {listed_names(key, known)}")
-    for key in known:
-        if key not in data:
-            raise SettingsError(f"{source}: {key}: missing; expected {known[key]}")
-    result = kind(**{key: _convert(source, key, data[key], form) for key, form in known.items()})
-    _check_samples(source, result)
-    return result
+    checks = {field.name: field.metadata["check"] for field in fields(kind)}
+    values: dict[str, Any] = {}
+    for source, data in sources.items():
+        for key, value in data.items():
+            with _errors_of(source):
+                if key not in checks:
+                    raise ValueError(f"{key}: unknown setting; expected one of {listed_names(key, checks)}")
+                values[key] = checks[key](key, value)
+    used = [source for source, data in sources.items() if data] or [GIVEN]
+    with _errors_of(used[0]):
+        if missing := [key for key in checks if key not in values]:
+            raise ValueError(f"{missing[0]}: missing; expected all settings of the learner")
+    with _errors_of(used[-1]):
+        return kind(**values)
 
 
-def _check_samples(source: str, s: Any) -> None:
-    """Check that every minibatch has two samples, otherwise the variance of its advantages would be 0 / 0."""
-    samples = s.num_envs * s.rollout
-    if samples > MOST_SAMPLES:
-        raise SettingsError(
-            f"{source}: num_envs * rollout: {samples}; expected at most {MOST_SAMPLES} samples between two updates"
-        )
-    size = -(-samples // s.minibatches)
-    if size < 2 or samples % size == 1:
-        raise SettingsError(
-            f"{source}: minibatches: {s.minibatches} of {samples} samples; expected at least 2 samples in each"
-        )
+@contextlib.contextmanager
+def _errors_of(source: str) -> Iterator[None]:
+    """Turn errors about values into errors that begin with their source."""
+    try:
+        yield
+    except ValueError as error:
+        raise SettingsError(f"{source}: {error}") from None
 
 
-def parsed(overrides: Iterable[str]) -> dict[str, Any]:
-    """Return overrides, each `KEY=VALUE`, as plain data.
+def by_name(given: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
+    """Return settings by name; each may be a text `KEY=VALUE`, whose value is YAML.
 
     Raises:
-        SettingsError: If an override has another form.
+        SettingsError: If a text has another form.
     """
-    return dict(_parse_override(text) for text in overrides)
+    return dict(given) if isinstance(given, Mapping) else dict(map(_parse, given))
 
 
-def _parse_override(text: str) -> tuple[str, Any]:
+def _parse(text: str) -> tuple[str, Any]:
     """Split one `KEY=VALUE`."""
     key, equals, value = text.partition("=")
     if not equals:
-        raise SettingsError(f"--set {text}: expected KEY=VALUE")
+        raise SettingsError(f"{GIVEN}: {text}: expected KEY=VALUE")
     try:
         return key.strip().replace("-", "_"), parse_yaml(value)
     except ValueError as error:
-        reason = " ".join(str(error).split())[:200]
-        raise SettingsError(f"--set {key.strip()}: cannot be read as YAML: {reason}") from None
+        raise SettingsError(f"{GIVEN}: {key.strip()}: cannot be read as YAML: {_reason(error)}") from None
 
 
-def _convert(source: str, key: str, value: Any, kind: str) -> Any:
-    """Return one value with the type of its setting; numbers may be quoted."""
-    expected = f"one of {', '.join(ACTIVATIONS)}" if kind == "Activation" else "a list of layer sizes"
-    try:
-        if kind == "int":
-            high: Any = LIMITS[key]
-            expected = f"a positive whole number, at most {high:g}"
-            number = float(value)
-            if isinstance(value, bool) or number != int(number) or not 1 <= number <= high:
-                raise ValueError
-            return int(number)
-        if kind == "float":
-            low, high = LIMITS[key]  # type: ignore[misc]
-            expected = f"a number from {low:g} to {high:g}"
-            number = float(value)
-            if isinstance(value, bool) or not low <= number <= high:
-                raise ValueError
-            return number
-        if kind.startswith("Mapping"):
-            expected = "arguments of the environment by name, as plain data"
-            return checked_arguments(value)
-        if kind == "str":
-            expected = "a name or a path"
-            if not isinstance(value, str) or not value:
-                raise ValueError
-            return value
-        if kind == "Activation" and value in ACTIVATIONS:
-            return value
-        if kind == "Activation" or not isinstance(value, list | tuple) or len(value) > 100:
-            raise ValueError
-        return tuple(_convert(source, key, size, "int") for size in value)
-    except (TypeError, ValueError, OverflowError) as error:
-        if isinstance(error, SettingsError):
-            raise
-        raise SettingsError(f"{source}: {key}: {repr(value)[:200]}; expected {expected}") from None
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 def _snake(name: str) -> str:

@@ -1,15 +1,13 @@
-"""Train a learner on plain arrays, such as `fast_ppo.FastPPO`, and write its files.
+"""Train a learner on plain arrays, such as `learners.ppo.FastPPO`, and write its files.
 
 A learner has the methods `iterate`, `actor`, `state` and `restore`, and the attributes `steps`, `episodes`, `envs`,
-`step_seconds` and `collect_seconds`. A learner with other processes also has `processor_seconds`, their processor time
-[s].
+`step_seconds` and `collect_seconds`.
 """
 
 from __future__ import annotations
 
 import io
 import json
-import time
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -24,23 +22,22 @@ from ce_gym.learn.runs.folder import continue_if_full, make_folder, save_somewhe
 from ce_gym.learn.runs.job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
 from ce_gym.learn.runs.logs import open_writers
 from ce_gym.learn.runs.page import Present
-from ce_gym.learn.runs.progress import CURVE, LOG, Curve, Log, ProgressBar, StopInOrder, earlier_rows, log_row
+from ce_gym.learn.runs.progress import Log, ProgressBar, StopInOrder, log_row
 from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
 
 
-def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job, num_envs: int | None = None) -> Trained:
+def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job) -> Trained:
     """Train with a learner, and save the policy even if Ctrl-C ends training early.
 
     Args:
         kind: Function that returns the learner.
         job: The training run.
-        num_envs: Number of environments; None takes the number in the settings.
 
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
     make_folder(job.out)
-    envs = environments(job, num_envs)
+    envs = _environments(job)
     try:
         learner = kind(envs, job)
         if job.resume:
@@ -50,27 +47,22 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job, num_envs: int |
         envs.close()
 
 
-def environments(job: Job, num_envs: int | None = None) -> VectorEnv:
-    """Return the environments of a training run, `num_envs` or the number in the settings."""
+def _environments(job: Job) -> VectorEnv:
+    """Return the environments of a training run."""
     options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
-    mode, options = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, {**options, **job.env_kwargs, **job.settings.training}
-    return gymnasium.make_vec(
-        job.env_id, num_envs=num_envs or job.settings.num_envs, vectorization_mode=mode, **options
-    )
+    mode, num_envs = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, job.settings.num_envs
+    options |= {**job.env_kwargs, **job.settings.training}
+    return gymnasium.make_vec(job.env_id, num_envs=num_envs, vectorization_mode=mode, **options)
 
 
 def _learn(learner: Any, job: Job) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
-    s, native = job.settings, acting_environment(job, learner.envs.unwrapped)
-    start, clock = time.perf_counter(), Clock()
-    writers = open_writers(job.logs, job.out, s.as_dict())
-    curve = Curve(job.out / "curve.csv", earlier_rows(job.resume, "curve.csv", CURVE), learner.steps)
-    log = Log(job.out / "progress.csv", earlier_rows(job.resume, "progress.csv", LOG), learner.steps, writers)
+    s, native, clock = job.settings, acting_environment(job, learner.envs.unwrapped), Clock()
+    log = Log(job.out, job.resume, learner.steps, open_writers(job.logs, job.out, s.as_dict()))
     bar = ProgressBar(s.steps, learner.steps)
 
     def record(finished: bool = False) -> dict[str, Any]:
         written = make_record(job, native, learner.steps, clock, ("numba",))
-        written["processor_seconds"] += getattr(learner, "processor_seconds", 0.0)
         return written | {"finished": finished, "shares": bar.shares}
 
     every = max(s.steps // CHECKPOINTS, 1)
@@ -79,9 +71,8 @@ def _learn(learner: Any, job: Job) -> Trained:
         while learner.steps < s.steps and not stop.due:
             checkpoints = learner.steps // every
             figures, means = learner.iterate(), learner.episodes.means()
-            curve.add(learner.steps, means)
             if means:
-                log.add(log_row(learner.steps, time.perf_counter() - start, means, figures))
+                log.add(log_row(learner.steps, means, figures))
             bar.advance(learner.steps)
             bar.describe(means, learner.step_seconds, learner.collect_seconds)
             present.keep()
@@ -127,7 +118,7 @@ def resume(learner: Any, policy: Path) -> None:
     Raises:
         PolicyError: If the state of the policy's learner is missing, damaged or of another network.
     """
-    file = _learner_file(policy)
+    file = locate_policy(policy).with_suffix(".learner.npz")
     try:
         with np.load(file, allow_pickle=False) as arrays:
             learner.restore({name: arrays[name] for name in arrays.files})
@@ -135,7 +126,3 @@ def resume(learner: Any, policy: Path) -> None:
         raise PolicyError(f"{file}: no such file; expected the file that its learner writes beside a policy") from None
     except (OSError, LookupError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise PolicyError(f"{file}: training cannot continue: {' '.join(str(error).split())[:200]}") from None
-
-
-def _learner_file(policy: Path) -> Path:
-    return locate_policy(policy).with_suffix(".learner.npz")
