@@ -14,7 +14,6 @@ from toy import job, parameters
 
 from ce_gym.learn.evaluate.evaluation import evaluate
 from ce_gym.learn.learners.ppo import FastPPO, train
-from ce_gym.learn.learners.sb3_callbacks import FallCost
 from ce_gym.learn.runs.job import acting_environment
 from ce_gym.learn.runs.progress import fall_cost, read_curve
 from ce_gym.learn.runs.settings import SettingsError
@@ -99,16 +98,6 @@ def test_a_fall_has_its_cost_and_a_time_out_has_none(tmp_path):
     fallen = np.array(fallen[:120])
     assert 5 < fallen.sum() < 500
     np.testing.assert_allclose(rewards[0] - rewards[1], 7.0 * fallen, atol=1e-5)
-
-
-def test_the_reference_counts_falls_alike():
-    callback = FallCost(4.0, steps=1000)
-    callback.num_timesteps = 450
-    callback._on_rollout_start()
-    ends = [{"TimeLimit.truncated": late, "diverged": lost} for late, lost in [(0, 0), (1, 0), (0, 1), (0, 0)]]
-    callback.locals = {"rewards": np.ones(4), "dones": np.array([1, 1, 1, 0]), "infos": ends}
-    callback._on_step()
-    np.testing.assert_allclose(callback.locals["rewards"], [-1, 1, 1, 1])
 
 
 def test_falls_cost_nothing_at_first():
