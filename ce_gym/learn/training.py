@@ -10,7 +10,7 @@ from typing import Any
 
 from ce_gym.compile.system import usable_cores
 from ce_gym.learn.runs.folder import make_folder
-from ce_gym.learn.runs.job import Job, Trained, settings_of
+from ce_gym.learn.runs.job import Job, Trained
 from ce_gym.learn.runs.settings import (
     GIVEN,
     by_name,
@@ -39,7 +39,6 @@ def make_job(
     threads: int | None = None,
     seconds: float = float("inf"),
     logs: Sequence[str] = (),
-    page: bool = False,
 ) -> Job:
     """Return a training run.
 
@@ -55,7 +54,6 @@ def make_job(
         threads: Processor threads; all usable cores if None.
         seconds: Longest training time [s].
         logs: Packages to which curves are also written: "tensorboard", "wandb", "trackio".
-        page: Whether the current policy is written every 5 s, for a page that shows it.
 
     Raises:
         ValueError: If a setting, an argument or the policy cannot be used; one line.
@@ -67,7 +65,7 @@ def make_job(
     env_id, algo = environment_of(record, env_id), algo or learner_of(record)
     kind = learner(algo).Settings
     path = Path(config) if config else config_file(env_id, kind.folder)
-    continued = {} if config else {str(policy): settings_of(record)}
+    continued = {} if config else {str(policy): record.get("settings", {})}
     sources = {str(path): read_settings(path), **continued, GIVEN: by_name(settings)}
     given = dict(env_kwargs or {})
     from_file = {} if record and not config else load_env_args(path)  # the record has them already
@@ -83,7 +81,6 @@ def make_job(
         resume=policy,
         seconds=seconds,
         logs=tuple(logs),
-        page=page,
     )
 
 

@@ -107,7 +107,7 @@ def test_runs_are_found_in_a_folder_of_seeds(run: Path):
 
 
 def test_the_newest_policy_counts(run: Path):
-    names = ["checkpoints/policy_100.npz", "present/policy.npz", "policy.zip"]
+    names = ["checkpoints/policy_100.npz", "policy.npz", "policy.zip"]
     for age, name in enumerate([*names, "policy.learner.npz", ".policy.npz", "policy.json"]):
         (run / name).parent.mkdir(exist_ok=True)
         (run / name).write_bytes(b"")
@@ -162,12 +162,12 @@ def test_the_page_gets_curves_and_the_present_policy(watched: tuple[Path, Watchi
     assert (state["steps"], state["ended"], state["policy_steps"]) == (300, False, None)
     (run / "progress.csv").write_text(log(5))
     assert events.next("curves", lambda data: data["span"][1] == 500)
-    policy(run / "present" / "policy.npz", steps=400)
+    policy(run / "policy.npz", steps=400)
     assert events.next("scene")
     state = events.next("message", lambda data: data["moves"])["state"]
     assert (state["policy_steps"], state["total"], state["ended"]) == (400, 600, False)
     assert (len(state["command"]), len(state["moves"])) == (3, 3)
-    policy(run / "present" / "policy.npz", bias=-0.3, steps=500)
+    policy(run / "policy.npz", bias=-0.3, steps=500)
     events.next("message", lambda data: data["state"]["policy_steps"] == 500)
     policy(run / "policy.npz", steps=600)
     state = events.next("message", lambda data: data["state"]["ended"])["state"]

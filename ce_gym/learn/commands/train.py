@@ -121,7 +121,6 @@ def make_jobs(args: argparse.Namespace) -> list[Job]:
         "threads": args.threads,
         "seconds": 60.0 * args.minutes,
         "logs": default_logs() if args.log is None else args.log,
-        "page": args.page,
     }
     jobs = [make_job(args.env, args.algo, out=args.out, seed=seed, **options) for seed in args.seeds or [args.seed]]
     return [job.replace(out=job.out / f"seed_{job.seed}") for job in jobs] if len(jobs) > 1 else jobs

@@ -5,9 +5,9 @@ A learner is a module with a function `train(job) -> Trained` and a dataclass `S
 
 from __future__ import annotations
 
-import json
 import platform
 import time
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,11 +15,7 @@ from typing import Any
 
 import gymnasium
 
-from ce_gym.learn.runs.settings import NETWORK, SettingsError
-from ce_gym.policies import PolicyError, load_policy
-
-CHECKPOINTS = 10
-"""Checkpoints per training run."""
+from ce_gym.learn.runs.settings import SettingsError
 
 
 @dataclass(frozen=True)
@@ -37,7 +33,6 @@ class Job:
         resume: Policy from which training continues.
         seconds: Longest training time [s].
         logs: Packages for which curves are also written, see `logs.py`.
-        page: Whether a page shows the current policy.
     """
 
     algo: str
@@ -50,7 +45,6 @@ class Job:
     resume: Path | None = None
     seconds: float = float("inf")
     logs: tuple[str, ...] = ()
-    page: bool = False
 
     def replace(self, **changes: Any) -> Job:
         """Return the run with other attributes."""
@@ -72,22 +66,6 @@ class Trained:
     record: dict[str, Any]
     policy: Path
     interrupted: bool
-
-
-class Clock:
-    """Measures time since its creation [s]."""
-
-    def __init__(self) -> None:
-        self._start = self._now()
-
-    def spent(self) -> dict[str, float]:
-        """Return wall-clock time, and processor time of all threads."""
-        wall, processor = (now - start for now, start in zip(self._now(), self._start, strict=True))
-        return {"training_seconds": round(wall, 1), "processor_seconds": round(processor, 1)}
-
-    @staticmethod
-    def _now() -> tuple[float, float]:
-        return time.perf_counter(), time.process_time()
 
 
 def acting_environment(job: Job, native: Any) -> Any:
@@ -127,14 +105,13 @@ def basic_record(native: Any, env_id: str, env_kwargs: dict[str, Any], settings:
     }
 
 
-def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple[str, ...]) -> dict[str, Any]:
+def make_record(job: Job, native: Any, steps: int, packages: Iterable[str]) -> dict[str, Any]:
     """Return the record of a policy: the data to use it and to repeat its training.
 
     Args:
         job: The training run.
         native: The environment of evaluations, unwrapped, see `acting_environment`.
         steps: Environment steps done.
-        clock: Clock created at the start of training.
         packages: Packages whose versions are recorded, in addition to ce_gym, gymnasium, numpy and Python.
     """
     return basic_record(native, job.env_id, job.env_kwargs, job.settings) | {
@@ -142,7 +119,6 @@ def make_record(job: Job, native: Any, steps: int, clock: Clock, packages: tuple
         "steps": steps,
         "seed": job.seed,
         "resumed_from": str(job.resume) if job.resume else None,
-        **clock.spent(),
         "date": time.strftime("%Y-%m-%d"),
         "versions": {name: _version(name) for name in ("ce_gym", "gymnasium", *packages, "numpy")}
         | {"python": platform.python_version()},
@@ -155,27 +131,3 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
-
-
-def resumed_record(job: Job) -> dict[str, Any]:
-    """Return the record of the policy from which a training run continues.
-
-    Raises:
-        PolicyError: If its network differs from the settings, or the record lacks the number of steps.
-    """
-    file: Any = job.resume
-    record = load_policy(file).record
-    requested, trained = json.loads(json.dumps(asdict(job.settings))), settings_of(record)
-    for key in NETWORK:
-        if trained.get(key) != requested[key]:
-            both = f"trained with {trained.get(key)}, requested {requested[key]}"
-            raise PolicyError(f"{file}: {key}: {both}; expected the same to continue")
-    if type(record.get("steps")) is not int or record["steps"] < 0:
-        raise PolicyError(f"{file}: steps: {record.get('steps')!r}; expected the steps of its training")
-    return record
-
-
-def settings_of(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings in the record of a policy, as plain data; empty if there are none."""
-    settings = record.get("settings")
-    return settings if isinstance(settings, dict) else {}

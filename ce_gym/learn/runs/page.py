@@ -6,21 +6,11 @@ The page uses processor time but does not block training, and training continues
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-from ce_gym.learn.runs.folder import continue_if_full
-
-PERIOD = 5.0
-"""Time between two policies for the page [s]."""
-
-PRESENT = "present"
-"""Subfolder of a run with these policies; it is removed at the end."""
 
 PATIENCE = 20.0
 """Longest time in which the page may end before it is killed [s]."""
@@ -51,33 +41,9 @@ class TrainingPage:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process, and remove the policies of the page."""
+        """End the process."""
         with self._process:
             try:
                 self._process.communicate(timeout=PATIENCE)  # closes the standard input
             except subprocess.TimeoutExpired:
                 self._process.kill()
-        for folder in self._folders:
-            shutil.rmtree(folder / PRESENT, ignore_errors=True)
-
-
-class Present:
-    """Writes the current policy of a run periodically.
-
-    Args:
-        save: Function that writes the policy to a path without suffix.
-        out: Folder of the run.
-        enabled: Whether there is a page; otherwise nothing is written.
-    """
-
-    def __init__(self, save: Callable[[Path], Any], out: Path, enabled: bool) -> None:
-        self._save, self._path = save, out / PRESENT / "policy"
-        self._due = 0.0 if enabled else float("inf")
-
-    def keep(self) -> None:
-        """Write the policy if the last one is older than `PERIOD`."""
-        if time.monotonic() < self._due:
-            return
-        with continue_if_full():
-            self._save(self._path)
-        self._due = time.monotonic() + PERIOD

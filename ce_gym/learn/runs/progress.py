@@ -6,7 +6,7 @@ import csv
 import signal
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ce_gym.learn.runs.folder import continue_if_full
-from ce_gym.learn.runs.logs import Writer, numbers_of
 from ce_gym.policies import locate_policy
 
 LOG = "progress.csv"
@@ -26,14 +25,6 @@ STEPS, SECONDS, REWARD, LENGTH = (
     "time/total_timesteps", "time/time_elapsed", "rollout/ep_rew_mean", "rollout/ep_len_mean",
 )  # fmt: skip
 """Columns of the learning curve, with the names that Stable-Baselines3 uses."""
-
-
-def episode_means(episodes: Iterable[Mapping[str, float]] | None) -> dict[str, float]:
-    """Return the mean of every entry of recent episodes except the time `t`; empty before the first episode ends."""
-    recent = list(episodes or ())
-    if not recent:
-        return {}
-    return {key: float(np.mean([episode[key] for episode in recent])) for key in recent[-1] if key != "t"}
 
 
 def spread_episodes(native: Any, rng: np.random.Generator) -> None:
@@ -87,34 +78,39 @@ class Log:
         folder: Folder of the run.
         resume: Policy from which training continues; the rows of its run are kept.
         steps: Steps done so far; earlier rows beyond them are dropped.
-        writers: Receive the numbers of each row as well.
+        trackers: Receive each row as well, see `logs.open_trackers`.
     """
 
-    def __init__(
-        self, folder: Path, resume: Path | None = None, steps: int = 0, writers: Sequence[Writer] = ()
-    ) -> None:
-        self.file, self.writers = folder / LOG, writers
+    def __init__(self, folder: Path, resume: Path | None, steps: int, trackers: Sequence[Any] = ()) -> None:
+        self.file, self.trackers = folder / LOG, trackers
         self.rows: list[Mapping[str, Any]] = [row for row in _earlier_rows(resume) if row[STEPS] <= steps]
         self.columns = list(dict.fromkeys(name for row in self.rows for name in row))
         self.started = time.perf_counter() - (self.rows[-1][SECONDS] if self.rows else 0.0)
         self._write(self.rows, "w")
 
-    def add(self, row: Mapping[str, Any]) -> None:
-        """Write one row with its time. If the row has new columns, write the whole file again."""
-        row = {**row, SECONDS: round(time.perf_counter() - self.started, 3)}
+    def add(self, steps: int, means: Mapping[str, float], figures: Mapping[str, float]) -> None:
+        """Write one row with its time. If the row has new columns, write the whole file again.
+
+        Args:
+            steps: Environment steps done.
+            means: Means of recent episodes, see `RecentEpisodes`.
+            figures: Statistics of the update.
+        """
+        row = {STEPS: steps, SECONDS: round(time.perf_counter() - self.started, 3)}
+        row |= {{"r": REWARD, "l": LENGTH}.get(key, key): mean for key, mean in means.items()} | dict(figures)
         self.rows.append(row)
         new = [name for name in row if name not in self.columns]
         self.columns += new
         self._write(self.rows if new else [row], "w" if new else "a")
-        for writer in self.writers:
+        for tracker in self.trackers:
             with continue_if_full():
-                writer.write(numbers_of(row), int(row[STEPS]))
+                tracker.log(row, step=steps)
 
     def close(self) -> None:
         """End the logs of other programs."""
-        for writer in self.writers:
+        for tracker in self.trackers:
             with continue_if_full():
-                writer.close()
+                tracker.finish()
 
     def _write(self, rows: Sequence[Mapping[str, Any]], mode: str) -> None:
         with continue_if_full(), self.file.open(mode, newline="", encoding="utf-8") as file:
@@ -122,18 +118,6 @@ class Log:
             if mode == "w" and self.columns:
                 writer.writeheader()
             writer.writerows(rows)
-
-
-def log_row(steps: int, means: Mapping[str, float], figures: Mapping[str, float]) -> dict[str, float]:
-    """Return a row of `progress.csv`.
-
-    Args:
-        steps: Environment steps done.
-        means: Means of recent episodes, see `RecentEpisodes`.
-        figures: Statistics of the update.
-    """
-    names = {"r": REWARD, "l": LENGTH}
-    return {STEPS: steps} | {names.get(key, key): mean for key, mean in means.items()} | dict(figures)
 
 
 def read_rows(file: Path) -> list[dict[str, Any]]:
@@ -260,14 +244,11 @@ class ProgressBar:
         )  # fmt: skip
         self.started, self.shares = time.perf_counter(), dict.fromkeys(("physics", "policy", "learning"), 0.0)
 
-    def advance(self, steps: int) -> None:
-        """Show the number of steps done."""
-        self.bar.update(min(steps, self.total) - self.bar.n)
-
-    def describe(self, means: Mapping[str, float], physics: float, collecting: float) -> None:
-        """Show means of recent episodes and shares of the time.
+    def show(self, steps: int, means: Mapping[str, float], physics: float, collecting: float) -> None:
+        """Show the present state.
 
         Args:
+            steps: Number of steps done.
             means: Means of recent episodes.
             physics: Time inside the environment [s].
             collecting: Time of collection, physics included [s].
@@ -276,17 +257,18 @@ class ProgressBar:
         parts = {"physics": physics, "policy": collecting - physics, "learning": total - collecting}
         self.shares = {name: round(seconds / total, 3) for name, seconds in parts.items()}
         shares = " ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
-        self.bar.set_postfix_str(f"| {self._figures(means)} | {shares}", refresh=False)
+        self.bar.set_postfix_str(f"| {_figures(means)} | {shares}", refresh=False)
+        self.bar.update(min(steps, self.total) - self.bar.n)
 
     def close(self) -> None:
         """End the bar; its last line stays."""
         self.bar.close()
 
-    def _figures(self, means: Mapping[str, float]) -> str:
-        if not means:
-            return "no episode has ended yet"
-        metrics = [
-            (key.split("/", 1)[1].replace("_", " "), x) for key, x in means.items() if key.startswith("metrics/")
-        ]
-        shown = [("reward", means["r"]), ("length", means["l"]), *metrics[:2]]
-        return ", ".join(f"{name} {value:.3g}" for name, value in shown)
+
+def _figures(means: Mapping[str, float]) -> str:
+    """Return means of recent episodes as text: reward, length and two metrics."""
+    if not means:
+        return "no episode has ended yet"
+    metrics = {key.split("/")[1].replace("_", " "): x for key, x in means.items() if key.startswith("metrics/")}
+    shown = list({"reward": means["r"], "length": means["l"], **metrics}.items())[:4]
+    return ", ".join(f"{name} {value:.3g}" for name, value in shown)

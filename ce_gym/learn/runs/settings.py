@@ -22,9 +22,6 @@ MOST_SAMPLES = 10**8
 ENV_ARGS = "env_args"
 """Key of the arguments of the environment in a settings file; the only optional key."""
 
-NETWORK = ("hidden", "activation")
-"""Settings that cannot change when training continues."""
-
 GIVEN = "settings"
 """Beginning of errors about settings that are given by hand; `commands.errors` replaces it by `--set`."""
 

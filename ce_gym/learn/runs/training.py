@@ -1,13 +1,15 @@
-"""Train a learner on plain arrays, such as `learners.ppo.FastPPO`, and write its files.
+"""Train a learner, and write the files of its run.
 
 A learner has the methods `iterate`, `actor`, `state` and `restore`, and the attributes `steps`, `episodes`, `envs`,
-`step_seconds` and `collect_seconds`.
+`step_seconds` and `collect_seconds`. The learner of Stable-Baselines3 has `archive`, the content of its policy file,
+and `packages`, recorded with their versions.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import time
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -19,11 +21,16 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ce_gym.learn.runs.folder import continue_if_full, make_folder, save_somewhere, write_whole
-from ce_gym.learn.runs.job import CHECKPOINTS, Clock, Job, Trained, acting_environment, make_record
-from ce_gym.learn.runs.logs import open_writers
-from ce_gym.learn.runs.page import Present
-from ce_gym.learn.runs.progress import Log, ProgressBar, StopInOrder, log_row
+from ce_gym.learn.runs.job import Job, Trained, acting_environment, make_record
+from ce_gym.learn.runs.logs import open_trackers
+from ce_gym.learn.runs.progress import Log, ProgressBar, StopInOrder
 from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
+
+CHECKPOINTS = 10
+"""Checkpoints per training run."""
+
+PERIOD = 5.0
+"""Time between two writings of the current policy [s], for a page that shows it, and for runs that are killed."""
 
 
 def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job) -> Trained:
@@ -37,7 +44,10 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job) -> Trained:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
     make_folder(job.out)
-    envs = _environments(job)
+    options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
+    mode, num_envs = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, job.settings.num_envs
+    options |= {**job.env_kwargs, **job.settings.training}
+    envs = gymnasium.make_vec(job.env_id, num_envs=num_envs, vectorization_mode=mode, **options)
     try:
         learner = kind(envs, job)
         if job.resume:
@@ -47,38 +57,32 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job) -> Trained:
         envs.close()
 
 
-def _environments(job: Job) -> VectorEnv:
-    """Return the environments of a training run."""
-    options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
-    mode, num_envs = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, job.settings.num_envs
-    options |= {**job.env_kwargs, **job.settings.training}
-    return gymnasium.make_vec(job.env_id, num_envs=num_envs, vectorization_mode=mode, **options)
-
-
 def _learn(learner: Any, job: Job) -> Trained:
     """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
-    s, native, clock = job.settings, acting_environment(job, learner.envs.unwrapped), Clock()
-    log = Log(job.out, job.resume, learner.steps, open_writers(job.logs, job.out, s.as_dict()))
+    s, native = job.settings, acting_environment(job, learner.envs.unwrapped)
+    log = Log(job.out, job.resume, learner.steps, open_trackers(job.logs, job.out, s.as_dict()))
     bar = ProgressBar(s.steps, learner.steps)
+    started, packages = (time.perf_counter(), time.process_time()), getattr(learner, "packages", ("numba",))
+    checkpoint, due = max(s.steps // CHECKPOINTS, 1), 0.0
 
     def record(finished: bool = False) -> dict[str, Any]:
-        written = make_record(job, native, learner.steps, clock, ("numba",))
-        return written | {"finished": finished, "shares": bar.shares}
+        spent = {"training_seconds": time.perf_counter(), "processor_seconds": time.process_time()}
+        spent = {name: round(now - start, 1) for (name, now), start in zip(spent.items(), started, strict=True)}
+        return make_record(job, native, learner.steps, packages) | spent | {"finished": finished, "shares": bar.shares}
 
-    every = max(s.steps // CHECKPOINTS, 1)
-    present = Present(lambda path: save_policy(learner, record(), path), job.out, job.page)
     with StopInOrder(job.seconds) as stop:
         while learner.steps < s.steps and not stop.due:
-            checkpoints = learner.steps // every
+            checkpoints = learner.steps // checkpoint
             figures, means = learner.iterate(), learner.episodes.means()
             if means:
-                log.add(log_row(learner.steps, means, figures))
-            bar.advance(learner.steps)
-            bar.describe(means, learner.step_seconds, learner.collect_seconds)
-            present.keep()
-            if learner.steps // every > checkpoints and learner.steps < s.steps:
-                with continue_if_full():
+                log.add(learner.steps, means, figures)
+            bar.show(learner.steps, means, learner.step_seconds, learner.collect_seconds)
+            with continue_if_full():
+                if learner.steps // checkpoint > checkpoints and learner.steps < s.steps:
                     save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
+                if time.monotonic() >= due:
+                    due = time.monotonic() + PERIOD
+                    save(learner, record(), job.out / "policy")
         bar.close()
         log.close()
     written = record(finished=not stop.interrupted)
@@ -87,29 +91,22 @@ def _learn(learner: Any, job: Job) -> Trained:
 
 
 def save(learner: Any, record: dict[str, Any], path: Path) -> Path:
-    """Write `path`.npz, .json and .learner.npz, all or no file, and return the path of the policy.
+    """Write `path`.npz or .zip, .json and .learner.npz, all or no file, and return the path of the policy.
 
     Raises:
         OSError: If they cannot be written.
     """
     state, policy = io.BytesIO(), io.BytesIO()
     np.savez(state, allow_pickle=False, **learner.state())
-    write_npz(learner.actor(), record, policy)
+    suffix = ".zip" if hasattr(learner, "archive") else ".npz"
+    if suffix == ".zip":
+        policy.write(learner.archive())
+    else:
+        write_npz(learner.actor(), record, policy)
     text = json.dumps(record, indent=2) + "\n"
-    files = {".learner.npz": state.getvalue(), ".json": text.encode(), ".npz": policy.getvalue()}
+    files = {".learner.npz": state.getvalue(), ".json": text.encode(), suffix: policy.getvalue()}
     write_whole({path.with_name(path.name + kind): data for kind, data in files.items()})
-    return path.with_name(f"{path.name}.npz")
-
-
-def save_policy(learner: Any, record: dict[str, Any], path: Path) -> None:
-    """Write `path`.npz, the policy without the state of its learner.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    policy = io.BytesIO()
-    write_npz(learner.actor(), record, policy)
-    write_whole({path.with_name(f"{path.name}.npz"): policy.getvalue()})
+    return path.with_name(path.name + suffix)
 
 
 def resume(learner: Any, policy: Path) -> None:

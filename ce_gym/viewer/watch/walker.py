@@ -15,7 +15,7 @@ from ce_gym.viewer.rollouts.driving import make_envs
 from ce_gym.viewer.rollouts.scan import scans_of
 from ce_gym.viewer.stream import Feed
 
-POLICIES = ("policy.*", "present/policy.*", "checkpoints/policy_*")
+POLICIES = ("policy.*", "checkpoints/policy_*")
 """Policies in the folder of a run."""
 
 
