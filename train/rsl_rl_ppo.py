@@ -25,7 +25,6 @@ from ce_gym.__main__ import run
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
 from ce_gym.console import EPISODES, SEED, Parser
 from ce_gym.learn.commands.errors import in_one_line
-from ce_gym.learn.commands.train import env_kwargs_of
 from ce_gym.learn.evaluate.evaluation import evaluate, report
 from ce_gym.learn.export import to_onnx, write
 from ce_gym.learn.runs.folder import make_folder
@@ -110,7 +109,8 @@ def _work(args: argparse.Namespace) -> int:
     """Train, write and evaluate the policy, and print its path."""
     path = config_file(args.env)
     kwargs: dict[str, Any] = {"dtype": "float32"} if args.device.startswith("cuda") else {}
-    kwargs |= load_env_args(path) | env_kwargs_of(args)
+    kwargs |= load_env_args(path) | ({"transmission": args.transmission} if args.transmission else {})
+    kwargs |= ({"obs_mode": "dict", "critic": args.critic} if args.critic else {}) | dict(args.env_args)
     settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
     settings = with_named(settings, dict(args.env_args))
     out = args.out or Path("runs") / f"{path.stem}-rsl_rl"

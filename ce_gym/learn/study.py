@@ -1,88 +1,76 @@
-"""Train one task with several seeds at several transmission levels, with what is trained already left alone."""
+"""Training runs of one task at several transmission levels and with several seeds; finished runs are kept."""
 
 from __future__ import annotations
 
+import itertools
 import json
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ce_gym.learn.runs.job import Job
-from ce_gym.learn.training import make_job, run_job
-from ce_gym.policies import PolicyError, load_policy
-
-POLICY = "policy.npz"
+from ce_gym.learn.training import make_job
+from ce_gym.policies import PolicyError, find_policy, load_policy, locate_policy
 
 
-@dataclass(frozen=True)
-class Study:
-    """Training runs of one task, in the subfolders `LEVEL/seed_N` of a folder.
+def study_jobs(
+    env_id: str = "",
+    algo: str = "",
+    *,
+    levels: Sequence[str] = (),
+    seeds: Sequence[int] = (0,),
+    env_kwargs: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> list[Job]:
+    """Return training runs, level by level, in the subfolders `LEVEL/seed_N` of one folder.
 
-    Attributes:
-        env_id: Registered environment id.
-        levels: Transmission levels.
+    The folder has no subfolders for levels or seeds if there is at most one.
+
+    Args:
+        env_id: Registered environment id; may be empty with `resume`.
+        algo: Name of the learner, see `make_job`.
+        levels: Transmission levels; if empty, that of the environment.
         seeds: Seeds of each level.
-        settings: Settings that replace those of the settings file, by name.
         env_kwargs: Arguments of the environment.
-        folder: The folder; by default `runs/transfer/`, then the name of the settings file.
+        **options: See `make_job`.
     """
-
-    env_id: str
-    levels: Sequence[str]
-    seeds: Sequence[int]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    folder: Path | None = None
-
-    def jobs(self, threads: int | None = None) -> list[Job]:
-        """Return the training runs, level by level; `threads` as in `make_job`."""
-        jobs = []
-        for level in self.levels:
-            for seed in self.seeds:
-                kwargs = {**self.env_kwargs, "transmission": level}
-                job = make_job(self.env_id, settings=self.settings, env_kwargs=kwargs, seed=seed, threads=threads)
-                folder = self.folder or Path("runs") / "transfer" / job.out.name.removesuffix(f"-{level}")
-                jobs.append(job.replace(out=folder / level / f"seed_{seed}"))
-        return jobs
+    kwargs = dict(env_kwargs or {})
+    of_level = [kwargs | {"transmission": level} for level in levels] or [kwargs]
+    folder = make_job(env_id, algo, env_kwargs=of_level[0] if len(levels) < 2 else kwargs, **options).out
+    jobs = []
+    for arguments, seed in itertools.product(of_level, seeds):
+        parts = [arguments["transmission"]] if len(levels) > 1 else []
+        parts += [f"seed_{seed}"] if len(seeds) > 1 else []
+        job = make_job(env_id, algo, seed=seed, env_kwargs=arguments, **options)
+        jobs.append(job.replace(out=folder.joinpath(*parts)))
+    return jobs
 
 
-def train_missing(study: Study, threads: int | None = None) -> list[Path]:
-    """Make all runs of a study whose policies are missing or unfinished, and return all policies.
-
-    Raises:
-        ValueError: If the folder has a policy with other settings, or settings are wrong.
-        KeyboardInterrupt: After Ctrl-C. Finished and interrupted runs are kept, and the next call continues.
-    """
-    policies = []
-    for job in study.jobs(threads):
-        policy = job.out / POLICY
-        finished = policy.exists() and checked_record(policy, job)["finished"]
-        if not finished:
-            print(f"training seed {job.seed}, {job.settings.steps:,} steps -> {job.out}", file=sys.stderr)
-            if run_job(job.replace(resume=policy if policy.exists() else None)).interrupted:
-                raise KeyboardInterrupt
-        policies.append(policy)
-    return policies
-
-
-def checked_record(policy: Path, job: Job) -> dict[str, Any]:
-    """Return the record of an existing policy after checking that a training run would repeat it.
+def unfinished(job: Job) -> Job | None:
+    """Return a run that continues the policy in its folder if there is one, or None if that is finished.
 
     Raises:
         PolicyError: If the policy was trained with another environment, seed or settings.
     """
+    policy = find_policy(job.out)
+    if policy is None:
+        return job
     record = load_policy(policy).record
-    requested = {"env": job.env_id, "seed": job.seed, "env_kwargs": job.env_kwargs}
-    requested["settings"] = json.loads(json.dumps(job.settings.as_dict()))
-    for key, value in requested.items():
-        trained = record[key]
-        if trained != value:
-            if isinstance(value, dict):
-                key = next(name for name in {**value, **trained} if trained.get(name, ...) != value.get(name, ...))
-                trained, value = trained.get(key), value.get(key)
-            raise PolicyError(
-                f"{policy}: trained with {key} = {trained!r}, requested {value!r}; give another --runs folder"
-            )
-    return record
+    trained = {"env": record["env"], "seed": record["seed"], **record["env_kwargs"], **record["settings"]}
+    settings = json.loads(json.dumps(job.settings.as_dict()))
+    requested = {"env": job.env_id, "seed": job.seed, **job.env_kwargs, **settings}
+    for key in {**requested, **trained}:
+        if trained.get(key, ...) != requested.get(key, ...):
+            both = f"trained with {key} = {trained.get(key)!r}, requested {requested.get(key)!r}"
+            raise PolicyError(f"{policy}: {both}; give another --out folder")
+    return None if record["finished"] else job.replace(resume=policy)
+
+
+def policies_in(path: str | Path) -> list[Path]:
+    """Return the policy at a path, see `ce_gym.policies.locate_policy`, or those of all runs in a folder.
+
+    Raises:
+        PolicyError: If there is no policy.
+    """
+    runs = sorted(file.parent for file in Path(path).rglob("policy.json"))
+    return [locate_policy(run) for run in runs if find_policy(path) is None] or [locate_policy(path)]

@@ -53,7 +53,7 @@ def test_an_option_of_several_commands_looks_the_same_in_all():
                 kind = action.metavar if option == "--out" else (action.metavar, action.nargs)
                 shapes.setdefault(option, set()).add(kind)
     different = {option: kinds for option, kinds in shapes.items() if len(kinds) > 1}
-    assert different == {"--out": {"FOLDER", "FILE"}, "--levels": {("LEVEL", "+"), ("LEVEL", "*")}}
+    assert different == {"--out": {"FOLDER", "FILE"}, "--transmission": {("LEVEL", None), ("LEVEL", "+")}}
 
 
 @pytest.mark.parametrize("name", ["evaluate", "transfer", "sim2sim", "card", "train"])
@@ -140,13 +140,9 @@ def test_command_lines_that_make_no_sense_are_one_line(argv, words, tmp_path, ca
     [
         (["train"], "ENV: missing; expected an environment id"),
         (["train", "nobody/Nothing-v0", "--log"], "nobody"),
-        (["transfer"], "expected either policies to evaluate, or --train and --env"),
-        (["transfer", "--train"], "--env: missing; expected the environment to train in"),
+        (["transfer"], "the following arguments are required: POLICY"),
+        (["transfer", "."], ".: no such policy"),
         (["sim2sim", "nothing"], "nothing: no such policy"),
-        (
-            ["evaluate", "mini_cheetah_velocity", "--json", "/nowhere/x.json", "--episodes", "1"],
-            "--json /nowhere/x.json",
-        ),
     ],
 )
 def test_missing_things_are_one_line(argv, words, tmp_path, capsys, monkeypatch):

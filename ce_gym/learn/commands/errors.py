@@ -21,7 +21,7 @@ EXTRAS = {
 UNKNOWN_ARGUMENT = "unexpected keyword argument"
 """Message of Python about a wrong name in `--env-arg`, if an environment does not check names."""
 
-FILES = ("config", "resume", "out", "runs", "json")
+FILES = ("config", "resume", "out", "json")
 """Options whose values are files or folders."""
 
 

@@ -6,21 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ce_gym.console import (
-    EPISODES,
-    SEED,
-    STEPS,
-    WEIGHTS_SEED,
-    above_zero,
-    add_command,
-    add_json_argument,
-    add_threads_argument,
-    print_result,
-    whole,
-)  # fmt: skip
+from ce_gym.console import EPISODES, WEIGHTS_SEED, above_zero, add_command, add_json_argument, print_result, whole
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.model.mechanism import ELASTIC, LEVELS
-from ce_gym.policies import WHERE, add_env_arguments, locate_policy
+from ce_gym.policies import WHERE, add_env_arguments
 
 
 def add_evaluate_command(subparsers: Any) -> None:
@@ -81,47 +70,25 @@ def add_transfer_command(subparsers: Any) -> None:
         subparsers,
         transfer,
         "a policy on every transmission level",
-        "Evaluate policies at every transmission level. With --train, policies of every level and seed are trained\n"
-        "first, unless they are in the folder already. Means over seeds have 95 % confidence intervals.",
+        "Evaluate policies at every transmission level. Means over several seeds have 95 % confidence intervals.",
         "transfer mini_cheetah_velocity",
-        "transfer --train --env ce_gym/TelloVelocity-v0 --seeds 0 1 2",
+        "transfer runs/tello_velocity --out report",
     )
-    parser.add_argument(
-        "policies", nargs="*", metavar="POLICY", help=f"{WHERE}; policies of several seeds are combined"
-    )
+    text = f"{WHERE}; or a folder with several runs, such as `train` makes with --seeds"
+    parser.add_argument("policies", nargs="+", metavar="POLICY", help=text)
     _add_common(parser, episodes=256)
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="write transfer.json, .md and .png there")
-    how = parser.add_argument_group("training")
-    how.add_argument("--train", action="store_true", help="train missing policies of --levels and --seeds")
-    _add_levels_argument(how, "+", "default: all")
-    how.add_argument("--seeds", type=SEED, nargs="+", default=[0, 1, 2], metavar="N", help="default: 0 1 2")
-    how.add_argument("--steps", type=STEPS, metavar="N", help="environment steps of each (default: settings file)")
-    add_threads_argument(how)
-    how.add_argument(
-        "--runs", type=Path, metavar="FOLDER", help="where runs are kept (default: runs/transfer/<settings file>)"
-    )
-    parser.set_defaults(complain=parser.error)
 
 
 @in_one_line
 def transfer(args: argparse.Namespace) -> int:
-    """Train if `--train` is given, evaluate, and write the report."""
+    """Evaluate, and write the report."""
     from ce_gym.learn.evaluate.transfer import evaluate_policies, table, write_report
-    from ce_gym.learn.study import Study, train_missing
+    from ce_gym.learn.study import policies_in
 
-    if args.train == bool(args.policies):
-        args.complain("expected either policies to evaluate, or --train and --env")
-    if args.train and not args.env:
-        args.complain("--env: missing; expected the environment to train in")
-    if args.train:
-        settings = {"steps": args.steps} if args.steps else {}
-        study = Study(args.env, args.levels, args.seeds, settings, dict(args.env_args), args.runs)
-        policies = train_missing(study, args.threads)
-    else:
-        policies = [locate_policy(path) for path in args.policies]
+    policies = [policy for path in args.policies for policy in policies_in(path)]
     result = evaluate_policies(policies, args.episodes, args.seed, args.env, args.env_args)
-    out = args.out or (policies[0].parents[2] if args.train else None)
-    files = write_report(result, out) if out else []
+    files = write_report(result, args.out) if args.out else []
     print_result(result, "\n".join([table(result["summary"]), *map(str, files)]), args.json)
     return 0
 
@@ -175,7 +142,8 @@ def add_card_command(subparsers: Any) -> None:
     parser.add_argument(
         "--robots", type=whole(0, 100_000), default=50, metavar="N", help="in MuJoCo; 0 skips MuJoCo (default 50)"
     )
-    _add_levels_argument(parser, "*", "of the evaluation, in addition to the training level (default: all)")
+    text = "levels of the evaluation, in addition to the training level (default: all)"
+    parser.add_argument("--levels", nargs="*", choices=LEVELS, default=LEVELS, metavar="LEVEL", help=text)
     add_env_arguments(parser)
     add_json_argument(parser)
 
@@ -204,7 +172,3 @@ def _add_common(parser: argparse.ArgumentParser, episodes: int) -> None:
 def _add_episodes_argument(parser: argparse.ArgumentParser, episodes: int) -> None:
     text = f"episodes, in parallel (default {episodes})"
     parser.add_argument("--episodes", type=EPISODES, default=episodes, metavar="N", help=text)
-
-
-def _add_levels_argument(parser: Any, count: str, text: str) -> None:
-    parser.add_argument("--levels", nargs=count, choices=LEVELS, default=LEVELS, metavar="LEVEL", help=text)
