@@ -6,6 +6,7 @@ another folder with its files read-only. Knows the files of the repository; `ce_
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import subprocess
@@ -18,6 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from pages import ROOT, blocks, commands, links
 
@@ -79,12 +81,13 @@ def sources(folder: str) -> set[str]:
 
 
 def test_wheel_has_all_code_and_assets_and_is_small(built: Path):
-    """At most 5 MB; robots and trained policies are part of the wheel, benchmarks are not."""
+    """At most 5 MB; robots, trained policies and settings are part of the wheel, benchmarks are not."""
     wheel = only(built, "*.whl")
     assert wheel.stat().st_size <= 5e6
     names = {name for name in files_of(wheel) if ".dist-info/" not in name}
     code = sources("ce_gym") - sources("ce_gym/bench")
-    assert names == code | {f"ce_gym/{name}" for name in sources("assets")}
+    settings = {f"ce_gym/learn/{name.removeprefix('train/')}" for name in sources("train/config")}
+    assert names == code | settings | {f"ce_gym/{name}" for name in sources("assets")}
     for kind in ("mini_cheetah/mini_cheetah.urdf", "policies/mini_cheetah_velocity_exact/policy.npz"):
         assert f"ce_gym/assets/{kind}" in names
 
@@ -179,19 +182,20 @@ def test_the_wheel_steps_an_environment(python: Path, elsewhere: dict, home: Pat
     assert any((home / ".cache" / "ce_gym").iterdir())
 
 
-def linked(python: Path, extra: str, folder: Path) -> str:
-    """A folder with links to the packages of an extra."""
+def linked(python: Path, folder: Path, *extras: str) -> str:
+    """A folder with links to the packages of extras."""
     folder.mkdir()
     site = only(python.parents[1], "lib/python*/site-packages")
-    for one in dependencies(Distribution.at(only(site, "ce_gym-*.dist-info")), extra).values():
-        link(one, folder)
+    for extra in extras:
+        for one in dependencies(Distribution.at(only(site, "ce_gym-*.dist-info")), extra).values():
+            link(one, folder)
     return str(folder)
 
 
-def test_the_wheel_trains(python: Path, elsewhere: dict, tmp_path: Path):
+def test_stable_baselines3_trains_with_the_wheel(python: Path, elsewhere: dict, tmp_path: Path):
     """As the page about other learners does it, with the packages of the extra."""
     pytest.importorskip("stable_baselines3")
-    elsewhere["env"]["PYTHONPATH"] = linked(python, "train", tmp_path / "extra")
+    elsewhere["env"]["PYTHONPATH"] = linked(python, tmp_path / "extra", "sb3")
     (code,) = (
         block.text for block in blocks(ROOT / "docs" / "how-to" / "learners.md") if "stable_baselines3" in block.text
     )
@@ -200,10 +204,36 @@ def test_the_wheel_trains(python: Path, elsewhere: dict, tmp_path: Path):
     assert (tmp_path / "walk.zip").exists()
 
 
+def test_the_wheel_trains_evaluates_exports_and_plays(python: Path, elsewhere: dict, tmp_path: Path):
+    """Each by one command, with settings from the wheel; MuJoCo judges a policy that has hardly learned."""
+    for package in ("numba", "mujoco", "onnx", "meshcat"):
+        pytest.importorskip(package)
+    elsewhere["env"]["PYTHONPATH"] = linked(python, tmp_path / "extra", "train", "mjcf", "export", "viewer")
+
+    def command(line: str, *codes: int) -> str:
+        result = run([python, "-m", "ce_gym", *shlex.split(line)], **elsewhere)
+        assert result.returncode in (0, *codes), f"{line}\n{result.stdout[-2000:]}\n{result.stderr[-3000:]}"
+        return result.stdout
+
+    few = "--num-envs 64 --steps 20000 --episodes 4"
+    assert "forward speed error" in command(f"train ce_gym/MiniCheetahVelocity-v0 --out walk {few}")
+    record = json.loads((tmp_path / "walk" / "policy.json").read_text())
+    config = yaml.safe_load((ROOT / "train" / "config" / "mini_cheetah_velocity.yaml").read_text())
+    assert record["settings"]["hidden"] == config["hidden"]
+    assert list((tmp_path / "walk").glob("events.out.tfevents.*"))
+    assert "motor torque" in command("evaluate walk --episodes 4")
+    assert "| armature" in command("transfer walk --episodes 2")
+    assert "MuJoCo" in command("sim2sim walk --episodes 2 --seconds 1", 1)
+    command("export walk --out walk.onnx")
+    assert (tmp_path / "walk.onnx").stat().st_size > 1e4
+    command("play walk --command 0.2 0.5 0 0")
+    assert "mini_cheetah" in (tmp_path / "walk.html").read_text()
+
+
 def test_the_wheel_inspects_and_plays(python: Path, elsewhere: dict, tmp_path: Path):
     pytest.importorskip("meshcat")
     assert "FL_knee" in checked([python, "-m", "ce_gym", "inspect", "mini_cheetah", "--no-errors"], **elsewhere)
-    elsewhere["env"]["PYTHONPATH"] = linked(python, "viewer", tmp_path / "extra")
+    elsewhere["env"]["PYTHONPATH"] = linked(python, tmp_path / "extra", "viewer")
     show = ["play", "mini_cheetah_velocity", "--command", "0.2", "0.5", "0", "0", "--html", "walk.html"]
     checked([python, "-m", "ce_gym", *show], **elsewhere)
     assert "mini_cheetah" in (tmp_path / "walk.html").read_text()
