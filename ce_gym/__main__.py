@@ -183,7 +183,7 @@ def _new(args: argparse.Namespace) -> int:
         f"Go through the file; then\n  python -m ce_gym inspect {path}\n"
         "and, to train, with a module that registers it:\n"
         f"  echo 'import ce_gym; ce_gym.register_robot(\"{path}\")' > my_robots.py\n"
-        f"  PYTHONPATH=. python train/fast_ppo.py --env my_robots:{id_stem(robot)}Velocity-v0"
+        f"  PYTHONPATH=. python -m ce_gym train my_robots:{id_stem(robot)}Velocity-v0"
     )
     return 0
 

@@ -48,7 +48,8 @@ def make_job(
         settings: Settings that replace those of the file, by name or each as text `KEY=VALUE`.
         out: Folder to write to; by default `runs/`, then the names of settings file, level and learner.
         seed: Seed of initial weights, exploration and environments.
-        config: Settings file; by default that of the environment in the folder of the learner.
+        config: Settings file, or name of one in the folder of the learner, such as "mini_cheetah_stairs"; by default
+            that of the environment.
         env_kwargs: Arguments of the environment.
         resume: Policy from which training continues, with its settings unless `config` is given.
         threads: Processor threads; all usable cores if None.
@@ -64,7 +65,7 @@ def make_job(
         raise ValueError("ENV: missing; expected an environment id, or --resume with a policy")
     env_id, algo = environment_of(record, env_id), algo or learner_of(record)
     kind = learner(algo).Settings
-    path = Path(config) if config else config_file(env_id, kind.folder)
+    path = _named_file(config, kind.folder) if config else config_file(env_id, kind.folder)
     continued = {} if config else {str(policy): record.get("settings", {})}
     sources = {str(path): read_settings(path), **continued, GIVEN: by_name(settings)}
     given = dict(env_kwargs or {})
@@ -82,6 +83,12 @@ def make_job(
         seconds=seconds,
         logs=tuple(logs),
     )
+
+
+def _named_file(config: str | Path, folder: Path) -> Path:
+    """Return a settings file by its path, or by its name in a folder."""
+    named = folder / f"{config}.yaml"
+    return named if named.exists() else Path(config)
 
 
 def run_job(job: Job) -> Trained:

@@ -110,9 +110,9 @@ def add_watch_command(subparsers: Any) -> None:
         "watch",
         help="show how training goes: learning curves, reward terms, the present policy",
         description="Show training runs in a browser on this machine, during and after training, until Ctrl-C: "
-        "learning\ncurves, and a robot under the newest policy. `--page` of the training scripts shows their own run.",
+        "learning\ncurves, and a robot under the newest policy. `train --page` shows its own run.",
         epilog=examples(
-            "watch runs/mini_cheetah_velocity-fast",
+            "watch runs/mini_cheetah_velocity",
             "watch runs/one runs/other",
             "watch runs/my_robot --env my_module:ce_gym/MyRobotVelocity-v0",
         ),

@@ -7,7 +7,6 @@ policies and results of benchmarks, so that a page cannot say what the code does
 from __future__ import annotations
 
 import argparse
-import ast
 import inspect
 import re
 from collections.abc import Iterator
@@ -16,7 +15,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import yaml
 from environment_page import attributes_of, plain, table, task_fields
 
 from ce_gym.__main__ import _parser
@@ -25,6 +23,8 @@ from ce_gym.dynamics.laws.scene_laws import OUTPUTS, PARAMETERS
 from ce_gym.envs.task.tasks import RANDOMISED
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.registry import OWN
+from ce_gym.learn.runs.settings import load_settings
+from ce_gym.learn.training import learner
 
 ROOT = Path(__file__).parents[2]
 KINDS = {"reward": "Rewards", "observation": "Observations", "termination": "Terminations", "metric": "Metrics"}
@@ -89,19 +89,16 @@ def outputs() -> str:
 
 
 def settings() -> str:
-    """Return the table of training settings: name, default of PPO and of SHAC, meaning."""
-    meanings: dict[str, str] = {}
-    for file in ("settings.py", "shac.py"):
-        for node in ast.walk(ast.parse((ROOT / "train" / file).read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef) and node.name.endswith("Settings"):
-                meanings |= {k: v for k, v in attributes_of(ast.get_docstring(node) or "").items() if k not in meanings}
-    files = [ROOT / "train" / "config" / name for name in ("default.yaml", "shac/default.yaml")]
-    ppo, shac = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
-    rows = [
-        (f"`{name}`", *(f"`{data[name]}`" if name in data else "" for data in (ppo, shac)), meanings.get(name, ""))
-        for name in dict.fromkeys([*ppo, *shac])
-    ]
-    return table(("Setting", "PPO", "SHAC", "Meaning"), rows) + "\n"
+    """Return a table of settings for each learner: name, default, unit, meaning."""
+    parts = []
+    for title, algo in (("PPO", "ppo"), ("SHAC", "shac"), ("Distillation", "distill")):
+        kind = learner(algo).Settings
+        values = load_settings(kind.folder / "default.yaml", (), kind).as_dict()
+        texts = [attributes_of(inspect.cleandoc(base.__doc__ or "")) for base in reversed(kind.__mro__)]
+        meanings = {name: text for each in texts for name, text in each.items()}
+        rows = [(f"`{name}`", f"`{plain(value)}`", *_split_unit(meanings[name])) for name, value in values.items()]
+        parts.append(f"## {title}\n\n{table(('Setting', 'Default', 'Meaning', 'Unit'), rows)}")
+    return "\n\n".join(parts) + "\n"
 
 
 def command_line() -> str:
@@ -166,7 +163,11 @@ def _first_line(function: Any) -> str:
 
 
 def _meaning_and_unit(function: Any) -> tuple[str, str]:
-    text = _first_line(function)
+    return _split_unit(_first_line(function))
+
+
+def _split_unit(text: str) -> tuple[str, str]:
+    """Return a text without its units in brackets, and the units, "-" if there are none."""
     units = re.findall(r"\[([^\]]+)\]", text)
     return re.sub(r" ?\[[^\]]+\]", "", text), ", ".join(dict.fromkeys(units)) or "-"
 

@@ -25,7 +25,7 @@ from ce_gym import __main__ as command_line
 from ce_gym.bench import __main__ as benchmarks
 
 WITH_CODE = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
-ELSEWHERE = ("ray start", "python3 -m venv", "pip install torch onnx", "python -c", "source ")
+ELSEWHERE = ("ray start", "python3 -m venv", "pip install torch", "python -c", "source ")
 """Beginnings of commands that are not ours to check."""
 RUN = """
 import runpy

@@ -5,8 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from ce_gym.learn.runs.settings import SettingsError, config_file, load_settings
-from ce_gym.learn.training import learner
+from ce_gym.learn.runs.settings import Settings, SettingsError, config_file, load_settings
+from ce_gym.learn.training import learner, make_job
+
+SHIPPED = Settings.folder / "mini_cheetah_stairs.yaml"
 
 
 @pytest.mark.parametrize("algo", ["ppo", "shac", "distill"])
@@ -30,6 +32,14 @@ def test_the_command_line_wins():
     settings = load_settings(path, ["steps=2e5", "hidden=[8, 8]", "learning_rate=1e-4"])
     assert (settings.steps, settings.hidden, settings.learning_rate) == (200_000, (8, 8), 1e-4)
     assert settings.gamma == load_settings(path).gamma
+
+
+def test_a_file_is_named_with_or_without_its_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    by_name, by_path = (make_job("any/Thing-v0", config=config) for config in ("mini_cheetah_stairs", SHIPPED))
+    assert by_name == by_path
+    assert by_name.env_kwargs["terrain"]["kind"] == "stairs"
+    assert str(by_name.out) == "runs/mini_cheetah_stairs"
 
 
 def test_settings_are_given_by_name_or_as_text():

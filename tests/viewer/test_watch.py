@@ -72,16 +72,6 @@ def test_figures_are_those_of_the_files(run: Path):
     assert first_plots([found]) == [[REWARD], [LENGTH], ["reward: pose", "reward: torques"]]
 
 
-def test_what_came_before_the_run_stands_in_front(run: Path):
-    (run / "progress.csv").write_text(log(2, first=5))
-    (run / "curve.csv").write_text("steps,seconds,reward,length\n100,1,7,70\n300,2,8,80\n500,3,99,99\n")
-    found = read_log(run)
-    assert found.steps.tolist() == [100, 300, 500, 600]
-    assert found.signals[REWARD].tolist() == [7, 8, 2.5, 3]
-    assert found.signals[LENGTH].tolist() == [70, 80, 15, 16]
-    np.testing.assert_array_equal(found.signals["reward: pose"], [np.nan, np.nan, -5, -6])
-
-
 def test_a_long_log_is_thinned_to_means(run: Path):
     (run / "progress.csv").write_text(log(1000))
     few = read_log(run).thinned(100)

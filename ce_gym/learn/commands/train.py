@@ -50,7 +50,8 @@ def add_train_command(subparsers: Any) -> None:
     seeds.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     seeds.add_argument("--seeds", type=SEED, nargs="+", metavar="N", help="several seeds")
     how = parser.add_argument_group("how")
-    how.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: that of the environment)")
+    text = "settings file, or the name of one such as mini_cheetah_stairs (default: that of the environment)"
+    how.add_argument("--config", type=Path, metavar="FILE", help=text)
     text = "settings, such as gamma=0.98"
     how.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=text)
     how.add_argument("--steps", type=STEPS, metavar="N", help="environment steps in all, such as 6e6")

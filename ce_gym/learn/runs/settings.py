@@ -71,9 +71,9 @@ class CommonSettings(Options):
     """Settings of every learner.
 
     Attributes:
-        steps: Environment steps to train for, over all environments.
+        steps: Duration of training, over all environments [environment steps].
         num_envs: Environments stepped in parallel.
-        rollout: Control steps of each environment between two updates.
+        rollout: Length of the experience of each environment between two updates [control steps].
         minibatches: Number of minibatches of an update.
         epochs: Number of passes over the collected steps in each update.
         hidden: Sizes of the hidden layers, the same for policy and value.
@@ -123,8 +123,8 @@ class ActorCriticSettings(CommonSettings):
     Attributes:
         gamma: Discount per step.
         gae_lambda: Lambda of generalised advantage estimation (PPO), or of the critic's TD(lambda) targets (SHAC).
-        fall_cost: Final cost that is subtracted from the last reward of an episode that ends as a failure. The cost is
-            0 until 30 % of training and grows until 60 %. Reported rewards do not contain it.
+        fall_cost: Final cost that is subtracted from the last reward of an episode that ends as a failure [reward]. It
+            is 0 until 30 % of training and grows until 60 %. Reported rewards do not contain it.
     """
 
     gamma: float = option(number(0, 1))

@@ -14,13 +14,11 @@ from ce_gym.viewer.errors import ViewerError
 
 Array = NDArray[np.float64]
 
-LOG, CURVE = "progress.csv", "curve.csv"
+LOG = "progress.csv"
 STEPS, SECONDS = "time/total_timesteps", "time/time_elapsed"
 MOST_BYTES, MOST_COLUMNS = 2**26, 500
 REWARD, LENGTH, SPEED = "reward of an episode", "length of an episode [steps]", "speed of training [steps/s]"
 TERM = "reward: "
-FROM_CURVE = {REWARD: "reward", LENGTH: "length"}
-"""Columns of `curve.csv` by signal. For a run that continues a policy they include the earlier training."""
 NAMES = {"rollout/ep_rew_mean": REWARD, "rollout/ep_len_mean": LENGTH}
 GROUPS = {"reward": TERM, "metrics": "", "train": "learning: "}
 
@@ -81,7 +79,6 @@ def read_log(run: Path) -> RunLog:
     signals = {_signal_name(name): values for name, values in columns.items() if not name.startswith("time/")}
     if len(steps) > 1:
         signals[SPEED] = _speed(steps, seconds)
-    steps, signals = _with_earlier(run, steps, signals)
     return RunLog(run.resolve().name, steps, float(np.nanmax(seconds, initial=0.0)), signals)
 
 
@@ -117,19 +114,6 @@ def _speed(steps: Array, seconds: Array) -> Array:
         speed = np.diff(steps) / np.diff(seconds)
     speed[~np.isfinite(speed)] = np.nan  # Stable-Baselines3 logs whole seconds
     return np.append(speed[:1], speed)
-
-
-def _with_earlier(run: Path, steps: Array, signals: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
-    """Return steps and signals, preceded by the earlier training of `curve.csv`."""
-    curve = _table(run / CURVE)
-    if not {"steps", *FROM_CURVE.values()} <= set(curve):
-        return steps, signals
-    earlier = curve["steps"] < (steps[0] if len(steps) else np.inf)
-    joined = {}
-    for name in dict.fromkeys([*signals, *FROM_CURVE]):
-        front = curve[FROM_CURVE[name]][earlier] if name in FROM_CURVE else np.full(earlier.sum(), np.nan)
-        joined[name] = np.concatenate([front, signals.get(name, np.full(len(steps), np.nan))])
-    return np.concatenate([curve["steps"][earlier], steps]), joined
 
 
 def _block_means(values: Array, starts: NDArray[np.int64]) -> Array:
