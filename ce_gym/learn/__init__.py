@@ -43,11 +43,11 @@ def evaluate(
 
     Args:
         policy: A file (policy.zip, .npz or .onnx), the folder of a training run, or the name of a shipped policy.
-        env_id: Registered environment id; None keeps that of the training.
-        transmission: Transmission level; None keeps that of the training.
+        env_id: Registered environment id; None for the environment of training.
+        transmission: Transmission level; None for the level of training.
         episodes: Number of episodes, played in parallel.
         seed: Seed of the first episode; None computes it from the weights.
-        **env_args: Arguments of the environment that replace those of the training.
+        **env_args: Arguments of the environment in place of the arguments of training.
 
     Returns:
         Errors [m/s, rad/s], falls and others by name, see `evaluation.evaluation.evaluate`.

@@ -29,7 +29,7 @@ def study_jobs(
     Args:
         env_id: Registered environment id; may be empty with `resume`.
         algo: Name of the learner, see `make_job`.
-        levels: Transmission levels; if empty, that of the environment.
+        levels: Transmission levels; if empty, the environment's level.
         seeds: Seeds of each level.
         env_kwargs: Arguments of the environment.
         **options: See `make_job`.
@@ -67,7 +67,7 @@ def unfinished(job: Job) -> Job | None:
 
 
 def policies_in(path: str | Path) -> list[Path]:
-    """Return the policy at a path, see `ce_gym.policies.locate_policy`, or those of all runs in a folder.
+    """Return the policy at a path, see `ce_gym.policies.locate_policy`, or the policies of all runs in a folder.
 
     Raises:
         PolicyError: If there is no policy.

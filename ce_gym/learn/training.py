@@ -45,11 +45,11 @@ def make_job(
     Args:
         env_id: Registered environment id; may be empty with `resume`.
         algo: One of `ALGORITHMS`; if empty, the learner of the resumed policy, or "ppo".
-        settings: Settings that replace those of the file, by name or each as text `KEY=VALUE`.
+        settings: Settings that replace values of the file, by name or each as text `KEY=VALUE`.
         out: Folder to write to; by default `runs/`, then the names of settings file, level and learner.
         seed: Seed of initial weights, exploration and environments.
         config: Settings file, or name of one in the folder of the learner, such as "mini_cheetah_stairs"; by default
-            that of the environment.
+            the file of the environment.
         env_kwargs: Arguments of the environment.
         resume: Policy from which training continues, with its settings unless `config` is given.
         threads: Processor threads; all usable cores if None.
