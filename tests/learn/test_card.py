@@ -9,10 +9,10 @@ import pytest
 
 import ce_gym
 from ce_gym.__main__ import _parser, main
+from ce_gym.learn import train
 from ce_gym.learn.commands.train import make_jobs
 from ce_gym.learn.evaluate.card import card, command, portable, short_name
 from ce_gym.learn.evaluate.evaluation import report
-from ce_gym.learn.training import train
 from ce_gym.policies import PolicyError, load_policy, locate_policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
@@ -23,7 +23,7 @@ SMALL = ["num_envs=32", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 1
 def run(tmp_path_factory):
     """Folder of a training run, hardly begun."""
     out = tmp_path_factory.mktemp("run")
-    train(ROBOT_ENV, out=out, overrides=SMALL)
+    train(ROBOT_ENV, out=out, settings=SMALL)
     return out
 
 

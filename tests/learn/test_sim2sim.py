@@ -15,6 +15,7 @@ from tripod import TRIPOD
 import ce_gym
 from ce_gym.__main__ import main
 from ce_gym.export.mujoco_twin import MujocoTwin
+from ce_gym.learn import train
 from ce_gym.learn.evaluate.episodes import UNLIMITED, open_environments
 from ce_gym.learn.evaluate.sim2sim import (
     MujocoEnvs,
@@ -24,7 +25,6 @@ from ce_gym.learn.evaluate.sim2sim import (
     random_commands,
     verdicts,
 )
-from ce_gym.learn.training import train
 from ce_gym.model import Body, ContactMaterial, ContactSphere, Inertial, Joint, Placement, Robot, RobotError
 from ce_gym.policies import Policy
 
@@ -314,7 +314,7 @@ BLANK = {"forward_error": 0.0, "lateral_error": 0.0, "episode_length": 1.0}
 @pytest.mark.slow
 def test_the_program_compares_four_simulations(tmp_path, capsys):
     small = ["num_envs=16", "rollout=8", "steps=300", "minibatches=2", "training={}"]
-    policy = train(ROBOT_ENV, out=tmp_path, overrides=small).policy
+    policy = train(ROBOT_ENV, out=tmp_path, settings=small).policy
     capsys.readouterr()
     arguments = ["sim2sim", str(policy), "--episodes", "2", "--seconds", "0.2", "--json"]
     code = main(arguments)
