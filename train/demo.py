@@ -17,9 +17,9 @@ import numpy as np
 from ce_gym.__main__ import run
 from ce_gym.console import EPISODES, SEED, STEPS, Parser, above_zero, add_threads_argument
 from ce_gym.learn.commands.errors import in_one_line
-from ce_gym.learn.evaluate.episodes import EVALUATION_SEED
-from ce_gym.learn.evaluate.evaluation import report
-from ce_gym.learn.evaluate.transfer import summary, table, transfer
+from ce_gym.learn.evaluation.episodes import EVALUATION_SEED
+from ce_gym.learn.evaluation.evaluation import report
+from ce_gym.learn.evaluation.transfer import summary, table, transfer
 from ce_gym.learn.runs.job import Trained
 from ce_gym.learn.training import make_job, run_job
 from ce_gym.policies import add_env_arg, load_policy, with_map

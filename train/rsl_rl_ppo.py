@@ -25,7 +25,7 @@ from ce_gym.__main__ import run
 from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
 from ce_gym.console import EPISODES, SEED, Parser
 from ce_gym.learn.commands.errors import in_one_line
-from ce_gym.learn.evaluate.evaluation import evaluate, report
+from ce_gym.learn.evaluation.evaluation import evaluate, report
 from ce_gym.learn.export import to_onnx, write
 from ce_gym.learn.runs.folder import make_folder
 from ce_gym.learn.runs.job import Job, acting_environment, basic_record

@@ -55,8 +55,8 @@ def evaluate(
     Raises:
         PolicyError: If the policy cannot be used.
     """
-    from ce_gym.learn.evaluate.evaluation import evaluate as evaluate_model
-    from ce_gym.learn.evaluate.evaluation import load
+    from ce_gym.learn.evaluation.evaluation import evaluate as evaluate_model
+    from ce_gym.learn.evaluation.evaluation import load
 
     model = load(policy, env_id, transmission, env_args.items())
     return evaluate_model(model, model.record["env"], episodes=episodes, seed=seed, **model.record["env_kwargs"])

@@ -41,8 +41,8 @@ LEARN_MAY_IMPORT = {
     "learners": {"networks", "runs"},
     "training": {"runs"},  # and learners by name
     "study": {"runs", "training"},
-    "evaluate": {"runs", "training"},
-    "commands": {"runs", "training", "study", "evaluate", "export"},
+    "evaluation": {"runs", "training"},
+    "commands": {"runs", "training", "study", "evaluation", "export"},
 }
 """The same within `ce_gym/learn`."""
 MAY_IMPORT_THE_PACKAGE = ("viewer", "bench", "adapters")

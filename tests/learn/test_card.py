@@ -11,8 +11,8 @@ import ce_gym
 from ce_gym.__main__ import _parser, main
 from ce_gym.learn import train
 from ce_gym.learn.commands.train import make_jobs
-from ce_gym.learn.evaluate.card import card, command, portable, short_name
-from ce_gym.learn.evaluate.evaluation import report
+from ce_gym.learn.evaluation.card import card, command, portable, short_name
+from ce_gym.learn.evaluation.evaluation import report
 from ce_gym.policies import PolicyError, load_policy, locate_policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))

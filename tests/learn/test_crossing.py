@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ce_gym.learn.evaluate.crossing import cross, steering_command
-from ce_gym.learn.evaluate.tables import crossing_table
+from ce_gym.learn.evaluation.crossing import cross, steering_command
+from ce_gym.learn.evaluation.tables import crossing_table
 from ce_gym.policies import Policy, PolicyError
 
 

@@ -15,8 +15,8 @@ from test_networks import close, make_network, run
 from toy import parameters
 
 import ce_gym
-from ce_gym.learn.evaluate.card import command, portable
-from ce_gym.learn.evaluate.evaluation import evaluate
+from ce_gym.learn.evaluation.card import command, portable
+from ce_gym.learn.evaluation.evaluation import evaluate
 from ce_gym.learn.learners import distill
 from ce_gym.learn.learners.distill import Distiller, Settings, main, teacher_columns, train
 from ce_gym.learn.networks.perceptron import KINDS, make_work

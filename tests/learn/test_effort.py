@@ -8,10 +8,10 @@ import pytest
 from tripod import TRIPOD
 
 import ce_gym
-from ce_gym.learn.evaluate.effort import Drives, effort, largest_power
-from ce_gym.learn.evaluate.episodes import open_environments
-from ce_gym.learn.evaluate.pushes import push_envelope
-from ce_gym.learn.evaluate.tables import push_table
+from ce_gym.learn.evaluation.effort import Drives, effort, largest_power
+from ce_gym.learn.evaluation.episodes import open_environments
+from ce_gym.learn.evaluation.pushes import push_envelope
+from ce_gym.learn.evaluation.tables import push_table
 from ce_gym.model import Elasticity
 from ce_gym.policies import Policy
 

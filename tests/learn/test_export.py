@@ -11,8 +11,8 @@ from saved import load_learner
 from toy import job
 
 import ce_gym
-from ce_gym.learn.evaluate.evaluation import evaluate
-from ce_gym.learn.evaluate.evaluation import main as evaluate_main
+from ce_gym.learn.evaluation.evaluation import evaluate
+from ce_gym.learn.evaluation.evaluation import main as evaluate_main
 from ce_gym.learn.learners.sb3 import train
 from ce_gym.policies import ACTIVATIONS, load_policy
 

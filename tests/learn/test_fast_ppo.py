@@ -12,7 +12,7 @@ import pytest
 from point_mass import ID
 from toy import job, parameters
 
-from ce_gym.learn.evaluate.evaluation import evaluate
+from ce_gym.learn.evaluation.evaluation import evaluate
 from ce_gym.learn.learners.ppo import FastPPO, train
 from ce_gym.learn.runs.job import acting_environment
 from ce_gym.learn.runs.progress import fall_cost, read_curve

@@ -18,8 +18,8 @@ from saved import load_learner
 from toy import FAST, job, jobs
 
 from ce_gym.__main__ import main
-from ce_gym.learn.evaluate.card import command
-from ce_gym.learn.evaluate.evaluation import evaluate
+from ce_gym.learn.evaluation.card import command
+from ce_gym.learn.evaluation.evaluation import evaluate
 from ce_gym.learn.runs.progress import read_curve
 from ce_gym.learn.training import run_job
 from ce_gym.policies import load_policy

@@ -11,7 +11,7 @@ import gymnasium
 import pytest
 
 from ce_gym.__main__ import main
-from ce_gym.learn.evaluate import transfer
+from ce_gym.learn.evaluation import transfer
 from ce_gym.model import load_robot
 from ce_gym.viewer.live.runner import Runner
 from ce_gym.viewer.live.setup import named

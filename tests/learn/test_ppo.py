@@ -14,7 +14,7 @@ from saved import load_learner
 from toy import FAST, job
 
 from ce_gym.__main__ import main
-from ce_gym.learn.evaluate.evaluation import evaluate
+from ce_gym.learn.evaluation.evaluation import evaluate
 from ce_gym.learn.learners.sb3 import SB3Learner, train
 from ce_gym.policies import PolicyError, load_policy
 

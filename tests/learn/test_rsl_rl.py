@@ -12,8 +12,8 @@ from rsl_rl_ppo import actor_of, main, train
 from toy import SMALL
 
 from ce_gym.adapters.rsl_rl import make_rsl_rl_vec_env
-from ce_gym.learn.evaluate.evaluation import evaluate
-from ce_gym.learn.evaluate.evaluation import main as evaluate_main
+from ce_gym.learn.evaluation.evaluation import evaluate
+from ce_gym.learn.evaluation.evaluation import main as evaluate_main
 from ce_gym.learn.runs.job import basic_record
 from ce_gym.learn.runs.settings import config_file, load_settings
 from ce_gym.policies import Policy, load_policy

@@ -16,7 +16,7 @@ from tripod import TRIPOD
 from ce_gym import environment_ids
 from ce_gym.envs.differentiable import _roughness
 from ce_gym.envs.runtime.setup import make_program
-from ce_gym.learn.evaluate.card import command
+from ce_gym.learn.evaluation.card import command
 from ce_gym.learn.learners import shac
 from ce_gym.learn.learners.shac import SHAC, Settings, train
 from ce_gym.learn.networks.pathwise import back_through

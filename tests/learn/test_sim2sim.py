@@ -16,8 +16,8 @@ import ce_gym
 from ce_gym.__main__ import main
 from ce_gym.export.mujoco_twin import MujocoTwin
 from ce_gym.learn import train
-from ce_gym.learn.evaluate.episodes import UNLIMITED, open_environments
-from ce_gym.learn.evaluate.sim2sim import (
+from ce_gym.learn.evaluation.episodes import UNLIMITED, open_environments
+from ce_gym.learn.evaluation.sim2sim import (
     MujocoEnvs,
     _check_ratios,
     comparison_table,

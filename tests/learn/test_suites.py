@@ -14,7 +14,7 @@ from point_mass import ID, PointMassVectorEnv
 
 import ce_gym
 from ce_gym.__main__ import main
-from ce_gym.learn.evaluate.episodes import (
+from ce_gym.learn.evaluation.episodes import (
     EVALUATION_SEED,
     LEVEL,
     open_environments,
@@ -23,9 +23,9 @@ from ce_gym.learn.evaluate.episodes import (
     weights_seed,
     without_curricula,
 )
-from ce_gym.learn.evaluate.evaluation import evaluate, report
-from ce_gym.learn.evaluate.suites import SUITES, driver
-from ce_gym.learn.evaluate.tables import suite_table
+from ce_gym.learn.evaluation.evaluation import evaluate, report
+from ce_gym.learn.evaluation.suites import SUITES, driver
+from ce_gym.learn.evaluation.tables import suite_table
 from ce_gym.policies import Actor, Policy, write_npz
 
 RANGES = np.array([[-1.0, 2.0], [-0.5, 0.5], [-0.7, 0.9]])
@@ -197,7 +197,7 @@ def test_progress_is_counted_in_steps_of_the_longest_episode(monkeypatch):
         bars.append((label, total))
         return iter(items)
 
-    monkeypatch.setattr("ce_gym.learn.evaluate.episodes.progress", progress)
+    monkeypatch.setattr("ce_gym.learn.evaluation.episodes.progress", progress)
     evaluate(RESTING, ID, episodes=2, horizon=30)
     with open_environments(ID, 2, 0) as (envs, obs):
         assert len(list(run_policy(RESTING, envs, obs, steps=7, label="short"))) == 7

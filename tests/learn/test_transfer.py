@@ -8,8 +8,8 @@ from point_mass import ID
 from toy import FAST
 
 from ce_gym.__main__ import main
-from ce_gym.learn.evaluate.episodes import ERRORS
-from ce_gym.learn.evaluate.transfer import interval, summary, table, transfer
+from ce_gym.learn.evaluation.episodes import ERRORS
+from ce_gym.learn.evaluation.transfer import interval, summary, table, transfer
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.policies import Policy, read_actor, write_npz
 
@@ -53,7 +53,7 @@ def test_the_interval_covers_the_mean_of_samples_as_often_as_it_says():
 
 def test_a_policy_of_the_elastic_level_is_evaluated_there_too(monkeypatch):
     monkeypatch.setattr(
-        "ce_gym.learn.evaluate.transfer.evaluate",
+        "ce_gym.learn.evaluation.transfer.evaluate",
         lambda *_, transmission, **__: dict.fromkeys((*ERRORS, "falls", "episode_length", "reward"), len(transmission)),
     )
     record = {"env": ID, "env_kwargs": {"transmission": "exact"}, "transmission": "elastic"}

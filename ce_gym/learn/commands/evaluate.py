@@ -41,12 +41,12 @@ def add_evaluate_command(subparsers: Any) -> None:
 @in_one_line
 def evaluate(args: argparse.Namespace) -> int:
     """Evaluate, and print the results."""
-    from ce_gym.learn.evaluate.crossing import cross
-    from ce_gym.learn.evaluate.effort import effort
-    from ce_gym.learn.evaluate.evaluation import evaluate as evaluate_policy
-    from ce_gym.learn.evaluate.evaluation import load, report
-    from ce_gym.learn.evaluate.pushes import push_envelope
-    from ce_gym.learn.evaluate.suites import evaluate_suites
+    from ce_gym.learn.evaluation.crossing import cross
+    from ce_gym.learn.evaluation.effort import effort
+    from ce_gym.learn.evaluation.evaluation import evaluate as evaluate_policy
+    from ce_gym.learn.evaluation.evaluation import load, report
+    from ce_gym.learn.evaluation.pushes import push_envelope
+    from ce_gym.learn.evaluation.suites import evaluate_suites
 
     policy = load(args.policy, args.env, args.transmission, args.env_args)
     kwargs = policy.record["env_kwargs"]
@@ -83,7 +83,7 @@ def add_transfer_command(subparsers: Any) -> None:
 @in_one_line
 def transfer(args: argparse.Namespace) -> int:
     """Evaluate, and write the report."""
-    from ce_gym.learn.evaluate.transfer import evaluate_policies, table, write_report
+    from ce_gym.learn.evaluation.transfer import evaluate_policies, table, write_report
     from ce_gym.learn.study import policies_in
 
     policies = [policy for path in args.policies for policy in policies_in(path)]
@@ -114,8 +114,8 @@ def add_sim2sim_command(subparsers: Any) -> None:
 @in_one_line
 def sim2sim(args: argparse.Namespace) -> int:
     """Compare, print, and return 0 if the policy passed."""
-    from ce_gym.learn.evaluate.evaluation import load
-    from ce_gym.learn.evaluate.sim2sim import compare, comparison_table
+    from ce_gym.learn.evaluation.evaluation import load
+    from ce_gym.learn.evaluation.sim2sim import compare, comparison_table
 
     policy = load(args.policy, args.env, env_args=args.env_args)
     result = compare(policy, episodes=args.episodes, seconds=args.seconds, every=args.every, seed=args.seed)
@@ -151,7 +151,7 @@ def add_card_command(subparsers: Any) -> None:
 @in_one_line
 def card(args: argparse.Namespace) -> int:
     """Evaluate, and write the files of a card."""
-    from ce_gym.learn.evaluate.card import write_card
+    from ce_gym.learn.evaluation.card import write_card
 
     file, result = write_card(
         args.policy, args.out, args.ship, args.task, args.episodes, args.robots, args.levels, args.env, args.env_args

@@ -71,7 +71,7 @@ def add_train_command(subparsers: Any) -> None:
 @in_one_line
 def train(args: argparse.Namespace) -> int:
     """Make all training runs, evaluate each policy, print its path, and return the exit code."""
-    from ce_gym.learn.evaluate.evaluation import evaluate, report
+    from ce_gym.learn.evaluation.evaluation import evaluate, report
     from ce_gym.learn.runs.page import TrainingPage
 
     jobs = make_jobs(args)

@@ -13,15 +13,15 @@ from typing import Any
 
 import gymnasium
 
-from ce_gym.learn.evaluate.crossing import cross
-from ce_gym.learn.evaluate.effort import effort
-from ce_gym.learn.evaluate.episodes import weights_seed
-from ce_gym.learn.evaluate.evaluation import evaluate, load
-from ce_gym.learn.evaluate.pictures import draw_curve
-from ce_gym.learn.evaluate.pushes import push_envelope
-from ce_gym.learn.evaluate.sim2sim import compare, comparison_table
-from ce_gym.learn.evaluate.suites import evaluate_suites
-from ce_gym.learn.evaluate.tables import metrics, sections, table, two_columns
+from ce_gym.learn.evaluation.crossing import cross
+from ce_gym.learn.evaluation.effort import effort
+from ce_gym.learn.evaluation.episodes import weights_seed
+from ce_gym.learn.evaluation.evaluation import evaluate, load
+from ce_gym.learn.evaluation.pictures import draw_curve
+from ce_gym.learn.evaluation.pushes import push_envelope
+from ce_gym.learn.evaluation.sim2sim import compare, comparison_table
+from ce_gym.learn.evaluation.suites import evaluate_suites
+from ce_gym.learn.evaluation.tables import metrics, sections, table, two_columns
 from ce_gym.learn.runs.progress import LOG, read_curve
 from ce_gym.learn.runs.settings import config_file, load_settings
 from ce_gym.learn.training import learner, learner_of

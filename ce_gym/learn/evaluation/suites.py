@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ce_gym.learn.evaluate.episodes import UNDISTURBED, open_environments, play, without_curricula
+from ce_gym.learn.evaluation.episodes import UNDISTURBED, open_environments, play, without_curricula
 from ce_gym.policies import Policy, PolicyError
 
 SETTLE = 1.0

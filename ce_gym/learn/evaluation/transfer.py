@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from ce_gym.console import Table, markdown
-from ce_gym.learn.evaluate.episodes import ERRORS, Predicts
-from ce_gym.learn.evaluate.evaluation import evaluate, load
-from ce_gym.learn.evaluate.pictures import draw_transfer
-from ce_gym.learn.evaluate.tables import COLUMNS
+from ce_gym.learn.evaluation.episodes import ERRORS, Predicts
+from ce_gym.learn.evaluation.evaluation import evaluate, load
+from ce_gym.learn.evaluation.pictures import draw_transfer
+from ce_gym.learn.evaluation.tables import COLUMNS
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import PolicyError
 

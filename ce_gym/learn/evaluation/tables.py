@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from ce_gym.console import Table, markdown
-from ce_gym.learn.evaluate.pushes import SAFE, WAIT
-from ce_gym.learn.evaluate.suites import SUITES
+from ce_gym.learn.evaluation.pushes import SAFE, WAIT
+from ce_gym.learn.evaluation.suites import SUITES
 
 COLUMNS = {
     "forward_error": ("forward [m/s]", ".3f"),

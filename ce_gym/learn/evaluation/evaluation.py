@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ce_gym.learn.evaluate.episodes import Predicts, open_environments, play, weights_seed, without_curricula
-from ce_gym.learn.evaluate.tables import metrics, sections, two_columns
+from ce_gym.learn.evaluation.episodes import Predicts, open_environments, play, weights_seed, without_curricula
+from ce_gym.learn.evaluation.tables import metrics, sections, two_columns
 from ce_gym.policies import Policy, environment_of, load_policy
 
 

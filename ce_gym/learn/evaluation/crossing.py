@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.learn.evaluate.episodes import UNDISTURBED, open_environments, run_policy, without_curricula
+from ce_gym.learn.evaluation.episodes import UNDISTURBED, open_environments, run_policy, without_curricula
 from ce_gym.policies import Policy, PolicyError
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from ce_gym.learn.evaluate.episodes import (
+from ce_gym.learn.evaluation.episodes import (
     UNDISTURBED,
     UNLIMITED,
     TrackingErrors,
@@ -23,7 +23,7 @@ from ce_gym.learn.evaluate.episodes import (
     run_policy,
     weights_seed,
 )
-from ce_gym.learn.evaluate.tables import table
+from ce_gym.learn.evaluation.tables import table
 from ce_gym.model import RobotError
 from ce_gym.policies import Policy, PolicyError
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ce_gym.learn.evaluate.episodes import UNDISTURBED, UNLIMITED, open_environments, run_policy
+from ce_gym.learn.evaluation.episodes import UNDISTURBED, UNLIMITED, open_environments, run_policy
 from ce_gym.policies import Policy
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)

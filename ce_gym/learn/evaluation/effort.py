@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.dynamics.model import Model
-from ce_gym.learn.evaluate.episodes import UNLIMITED, open_environments, run_policy
+from ce_gym.learn.evaluation.episodes import UNLIMITED, open_environments, run_policy
 from ce_gym.policies import Policy
 
 Array = NDArray[np.float64]
