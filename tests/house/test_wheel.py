@@ -109,7 +109,6 @@ def test_sdist_has_what_the_readme_names(built: Path):
     }  # fmt: skip
     words = {word for command in commands(ROOT / "README.md") for word in shlex.split(command, comments=True)}
     scripts = {word for word in words if word.endswith(".py")}
-    assert scripts, "README runs no script of the repository"
     assert scripts | set(links(ROOT / "README.md")) <= names
     for folder in ("assets", "ce_gym", "train", "tests"):
         assert sources(folder) <= names
@@ -209,6 +208,7 @@ def test_the_wheel_trains_evaluates_exports_and_plays(python: Path, elsewhere: d
     for package in ("numba", "mujoco", "onnx", "meshcat"):
         pytest.importorskip(package)
     elsewhere["env"]["PYTHONPATH"] = linked(python, tmp_path / "extra", "train", "mjcf", "export", "viewer")
+    elsewhere["env"]["NUMBA_CACHE_DIR"] = str(tmp_path / "numba")  # an administrator's would be beside the package
 
     def command(line: str, *codes: int) -> str:
         result = run([python, "-m", "ce_gym", *shlex.split(line)], **elsewhere)
@@ -221,7 +221,7 @@ def test_the_wheel_trains_evaluates_exports_and_plays(python: Path, elsewhere: d
     config = yaml.safe_load((ROOT / "train" / "config" / "mini_cheetah_velocity.yaml").read_text())
     assert record["settings"]["hidden"] == config["hidden"]
     assert list((tmp_path / "walk").glob("events.out.tfevents.*"))
-    assert "motor torque" in command("evaluate walk --episodes 4")
+    assert "Mechanical, at the rotors" in command("evaluate walk --episodes 4")
     assert "| armature" in command("transfer walk --episodes 2")
     assert "MuJoCo" in command("sim2sim walk --episodes 2 --seconds 1", 1)
     command("export walk --out walk.onnx")
