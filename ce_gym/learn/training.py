@@ -11,15 +11,7 @@ from typing import Any
 from ce_gym.compile.system import usable_cores
 from ce_gym.learn.runs.folder import make_folder
 from ce_gym.learn.runs.job import Job, Trained
-from ce_gym.learn.runs.settings import (
-    GIVEN,
-    by_name,
-    config_file,
-    load_env_args,
-    make_settings,
-    read_settings,
-    with_named,
-)
+from ce_gym.learn.runs.settings import GIVEN, by_name, config_file, make_settings, read_file, with_named
 from ce_gym.policies import environment_of, keep_map, load_policy, locate_policy
 
 ALGORITHMS = ("ppo", "shac", "distill", "sb3")
@@ -67,16 +59,16 @@ def make_job(
     kind = learner(algo).Settings
     path = _named_file(config, kind.folder) if config else config_file(env_id, kind.folder)
     continued = {} if config else {str(policy): record.get("settings", {})}
-    sources = {str(path): read_settings(path), **continued, GIVEN: by_name(settings)}
-    given = dict(env_kwargs or {})
-    from_file = {} if record and not config else load_env_args(path)  # the record has them already
+    in_file, env_args = read_file(path)
+    sources = {str(path): in_file, **continued, GIVEN: by_name(settings)}
+    given, trained = dict(env_kwargs or {}), record.get("env_kwargs", {})
     level, suffix = given.get("transmission"), "" if algo == ALGORITHMS[0] else algo
     return Job(
         algo=algo,
         env_id=env_id,
         settings=with_named(make_settings(kind, sources), given),
         out=Path(out) if out else Path("runs") / "-".join(filter(None, (path.stem, level, suffix))),
-        env_kwargs={**record.get("env_kwargs", {}), **from_file, **given},
+        env_kwargs={**(trained if record and not config else {**trained, **env_args}), **given},
         seed=seed,
         threads=threads or usable_cores(),
         resume=policy,

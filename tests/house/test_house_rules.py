@@ -27,7 +27,7 @@ MAY_IMPORT = {
     "policies": {"model"},
     "viewer": {"model", "dynamics", "sim", "envs", "policies"},
     "identify": {"model", "dynamics", "compile", "sim", "viewer"},
-    "learn": {"model", "dynamics", "compile", "export", "envs", "adapters", "policies"},
+    "learn": {"model", "dynamics", "compile", "export", "envs", "adapters", "policies", "viewer"},
     "bench": {
         "model", "dynamics", "compile", "export", "sim", "envs", "diagnostics", "adapters", "policies", "viewer",
         "identify",

@@ -10,8 +10,8 @@ from toy import FAST, job
 
 from ce_gym.__main__ import main
 from ce_gym.learn.runs import training
-from ce_gym.learn.runs.page import TrainingPage
 from ce_gym.learn.training import run_job
+from ce_gym.viewer.watch.process import TrainingPage
 
 
 @pytest.mark.parametrize("algo", ["ppo", "sb3"])
@@ -50,10 +50,8 @@ def test_the_page_ends_with_training_and_leaves_nothing(tmp_path, capfd):
 
 def test_the_command_line_asks_for_it(monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(
-        "ce_gym.learn.runs.page.TrainingPage.__enter__", lambda page: asked.append((page._folders, page._env_id))
-    )
-    monkeypatch.setattr("ce_gym.learn.runs.page.TrainingPage.__exit__", lambda *_: None)
+    monkeypatch.setattr(TrainingPage, "__enter__", lambda page: asked.append((page._folders, page._env_id)))
+    monkeypatch.setattr(TrainingPage, "__exit__", lambda *_: None)
     command = ["train", ID, "--steps", "1000", "--out", str(tmp_path), *FAST]
     assert main([*command, "--page"]) == 0
     assert asked == [([tmp_path], ID)]

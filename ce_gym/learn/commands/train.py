@@ -72,7 +72,7 @@ def add_train_command(subparsers: Any) -> None:
 def train(args: argparse.Namespace) -> int:
     """Make all training runs, evaluate each policy, print its path, and return the exit code."""
     from ce_gym.learn.evaluation.evaluation import evaluate, report
-    from ce_gym.learn.runs.page import TrainingPage
+    from ce_gym.viewer.watch.process import TrainingPage
 
     jobs = make_jobs(args)
     with TrainingPage([job.out for job in jobs], jobs[0].env_id) if args.page else contextlib.nullcontext():

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -83,7 +83,9 @@ class Log:
 
     def __init__(self, folder: Path, resume: Path | None, steps: int, trackers: Sequence[Any] = ()) -> None:
         self.file, self.trackers = folder / LOG, trackers
-        self.rows: list[Mapping[str, Any]] = [row for row in _earlier_rows(resume) if row[STEPS] <= steps]
+        run = locate_policy(resume).parent if resume else folder
+        earlier = read_rows((run.parent if run.name == "checkpoints" else run) / LOG) if resume else []
+        self.rows: list[Mapping[str, Any]] = [row for row in earlier if row[STEPS] <= steps]
         self.columns = list(dict.fromkeys(name for row in self.rows for name in row))
         self.started = time.perf_counter() - (self.rows[-1][SECONDS] if self.rows else 0.0)
         self._write(self.rows, "w")
@@ -142,14 +144,6 @@ def read_curve(file: Path) -> list[dict[str, float]]:
     return [{name: float(row[key]) for name, key in names.items()} for row in read_rows(file) if row.get(REWARD)]
 
 
-def _earlier_rows(resume: Path | None) -> list[dict[str, Any]]:
-    """Return the rows of the run whose policy is resumed; see `read_rows`."""
-    if resume is None:
-        return []
-    folder = locate_policy(resume).parent
-    return read_rows((folder.parent if folder.name == "checkpoints" else folder) / LOG)
-
-
 def adapted_rate(rate: float, kl: float, target: float, limits: tuple[float, float] = (1e-5, 1e-2)) -> float:
     """Return the learning rate that keeps the KL divergence of an update near a target.
 
@@ -184,36 +178,18 @@ def fall_cost(most: float, done: float) -> float:
     return most * float(np.clip((done - 0.3) / 0.3, 0.0, 1.0))
 
 
-class StopInOrder:
-    """Context that ends training between two updates: at a deadline, after Ctrl-C or after SIGTERM.
-
-    A second signal interrupts immediately.
+class Stop:
+    """Whether training ends before its last step: at a deadline, after Ctrl-C or after SIGTERM.
 
     Args:
         seconds: Longest time to train [s].
 
     Attributes:
-        interrupted: Whether a signal ended training.
+        interrupted: Whether a signal ends training.
     """
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self, seconds: float = float("inf")) -> None:
-        self.seconds, self.interrupted = seconds, False
-
-    def __enter__(self) -> StopInOrder:
-        self._previous = {number: signal.signal(number, self._on_signal) for number in self.SIGNALS}
-        self._deadline = time.monotonic() + self.seconds
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, previous in self._previous.items():
-            signal.signal(number, previous)
-
-    def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
-        if self.interrupted:
-            raise KeyboardInterrupt
-        self.interrupted = True
+    def __init__(self, seconds: float) -> None:
+        self.interrupted, self._deadline = False, time.monotonic() + seconds
 
     @property
     def due(self) -> bool:
@@ -221,48 +197,46 @@ class StopInOrder:
         return self.interrupted or time.monotonic() >= self._deadline
 
 
+@contextlib.contextmanager
+def stop_in_order(seconds: float) -> Iterator[Stop]:
+    """Context in which a signal ends training between two updates; a second signal interrupts immediately."""
+    stop = Stop(seconds)
+
+    def on_signal(*_: Any) -> None:
+        if stop.interrupted:
+            raise KeyboardInterrupt
+        stop.interrupted = True
+
+    previous = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
 class ProgressBar:
     """Progress bar with steps, speed, remaining time, recent episodes and shares of the time.
-
-    "physics" is time inside the environment, "policy" is the rest of collection, "learning" is all other time.
 
     Args:
         total: Steps at which training ends.
         steps: Steps done so far.
-
-    Attributes:
-        shares: Fractions of the time in physics, policy and learning.
     """
 
-    def __init__(self, total: int, steps: int = 0) -> None:
+    def __init__(self, total: int, steps: int) -> None:
         interval = 0.5 if sys.stderr.isatty() else 10.0  # fewer lines in a log file
         form = "{percentage:3.0f}% |{bar:20}| {n_fmt}/{total_fmt} steps, {rate_fmt}, {remaining} left {postfix}"
-        self.total = total
-        self.bar = tqdm(
-            total=total, initial=steps, unit=" steps", unit_scale=True, mininterval=interval,
-            bar_format=form, dynamic_ncols=True, smoothing=0.05,
-        )  # fmt: skip
-        self.started, self.shares = time.perf_counter(), dict.fromkeys(("physics", "policy", "learning"), 0.0)
+        options = {"unit": " steps", "unit_scale": True, "dynamic_ncols": True, "smoothing": 0.05}
+        self.bar: Any = tqdm(total=total, initial=steps, mininterval=interval, bar_format=form, **options)
+        self.started = time.perf_counter()
 
-    def show(self, steps: int, means: Mapping[str, float], physics: float, collecting: float) -> None:
-        """Show the present state.
-
-        Args:
-            steps: Number of steps done.
-            means: Means of recent episodes.
-            physics: Time inside the environment [s].
-            collecting: Time of collection, physics included [s].
-        """
-        total = time.perf_counter() - self.started
-        parts = {"physics": physics, "policy": collecting - physics, "learning": total - collecting}
-        self.shares = {name: round(seconds / total, 3) for name, seconds in parts.items()}
-        shares = " ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
+    def show(self, learner: Any) -> None:
+        """Show steps, recent episodes, and shares of the time: physics, rest of collection, learning."""
+        total, means = time.perf_counter() - self.started, learner.episodes.means()
+        physics, collecting = learner.step_seconds / total, learner.collect_seconds / total
+        shares = f"physics {physics:.0%} policy {collecting - physics:.0%} learning {1 - collecting:.0%}"
         self.bar.set_postfix_str(f"| {_figures(means)} | {shares}", refresh=False)
-        self.bar.update(min(steps, self.total) - self.bar.n)
-
-    def close(self) -> None:
-        """End the bar; its last line stays."""
-        self.bar.close()
+        self.bar.update(min(learner.steps, self.bar.total) - self.bar.n)
 
 
 def _figures(means: Mapping[str, float]) -> str:

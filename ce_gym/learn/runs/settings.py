@@ -180,48 +180,38 @@ def load_settings(path: Path, given: Mapping[str, Any] | Iterable[str] = (), kin
     Raises:
         SettingsError: If the file cannot be read, a key is missing or unknown, or a value is wrong.
     """
-    return make_settings(kind, {str(path): read_settings(path), GIVEN: by_name(given)})
+    return make_settings(kind, {str(path): read_file(path)[0], GIVEN: by_name(given)})
 
 
 def load_env_args(path: Path) -> dict[str, Any]:
-    """Return the arguments of the environment in a settings file, or an empty dictionary.
+    """Return the arguments of the environment in a settings file, see `read_file`."""
+    return read_file(path)[1]
+
+
+def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the settings in a file, unchecked, and the arguments of the environment.
 
     Raises:
-        SettingsError: If the file cannot be read, or the arguments are not plain data by name.
+        SettingsError: If the file cannot be read, or arguments of the environment are not plain data by name.
     """
-    return _read(path).get(ENV_ARGS, {})
+    try:
+        data = parse_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"{path}: cannot be read as YAML: {_line(error)}") from None
+    if not isinstance(data, dict):
+        raise SettingsError(f"{path}: expected one `key: value` per line, got {type(data).__name__}")
+    with _errors_of(str(path)):
+        return data, _env_arguments(ENV_ARGS, data.pop(ENV_ARGS, {}))
 
 
 def with_named(settings: Any, env_args: Mapping[str, Any]) -> Any:
     """Return settings whose `training` does not override arguments of the environment; mappings are merged."""
     training = dict(settings.training)
     for name, value in env_args.items():
-        if isinstance(value, Mapping) and isinstance(training.get(name), Mapping):
-            training[name] = {**training[name], **value}
-        else:
-            training.pop(name, None)
+        earlier = training.pop(name, None)
+        if isinstance(value, Mapping) and isinstance(earlier, Mapping):
+            training[name] = {**earlier, **value}
     return replace(settings, training=training)
-
-
-def read_settings(path: Path) -> dict[str, Any]:
-    """Return the settings in a file, unchecked.
-
-    Raises:
-        SettingsError: If the file cannot be read.
-    """
-    return {key: value for key, value in _read(path).items() if key != ENV_ARGS}
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """Return the content of a settings file: unchecked settings, checked arguments of the environment."""
-    try:
-        data = parse_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SettingsError(f"{path}: cannot be read as YAML: {_reason(error)}") from None
-    if not isinstance(data, dict):
-        raise SettingsError(f"{path}: expected one `key: value` per line, got {type(data).__name__}")
-    with _errors_of(str(path)):
-        return data | ({ENV_ARGS: _env_arguments(ENV_ARGS, data[ENV_ARGS])} if ENV_ARGS in data else {})
 
 
 def make_settings(kind: type, sources: Mapping[str, Mapping[str, Any]]) -> Any:
@@ -265,21 +255,21 @@ def by_name(given: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
     Raises:
         SettingsError: If a text has another form.
     """
-    return dict(given) if isinstance(given, Mapping) else dict(map(_parse, given))
+    if isinstance(given, Mapping):
+        return dict(given)
+    settings = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise SettingsError(f"{GIVEN}: {text}: expected KEY=VALUE")
+        try:
+            settings[key.strip().replace("-", "_")] = parse_yaml(value)
+        except ValueError as error:
+            raise SettingsError(f"{GIVEN}: {key}: cannot be read as YAML: {_line(error)}") from None
+    return settings
 
 
-def _parse(text: str) -> tuple[str, Any]:
-    """Split one `KEY=VALUE`."""
-    key, equals, value = text.partition("=")
-    if not equals:
-        raise SettingsError(f"{GIVEN}: {text}: expected KEY=VALUE")
-    try:
-        return key.strip().replace("-", "_"), parse_yaml(value)
-    except ValueError as error:
-        raise SettingsError(f"{GIVEN}: {key.strip()}: cannot be read as YAML: {_reason(error)}") from None
-
-
-def _reason(error: Exception) -> str:
+def _line(error: Exception) -> str:
     return " ".join(str(error).split())[:200]
 
 

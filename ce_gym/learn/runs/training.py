@@ -23,7 +23,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from ce_gym.learn.runs.folder import continue_if_full, make_folder, save_somewhere, write_whole
 from ce_gym.learn.runs.job import Job, Trained, acting_environment, make_record
 from ce_gym.learn.runs.logs import open_trackers
-from ce_gym.learn.runs.progress import Log, ProgressBar, StopInOrder
+from ce_gym.learn.runs.progress import Log, ProgressBar, stop_in_order
 from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
 
 CHECKPOINTS = 10
@@ -68,22 +68,22 @@ def _learn(learner: Any, job: Job) -> Trained:
     def record(finished: bool = False) -> dict[str, Any]:
         spent = {"training_seconds": time.perf_counter(), "processor_seconds": time.process_time()}
         spent = {name: round(now - start, 1) for (name, now), start in zip(spent.items(), started, strict=True)}
-        return make_record(job, native, learner.steps, packages) | spent | {"finished": finished, "shares": bar.shares}
+        return make_record(job, native, learner.steps, packages) | spent | {"finished": finished}
 
-    with StopInOrder(job.seconds) as stop:
+    with stop_in_order(job.seconds) as stop:
         while learner.steps < s.steps and not stop.due:
             checkpoints = learner.steps // checkpoint
             figures, means = learner.iterate(), learner.episodes.means()
             if means:
                 log.add(learner.steps, means, figures)
-            bar.show(learner.steps, means, learner.step_seconds, learner.collect_seconds)
+            bar.show(learner)
             with continue_if_full():
                 if learner.steps // checkpoint > checkpoints and learner.steps < s.steps:
                     save(learner, record(), job.out / "checkpoints" / f"policy_{learner.steps}")
                 if time.monotonic() >= due:
                     due = time.monotonic() + PERIOD
                     save(learner, record(), job.out / "policy")
-        bar.close()
+        bar.bar.close()
         log.close()
     written = record(finished=not stop.interrupted)
     policy = save_somewhere(lambda folder: save(learner, written, folder / "policy"), job.out)

@@ -1,4 +1,4 @@
-"""Show a training run in a browser, for `--page`: another process reads the files of the run and serves the page.
+"""Show a training run in a browser during training: another process reads the files of the run and serves the page.
 
 The page uses processor time but does not block training, and training continues if the page fails.
 """
