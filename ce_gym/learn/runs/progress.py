@@ -228,6 +228,7 @@ class ProgressBar:
         form = "{percentage:3.0f}% |{bar:20}| {n_fmt}/{total_fmt} steps, {rate_fmt}, {remaining} left {postfix}"
         options = {"unit": " steps", "unit_scale": True, "dynamic_ncols": True, "smoothing": 0.05}
         self.bar: Any = tqdm(total=total, initial=steps, mininterval=interval, bar_format=form, **options)
+        self.bar.set_postfix_str("| the first run also compiles the learner")
         self.started = time.perf_counter()
 
     def show(self, learner: Any) -> None:
