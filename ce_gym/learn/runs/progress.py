@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -178,41 +177,38 @@ def fall_cost(most: float, done: float) -> float:
     return most * float(np.clip((done - 0.3) / 0.3, 0.0, 1.0))
 
 
-class Stop:
-    """Whether training ends before its last step: at a deadline, after Ctrl-C or after SIGTERM.
+class StopInOrder:
+    """Context that ends training between two updates: at a deadline, after Ctrl-C or after SIGTERM.
+
+    A second signal interrupts immediately.
 
     Args:
         seconds: Longest time to train [s].
 
     Attributes:
-        interrupted: Whether a signal ends training.
+        interrupted: Whether a signal ended training.
     """
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float = float("inf")) -> None:
         self.interrupted, self._deadline = False, time.monotonic() + seconds
+
+    def __enter__(self) -> StopInOrder:
+        self._previous = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)
+
+    def _on_signal(self, *_: object) -> None:
+        if self.interrupted:
+            raise KeyboardInterrupt
+        self.interrupted = True
 
     @property
     def due(self) -> bool:
         """Whether to stop now."""
         return self.interrupted or time.monotonic() >= self._deadline
-
-
-@contextlib.contextmanager
-def stop_in_order(seconds: float) -> Iterator[Stop]:
-    """Context in which a signal ends training between two updates; a second signal interrupts immediately."""
-    stop = Stop(seconds)
-
-    def on_signal(*_: Any) -> None:
-        if stop.interrupted:
-            raise KeyboardInterrupt
-        stop.interrupted = True
-
-    previous = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 class ProgressBar:

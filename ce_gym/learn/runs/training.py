@@ -23,7 +23,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from ce_gym.learn.runs.folder import continue_if_full, make_folder, save_somewhere, write_whole
 from ce_gym.learn.runs.job import Job, Trained, acting_environment, make_record
 from ce_gym.learn.runs.logs import open_trackers
-from ce_gym.learn.runs.progress import Log, ProgressBar, stop_in_order
+from ce_gym.learn.runs.progress import Log, ProgressBar, StopInOrder
 from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
 
 CHECKPOINTS = 10
@@ -70,7 +70,7 @@ def _learn(learner: Any, job: Job) -> Trained:
         spent = {name: round(now - start, 1) for (name, now), start in zip(spent.items(), started, strict=True)}
         return make_record(job, native, learner.steps, packages) | spent | {"finished": finished}
 
-    with stop_in_order(job.seconds) as stop:
+    with StopInOrder(job.seconds) as stop:
         while learner.steps < s.steps and not stop.due:
             checkpoints = learner.steps // checkpoint
             figures, means = learner.iterate(), learner.episodes.means()
