@@ -9,6 +9,7 @@ import pytest
 
 from ce_gym.compile import machine_code
 from ce_gym.compile.cache import FOLDER_VARIABLE, cache_folder
+from ce_gym.dynamics import batched_function
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -17,6 +18,9 @@ OPTIMISED = (
     *("test_adaptive", "test_failures", "test_simulator", "test_substeps", "test_terrain"),
 )
 """Folders and files of tests that run optimised kernels, as users do."""
+
+COMPILED = ("test_batched_functions",)
+"""Files of other tests that compile the quantities of `Model`."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -35,11 +39,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 def quick_kernels(request: pytest.FixtureRequest) -> Iterator[None]:
     """Compile without optimisation for all but OPTIMISED: less than half the time, and the same results bit by bit.
 
-    Kernels are cached in a folder of their own, which all workers and later runs share.
+    Kernels are cached in a folder of their own, which all workers and later runs share. Quantities are interpreted, to
+    the same results but for rounding, because tests evaluate them a few times for each of many small robots.
     """
-    folder = cache_folder()
+    folder, names = cache_folder(), {request.path.parent.name, request.path.stem}
     with pytest.MonkeyPatch.context() as patch:
-        if folder and not {request.path.parent.name, request.path.stem} & set(OPTIMISED):
+        if not names & {*OPTIMISED, *COMPILED}:
+            patch.setattr(batched_function, "LONG", 0)
+        if folder and not names & set(OPTIMISED):
             patch.setenv(FOLDER_VARIABLE, str(folder / "quick"))
             patch.setattr(machine_code, "GENERATION", 0)
             patch.setattr(machine_code, "OPTIMISATION", 0)

@@ -1,7 +1,7 @@
 """A compiled kernel that can be called: checks of its arguments, addresses, threads."""
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -28,15 +28,22 @@ class Kernel:
         lanes: environments in a tile.
         buffers: by name.
         repeats: names of the run-time integers.
+        code: the machine code.
+        digest: name of the kernel in the cache, which depends on the whole program.
+        arguments: buffers whose arrays the caller passes, in the order of their addresses.
+        scratch_words: 64-bit words of memory for each thread.
     """
 
-    def __init__(self, layout: Layout, run: MachineCode):
+    def __init__(self, layout: Layout, run: MachineCode, digest: str):
         self.name = layout.name
+        self.digest = digest
         self.dtype = layout.dtype
         self.lanes = lane_count(layout.dtype)
         self.buffers: dict[str, Buffer] = {b.name: b for b in layout.buffers}
         self.repeats = layout.repeats
-        self._run = run
+        self.arguments = layout.arguments
+        self.scratch_words = layout.scratch_bytes // WORD
+        self.code = run
         self._is_random = layout.is_random
         self._arguments = [
             (b.name, b.kind, b.size, np.dtype(b.dtype or layout.dtype), b.name in layout.written)
@@ -44,7 +51,7 @@ class Kernel:
         ]
         self._n_words = layout.counts
         self._tables = MemoryPool(self._n_words + len(self.repeats))
-        self._scratch = MemoryPool(layout.scratch_bytes // WORD)
+        self._scratch = MemoryPool(self.scratch_words)
         self._known: dict[str, tuple[weakref.ref[np.ndarray], int]] = {}
 
     def __call__(
@@ -86,11 +93,34 @@ class Kernel:
         # The default argument keeps the arrays alive as long as a thread works, even if this call is interrupted.
         def work(first_tile: int, end_tile: int, _kept: object = (block, arrays, keys, counters)) -> None:
             scratch = self._scratch.take()
-            self._run(address, counts, scratch[1], first_tile, end_tile, num_envs)
+            self.code(address, counts, scratch[1], first_tile, end_tile, num_envs)
             self._scratch.give(scratch)
 
         run_chunks(work, n_tiles, num_threads)
         self._tables.give(block)
+
+    def bind(self, arrays: Mapping[str, np.ndarray], num_envs: int) -> Callable[[], None]:
+        """Return a function that runs the program on the same arrays at each call, in one thread at a time.
+
+        Args:
+            arrays: as in a call.
+            num_envs: number of environments.
+
+        Raises:
+            ValueError: as in a call; or if the program repeats steps or draws random numbers.
+        """
+        if self.repeats or self._is_random:
+            raise ValueError(f"kernel {self.name!r}: repeats or draws, expected a program that does neither to bind")
+        n_tiles = tile_count(num_envs, self.dtype)
+        words = self._addresses(arrays, num_envs, n_tiles)
+        table, scratch = self._tables.take(), self._scratch.take()
+        table[0][: len(words)] = words
+        run_code, address, memory = self.code, table[1], scratch[1]
+
+        def run(_kept: object = (arrays, table, scratch)) -> None:
+            run_code(address, address, memory, 0, n_tiles, num_envs)
+
+        return run
 
     def _addresses(self, arrays: Mapping[str, np.ndarray], num_envs: int, n_tiles: int) -> list[int]:
         """Return the addresses of all arrays, then the shapes of tables, in the order of the layout."""

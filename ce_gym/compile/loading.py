@@ -68,7 +68,7 @@ def _load(folder: Path | None, name: str, build: Callable[[], Program], dtype: s
     from ce_gym.compile.machine_code import load_object
 
     record, code = read_or_make(folder, name, lambda: _compile(build, dtype, folder))
-    return Kernel(layout_from(record), load_object(code))
+    return Kernel(layout_from(record), load_object(code), name)
 
 
 def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> tuple[dict, bytes]:

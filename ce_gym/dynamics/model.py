@@ -1,7 +1,7 @@
 """`Model`: one robot at one transmission level, and its dynamics on numpy arrays.
 
-Each quantity is traced once, on first use, into a CasADi function. The methods take arrays with any leading batch
-shape. To step thousands of robots in time, use `ce_gym.Simulator`.
+Each quantity is traced once, on first use, into a CasADi function, and compiled, see `Model.evaluate`. The methods take
+arrays with any leading batch shape. To step thousands of robots in time, use `ce_gym.Simulator`.
 """
 
 from __future__ import annotations
@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.dynamics.algebra.batched import call_on_batch
+from ce_gym.dynamics.batched_function import CLOSED, BatchedFunction
 from ce_gym.dynamics.constraints.closure import closures, loop_report, reference_guess
-from ce_gym.dynamics.constraints.continuation import follow
+from ce_gym.dynamics.constraints.continuation import Continuation
 from ce_gym.dynamics.derivatives import Derivatives
 from ce_gym.dynamics.functions import trace
 from ce_gym.dynamics.quantities.configurations import neutral_positions, random_positions
@@ -24,6 +25,7 @@ from ce_gym.dynamics.quantities.forces import inertial_parameters
 from ce_gym.dynamics.quantities.frames import frames_of
 from ce_gym.dynamics.standing import check_standing
 from ce_gym.model import Robot, load_robot
+from ce_gym.model.arguments import check_choice, check_whole
 from ce_gym.model.clusters import ClusterTree
 from ce_gym.model.coordinates import unit_quaternions
 from ce_gym.model.errors import check_names
@@ -53,6 +55,8 @@ class Model:
             total mass is the same at every level. False deletes them, as the paper does in its figures.
         eliminate_rotors: Whether rotors that need no body are eliminated at the exact level. False runs the general
             algorithm, with every rotor a body: the same result, for more work.
+        dtype: "float64" or "float32" for arithmetic and results.
+        num_threads: Threads that share the robots of a call; results do not depend on the number.
 
     Attributes:
         guess: Dependent coordinates that no formula gives, at the reference pose [rad or m], shape (n_guess,).
@@ -76,9 +80,13 @@ class Model:
         *,
         locked_rotors: bool = True,
         eliminate_rotors: bool = True,
+        dtype: str = "float64",
+        num_threads: int = 1,
     ) -> None:
+        check_choice("dtype", dtype, ("float64", "float32"))
+        check_whole("num_threads", num_threads, 1)
         described = robot if isinstance(robot, Robot) else load_robot(robot)
-        self.transmission = transmission
+        self.transmission, self.dtype, self.num_threads = transmission, dtype, num_threads
         self.locked_rotors = locked_rotors
         self.eliminate_rotors = eliminate_rotors
         self.mechanism = build_mechanism(
@@ -88,11 +96,15 @@ class Model:
         self.guess = reference_guess(self.mechanism)
         self._has_loops = any(closures(self.mechanism))
         self._functions: dict[str, ca.Function] = {}
+        self._batched: dict[str | ca.Function, BatchedFunction] = {}
         self._derivatives: dict[tuple[str, tuple[str, ...]], Derivatives] = {}
         check_standing(self.mechanism)
 
     def __repr__(self) -> str:
         return f"Model({self.robot.name!r}, transmission={self.transmission!r}, nq={self.nq}, nv={self.nv})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_batched": {}}  # kernels are loaded again
 
     @property
     def nv(self) -> int:
@@ -188,6 +200,10 @@ class Model:
     def evaluate(self, function: str | ca.Function, *arguments: ArrayLike) -> list[Array]:
         """Evaluate a function of `q`, among others, on arrays that share leading batch dimensions.
 
+        The first call compiles the function in 0.05 to 2 seconds; later processes find it in the folder of kernels.
+        Functions of more than 25,000 instructions, such as Jacobians of large robots, are interpreted for the first
+        5000 robots and then compiled. Interpreted and compiled results differ by rounding.
+
         Args:
             function: Name of a quantity, see `casadi_function`, or a function of column vectors.
             arguments: Its inputs but for the guess of dependent coordinates, shape (..., n) each.
@@ -198,16 +214,32 @@ class Model:
         Raises:
             ValueError: If a shape is wrong, or a loop does not close at `q`.
         """
-        traced: ca.Function = self.casadi_function(function) if isinstance(function, str) else function
-        arrays = [np.asarray(a, dtype=float) for a in arguments]
-        arrays = [self.unit(a) if name == "q" else a for name, a in zip(traced.name_in(), arrays, strict=False)]
-        if "guess" in traced.name_in():
-            arrays.append(self.dependent_guess(arrays[0]))
-        results = call_on_batch(traced, arrays)
-        has_nan = any(np.isnan(r).any() for r in results) and not any(np.isnan(a).any() for a in arrays)
-        if self._has_loops and traced.name() != "loops" and has_nan:
-            raise ValueError(f"{traced.name()}: the loops of {self.robot.name} cannot be closed at this q")
+        batched = self._batched.get(function) or self.batched_function(function)
+        results, are_numbers = batched(*arguments)
+        if not are_numbers:
+            self._check_results(batched, arguments, results)
         return results
+
+    def batched_function(self, function: str | ca.Function) -> BatchedFunction:
+        """Return the kernel of a quantity, see `evaluate`."""
+        if function not in self._batched:
+            traced: ca.Function = self.casadi_function(function) if isinstance(function, str) else function
+            name = f"{self.robot.name} {self.transmission} {traced.name()}"
+            turns = [i for i, _ in self.robot.layout.turns]
+            self._batched[function] = BatchedFunction(
+                name, traced, turns, self._continuation, self.dtype, self.num_threads
+            )
+        return self._batched[function]
+
+    def _check_results(self, batched: BatchedFunction, arguments: Sequence[ArrayLike], results: list[NDArray]) -> None:
+        """Raise the error of a state that has no results, if the arguments are numbers."""
+        arrays = {x: np.asarray(a, dtype=float) for x, a in zip(batched.inputs, arguments, strict=True)}
+        if "q" in arrays:
+            self.dependent_guess(arrays["q"])
+        name = batched.function.name()
+        has_nan = any(np.isnan(r).any() for r in results) and not any(np.isnan(a).any() for a in arrays.values())
+        if self._has_loops and name != "loops" and has_nan:
+            raise ValueError(f"{name}: the loops of {self.robot.name} cannot be closed at this q")
 
     def forward_dynamics(
         self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: dict[str, ArrayLike] | None = None
@@ -269,7 +301,7 @@ class Model:
             v_span: Velocities, shape (..., nv_span).
 
         Raises:
-            ValueError: If the constraints are not met, to 1e-6, at these positions and velocities, or are met in
+            ValueError: If the constraints are not met, to 1e-6 or in single precision 1e-4, or are met in
                 another way than the robot's reference pose is assembled.
         """
         q_span, v_span = np.asarray(q_span, dtype=float), np.asarray(v_span, dtype=float)
@@ -279,7 +311,7 @@ class Model:
         expected, angles = self.spanning(q, v), [rows[0] for rows, _ in span.values() if len(rows) == 1]
         turned = np.exp(1j * (expected[0] - q_span)[..., angles]) - 1  # whole turns do not matter
         for name, error in (("q_span", turned), ("v_span", expected[1] - v_span)):
-            if error.size and np.abs(error).max() > 1e-6:
+            if error.size and np.abs(error).max() > (1e-6 if self.dtype == "float64" else 1e-4):
                 raise ValueError(f"{name} misses the constraints of {self.robot.name} by {np.abs(error).max():.2g}")
         return q, v
 
@@ -665,6 +697,12 @@ class Model:
         jacobians = self.derivatives("inverse_dynamics", inputs).jacobian(q, v, vdot)
         return jacobians["tau", "q"], jacobians["tau", "v"], jacobians["tau", "vdot"]
 
+    @cached_property
+    def _continuation(self) -> Continuation | None:
+        """What finds the dependent coordinates that no formula gives; None if there are none."""
+        has_guess = self.guess.size > 0
+        return Continuation(self.casadi_function("loops"), self.standing_q, self.guess) if has_guess else None
+
     def loop_gap(self, q: ArrayLike) -> Array:
         """Return the norm of the residuals of all loops, rods and functions, redundant rows included, shape (...).
 
@@ -697,13 +735,13 @@ class Model:
         if q.ndim == 0 or q.shape[-1] != self.nq:
             raise ValueError(f"q has shape {q.shape}; expected (..., {self.nq})")
         flat = self.unit(q).reshape(-1, self.nq)
-        if self.guess.size == 0 or len(flat) == 0:
+        if self._continuation is None or len(flat) == 0:
             return np.zeros((*q.shape[:-1], len(self.guess)))
-        guess, gap, nearness = follow(self.casadi_function("loops"), self.standing_q, self.guess, flat)
-        if not nearness > 0.0:
+        guess, gap = self._continuation.follow(flat)
+        if np.isnan(guess).any():
             raise ValueError(f"the loops of {self.robot.name} pass a singularity on the way to this q")
-        if not gap < 1e-9:
-            raise ValueError(f"the loops of {self.robot.name} do not close at this q: gap {gap:.2g}")
+        if not gap.max() < CLOSED["float64"]:
+            raise ValueError(f"the loops of {self.robot.name} do not close at this q: gap {gap.max():.2g}")
         return guess.reshape(*q.shape[:-1], len(self.guess))
 
     def unit(self, q: Array) -> Array:

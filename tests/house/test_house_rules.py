@@ -18,7 +18,7 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py") if "assets" not in path.pa
 MAY_IMPORT = {
     "model": set(),
     "compile": set(),
-    "dynamics": {"model"},
+    "dynamics": {"model", "compile"},  # `Model` runs kernels
     "export": {"model", "dynamics"},
     "sim": {"model", "dynamics", "compile"},
     "envs": {"model", "dynamics", "compile", "sim"},
