@@ -31,6 +31,9 @@ numpy.typing.NDArray = NDArray  # type: ignore[misc,assignment]
 numpy.typing.ArrayLike = type("ArrayLike", (), {"__module__": "numpy.typing"})  # type: ignore[misc,assignment]
 
 import ce_gym  # noqa: E402
+from ce_gym.dynamics import batched_function  # noqa: E402
+
+batched_function.LONG = 0  # interpret: pages evaluate each quantity of a robot once or twice
 
 project = "ce_gym"
 author = copyright = "The ce_gym authors"

@@ -19,8 +19,8 @@ OPTIMISED = (
 )
 """Folders and files of tests that run optimised kernels, as users do."""
 
-COMPILED = ("test_batched_functions",)
-"""Files of other tests that compile the quantities of `Model`."""
+COMPILED = "njit", "test_batched_functions"
+"""Folders and files of other tests that compile the quantities of `Model`."""
 
 
 @pytest.hookimpl(optionalhook=True)

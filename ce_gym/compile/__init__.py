@@ -6,7 +6,7 @@ Importing this package imports neither CasADi nor LLVM; `load_kernel` does so wh
 from ce_gym.compile.arrays import aligned_copy, aligned_zeros, lane_count, tile_count
 from ce_gym.compile.critical import CriticalSection
 from ce_gym.compile.kernel import Kernel
-from ce_gym.compile.loading import load_kernel
+from ce_gym.compile.loading import export_symbol, load_kernel
 from ce_gym.compile.program import Buffer, Call, Grid, Lookup, Program, Repeat, Step, While, calls_of, scratch_buffers
 from ce_gym.compile.sources import source_fingerprint
 
@@ -24,6 +24,7 @@ __all__ = [
     "aligned_copy",
     "aligned_zeros",
     "calls_of",
+    "export_symbol",
     "lane_count",
     "load_kernel",
     "scratch_buffers",

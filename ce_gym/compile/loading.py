@@ -56,6 +56,15 @@ def load_kernel(key: str, build: Callable[[], Program], dtype: str = "float64") 
         return _loaded[folder, name]
 
 
+def export_symbol(kernel: Kernel) -> str:
+    """Let code that numba compiles in this process call a kernel by name, and return the name."""
+    from ce_gym.compile.machine_code import add_symbol
+
+    name = f"ce_gym_{kernel.digest}"
+    add_symbol(name, kernel.code)
+    return name
+
+
 def kernel_name(key: str, dtype: str) -> str:
     """Return the name of a kernel in the cache, from the key, the dtype, the compiler and the CPU."""
     from ce_gym.compile.machine_code import host_cpu

@@ -83,6 +83,11 @@ def load_object(code: bytes) -> MachineCode:
     return run
 
 
+def add_symbol(name: str, code: MachineCode) -> None:
+    """Let other code that LLVM compiles in this process call a function of `load_object` by name."""
+    binding.add_symbol(name, ctypes.cast(code, ctypes.c_void_p).value)  # type: ignore[arg-type]
+
+
 def _loop_over_tiles(emit: Emit) -> ir.Module:
     module, word = ir.Module("kernel"), ir.IntType(64)
     module.triple = _triple()

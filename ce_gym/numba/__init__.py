@@ -1,0 +1,27 @@
+"""Dynamics and steps as functions for numba's `@njit` code.
+
+The functions run the kernels of `ce_gym.Model` and `ce_gym.Simulator` without Python, with the same bits.
+"""
+
+from ce_gym.numba.quantities import (
+    bias_force,
+    body_poses,
+    contact_points,
+    forward_dynamics,
+    inverse_dynamics,
+    mass_matrix,
+    quantity,
+)
+from ce_gym.numba.stepper import Robots, stepper
+
+__all__ = [
+    "Robots",
+    "bias_force",
+    "body_poses",
+    "contact_points",
+    "forward_dynamics",
+    "inverse_dynamics",
+    "mass_matrix",
+    "quantity",
+    "stepper",
+]
