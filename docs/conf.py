@@ -62,7 +62,9 @@ default_role = "literal"
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_mock_imports = [
-    name for name in ("stable_baselines3", "torch", "jax", "rsl_rl", "tensordict", "meshcat") if find_spec(name) is None
+    name
+    for name in ("stable_baselines3", "torch", "jax", "rsl_rl", "tensordict", "meshcat", "numba")
+    if find_spec(name) is None
 ]
 autodoc_default_options = {"members": True}
 napoleon_use_ivar = True
