@@ -26,11 +26,11 @@ from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
 from ce_gym.console import EPISODES, SEED, Parser
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.learn.evaluation.evaluation import evaluate, report
-from ce_gym.learn.export import to_onnx, write
 from ce_gym.learn.runs.folder import make_folder
 from ce_gym.learn.runs.job import Job, acting_environment, basic_record
 from ce_gym.learn.runs.settings import Settings, config_file, load_env_args, load_settings, with_named
 from ce_gym.policies import Actor, add_env_arg, keep_map, load_policy
+from ce_gym.policies.onnx_writer import to_onnx, write_onnx
 
 DIVERGENCE = 0.01
 """KL divergence that is usual with rsl_rl, for settings with `target_kl` 0; rsl_rl has no linear decay of the rate."""
@@ -121,7 +121,7 @@ def _work(args: argparse.Namespace) -> int:
     runner = train(envs, settings, args.seed, out)
     acting = acting_environment(Job("rsl_rl", args.env, settings, out, kwargs), envs.envs.unwrapped)
     record = basic_record(acting, args.env, kwargs, settings)
-    write(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
+    write_onnx(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
     policy = load_policy(out / "policy.onnx")
     print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))
     print(out / "policy.onnx")

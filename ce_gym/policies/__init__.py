@@ -5,9 +5,11 @@ from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.arguments import add_env_arg, add_env_arguments, checked_arguments, parse_yaml
 from ce_gym.policies.environments import environment_of
 from ce_gym.policies.errors import LevelWarning, PolicyError
-from ce_gym.policies.files import RECORD_KEY, load_policy, read_actor, write_npz
+from ce_gym.policies.files import load_policy, read_actor, write_npz
 from ce_gym.policies.height_maps import keep_map, with_map
 from ce_gym.policies.places import WHERE, find_policy, locate_policy, shelf, shipped_policies
+from ce_gym.policies.records import RECORD_KEY, environment_record
+from ce_gym.policies.saving import save
 from ce_gym.policies.weights import read_weights
 
 __all__ = [
@@ -22,6 +24,7 @@ __all__ = [
     "add_env_arguments",
     "checked_arguments",
     "environment_of",
+    "environment_record",
     "find_policy",
     "keep_map",
     "listed_names",
@@ -30,6 +33,7 @@ __all__ = [
     "parse_yaml",
     "read_actor",
     "read_weights",
+    "save",
     "shelf",
     "shipped_policies",
     "with_map",

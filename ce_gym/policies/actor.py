@@ -31,15 +31,21 @@ class Actor:
     Attributes:
         layers: Weight (n_out, n_in) and bias (n_out,) of each linear layer.
         activation: One of `ACTIVATIONS`, applied between layers.
+        normalisation: Mean, standard deviation and bound of each observation, shape (3, n_obs), or None. The first
+            layer takes `clip((observation - mean) / std, -bound, bound)`.
     """
 
     layers: tuple[tuple[Array, Array], ...]
     activation: str
+    normalisation: NDArray[np.float64] | None = None
 
     def __call__(self, observations: NDArray) -> Array:
         """Return actions in [-1, 1], shape (n, n_actions), for observations (n, n_obs); `n` may be missing."""
         activate = ACTIVATIONS[self.activation]
         x = np.asarray(observations, np.float32)
+        if self.normalisation is not None:
+            mean, std, bound = self.normalisation
+            x = np.clip((x - mean) / std, -bound, bound).astype(np.float32)
         for i, (weight, bias) in enumerate(self.layers):
             x = (activate(x) if i else x) @ weight.T + bias
         return np.clip(x, -1.0, 1.0).astype(np.float32, copy=False)

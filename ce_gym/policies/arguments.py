@@ -81,7 +81,7 @@ def _is_plain(value: Any, depth: int = 0) -> bool:
     """Return whether a value consists of finite numbers, text, booleans, None, lists and mappings."""
     if depth > DEEPEST:
         return False
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return all(_is_plain(item, depth + 1) for item in value)
     if isinstance(value, dict):
         return all(isinstance(key, str) and _is_plain(item, depth + 1) for key, item in value.items())

@@ -38,12 +38,11 @@ MAY_IMPORT = {
 LEARN_MAY_IMPORT = {
     "networks": set(),
     "runs": set(),
-    "export": set(),
     "learners": {"networks", "runs"},
     "training": {"runs"},  # and learners by name
     "study": {"runs", "training"},
     "evaluation": {"runs", "training"},
-    "commands": {"runs", "training", "study", "evaluation", "export"},
+    "commands": {"runs", "training", "study", "evaluation"},
 }
 """The same within `ce_gym/learn`."""
 MAY_IMPORT_THE_PACKAGE = ("viewer", "bench", "adapters")

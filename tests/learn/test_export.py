@@ -1,4 +1,4 @@
-"""Policies as files: ONNX acts as the learner does, and a specification describes its observation."""
+"""Policies as files: commands take saved policies, and a specification describes their observations."""
 
 import json
 from pathlib import Path
@@ -7,68 +7,58 @@ import gymnasium
 import numpy as np
 import pytest
 from point_mass import ID
-from saved import load_learner
-from toy import job
 
 import ce_gym
-from ce_gym.learn.evaluation.evaluation import evaluate
-from ce_gym.learn.evaluation.evaluation import main as evaluate_main
-from ce_gym.learn.learners.sb3 import train
-from ce_gym.policies import ACTIVATIONS, load_policy
+from ce_gym.__main__ import main
+from ce_gym.policies import ACTIVATIONS, load_policy, save
 
+torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-from ce_gym.learn.export import main  # noqa: E402
+sb3 = pytest.importorskip("stable_baselines3")
+from ce_gym.adapters.sb3 import make_sb3_vec_env  # noqa: E402
+from ce_gym.learn.evaluation.evaluation import evaluate  # noqa: E402
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
-SMALL = ["num_envs=16", "rollout=8", "minibatches=2", "epochs=1", "hidden=[32, 16]"]
 
 
-def trained_policy(out: Path, *settings: str, env=ID, **env_kwargs) -> Path:
-    return train(job(out, 300, env, [*SMALL, *settings], env_kwargs=env_kwargs)).policy
+def network(n_obs: int, n_actions: int, activation: str = "ELU", *last):
+    torch.manual_seed(0)
+    layers = torch.nn.Linear(n_obs, 32), getattr(torch.nn, activation)(), torch.nn.Linear(32, n_actions)
+    return torch.nn.Sequential(*layers, *last)
 
 
-@pytest.fixture(scope="module")
-def policy(tmp_path_factory):
-    """A robot's policy, hardly trained, and its ONNX file."""
-    path = trained_policy(tmp_path_factory.mktemp("robot"), "initial_std=2.0", env=ROBOT_ENV)
-    assert main([str(path), str(path.parent / "out.onnx")]) == 0
-    return path
+def saved(file: Path, env=ID, **options) -> Path:
+    """Save a random policy."""
+    envs = gymnasium.make_vec(env, 1, vectorization_mode="vector_entry_point", **options)
+    sizes = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    return save(network(*sizes), envs, file)
+
+
+def command(*arguments) -> int:
+    return main([str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_onnx_acts_as_the_learner(activation, tmp_path):
-    rate = 0.03 if activation == "Softplus" else 0.1  # fast enough that some are clipped, not so that all are
-    path = trained_policy(tmp_path, f"activation={activation}", f"learning_rate={rate}", "target_kl=0")
-    assert main([str(path), str(tmp_path / "out.onnx")]) == 0
+def test_onnx_acts_as_the_network(activation, tmp_path):
+    module = network(2, 1, activation)
+    module[0].weight.data *= 5
+    module[2].weight.data *= 5
+    policy = save(module, make_sb3_vec_env(ID, 1), tmp_path / "walk.npz")
+    assert command("export", policy, "--out", tmp_path / "out.onnx") == 0
     obs = 3 * np.random.default_rng(0).standard_normal((500, 2)).astype(np.float32)
-    expected, _ = load_learner(path)[0].predict(obs, deterministic=True)
-    assert np.abs(expected).max() == 1.0 or activation in ("Sigmoid", "Softplus")  # some are clipped
-    assert np.ptp(expected) > 0.05
-    for file in (path, tmp_path / "out.onnx"):
-        actions, _ = load_policy(file).predict(obs)
-        np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-5)
+    with torch.no_grad():
+        expected = module(torch.from_numpy(obs)).clamp(-1, 1).numpy()
+    assert np.abs(expected).max() == 1.0  # some are clipped
+    assert np.abs(expected).min() < 0.5
+    for file in (policy, tmp_path / "out.onnx"):
+        np.testing.assert_allclose(load_policy(file).predict(obs)[0], expected, rtol=0, atol=1e-5)
 
 
-def test_onnx_of_a_robot_acts_as_the_learner(policy):
-    size = load_policy(policy).record["observation_size"]
-    obs = np.random.default_rng(1).standard_normal((64, size)).astype(np.float32)
-    expected, _ = load_learner(policy)[0].predict(obs, deterministic=True)
-    np.testing.assert_allclose(load_policy(policy.parent / "out.onnx").predict(obs)[0], expected, rtol=0, atol=1e-5)
-
-
-def test_an_asymmetric_policy_needs_no_critic_to_act(tmp_path):
-    path = trained_policy(tmp_path, obs_mode="dict")
-    assert main([str(path), str(tmp_path / "out.onnx")]) == 0
-    rng = np.random.default_rng(2)
-    obs = {key: rng.standard_normal((9, size)).astype(np.float32) for key, size in (("policy", 2), ("critic", 3))}
-    expected, _ = load_learner(path)[0].predict(obs, deterministic=True)
-    np.testing.assert_allclose(load_policy(tmp_path / "out.onnx").predict(obs["policy"])[0], expected, atol=1e-5)
-
-
-def test_the_specification_lies_in_the_file_and_beside_it(policy):
-    beside = json.loads((policy.parent / "out.json").read_text())
-    entries = {entry.key: entry.value for entry in onnx.load(policy.parent / "out.onnx").metadata_props}
+def test_the_specification_lies_in_the_file_and_beside_it(tmp_path):
+    assert command("export", saved(tmp_path / "walk.npz", ROBOT_ENV), "--out", tmp_path / "out.onnx") == 0
+    beside = json.loads((tmp_path / "out.json").read_text())
+    entries = {entry.key: entry.value for entry in onnx.load(tmp_path / "out.onnx").metadata_props}
     assert beside == gymnasium.make_vec(ROBOT_ENV, 1).unwrapped.policy_spec()
     assert json.loads(entries["joints"]) == beside["joints"]
     assert json.loads(entries["observation"]) == beside["observation"]
@@ -112,32 +102,50 @@ def test_an_episode_that_ends_is_seen_to_end():
     assert envs.look(state)[1].tolist() == [False, True]
 
 
-def test_an_onnx_file_is_judged_as_the_policy(tmp_path, capsys):
-    path = trained_policy(tmp_path)
-    assert main([str(path)]) == 0
-    capsys.readouterr()
-    assert evaluate_main([str(tmp_path / "exported.onnx"), "--episodes", "8", "--json"]) == 0
-    judged = json.loads(capsys.readouterr().out)
-    assert judged["reward"] == pytest.approx(evaluate(load_learner(path)[0], ID, episodes=8)["reward"], rel=1e-4)
+def test_a_saved_policy_has_the_results_of_the_original(tmp_path, capsys):
+    envs = make_sb3_vec_env(ID, 4)
+    learner = sb3.PPO("MlpPolicy", envs, device="cpu", seed=0)
+    learner.policy.action_net.weight.data *= 30
+    learner.policy.action_net.bias.data += 0.3
+    learner.save(tmp_path / "walk.zip")
+    expected = evaluate(learner, ID, episodes=64, seed=5)
+    assert expected["falls"] > 0.1
+    files = [save(learner, envs, tmp_path / name) for name in ("a.npz", "a.onnx")]
+    assert command("export", files[0], "--out", tmp_path / "b.onnx") == 0
+    named = ["--env", ID, "--env-arg", "horizon=50"]
+    for arguments in ([files[0]], [files[1]], [tmp_path / "b.onnx"], [tmp_path / "walk.zip", *named]):
+        capsys.readouterr()
+        assert command("evaluate", *arguments, "--episodes", "64", "--seed", "5", "--json") == 0
+        result = json.loads(capsys.readouterr().out)
+        for key in ("falls", "velocity_error", "episode_length", "reward"):
+            assert result[key] == pytest.approx(expected[key], rel=1e-4)
+
+
+def test_an_onnx_file_is_exported_as_it_is(tmp_path):
+    policy = save(network(2, 1, "SiLU", torch.nn.Tanh()), make_sb3_vec_env(ID, 1), tmp_path / "walk.onnx")
+    assert command("export", policy) == 0
+    assert (tmp_path / "exported.onnx").read_bytes() == policy.read_bytes()
+    assert json.loads((tmp_path / "exported.json").read_text()) == load_policy(policy).record["policy_spec"]
 
 
 def test_mistakes_are_one_line(tmp_path, capsys):
-    path = trained_policy(tmp_path)
+    path = saved(tmp_path / "policy.npz")
     (tmp_path / "not.onnx").write_bytes(b"not onnx")
-    record = path.with_suffix(".json")
+    sb3.PPO("MlpPolicy", make_sb3_vec_env(ID, 1), device="cpu").save(tmp_path / "walk.zip")
     capsys.readouterr()
     cases = [
-        (main, [str(tmp_path / "missing.zip")], "missing.zip: no such policy"),
-        (main, [str(path), str(path.with_suffix(".onnx"))], "not the policy's own"),
-        (main, [str(path), str(tmp_path / "nowhere" / "out.onnx")], "cannot be written"),
-        (evaluate_main, [str(tmp_path / "not.onnx")], "not.onnx"),
-        (evaluate_main, [str(tmp_path / "no.onnx")], "no.onnx: no such policy"),
+        (["export", tmp_path / "missing.zip"], "missing.zip: no such policy"),
+        (["export", path, "--out", path.with_suffix(".onnx")], "not the policy's own"),
+        (["export", path, "--out", tmp_path / "nowhere" / "out.onnx"], "cannot be written"),
+        (["export", tmp_path / "not.onnx"], "not.onnx: not an ONNX file"),
+        (["export", tmp_path / "walk.zip"], "walk.json: no such file: an archive of Stable-Baselines3"),
+        (["evaluate", tmp_path / "walk.zip"], "walk.json: no such file: an archive of Stable-Baselines3"),
+        (["evaluate", tmp_path / "walk.zip", "--env", ROBOT_ENV], "a layer takes 2 numbers; expected 48"),
+        (["evaluate", tmp_path / "not.onnx"], "not.onnx"),
+        (["evaluate", tmp_path / "no.onnx"], "no.onnx: no such policy"),
     ]
-    for function, arguments, words in cases:
-        assert function(arguments) == 2
+    for arguments, words in cases:
+        assert command(*arguments) == 2
         error = capsys.readouterr().err.strip()
         assert words in error
         assert "\n" not in error
-    record.write_text(json.dumps({k: v for k, v in json.loads(record.read_text()).items() if k != "policy_spec"}))
-    assert main([str(path)]) == 2
-    assert "policy_spec: missing" in capsys.readouterr().err

@@ -1,6 +1,7 @@
-"""Makes the policy that stands importable by name."""
+"""Makes the policy that stands, and the toy environment, importable by name."""
 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
+TESTS = Path(__file__).parents[1]
+sys.path[:0] = [str(TESTS / "policies"), str(TESTS / "adapters")]

@@ -172,7 +172,7 @@ def test_a_damaged_zip_is_one_line(tmp_path: Path, damage: str) -> None:
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("{", "cannot be read as JSON"), ("[]", "env: missing"), (None, r"no such file; expected .*train/ppo\.py")],
+    [("{", "cannot be read as JSON"), ("[]", "env: missing"), (None, r"no such file: .*ce_gym\.policies\.save")],
 )
 def test_a_damaged_record_is_one_line(tmp_path: Path, text: str | None, words: str) -> None:
     file = write_zip(tmp_path)

@@ -154,6 +154,21 @@ def test_play_shows_many_robots(stander: Path) -> None:
     assert ">and 5 more</label>" in text
 
 
+def test_play_takes_an_archive_of_stable_baselines3(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    from ce_gym.adapters.sb3 import make_sb3_vec_env
+
+    monkeypatch.chdir(tmp_path)
+    env = "ce_gym/MiniCheetahVelocity-v0"
+    sb3.PPO("MlpPolicy", make_sb3_vec_env(env, 1), device="cpu").save("walk.zip")
+    assert main(["play", "walk.zip"]) == 2
+    assert "no record of its environment; name the environment with --env ID" in capsys.readouterr().err
+    assert main(["play", "walk.zip", "--env", env, "--command", "0.1", "0", "0", "0"]) == 0
+    assert list(tmp_path.glob("*.html"))
+
+
 def test_environments_of_other_modules_are_inspected_and_play(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ce_gym.console import add_command
 from ce_gym.learn.commands.errors import in_one_line
-from ce_gym.policies import WHERE, PolicyError, locate_policy, read_actor, shelf
+from ce_gym.policies import WHERE, PolicyError, locate_policy, shelf
 
 
 def add_export_command(subparsers: Any) -> None:
@@ -30,14 +30,13 @@ def add_export_command(subparsers: Any) -> None:
 @in_one_line
 def export(args: argparse.Namespace) -> int:
     """Write the two files."""
-    from ce_gym.learn.export import to_onnx, write
+    from ce_gym.policies.onnx_writer import export_policy
 
     policy = locate_policy(args.policy)
     shipped = policy.is_relative_to(shelf())
     out = args.out or (Path(f"{args.policy}.onnx") if shipped else policy.with_name("exported.onnx"))
     if out.suffix != ".onnx" or out.with_suffix(".json") == policy.with_suffix(".json"):
         raise PolicyError(f"{out}: expected a name that ends in .onnx and is not the policy's own")
-    actor, record = read_actor(policy)
-    write(to_onnx(actor, record), record, out)
+    export_policy(policy, out)
     print(f"{out}\n{out.with_suffix('.json')}")
     return 0

@@ -33,7 +33,7 @@ def load(
         PolicyError: If the policy cannot be used, or its environment needs `--env`: see
             `ce_gym.policies.environment_of`.
     """
-    policy = load_policy(path, transmission)
+    policy = load_policy(path, transmission, env, dict(env_args))
     level = {"transmission": transmission} if transmission else {}
     kwargs = {**policy.record["env_kwargs"], **dict(env_args), **level}
     return replace(policy, record=policy.record | {"env": environment_of(policy.record, env), "env_kwargs": kwargs})

@@ -16,6 +16,7 @@ from typing import Any
 import gymnasium
 
 from ce_gym.learn.runs.settings import SettingsError
+from ce_gym.policies import environment_record
 
 
 @dataclass(frozen=True)
@@ -91,18 +92,8 @@ def acting_environment(job: Job, native: Any) -> Any:
 
 def basic_record(native: Any, env_id: str, env_kwargs: dict[str, Any], settings: Any) -> dict[str, Any]:
     """Return the part of a policy's record that all learners write; `native` is the environment of evaluations."""
-    space, action = native.single_observation_space, native.single_action_space.shape
-    observation = space["policy"].shape if isinstance(space, gymnasium.spaces.Dict) else space.shape
-    return {
-        "env": env_id,
-        "transmission": native.model.transmission,
-        "env_kwargs": env_kwargs,
-        "observation_size": observation[0] if observation else 0,
-        "action_size": action[0] if action else 0,
-        "activation": settings.activation,
-        "policy_spec": native.policy_spec(),
-        "settings": asdict(settings),
-    }
+    network = {"activation": settings.activation, "settings": asdict(settings)}
+    return environment_record(native, env_id, env_kwargs) | network
 
 
 def make_record(job: Job, native: Any, steps: int, packages: Iterable[str]) -> dict[str, Any]:

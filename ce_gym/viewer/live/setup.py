@@ -72,7 +72,7 @@ class Setup:
     def _policy(self) -> tuple[Act | None, str, dict[str, Any]]:
         if not self.policy:
             return None, self.env_id, dict(self.kwargs)
-        policy = load_policy(self.policy)
+        policy = load_policy(self.policy, env=self.env_id, env_kwargs=self.kwargs)
         env_id = environment_of(policy.record, self.env_id or None)
         kwargs = {**policy.record["env_kwargs"], **self.kwargs}
         return (lambda observation: policy.predict(observation)[0]), env_id, kwargs

@@ -94,7 +94,8 @@ def walk(file: Path, script: Script = SHOW, *, env: str | None = None, **options
         PolicyError: The file is not a policy, or its environment is not registered.
         ViewerError: The environment cannot be made, or is not of ce_gym.
     """
-    policy = load_policy(file)
+    arguments = {name: value for name, value in options.items() if name not in ("robots", "seed", "label")}
+    policy = load_policy(file, env=env, env_kwargs=arguments)
     record = policy.record
     env_id = environment_of(record, env)
     kwargs: Mapping[str, Any] = {"robots": 1, "label": file.resolve().parent.name, **record["env_kwargs"], **options}
