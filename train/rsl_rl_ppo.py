@@ -1,12 +1,12 @@
-"""Train a policy with rsl_rl's PPO: any registered environment, with the settings files of train/ppo.py.
+"""Train a policy with rsl_rl's PPO: any registered environment, with the settings files of `python -m ce_gym train`.
 
-Writes rsl_rl's checkpoints and TensorBoard logs to the output folder, and the policy as `policy.onnx` with its
-specification. evaluate.py, transfer.py, sim2sim.py and `python -m ce_gym play` read this file. Needs the extra
-`rsl-rl`. Uses public names of ce_gym only, and no name of a robot or task.
+The output folder has rsl_rl's checkpoints and TensorBoard logs, and the policy as `policy.npz`, which `python -m ce_gym
+evaluate`, `transfer`, `sim2sim`, `export` and `play` read. Needs the extra `rsl-rl`.
 
-    python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --steps 6e6
-    python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --critic contact_forces base_height
-    python train/rsl_rl_ppo.py --env ce_gym/MiniCheetahVelocity-v0 --device cuda --set num_envs=4096
+    python train/rsl_rl_ppo.py ce_gym/MiniCheetahVelocity-v0 --steps 6e6
+    python train/rsl_rl_ppo.py ce_gym/MiniCheetahVelocity-v0 --critic contact_forces base_height
+    python train/rsl_rl_ppo.py ce_gym/MiniCheetahVelocity-v0 --device cuda --set num_envs=4096
+    python train/rsl_rl_ppo.py --resume runs/mini_cheetah_velocity-rsl_rl --steps 12e6
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 # isort: split
 
 import argparse
+import contextlib
 import math
 from pathlib import Path
 from typing import Any
@@ -22,15 +23,16 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from ce_gym.__main__ import run
-from ce_gym.adapters.rsl_rl import RslRlVecEnv, make_rsl_rl_vec_env
+from ce_gym.adapters.rsl_rl import make_rsl_rl_vec_env
 from ce_gym.console import EPISODES, SEED, Parser
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.learn.evaluation.evaluation import evaluate, report
 from ce_gym.learn.runs.folder import make_folder
-from ce_gym.learn.runs.job import Job, acting_environment, basic_record
-from ce_gym.learn.runs.settings import Settings, config_file, load_env_args, load_settings, with_named
-from ce_gym.policies import Actor, add_env_arg, keep_map, load_policy
-from ce_gym.policies.onnx_writer import to_onnx, write_onnx
+from ce_gym.learn.runs.job import Job, Trained, acting_environment, make_record
+from ce_gym.learn.runs.progress import StopInOrder
+from ce_gym.learn.runs.settings import Settings, config_file
+from ce_gym.learn.training import make_job
+from ce_gym.policies import Actor, Policy, PolicyError, add_env_arg, keep_map, locate_policy, write_npz
 
 DIVERGENCE = 0.01
 """KL divergence that is usual with rsl_rl, for settings with `target_kl` 0; rsl_rl has no linear decay of the rate."""
@@ -44,11 +46,10 @@ def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str
     """
     network = {"class_name": "MLPModel", "hidden_dims": list(s.hidden), "activation": s.activation.lower()}
     spread = {"class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log"}
-    iterations = math.ceil(s.steps / (s.num_envs * s.rollout))
     return {
         "seed": seed,
         "num_steps_per_env": s.rollout,
-        "save_interval": max(iterations // 10, 1),
+        "save_interval": max(iterations(s) // 10, 1),
         "obs_groups": {"actor": ["policy"], "critic": ["critic" if "critic" in groups else "policy"]},
         "actor": network | {"distribution_cfg": spread},
         "critic": dict(network),
@@ -69,14 +70,68 @@ def runner_settings(s: Settings, groups: tuple[str, ...], seed: int) -> dict[str
     }
 
 
-def train(envs: RslRlVecEnv, settings: Settings, seed: int, out: Path | None = None) -> OnPolicyRunner:
-    """Train for the steps of the settings, and return the runner; log and save in `out` if it is given."""
-    torch.manual_seed(seed)
-    chosen = runner_settings(settings, tuple(map(str, envs.get_observations().keys())), seed)
-    runner = OnPolicyRunner(envs, chosen, str(out) if out else None, device=str(envs.device))
-    iterations = math.ceil(settings.steps / (settings.num_envs * settings.rollout))
-    runner.learn(iterations, init_at_random_ep_len=True)
-    return runner
+def iterations(s: Settings) -> int:
+    """Return the number of rollouts of a training."""
+    return math.ceil(s.steps / (s.num_envs * s.rollout))
+
+
+def restore(runner: OnPolicyRunner, folder: Path) -> None:
+    """Continue from the last checkpoint in a folder: networks, optimiser, learning rate and number of iterations.
+
+    Raises:
+        PolicyError: If there is no checkpoint, or it has other networks. No code in it is run.
+    """
+    checkpoints = sorted(folder.glob("model_*.pt"), key=lambda file: int(file.stem.removeprefix("model_")))
+    if not checkpoints:
+        raise PolicyError(f"{folder}: has no model_*.pt; expected the folder of a run of train/rsl_rl_ppo.py")
+    try:
+        state = torch.load(checkpoints[-1], map_location=runner.device, weights_only=True)
+        runner.alg.load(state, None, strict=True)
+        runner.current_learning_iteration = state["iter"] + 1
+    except Exception as error:  # damaged files raise errors of many classes
+        text = " ".join(str(error).split())[:200]
+        raise PolicyError(f"{checkpoints[-1]}: training cannot continue: {text}") from None
+
+
+def train(job: Job, device: str = "cpu") -> Trained:
+    """Train, and save the policy even if Ctrl-C or SIGTERM ends training early; the iteration is finished first.
+
+    Raises:
+        PolicyError: If the run to resume does not fit the environment or the settings.
+    """
+    s, file = job.settings, job.out / "policy.npz"
+    make_folder(job.out)
+    keep_map(job.env_kwargs, job.out)
+    torch.manual_seed(job.seed)
+    envs = make_rsl_rl_vec_env(job.env_id, s.num_envs, job.seed, device, **{**job.env_kwargs, **s.training})
+    groups = tuple(map(str, envs.get_observations().keys()))
+    runner = OnPolicyRunner(envs, runner_settings(s, groups, job.seed), str(job.out), device=device)
+    if job.resume:
+        restore(runner, job.resume.parent)
+    native, log = acting_environment(job, envs.envs.unwrapped), runner.logger.log
+
+    def save(done: int, finished: bool) -> Trained:
+        record = make_record(job, native, done * s.num_envs * s.rollout, ("rsl-rl-lib", "torch"))
+        policy = Policy(actor_of(runner, s.activation), record | {"finished": finished})
+        write_npz(policy.act, policy.record, file)  # type: ignore[arg-type]
+        return Trained(policy, policy.record, file, not finished)
+
+    def log_and_stop(**figures: Any) -> None:
+        log(**figures)  # the last call of an iteration
+        if stop.due:
+            raise KeyboardInterrupt
+
+    done = runner.current_learning_iteration
+    trained = save(done, done >= iterations(s))  # with the settings, which a killed run needs to continue
+    if done < iterations(s):
+        runner.logger.log = log_and_stop  # type: ignore[method-assign]
+        with StopInOrder() as stop, contextlib.suppress(KeyboardInterrupt):
+            runner.learn(iterations(s) - done, init_at_random_ep_len=True)
+        done = runner.current_learning_iteration + 1
+        runner.save(str(job.out / f"model_{done - 1}.pt"))
+        trained = save(done, not stop.interrupted)
+    envs.close()
+    return trained
 
 
 def actor_of(runner: OnPolicyRunner, activation: str) -> Actor:
@@ -89,13 +144,14 @@ def actor_of(runner: OnPolicyRunner, activation: str) -> Actor:
 def main(argv: list[str] | None = None) -> int:
     """Command line of this file."""
     parser = Parser(description="Train a policy with rsl_rl's PPO.")
-    parser.add_argument("--env", required=True, metavar="ID", help="environment id, such as ce_gym/MiniCheetahStand-v0")
+    parser.add_argument("env", nargs="?", default="", metavar="ENV", help="id, such as ce_gym/MiniCheetahStand-v0")
     parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic")
     parser.add_argument("--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees")
     add_env_arg(parser)
+    parser.add_argument("--resume", type=Path, metavar="FOLDER", help="run to continue; --steps includes its steps")
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
-    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda for networks and physics on a GPU (default cpu)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rsl_rl")
     parser.add_argument(
@@ -107,24 +163,25 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Train, write and evaluate the policy, and print its path."""
-    path = config_file(args.env)
     kwargs: dict[str, Any] = {"dtype": "float32"} if args.device.startswith("cuda") else {}
-    kwargs |= load_env_args(path) | ({"transmission": args.transmission} if args.transmission else {})
-    kwargs |= ({"obs_mode": "dict", "critic": args.critic} if args.critic else {}) | dict(args.env_args)
-    settings = load_settings(path, [*args.set, *([f"steps={args.steps}"] if args.steps else [])])
-    settings = with_named(settings, dict(args.env_args))
-    out = args.out or Path("runs") / f"{path.stem}-rsl_rl"
-    make_folder(out)
-    keep_map(kwargs, out)
-    training = {**kwargs, **settings.training}
-    envs = make_rsl_rl_vec_env(args.env, settings.num_envs, args.seed, args.device, **training)
-    runner = train(envs, settings, args.seed, out)
-    acting = acting_environment(Job("rsl_rl", args.env, settings, out, kwargs), envs.envs.unwrapped)
-    record = basic_record(acting, args.env, kwargs, settings)
-    write_onnx(to_onnx(actor_of(runner, settings.activation), record), record, out / "policy.onnx")
-    policy = load_policy(out / "policy.onnx")
-    print(report(evaluate(policy, args.env, episodes=args.episodes, **kwargs)))
-    print(out / "policy.onnx")
+    kwargs |= {"transmission": args.transmission} if args.transmission else {}
+    kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
+    folder = locate_policy(args.resume).parent if args.resume else Path("runs") / f"{config_file(args.env).stem}-rsl_rl"
+    job = make_job(
+        args.env,
+        "ppo",
+        out=args.out or folder,
+        seed=args.seed,
+        settings=[*args.set, *([f"steps={args.steps}"] if args.steps else [])],
+        env_kwargs=kwargs | dict(args.env_args),
+        resume=args.resume,
+    ).replace(algo="rsl_rl")
+    trained = train(job, args.device)
+    if trained.interrupted:
+        print(f"interrupted; continue with: python train/rsl_rl_ppo.py --resume {job.out}")
+        return 130
+    print(report(evaluate(trained.model, job.env_id, episodes=args.episodes, **job.env_kwargs)))
+    print(trained.policy)
     return 0
 
 
