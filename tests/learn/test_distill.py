@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 import torch
 from test_networks import close, make_network, run
-from toy import parameters
+from toy import jobs, parameters
 
-import ce_gym
+import ce_gym.__main__
 from ce_gym.learn.evaluation.card import command, portable
 from ce_gym.learn.evaluation.evaluation import evaluate
 from ce_gym.learn.learners import distill
-from ce_gym.learn.learners.distill import Distiller, Settings, main, teacher_columns, train
-from ce_gym.learn.networks.perceptron import KINDS, make_work
-from ce_gym.learn.networks.regression import squared_error_gradient
-from ce_gym.learn.runs.job import Job, jobs, parser
+from ce_gym.learn.learners.distill import Distiller, Settings, teacher_columns, train
+from ce_gym.learn.networks.perceptron import KINDS, make_work, squared_error_gradient
+from ce_gym.learn.runs.job import Job
 from ce_gym.learn.runs.settings import SettingsError, config_file, load_env_args, load_settings
 from ce_gym.policies import PolicyError, load_policy
 
@@ -34,7 +33,7 @@ F = np.float32
 def job(out, steps=4 * 512, settings=(), **changes):
     path = config_file(ROBOT, Settings.folder)
     chosen = load_settings(path, [*SMALL, f"steps={steps}", *settings], Settings)
-    return Job(ROBOT, chosen, out, **({"env_kwargs": load_env_args(path)} | changes))
+    return Job("distill", ROBOT, chosen, out, **({"env_kwargs": load_env_args(path)} | changes))
 
 
 def environments(task):
@@ -45,15 +44,16 @@ def environments(task):
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_gradient_is_that_of_torch(kind):
     rng, sizes = np.random.default_rng(0), np.array([7, 20, 16, 3])
-    theta, layers = make_network(rng, sizes)
+    network, layers = make_network(rng, sizes, kind)
     seen, labels = (rng.standard_normal((401, n)).astype(F) for n in (7, 3))
-    rows, gradient = rng.permutation(401)[:301], np.zeros_like(theta)
-    samples = (theta, sizes, KINDS.index(kind), seen, labels, rows, gradient, make_work(sizes))
-    found = squared_error_gradient(*samples)
+    rows, gradient = rng.permutation(401)[:301], np.zeros_like(network.theta)
+    weight = F(1 / (301 * 3))
+    samples = (network, seen, labels, rows, weight, gradient, make_work(sizes))
+    found = weight * squared_error_gradient(*samples)
     loss = ((run(layers, kind, torch.tensor(seen[rows])) - torch.tensor(labels[rows])) ** 2).mean()
     loss.backward()
     assert found == pytest.approx(loss.item(), rel=1e-5)
-    close(layers, gradient, sizes)
+    close(layers, gradient, network)
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_blocks_of_the_critic_are_named_in_order():
 
 def test_the_student_acts_and_the_teacher_labels(tmp_path):
     """Samples are the student's own states, and the teacher's action in each."""
-    task = job(tmp_path)
+    task = job(tmp_path, settings=["initial_std=0.05"])
     learner = Distiller(environments(task), task)
     learner.theta[:] = 0  # its mean action is 0
     given, step = [], learner.envs.step
@@ -105,8 +105,8 @@ def test_the_student_acts_and_the_teacher_labels(tmp_path):
         return step(actions)
 
     learner.envs.step = watched
-    before = learner.observed["critic"].copy()
-    learner.collect(F(0.05))
+    before = learner.observed[1].copy()
+    learner.collect(0.0)
     assert np.std(given) == pytest.approx(0.05, rel=0.05)
     expected = learner.teacher.predict(before[:, learner.columns])[0]
     np.testing.assert_array_equal(learner.labels[0], expected)
@@ -128,8 +128,8 @@ def test_the_command_on_its_card_repeats_it(tmp_path):
     record = load_policy(train(job(tmp_path)).policy).record
     assert record["learner"] == "distill"
     words = shlex.split(command(record))
-    assert words[:2] == ["python", "train/distill.py"]
-    (again,) = jobs(parser().parse_args(words[2:]), "-distill", Settings)
+    assert words[:6] == ["python", "-m", "ce_gym", "train", ROBOT, "--algo"]
+    (again,) = jobs(*words[4:])
     assert json.loads(json.dumps(asdict(again.settings))) == record["settings"]
     assert again.env_kwargs == record["env_kwargs"]
     elsewhere = portable(record | {"settings": {**record["settings"], "teacher": "/home/me/runs/walk/policy.npz"}})
@@ -207,11 +207,11 @@ def test_observations_of_the_student_alone_are_one_line(tmp_path):
 
 
 def test_wrong_settings_are_one_line(capsys, tmp_path):
-    with pytest.raises(SettingsError, match=r"teacher: 3; expected a name or a path"):
+    with pytest.raises(SettingsError, match=r"teacher=3; expected a name or a path"):
         load_settings(FILES[0], ["teacher=3"], Settings)
-    assert main(["--env", ROBOT, "--set", "teacher=nobody", "--out", str(tmp_path)]) == 2
+    words = ["train", ROBOT, "--algo", "distill", "--set", "teacher=nobody", "--out", str(tmp_path)]
+    assert ce_gym.__main__.main(words) == 2
     error = capsys.readouterr().err.strip()
-    assert error.startswith("distill.py: ")
     assert "nobody" in error
     assert "\n" not in error
 

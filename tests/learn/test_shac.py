@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from test_networks import close, make_network, run
-from toy import parameters
+from toy import jobs, parameters
 from tripod import TRIPOD
 
 from ce_gym import environment_ids
@@ -19,9 +19,8 @@ from ce_gym.envs.runtime.setup import make_program
 from ce_gym.learn.evaluation.card import command
 from ce_gym.learn.learners import shac
 from ce_gym.learn.learners.shac import SHAC, Settings, train
-from ce_gym.learn.networks.pathwise import back_through
-from ce_gym.learn.networks.perceptron import KINDS, make_work, outputs
-from ce_gym.learn.runs.job import Job, jobs, parser
+from ce_gym.learn.networks.perceptron import KINDS, back_through, make_work
+from ce_gym.learn.runs.job import Job
 from ce_gym.learn.runs.settings import SettingsError, config_file, load_env_args, load_settings
 from ce_gym.policies import PolicyError, load_policy
 
@@ -33,20 +32,20 @@ F = np.float32
 
 def job(out, steps=4 * 64, settings=(), **changes):
     chosen = load_settings(config_file(ROBOT, Settings.folder), [*SMALL, *PLAIN, f"steps={steps}", *settings], Settings)
-    return Job(ROBOT, chosen, out, **({"env_kwargs": {"dtype": "float64", "robot": TRIPOD}} | changes))
+    return Job("shac", ROBOT, chosen, out, **({"env_kwargs": {"dtype": "float64", "robot": TRIPOD}} | changes))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("hidden", [(16,), (20, 40, 8)])
 def test_the_way_back_through_a_network_is_that_of_torch(kind, hidden):
     rng, sizes = np.random.default_rng(0), np.array([7, *hidden, 3])
-    theta, layers = make_network(rng, sizes)
+    network, layers = make_network(rng, sizes, kind)
     seen, by_output = (rng.standard_normal((301, n)).astype(F) for n in (7, 3))
-    gradient, by_seen = np.zeros_like(theta), np.zeros_like(seen)
-    back_through(theta, sizes, KINDS.index(kind), seen, by_output, gradient, by_seen, make_work(sizes))
+    gradient, by_seen = np.zeros_like(network.theta), np.zeros_like(seen)
+    back_through(network, seen, by_output, gradient, by_seen, make_work([16], sizes))
     x = torch.tensor(seen, requires_grad=True)
     (run(layers, kind, x) * torch.tensor(by_output)).sum().backward()
-    close(layers, gradient, sizes)
+    close(layers, gradient, network)
     assert x.grad is not None
     np.testing.assert_allclose(by_seen, x.grad.numpy(), atol=1e-5)
 
@@ -57,17 +56,16 @@ class Window:
     def __init__(self, learner: SHAC) -> None:
         native = learner.envs.unwrapped
         self.learner, self.start, self.observed = learner, native.snapshot(), learner.observed
-        self.theta, self.noise = learner.policy.copy(), learner.rng.bit_generator.state
+        self.theta, self.noise = learner.policy.theta.copy(), learner.rng.bit_generator.state
 
     def act(self, change: np.ndarray) -> float:
         learner, s = self.learner, self.learner.settings
         learner.envs.unwrapped.restore(self.start)
         learner.observed, learner.rng.bit_generator.state = self.observed, self.noise
-        learner.policy[:] = self.theta + change
-        learner.collect(F(0.1))
-        learner.policy[:] = self.theta
-        worth = np.zeros((s.num_envs, 1), F)
-        outputs(learner.target, learner.critic_sizes, learner.kind, learner.after[-1], worth, learner.work)
+        learner.policy.theta[:] = self.theta + change
+        learner.collect(0.5)
+        learner.policy.theta[:] = self.theta
+        worth = learner.run(learner.target_value, learner.after[-1])
         discounts = s.gamma ** np.arange(s.rollout + 1)
         return float((discounts[:-1] @ learner.rewards + discounts[-1] * worth[:, 0]).sum()) / s.num_envs
 
@@ -81,7 +79,7 @@ def test_the_gradient_of_a_window_is_that_of_differences(tmp_path, monkeypatch):
     monkeypatch.setattr(shac, "adam", lambda _theta, gradient, *_: found.append(-gradient))
     learner.differentiable.clear()
     window.act(np.zeros_like(window.theta))
-    learner.learn_actor(1e-3)
+    learner._learn_policy(1e-3)
     size = 1e-3 / np.linalg.norm(found[0])
     slope = (window.act(size * found[0]) - window.act(-size * found[0])) / (2 * size)
     assert slope == pytest.approx(float(found[0] @ found[0]), rel=0.02)
@@ -107,11 +105,16 @@ def test_interrupted_and_resumed_is_as_if_it_never_stopped(tmp_path, monkeypatch
     record = load_policy(whole.policy).record
     assert record["learner"] == "shac"
     words = shlex.split(command(record))
-    assert words[:2] == ["python", "train/shac.py"]
-    (again,) = jobs(parser().parse_args(words[2:]), "-shac", Settings)
+    assert words[:6] == ["python", "-m", "ce_gym", "train", ROBOT, "--algo"]
+    (again,) = jobs(*words[4:])
     assert json.loads(json.dumps(asdict(again.settings))) == record["settings"]
     with pytest.raises(PolicyError, match=r"has layers \[18, 16, 2, 2\], Tanh; expected \[18, 8, 2, 2\]"):
         train(job(tmp_path / "other", settings=["hidden=[8]"], resume=part.policy))
+
+
+def test_a_batch_of_more_robots_than_a_chunk_trains(tmp_path):
+    trained = train(job(tmp_path, 2 * 4 * 200, ["num_envs=200"]))
+    assert np.isfinite(parameters(trained.policy)).all()
 
 
 def test_the_policy_squashes_its_actions(tmp_path):
@@ -139,7 +142,7 @@ def test_wrong_settings_are_one_line():
     for change, message in (
         ("training=[1]", r"training: \[1\]; expected arguments of the environment by name"),
         ("clip=0.2", "clip: unknown setting; expected one of steps"),
-        ("max_adjoint=0", "max_adjoint: 0; expected a number from 1e-09"),
+        ("max_adjoint=0", "max_adjoint=0; expected a positive number"),
     ):
         with pytest.raises(SettingsError, match=message):
             load_settings(config_file(ROBOT, Settings.folder), [change], Settings)

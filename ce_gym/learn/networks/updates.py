@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import numpy as np
-from numba import njit as numba_njit
 
-njit = partial(numba_njit, error_model="numpy")
-"""Without checks of divisions, as in numpy, so that loops become vector instructions."""
+from ce_gym.learn.networks.products import njit
 
 ONE, ZERO = np.float32(1), np.float32(0)
 
@@ -36,8 +33,11 @@ def sample_actions(means, noise, log_std, actions, clipped, log_probs):
 
 
 @njit(cache=True)
-def adam(theta, gradient, first, second, step, rate, max_norm):
-    """Make one step of Adam (Kingma & Ba 2015) with the gradient clipped to a norm; changes the arrays in place."""
+def adam(theta, gradient, moments, step, rate, max_norm):
+    """Make one step of Adam (Kingma & Ba 2015) with the gradient clipped to a norm.
+
+    Changes theta (n,) and the two moments (2, n) in place.
+    """
     square = 0.0
     for g in gradient:
         square += float(g) * float(g)
@@ -45,6 +45,7 @@ def adam(theta, gradient, first, second, step, rate, max_norm):
     b1, b2, epsilon = np.float32(0.9), np.float32(0.999), np.float32(1e-5)
     pace = np.float32(rate / (1 - 0.9**step))
     spread = np.float32(1 / math.sqrt(1 - 0.999**step))
+    first, second = moments
     for i in range(len(theta)):
         g = gradient[i] * shrink
         first[i] = b1 * first[i] + (ONE - b1) * g
