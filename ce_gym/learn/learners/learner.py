@@ -50,6 +50,9 @@ class Learner:
         policy, value: The networks of actor and critic, views of theta.
         moments: State of Adam, shape (2, n_parameters).
         observed: Observations of the actor, and of the critic if they differ, each (num_envs, size).
+        rewards, dones, late: Of the rollout: rewards, whether an episode ended, and whether because of its time limit,
+            each (rollout, num_envs).
+        final: For each step in which the time limit ended episodes, their last observations for the critic.
         steps: Environment steps done.
         updates: Number of Adam steps.
         step_seconds, collect_seconds: Time inside the environment, and in collection including it [s].
@@ -77,7 +80,8 @@ class Learner:
         self.pool = ThreadPoolExecutor(max(self.threads, 1))
         self.work = [make_work(*filter(len, (policy, value))) for _ in range(SHARES)]
         self.rewards = np.zeros((job.settings.rollout, job.settings.num_envs), F)
-        self.dones = np.zeros(self.rewards.shape, bool)
+        self.dones, self.late = (np.zeros(self.rewards.shape, bool) for _ in range(2))
+        self.final: list[NDArray[np.float32]] = []
         self.observed = self._views(envs.reset(seed=job.seed)[0])
         spread_episodes(envs.unwrapped, self.rng)
 
@@ -98,6 +102,7 @@ class Learner:
     def iterate(self) -> dict[str, float]:
         """Collect a rollout and learn from it; return statistics for the log."""
         done, start = min(self.steps / self.settings.steps, 1.0), time.perf_counter()
+        self.final = []
         self.collect(done)
         self.collect_seconds += time.perf_counter() - start
         self.steps += self.dones.size
@@ -117,8 +122,11 @@ class Learner:
         observations, self.rewards[t], terminated, truncated, infos = envs.step(actions)
         self.step_seconds += time.perf_counter() - start
         self.observed, self.dones[t] = self._views(observations), terminated | truncated
+        self.late[t] = truncated & ~terminated
         if self.dones[t].any():
             self.episodes.add(self.dones[t], infos)
+        if self.late[t].any():
+            self.final.append(self._views(infos["final_obs"])[-1][self.late[t]])
         return terminated, truncated, infos
 
     def run(self, network: Network, observations: NDArray) -> NDArray[np.float32]:
@@ -134,26 +142,23 @@ class Learner:
         list((self.pool.map if parts > 1 else map)(work, range(parts)))
         return result
 
-    def estimate(
-        self, critic: Network, seen: NDArray, rewards: NDArray, late: NDArray, final: NDArray
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+    def estimate(self, critic: Network, seen: NDArray, rewards: NDArray) -> tuple[NDArray, NDArray, float]:
         """Estimate advantages and TD(lambda) returns of the rollout.
+
+        The value of an episode's last observation replaces the rewards after the time limit.
 
         Args:
             critic: The critic.
             seen: Observations of the critic, shape (rollout, num_envs, size).
             rewards: Rewards, shape (rollout, num_envs).
-            late: Whether an episode ended because of its time limit, shape (rollout, num_envs).
-            final: Last observations of these episodes. The critic's value of this observation replaces the rewards
-                after the time limit.
 
         Returns:
             Advantages and returns, each (rollout * num_envs,), and the explained variance of the returns.
         """
         s, rewards = self.settings, rewards.copy()
         values = self.run(critic, seen.reshape(-1, seen.shape[-1])).reshape(rewards.shape)
-        if late.any():
-            rewards[late] += F(s.gamma) * self.run(critic, final)[:, 0]
+        if self.final:
+            rewards[self.late] += F(s.gamma) * self.run(critic, np.concatenate(self.final))[:, 0]
         last, advantages = self.run(critic, self.observed[-1])[:, 0], np.empty_like(values)
         estimate_advantages(rewards, values, last, self.dones, F(s.gamma), F(s.gae_lambda), advantages)
         returns = advantages + values

@@ -43,34 +43,30 @@ class PPO(Learner):
         self.rate = s.learning_rate
         self.seen = [np.zeros((*self.dones.shape, view.shape[1]), F) for view in self.observed]
         self.actions = np.zeros((*self.dones.shape, n_actions), F)
-        self.log_probs, self.late = np.zeros(self.dones.shape, F), np.zeros(self.dones.shape, bool)
-        self.final: list[NDArray[np.float32]] = []
+        self.log_probs = np.zeros(self.dones.shape, F)
 
     def collect(self, done: float) -> None:
         """Collect one rollout; falls have a cost."""
         s, cost = self.settings, F(fall_cost(self.settings.fall_cost, done))
         if s.final_std:
             self.log_std[:] = np.log(geometric(s.initial_std, s.final_std, done))
-        clipped, self.final = np.zeros_like(self.actions[0]), []
+        clipped = np.zeros_like(self.actions[0])
         for t in range(s.rollout):
             for view, rows in zip(self.seen, self.observed, strict=True):
                 view[t] = rows
             means = self.run(self.policy, self.observed[0])
             noise = self.rng.standard_normal(means.shape, F)
             sample_actions(means, noise, self.log_std, self.actions[t], clipped, self.log_probs[t])
-            terminated, truncated, infos = self.step(self.envs, t, clipped)
+            terminated, truncated, _ = self.step(self.envs, t, clipped)
             self.rewards[t] -= cost * (terminated & ~truncated)
-            self.late[t] = truncated & ~terminated
-            if self.late[t].any():
-                self.final.append(self._views(infos["final_obs"])[-1][self.late[t]])
 
     def learn(self, done: float) -> dict[str, float]:
         """Update the parameters with random minibatches of the rollout; return statistics of the last epoch."""
-        s, final = self.settings, np.concatenate(self.final) if self.final else np.empty(0, F)
+        s = self.settings
         if not s.target_kl:
             self.rate = linear(s.learning_rate, 0.0, done)
         entropy = F(linear(s.entropy, s.final_entropy, done))
-        advantages, returns, explained = self.estimate(self.value, self.seen[-1], self.rewards, self.late, final)
+        advantages, returns, explained = self.estimate(self.value, self.seen[-1], self.rewards)
         figures: list[NDArray] = []
         for minibatches in self.epochs():
             figures = [self._update(rows, advantages, returns, entropy) for rows in minibatches]
@@ -100,8 +96,10 @@ class PPO(Learner):
                 self.policy, self.log_std, samples, part, scaling, F(s.clip), entropy, by_actor, by_log_std,
                 figures[i], self.work[i],
             )  # fmt: skip
-            known_returns = (known, returns[:, None], part, F(s.value) * weight, by_critic, self.work[i])
-            figures[i, -1] = weight * squared_error_gradient(self.value, *known_returns)
+            loss = squared_error_gradient(
+                self.value, known, returns[:, None], part, F(s.value) * weight, by_critic, self.work[i]
+            )
+            figures[i, -1] = weight * loss
 
         list((self.pool.map if self.threads > 1 else map)(work, range(SHARES), np.array_split(rows, SHARES)))
         self.updates += 1
@@ -110,9 +108,5 @@ class PPO(Learner):
 
 
 def train(job: Job) -> Trained:
-    """Train, and save the policy even if Ctrl-C ends training early.
-
-    Raises:
-        PolicyError: If the policy to resume does not fit the environment or the settings.
-    """
+    """Train, and save the policy even if Ctrl-C ends training early; see `run_learner`."""
     return run_learner(PPO, job)

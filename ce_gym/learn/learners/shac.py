@@ -135,9 +135,9 @@ class SHAC(Learner):
 
     def _learn_critic(self, rate: float, cost: float) -> dict[str, float]:
         """Fit values to TD(lambda) returns of the target critic; `cost` is subtracted from the reward of a fall."""
-        s, late, moments = self.settings, self.dones & ~self.terminated, self.parts(self.moments)[2]
+        s, moments = self.settings, self.parts(self.moments)[2]
         rewards = self.rewards - F(cost) * self.terminated
-        _, returns, explained = self.estimate(self.target_value, self.seen, rewards, late, self.after[late])
+        _, returns, explained = self.estimate(self.target_value, self.seen, rewards)
         seen, targets, losses = self.seen.reshape(len(returns), -1), returns[:, None], []
         for minibatches in self.epochs():
             for rows in minibatches:
