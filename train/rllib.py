@@ -184,9 +184,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Train, write the policy, and print its path."""
-    overrides = [*args.set, *([f"steps={args.steps}"] if args.steps else [])]
+    settings = [*args.set, *([f"steps={args.steps}"] if args.steps else [])]
     level = {"transmission": args.transmission} if args.transmission else {}
-    job = make_job(args.env, overrides=overrides, env_kwargs={**level, **dict(args.env_args)}, seed=args.seed)
+    job = make_job(args.env, settings=settings, env_kwargs={**level, **dict(args.env_args)}, seed=args.seed)
     out = args.out or job.out.with_name(f"{job.out.name}-rllib")
     checkpoint, s = out / "checkpoint", job.settings
     if args.resume and not checkpoint.exists():
