@@ -137,6 +137,7 @@ def test_mistakes_are_one_line(tmp_path, capsys):
         (["export", tmp_path / "missing.zip"], "missing.zip: no such policy"),
         (["export", path, "--out", path.with_suffix(".onnx")], "not the policy's own"),
         (["export", path, "--out", tmp_path / "nowhere" / "out.onnx"], "cannot be written"),
+        (["card", path], "policy.npz: resumed_from: missing; expected a policy that `python -m ce_gym train` wrote"),
         (["export", tmp_path / "not.onnx"], "not.onnx: not an ONNX file"),
         (["export", tmp_path / "walk.zip"], "walk.json: no such file: an archive of Stable-Baselines3"),
         (["evaluate", tmp_path / "walk.zip"], "walk.json: no such file: an archive of Stable-Baselines3"),

@@ -31,6 +31,9 @@ from ce_gym.policies import Policy, PolicyError, keep_map, locate_policy, read_a
 FINER = 5
 """Ratio of sub-step lengths of a second evaluation, because a policy may rely on the length of its training."""
 
+OF_TRAINING = ("resumed_from", "seed", "settings", "steps", "training_seconds", "date", "versions")
+"""Keys of a record that a card needs, and that training alone writes."""
+
 
 def card_results(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[str] = LEVELS) -> dict[str, Any]:
     """Return all results for the card of a policy.
@@ -221,10 +224,12 @@ def write_card(
     """
     source = locate_policy(run)
     actor, record = read_actor(source)
+    evaluated = load(source, env, env_args=env_args)
+    if missing := [key for key in OF_TRAINING if key not in record]:
+        raise PolicyError(f"{source}: {missing[0]}: missing; expected a policy that `python -m ce_gym train` wrote")
     record, curve = portable(record), read_curve(source.parent / LOG)
     name = short_name(record, task)
     folder = shelf() / name if ship else out or source.parent
-    evaluated = load(source, env, env_args=env_args)
     result = card_results(Policy(actor, evaluated.record), episodes, robots, levels)
     folder.mkdir(parents=True, exist_ok=True)
     write_npz(actor, record, folder / "policy.npz")
