@@ -26,7 +26,7 @@ def test_the_learner_takes_them(env_id):
     envs = make_sb3_vec_env(ID, ZOO[env_id]["n_envs"])
     model = PPO(env=envs, learning_rate=float(rate), policy_kwargs=network, device="cpu", **given)
     ours = load_settings(config_file(env_id))
-    assert model.gamma == ours.gamma
+    assert (model.gamma, float(rate), ZOO[env_id]["n_timesteps"]) == (ours.gamma, ours.learning_rate, ours.steps)
     assert model.n_steps * envs.num_envs == ours.num_envs * ours.rollout
     assert model.batch_size * ours.minibatches == ours.num_envs * ours.rollout
     assert (model.n_epochs, model.ent_coef, model.gae_lambda) == (ours.epochs, ours.entropy, ours.gae_lambda)
