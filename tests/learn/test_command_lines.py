@@ -139,7 +139,10 @@ def test_command_lines_that_make_no_sense_are_one_line(argv, words, tmp_path, ca
     ("argv", "words"),
     [
         (["train"], "ENV: missing; expected an environment id"),
-        (["train", "nobody/Nothing-v0", "--log"], "nobody"),
+        (["train", "nobody/Nothing-v0"], "Namespace nobody not found"),
+        (["train", "ce_gym/MiniCheetaVelocity-v0"], "Did you mean: `MiniCheetahVelocity`?"),
+        (["train", "--resume", "mini_cheetah_velocity", "--out", "x"], "--resume "),
+        (["sim2sim", "mini_cheetah_backflip"], "has no commanded velocities; expected a task with them"),
         (["transfer"], "the following arguments are required: POLICY"),
         (["transfer", "."], ".: no such policy"),
         (["sim2sim", "nothing"], "nothing: no such policy"),

@@ -11,6 +11,7 @@ import gymnasium
 
 from ce_gym.console import InputError, file_error
 from ce_gym.learn.runs.settings import GIVEN
+from ce_gym.policies import find_policy
 
 EXTRAS = {
     "numba": "train", "tqdm": "train", "threadpoolctl": "train", "stable_baselines3": "sb3", "mujoco": "mjcf",
@@ -54,8 +55,11 @@ def _with_option(message: str, *namespaces: argparse.Namespace) -> str:
     options = {name: value for args in namespaces for name, value in vars(args).items()}
     if message.startswith(f"{GIVEN}: "):
         return message.replace(f"{GIVEN}: ", "--set ", 1)
-    for name in FILES:
-        if options.get(name) not in (None, "-") and message.startswith(str(options[name])):
+    files = {name: str(value) for name, value in options.items() if name in FILES and value not in (None, "-")}
+    if "resume" in files and (policy := find_policy(files["resume"])):
+        files["resume"] = str(policy.with_suffix(""))
+    for name, file in files.items():
+        if message.startswith(file):
             return f"--{name} {message}"
     for key, _ in options.get("env_args", ()):
         if message.startswith(key):

@@ -159,10 +159,13 @@ def compare(
 
     Raises:
         ModuleNotFoundError: If MuJoCo is not installed.
+        PolicyError: If the task of the policy has no commands.
     """
     import ce_gym.export.mujoco_twin  # noqa: F401  # fails at the start if MuJoCo is missing
 
     record, results, missing = policy.record, {}, []
+    if not any("command" in block["name"] for block in record["policy_spec"]["observation"]["blocks"]):
+        raise PolicyError(f"sim2sim: {record['env']} has no commanded velocities; expected a task with them")
     spec, trained = record["policy_spec"], record["transmission"]
     arguments = STEADY | {"noise": {block["name"]: 0.0 for block in spec["observation"]["blocks"]}}
     seed = weights_seed(policy) if seed is None else seed
