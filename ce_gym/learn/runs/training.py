@@ -43,6 +43,9 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job) -> Trained:
     Raises:
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
+    state = locate_policy(job.resume).with_suffix(".learner.npz") if job.resume else None
+    if state and not state.exists():
+        raise PolicyError(f"{state}: no such file; expected the file that its learner writes beside a policy")
     make_folder(job.out)
     options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
     mode, num_envs = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, job.settings.num_envs
@@ -50,8 +53,8 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job) -> Trained:
     envs = gymnasium.make_vec(job.env_id, num_envs=num_envs, vectorization_mode=mode, **options)
     try:
         learner = kind(envs, job)
-        if job.resume:
-            resume(learner, job.resume)
+        if state:
+            restore(learner, state)
         return _learn(learner, job)
     finally:
         envs.close()
@@ -109,17 +112,14 @@ def save(learner: Any, record: dict[str, Any], path: Path) -> Path:
     return path.with_name(path.name + suffix)
 
 
-def resume(learner: Any, policy: Path) -> None:
-    """Let a learner continue from a policy.
+def restore(learner: Any, file: Path) -> None:
+    """Let a learner continue from a state in a file, see `save`.
 
     Raises:
-        PolicyError: If the state of the policy's learner is missing, damaged or of another network.
+        PolicyError: If the state is damaged or of another network.
     """
-    file = locate_policy(policy).with_suffix(".learner.npz")
     try:
         with np.load(file, allow_pickle=False) as arrays:
             learner.restore({name: arrays[name] for name in arrays.files})
-    except FileNotFoundError:
-        raise PolicyError(f"{file}: no such file; expected the file that its learner writes beside a policy") from None
     except (OSError, LookupError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise PolicyError(f"{file}: training cannot continue: {' '.join(str(error).split())[:200]}") from None
