@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from ce_gym.console import file_error
@@ -47,21 +47,3 @@ def continue_if_full() -> Iterator[None]:
         yield
     except OSError as error:
         print(f"warning: {file_error(error)}; training continues", file=sys.stderr, flush=True)
-
-
-def save_somewhere(save: Callable[[Path], Path], out: Path) -> Path:
-    """Save a policy in a folder, or in a temporary folder if that fails, and return its path.
-
-    Args:
-        save: Function that saves the policy in a folder and returns its path.
-        out: Folder of the run.
-
-    Raises:
-        OSError: If both folders cannot be written.
-    """
-    try:
-        return save(out)
-    except OSError as error:
-        elsewhere = Path(tempfile.mkdtemp(prefix="ce_gym-"))
-        print(f"warning: {file_error(error)}; saving to {elsewhere}", file=sys.stderr, flush=True)
-        return save(elsewhere)

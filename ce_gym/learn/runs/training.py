@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import io
 import json
+import sys
+import tempfile
 import time
 import zipfile
 import zlib
@@ -20,7 +22,8 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ce_gym.learn.runs.folder import continue_if_full, make_folder, save_somewhere, write_whole
+from ce_gym.console import file_error
+from ce_gym.learn.runs.folder import continue_if_full, make_folder, write_whole
 from ce_gym.learn.runs.job import Job, Trained, acting_environment, make_record
 from ce_gym.learn.runs.logs import open_trackers
 from ce_gym.learn.runs.progress import Log, ProgressBar, StopInOrder
@@ -89,7 +92,12 @@ def _learn(learner: Any, job: Job) -> Trained:
         bar.bar.close()
         log.close()
     written = record(finished=not stop.interrupted)
-    policy = save_somewhere(lambda folder: save(learner, written, folder / "policy"), job.out)
+    try:
+        policy = save(learner, written, job.out / "policy")
+    except OSError as error:
+        elsewhere = Path(tempfile.mkdtemp(prefix="ce_gym-"))
+        print(f"warning: {file_error(error)}; saving to {elsewhere}", file=sys.stderr, flush=True)
+        policy = save(learner, written, elsewhere / "policy")
     return Trained(Policy(learner.actor(), written), written, policy, stop.interrupted)
 
 
