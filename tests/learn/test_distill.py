@@ -21,7 +21,7 @@ from ce_gym.learn.learners import distill
 from ce_gym.learn.learners.distill import Distiller, Settings, teacher_columns, train
 from ce_gym.learn.networks.perceptron import KINDS, make_work, squared_error_gradient
 from ce_gym.learn.runs.job import Job
-from ce_gym.learn.runs.settings import SettingsError, config_file, load_env_args, load_settings
+from ce_gym.learn.runs.settings import SettingsError, config_file, load_settings, read_file
 from ce_gym.policies import PolicyError, load_policy
 
 ROBOT = "ce_gym/MiniCheetahVelocity-v0"
@@ -33,7 +33,7 @@ F = np.float32
 def job(out, steps=4 * 512, settings=(), **changes):
     path = config_file(ROBOT, Settings.folder)
     chosen = load_settings(path, [*SMALL, f"steps={steps}", *settings], Settings)
-    return Job("distill", ROBOT, chosen, out, **({"env_kwargs": load_env_args(path)} | changes))
+    return Job("distill", ROBOT, chosen, out, **({"env_kwargs": read_file(path)[1]} | changes))
 
 
 def environments(task):
@@ -60,7 +60,7 @@ def test_the_gradient_is_that_of_torch(kind):
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_teacher_sees_the_numbers_of_its_own_environment(path):
     """Of shipped files, whose students see late, noisy, in the wrong place: the teacher is shown the truth."""
-    settings, kwargs = load_settings(path, kind=Settings), load_env_args(path)
+    settings, kwargs = load_settings(path, kind=Settings), read_file(path)[1]
     assert settings.num_envs * settings.rollout % settings.minibatches == 0
     teacher = load_policy(settings.teacher)
     exactly = {"start": {}, "push_period": 0.0, "randomise": {}, "noise": {}}
@@ -158,7 +158,7 @@ def test_interrupted_and_resumed_is_as_if_it_never_stopped(tmp_path, monkeypatch
 
 def columns(teacher, known=None, **scan):
     """Columns of a teacher's observation, for Mini Cheetah on stairs with other sizes and another `height_scan`."""
-    policy, kwargs = load_policy(teacher), load_env_args(Settings.folder / "mini_cheetah_stairs.yaml")
+    policy, kwargs = load_policy(teacher), read_file(Settings.folder / "mini_cheetah_stairs.yaml")[1]
     sizes = {block["name"]: block["size"] for block in policy.record["policy_spec"]["observation"]["blocks"]}
     kwargs["observations"]["height_scan"] |= scan
     return teacher_columns(policy, teacher, SimpleNamespace(critic_structure=known or sizes), kwargs)

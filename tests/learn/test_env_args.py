@@ -14,7 +14,7 @@ from toy import jobs
 
 import ce_gym
 from ce_gym.__main__ import main
-from ce_gym.learn.runs.settings import CONFIG_FOLDER, SettingsError, load_env_args, load_settings
+from ce_gym.learn.runs.settings import CONFIG_FOLDER, SettingsError, load_settings, read_file
 from ce_gym.policies import load_policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
@@ -67,7 +67,7 @@ def test_a_file_whose_aliases_multiply_is_refused(tmp_path):
     rows = [f"a{i + 1}: &a{i + 1} [{', '.join(10 * [f'*a{i}'])}]" for i in range(9)]
     file.write_text("a0: &a0 1\n" + "\n".join(rows) + "\nenv_args: {noise: *a9}\n")
     with pytest.raises(SettingsError, match="more than 50000 values"):
-        load_env_args(file)
+        read_file(file)
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_wrong_mapping_in_a_file_is_one_line(given, words, tmp_path):
     file = tmp_path / "settings.yaml"
     file.write_text(yaml.safe_dump({"env_args": given}))
     with pytest.raises(SettingsError, match=words) as caught:
-        load_env_args(file)
+        read_file(file)
     assert "\n" not in str(caught.value)
 
 

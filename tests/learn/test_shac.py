@@ -21,7 +21,7 @@ from ce_gym.learn.learners import shac
 from ce_gym.learn.learners.shac import SHAC, Settings, train
 from ce_gym.learn.networks.perceptron import KINDS, back_through, make_work
 from ce_gym.learn.runs.job import Job
-from ce_gym.learn.runs.settings import SettingsError, config_file, load_env_args, load_settings
+from ce_gym.learn.runs.settings import SettingsError, config_file, load_settings, read_file
 from ce_gym.policies import PolicyError, load_policy
 
 ROBOT = "ce_gym/MiniCheetahVelocity-v0"
@@ -133,7 +133,7 @@ def test_rewards_of_every_shipped_file_have_a_gradient(path):
     settings, ids = load_settings(path, kind=Settings), environment_ids()
     assert settings.num_envs * settings.rollout % settings.minibatches == 0
     kwargs = next(kwargs for env_id, kwargs in ids.items() if config_file(env_id, Settings.folder) == path)
-    program = make_program(**(kwargs | load_env_args(path) | settings.training))
+    program = make_program(**(kwargs | read_file(path)[1] | settings.training))
     rough = {name: _roughness(program.stages, term) for name, term in program.reward_terms.items()}
     assert set(rough.values()) <= {"", "kinks"}, rough
 

@@ -183,11 +183,6 @@ def load_settings(path: Path, given: Mapping[str, Any] | Iterable[str] = (), kin
     return make_settings(kind, {str(path): read_file(path)[0], GIVEN: by_name(given)})
 
 
-def load_env_args(path: Path) -> dict[str, Any]:
-    """Return the arguments of the environment in a settings file, see `read_file`."""
-    return read_file(path)[1]
-
-
 def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the settings in a file, unchecked, and the arguments of the environment.
 
