@@ -42,7 +42,7 @@ def test_every_observation_of_a_large_batch_has_its_output(tmp_path, threads):
     """Also on more threads than a minibatch has parts."""
     envs = gymnasium.make_vec(ID, num_envs=64, vectorization_mode="vector_entry_point")
     learner = PPO(envs, job(tmp_path, 100, settings=["hidden=[64]"], threads=threads))
-    observations = np.random.default_rng(0).standard_normal((2003, 2)).astype(np.float32)
+    observations = np.random.default_rng(threads).standard_normal((2003, 2)).astype(np.float32)
     assert observations.shape[0] * len(learner.policy.theta) > 4e6
     found = learner.run(learner.policy, observations)
     np.testing.assert_allclose(found, learner.actor()(observations), atol=1e-6)
