@@ -112,6 +112,12 @@ def test_interrupted_and_resumed_is_as_if_it_never_stopped(tmp_path, monkeypatch
         train(job(tmp_path / "other", settings=["hidden=[8]"], resume=part.policy))
 
 
+def test_a_critic_with_more_observations_is_refused_in_one_line(tmp_path):
+    kwargs = {"robot": TRIPOD, "obs_mode": "dict"}
+    with pytest.raises(PolicyError, match="obs_mode: dict; expected vector"):
+        train(job(tmp_path, env_kwargs=kwargs))
+
+
 def test_a_batch_of_more_robots_than_a_chunk_trains(tmp_path):
     trained = train(job(tmp_path, 2 * 4 * 200, ["num_envs=200"]))
     assert np.isfinite(parameters(trained.policy)).all()

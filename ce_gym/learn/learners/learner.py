@@ -77,7 +77,7 @@ class Learner:
         self.steps = self.updates = 0
         self.step_seconds = self.collect_seconds = 0.0
         self.episodes = RecentEpisodes(job.settings.num_envs)
-        self.pool = ThreadPoolExecutor(max(self.threads, 1))
+        self.pool = ThreadPoolExecutor(self.threads)
         self.work = [make_work(*filter(len, (policy, value))) for _ in range(SHARES)]
         self.rewards = np.zeros((job.settings.rollout, job.settings.num_envs), F)
         self.dones, self.late = (np.zeros(self.rewards.shape, bool) for _ in range(2))

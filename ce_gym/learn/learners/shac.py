@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from ce_gym.learn.runs.progress import fall_cost, geometric
 from ce_gym.learn.runs.settings import CONFIG_FOLDER, ActorCriticSettings
 from ce_gym.learn.runs.training import run_learner
 from ce_gym.model.options import number, option, positive
+from ce_gym.policies import PolicyError
 
 F = np.float32
 
@@ -56,6 +58,9 @@ class SHAC(Learner):
         envs: A vector environment of ce_gym in SAME_STEP autoreset mode.
         job: The training run.
 
+    Raises:
+        PolicyError: If the critic has an observation of its own.
+
     Attributes:
         critic_updates: Number of Adam steps of the critic; `updates` counts those of the policy.
     """
@@ -65,6 +70,10 @@ class SHAC(Learner):
 
     def __init__(self, envs: VectorEnv, job: Job) -> None:
         s, native, (seen, _, n_actions) = job.settings, envs.unwrapped, space_sizes(envs)
+        if isinstance(envs.single_observation_space, gymnasium.spaces.Dict):
+            raise PolicyError(
+                f"{job.env_id}: obs_mode: dict; expected vector: in SHAC the critic sees what the policy sees"
+            )
         self.differentiable = native.differentiable(s.max_adjoint)  # type: ignore[attr-defined]
         # The last layer is a constant identity, so that an activation follows the layer of the actions.
         super().__init__(envs, job, [seen, *s.hidden, n_actions, n_actions], [seen, *s.hidden, 1])
