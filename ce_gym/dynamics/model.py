@@ -214,13 +214,13 @@ class Model:
         Raises:
             ValueError: If a shape is wrong, or a loop does not close at `q`.
         """
-        batched = self._batched.get(function) or self.batched_function(function)
+        batched = self._batched.get(function) or self._batched_function(function)
         results, are_numbers = batched(*arguments)
         if not are_numbers:
             self._check_results(batched, arguments, results)
         return results
 
-    def batched_function(self, function: str | ca.Function) -> BatchedFunction:
+    def _batched_function(self, function: str | ca.Function) -> BatchedFunction:
         """Return the kernel of a quantity, see `evaluate`."""
         if function not in self._batched:
             traced: ca.Function = self.casadi_function(function) if isinstance(function, str) else function

@@ -34,7 +34,7 @@ def quantity(model: Model, name: str) -> Callable[..., Any]:
     Raises:
         KeyError: If there is no such quantity.
     """
-    batched = model.batched_function(name)
+    batched = model._batched_function(name)
     kernel, sizes = batched.kernel, batched.inputs
     label, first = batched.function.name(), next(x for x, size in sizes.items() if size)
     shapes = ", ".join(f"{x} (..., {size})" for x, size in sizes.items())

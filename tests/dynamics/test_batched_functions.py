@@ -114,7 +114,7 @@ def test_long_functions_are_interpreted_at_first(monkeypatch):
         results = []
         for _ in range(3):
             results.append(model.mass_matrix(inputs["q"]))
-            batched = model.batched_function("mass_matrix")
+            batched = model._batched_function("mass_matrix")
             assert ("kernel" in vars(batched)) == (len(results) == 3)
         monkeypatch.setattr(batched_function, "LONG", 10**9)
         assert np.array_equal(results[2], compiled.mass_matrix(inputs["q"]))
