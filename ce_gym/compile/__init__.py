@@ -7,13 +7,26 @@ from ce_gym.compile.arrays import aligned_copy, aligned_zeros, lane_count, tile_
 from ce_gym.compile.critical import CriticalSection
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.loading import export_symbol, load_kernel
-from ce_gym.compile.program import Buffer, Call, Grid, Lookup, Program, Repeat, Step, While, calls_of, scratch_buffers
+from ce_gym.compile.program import (
+    Buffer,
+    Call,
+    Foreign,
+    Grid,
+    Lookup,
+    Program,
+    Repeat,
+    Step,
+    While,
+    calls_of,
+    scratch_buffers,
+)
 from ce_gym.compile.sources import source_fingerprint
 
 __all__ = [
     "Buffer",
     "Call",
     "CriticalSection",
+    "Foreign",
     "Grid",
     "Kernel",
     "Lookup",

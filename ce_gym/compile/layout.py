@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from ce_gym.compile.arrays import ALIGNMENT
-from ce_gym.compile.program import Buffer, Program, Repeat
+from ce_gym.compile.program import Buffer, Program, run_time_integers
 
 MachineCode = Callable[[int, int, int, int, int, int], None]
 """Takes addresses of the list of arrays, the repeat counts and scratch memory; first tile, end tile, environments."""
@@ -81,7 +81,7 @@ class Layout:
 
 def layout_of(program: Program, dtype: str) -> Layout:
     """Return the calling convention of a program."""
-    repeats = dict.fromkeys(step.times for step in program.steps if isinstance(step, Repeat))
+    repeats = dict.fromkeys(run_time_integers(program.steps))
     written = dict.fromkeys(name for call in program.calls for name in call.outputs)
     return Layout(program.name, dtype, program.buffers, tuple(repeats), tuple(written))
 

@@ -126,7 +126,23 @@ class While:
     calls: tuple[Call | Lookup, ...]
 
 
-Step: TypeAlias = Call | Lookup | While
+@dataclass(frozen=True)
+class Foreign:
+    """A C function of the caller, called once for each tile.
+
+    Its arguments are the number of the first environment of the tile and the number of environments, then for each
+    buffer a pointer to its lanes, shape (size, lanes), and its size. All integers have 64 bits.
+
+    Attributes:
+        function: name of a run-time integer, the address of the function.
+        buffers: buffers that the function reads and may change.
+    """
+
+    function: str
+    buffers: tuple[str, ...]
+
+
+Step: TypeAlias = Call | Lookup | While | Foreign
 
 
 @dataclass(frozen=True)
@@ -147,8 +163,14 @@ def calls_of(steps: Sequence[Step | Repeat]) -> Iterator[Call | Lookup]:
     for step in steps:
         if isinstance(step, Repeat | While):
             yield from calls_of(step.calls)
-        else:
+        elif not isinstance(step, Foreign):
             yield step
+
+
+def run_time_integers(steps: Sequence[Step | Repeat]) -> Iterator[str]:
+    """Yield the names of the integers that the caller passes: numbers of repetitions, and addresses of functions."""
+    yield from (step.times for step in steps if isinstance(step, Repeat))
+    yield from (step.function for step in _foreign_steps(steps))
 
 
 def scratch_buffers(steps: Sequence[Step | Repeat], known: Collection[str]) -> list[Buffer]:
@@ -230,6 +252,9 @@ def check_program(program: Program) -> None:
         written.update(call.outputs)
         written.update(buffers[name].within for name in call.outputs)
         before = call
+    for step in _foreign_steps(program.steps):
+        for name in step.buffers:
+            _check_lanes(f"program {program.name!r}: function {step.function!r}", name, buffers)
     if unset := [b.name for b in program.buffers if b.name not in written and b.kind == "rows_out"]:
         raise ValueError(f"program {program.name!r}: no call writes the rows_out buffer {unset[0]!r}")
     for flag in program.flags:
@@ -238,6 +263,14 @@ def check_program(program: Program) -> None:
             raise ValueError(f"program {program.name!r}: reads {flag!r}, expected a call to write it")
     if program.skip_unless:
         _check_flag(f"program {program.name!r}: skip_unless", buffers.get(program.skip_unless), ("tiles",))
+
+
+def _foreign_steps(steps: Sequence[Step | Repeat]) -> Iterator[Foreign]:
+    for step in steps:
+        if isinstance(step, Foreign):
+            yield step
+        elif isinstance(step, Repeat | While):
+            yield from _foreign_steps(step.calls)
 
 
 def _check_flag(place: str, flag: Buffer | None, kinds: tuple[str, ...] = ("tiles", "scratch")) -> None:

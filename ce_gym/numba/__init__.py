@@ -3,6 +3,7 @@
 The functions run the kernels of `ce_gym.Model` and `ce_gym.Simulator` without Python, with the same bits.
 """
 
+from ce_gym.numba.controller import Controller, controller
 from ce_gym.numba.quantities import (
     bias_force,
     body_poses,
@@ -15,10 +16,12 @@ from ce_gym.numba.quantities import (
 from ce_gym.numba.stepper import Robots, stepper
 
 __all__ = [
+    "Controller",
     "Robots",
     "bias_force",
     "body_poses",
     "contact_points",
+    "controller",
     "forward_dynamics",
     "inverse_dynamics",
     "mass_matrix",

@@ -48,10 +48,10 @@ def stepper(simulator: Simulator) -> tuple[Robots, Callable[[Robots, int], None]
     changes the state of the simulator. No other thread may use the same simulator at the same time.
 
     Raises:
-        ValueError: If the simulator is on a GPU.
+        ValueError: If the simulator is on a GPU or has a controller.
     """
-    if simulator.device != "cpu":
-        raise ValueError(f"stepper: a simulator on {simulator.device!r}; expected one on 'cpu'")
+    if simulator.device != "cpu" or simulator.controlled:
+        raise ValueError("stepper: a simulator on a GPU or with a controller; expected one on the CPU without")
     kernel, state = simulator._kernel, simulator._arrays | simulator._batch.tables
     target = np.zeros((simulator.num_envs, len(simulator.target_names)), simulator.dtype)
     arrays = {**state, "target": target}

@@ -83,6 +83,8 @@ class StepDerivatives:
     def __init__(self, simulator: Simulator, keep_every: int = 1) -> None:
         if simulator.device != "cpu":
             raise ValueError(f"derivatives of a simulator on device {simulator.device!r}; expected 'cpu'")
+        if simulator.controlled:
+            raise ValueError("derivatives of a simulator with a controller; expected one without")
         if isinstance(keep_every, bool) or not isinstance(keep_every, int | np.integer) or keep_every < 1:
             raise ValueError(f"keep_every={keep_every!r}; expected a whole number, at least 1")
         self.simulator, self._records = simulator, list[Record]()

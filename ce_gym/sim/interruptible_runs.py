@@ -8,6 +8,7 @@ from typing import Any
 from ce_gym.compile import CriticalSection
 from ce_gym.sim.substeps import TIMES
 
+NONE: Mapping[str, int] = {}
 LONGEST = 100_000
 """Most sub-steps of all robots in one call of a kernel, which take a fraction of a second for any robot and method."""
 FEWEST = 16
@@ -26,6 +27,7 @@ def run_substeps(
     n_substeps: int,
     section: CriticalSection,
     num_threads: int = 1,
+    addresses: Mapping[str, int] = NONE,
 ) -> None:
     """Call a kernel until it has made `n_substeps` sub-steps; results have the same bits as after a single call.
 
@@ -36,10 +38,11 @@ def run_substeps(
         n_substeps: Number of sub-steps.
         section: The section around this call; its interruption points are between the calls of the kernel.
         num_threads: Threads that share the robots.
+        addresses: Addresses of functions that the kernel calls, by name.
     """
     longest = longest_run(num_envs)
     while True:
-        kernel(arrays, num_envs, repeats={TIMES: min(n_substeps, longest)}, num_threads=num_threads)
+        kernel(arrays, num_envs, repeats={TIMES: min(n_substeps, longest), **addresses}, num_threads=num_threads)
         n_substeps -= longest
         if n_substeps <= 0:
             return

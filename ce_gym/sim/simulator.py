@@ -29,7 +29,7 @@ from ce_gym.sim.ground_clearance import GroundClearance
 from ce_gym.sim.interruptible_runs import longest_run, run_substeps
 from ce_gym.sim.scene import resolve_scene
 from ce_gym.sim.schema import Row, Steps, physics_rows
-from ce_gym.sim.substeps import load_step_kernel
+from ce_gym.sim.substeps import COMMAND, CONTROLLER, load_step_kernel
 from ce_gym.sim.terrain import Terrain
 
 FAILURES = Row("failures", 0, "host", dtype="int64")
@@ -65,6 +65,7 @@ class Simulator:
         parameters: Names of physical parameters that can then differ from robot to robot, see `set_parameter`.
         terrain: The ground; the plane z = 0 if None, which is faster.
         device: "cpu"; or "cuda" or "cuda:N" for an NVIDIA GPU, where state, targets and outputs are torch tensors.
+        controller: Result of `ce_gym.numba.controller`, which changes the targets of each robot before every sub-step.
         **options: New values of fields of `scene`, such as `contacts="foot"`.
 
     Attributes:
@@ -101,6 +102,7 @@ class Simulator:
         parameters: Sequence[str] = (),
         terrain: Terrain | None = None,
         device: str | Device = "cpu",
+        controller: Any = None,
         **options: Any,
     ) -> None:
         arguments = {name: value for name, value in locals().items() if name not in ("self", "options")}
@@ -125,7 +127,8 @@ class Simulator:
         self._placement = GroundClearance(model, self.contact_names, terrain, self.options.hulls)
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
-        self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device)
+        self._addresses = self._addresses_of(controller)
+        self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device, controller is not None)
         self._section = CriticalSection(f"Simulator of {num_envs} {model.robot.name}")
         fields = state_fields(model.mechanism, self.options)
         self._memory = [field for field in fields if field.name not in ("q", "v", "dependent")]
@@ -136,6 +139,18 @@ class Simulator:
         ends = np.cumsum([0, *(len(default) for default in defaults.values())])
         self._columns = {name: slice(*ends[i : i + 2]) for i, name in enumerate(defaults)}
         self.reset()
+
+    def _addresses_of(self, controller: Any) -> dict[str, int]:
+        """Return the address of a controller, for the kernel."""
+        if controller is None:
+            return {}
+        expected = f"the result of ce_gym.numba.controller(function, dtype={self.dtype!r})"
+        check("controller", controller, getattr(controller, "dtype", None) == self.dtype, expected)
+        if self.device != "cpu" or not self.target_names:
+            raise ValueError(
+                f"controller on {self.device!r} with {len(self.target_names)} targets; expected 'cpu', 1 or more"
+            )
+        return {CONTROLLER: controller.address}
 
     def reset(self, mask: ArrayLike | None = None) -> None:
         """Put robots at rest into the standing pose, on terrain as high as their contacts need.
@@ -206,7 +221,7 @@ class Simulator:
         check_whole("n_substeps", n_substeps, 0)
         rows = self._device.rows(rows, self.dtype, (self.num_envs, n))
         with self._section:
-            self._advance({"target": rows}, n_substeps)
+            self._advance({COMMAND if self.controlled else "target": rows}, n_substeps)
 
     def _advance(self, given: dict[str, Array], n_substeps: int) -> None:
         """Step all robots; if Ctrl-C interrupts a long call, restore the state before."""
@@ -214,7 +229,9 @@ class Simulator:
         before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
         arrays = self._arrays | self._batch.tables | given
         try:
-            run_substeps(self._kernel, arrays, self.num_envs, n_substeps, self._section, self.num_threads)
+            run_substeps(
+                self._kernel, arrays, self.num_envs, n_substeps, self._section, self.num_threads, self._addresses
+            )
         except BaseException:
             for name, array in before.items():
                 self._arrays[name][...] = array
@@ -290,6 +307,11 @@ class Simulator:
     energy = _reading("energy", "Kinetic, potential and elastic energy after a step [J], shape (num_envs,).", True)
     loop_gap = _reading("loop_gap", "Norm of loop residuals before the last sub-step [m, -], shape (num_envs,).", True)
     nearness = _reading("nearness", "`Model.nearness` before the last sub-step [-], shape (num_envs,).", True)
+
+    @property
+    def controlled(self) -> bool:
+        """Whether the simulator calls a controller."""
+        return bool(self._addresses)
 
     @property
     def diverged(self) -> Array:

@@ -8,7 +8,9 @@ from typing import Any
 
 import casadi as ca
 
-from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, Step, While, scratch_buffers
+from ce_gym.compile import Buffer, Call, Foreign, Lookup, Program, Repeat, Step, While, scratch_buffers
+from ce_gym.dynamics.algebra.spatial import SX
+from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import LOAD
@@ -31,6 +33,10 @@ from ce_gym.sim.kernel_key import laws_key, model_key
 
 TIMES = "n_substeps"
 """Name of the run-time integer with the number of sub-steps."""
+CONTROLLER = "controller"
+"""Name of the run-time integer with the address of a user's controller."""
+COMMAND = "command"
+"""Name of the buffer of targets before the controller changes them."""
 DT = "dt"
 """Name of the buffer with the length of a sub-step of each robot [s]."""
 HEIGHTS = "heights"
@@ -44,7 +50,12 @@ UNCONVERGED = "unconverged"
 
 
 def load_step_kernel(
-    model: Model, options: StepOptions, outputs: tuple[str, ...], dtype: str, device: Device | None = None
+    model: Model,
+    options: StepOptions,
+    outputs: tuple[str, ...],
+    dtype: str,
+    device: Device | None = None,
+    controlled: bool = False,
 ) -> Any:
     """Compile, or load from the cache, the kernel that repeats a sub-step.
 
@@ -54,17 +65,28 @@ def load_step_kernel(
         outputs: Quantities to compute besides the state.
         dtype: "float64" or "float32".
         device: Device of the kernel; the CPU if None.
+        controlled: Whether each sub-step begins with a call of a controller, see `CONTROLLER`.
     """
 
     def build() -> tuple[Program]:
         sizes, further, steps = substeps(model.mechanism, options, outputs)
         joints = sizes.pop("target", 0)
         buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()]
-        buffers += [Buffer("target", joints, "rows_in")] if joints else []
+        buffers += [Buffer(COMMAND if controlled else "target", joints, "rows_in")] if joints else []
+        if controlled:
+            buffers.append(Buffer("target", joints, "scratch"))
+            steps = tuple(_controlled(step, joints) if isinstance(step, Repeat) else step for step in steps)
         return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
 
-    key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r}"
+    key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r} {controlled}"
     return (device or Cpu()).kernel(key, build, dtype)
+
+
+def _controlled(substep: Repeat, size: int) -> Repeat:
+    """Return a sub-step that begins with a call of the controller, which finds the command in the target."""
+    command = SX.sym(COMMAND, size)
+    copy = call(traced("copy", {COMMAND: command}, {"target": command}))
+    return replace(substep, calls=(copy, Foreign(CONTROLLER, ("q", "v", "target")), *substep.calls))
 
 
 def substeps(

@@ -1,5 +1,6 @@
 """How a kernel treats buffers, tiles, threads and wrong arguments."""
 
+import ctypes
 import os
 import time
 from dataclasses import replace
@@ -8,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ce_gym.compile import Buffer, Call, Program, Repeat, aligned_zeros, lane_count, load_kernel
+from ce_gym.compile import Buffer, Call, Foreign, Program, Repeat, aligned_zeros, lane_count, load_kernel
 
 DTYPES = ["float64", "float32"]
 
@@ -127,6 +128,31 @@ def test_padding_lanes_repeat_the_last_row(dtype):
     load_kernel("copy", lambda: program, dtype)({"rows": rows[: lanes + 3], "lanes": tiles}, lanes + 3)
     expected = np.concatenate([rows[: lanes + 3], np.repeat(rows[lanes + 2 : lanes + 3], lanes - 3, 0)])
     np.testing.assert_array_equal(tiles.transpose(0, 2, 1).reshape(-1, 2), expected)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_functions_of_the_caller(dtype):
+    """They see the lanes of a tile in each repetition, and change them."""
+    x, number = ca.SX.sym("x", 2), ctypes.c_int64
+    double = Call(ca.Function("double", [x], [2 * x]), ("lanes",), ("lanes",))
+    steps = (Repeat("n", (Foreign("add", ("lanes", "rows")), double)),)
+    program = Program("foreign", (Buffer("rows", 2, "rows_in"), Buffer("lanes", 2, "tiles")), steps)
+    lanes, seen = lane_count(dtype), []
+    scalar = ctypes.POINTER(ctypes.c_double if dtype == "float64" else ctypes.c_float)
+
+    @ctypes.CFUNCTYPE(None, number, number, scalar, number, scalar, number)
+    def add(first, count, to, to_size, rows, rows_size):
+        seen.append((first, count, to_size, rows_size))
+        to, rows = (np.ctypeslib.as_array(array, (2, lanes)) for array in (to, rows))
+        to[:, :count] += rows[:, :count]
+
+    tiles, rows = aligned_zeros((2, 2, lanes), dtype), np.arange(4 * lanes, dtype=dtype).reshape(-1, 2)
+    kernel = load_kernel("functions of the caller", lambda: program, dtype)
+    address = ctypes.cast(add, ctypes.c_void_p).value
+    kernel({"rows": rows[: lanes + 3], "lanes": tiles}, lanes + 3, {"n": 2, "add": address})
+    assert seen == 2 * [(0, lanes, 2, 2)] + 2 * [(lanes, 3, 2, 2)]
+    np.testing.assert_array_equal(tiles.transpose(0, 2, 1).reshape(-1, 2)[: lanes + 3], 6 * rows[: lanes + 3])
+    assert not tiles[1, :, 3:].any()
 
 
 def test_sleeping_tiles_are_left_alone(kernel):

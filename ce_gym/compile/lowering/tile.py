@@ -18,7 +18,7 @@ from ce_gym.compile.lowering.lookup_values import emit_value_lookup
 from ce_gym.compile.lowering.partial_evaluation import Fragment, Split
 from ce_gym.compile.lowering.random import emit_uniform
 from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
-from ce_gym.compile.program import Buffer, Call, Lookup, Program, Repeat, Step, While
+from ce_gym.compile.program import Buffer, Call, Foreign, Lookup, Program, Repeat, Step, While
 
 INT = ir.IntType(64)
 FLOATS = {"float64": ir.DoubleType(), "float32": ir.FloatType()}
@@ -178,8 +178,7 @@ class _TileWork:
     @contextmanager
     def _repeated(self, times: str) -> Iterator[None]:
         """Repeat the code built inside `with`; a run-time integer gives the number of times."""
-        count = self.builder.load(self.builder.gep(self.repeats, [INT(self.layout.repeats.index(times))]))
-        with loop(self.builder, count, "repeat"):
+        with loop(self.builder, self._run_time_integer(times), "repeat"):
             yield
 
     def _step(self, step: Step | Repeat) -> None:
@@ -189,8 +188,23 @@ class _TileWork:
                     self._step(call)
         elif isinstance(step, Lookup):
             self._look_up(step)
+        elif isinstance(step, Foreign):
+            self._call_foreign(step)
         else:
             self._call(step)
+
+    def _run_time_integer(self, name: str) -> Value:
+        return self.builder.load(self.builder.gep(self.repeats, [INT(self.layout.repeats.index(name))]))
+
+    def _call_foreign(self, step: Foreign) -> None:
+        """Call a function of the caller on the lanes of some buffers."""
+        b, pointer = self.builder, FLOATS[self.layout.dtype].as_pointer()
+        sizes = {buffer.name: buffer.size for buffer in self.layout.buffers}
+        arguments = [self.first_env, self.valid_lanes]
+        for name in step.buffers:
+            arguments += [b.bitcast(self.lanes[name], pointer), INT(sizes[name])]
+        signature = ir.FunctionType(ir.VoidType(), [argument.type for argument in arguments])
+        b.call(b.inttoptr(self._run_time_integer(step.function), signature.as_pointer()), arguments)
 
     @contextmanager
     def _while(self, flag: str) -> Iterator[None]:
