@@ -3,6 +3,11 @@
 The functions run the kernels of `ce_gym.Model` and `ce_gym.Simulator` without Python, with the same bits.
 """
 
+try:
+    import numba  # noqa: F401
+except ImportError:
+    raise ImportError('ce_gym.numba needs numba, which is not installed: pip install "ce_gym[numba]"') from None
+
 from ce_gym.numba.controller import Controller, controller
 from ce_gym.numba.quantities import (
     bias_force,
