@@ -35,9 +35,9 @@ METHODS = {
     "loops": lambda model, q, v, x: (model.dependent_guess(q), model.loop_gap(q), model.nearness(q)),
 }
 FRAMES = {
-    "frame_pose": lambda model, q, v, x, frame: model.frame_pose(q, frame),
-    "frame_velocity": lambda model, q, v, x, frame: model.frame_velocity(q, v, frame),
-    "frame_jacobian": lambda model, q, v, x, frame: model.frame_jacobian(q, frame),
+    "frame_pose": lambda model, q, v, x: model.frame_pose(q, model.body_names[-1]),
+    "frame_velocity": lambda model, q, v, x: model.frame_velocity(q, v, model.body_names[-1]),
+    "frame_jacobian": lambda model, q, v, x: model.frame_jacobian(q, model.body_names[-1]),
 }
 
 
@@ -59,12 +59,11 @@ def state(model: Model, batch: tuple[int, ...] = ()) -> list[np.ndarray]:
 @pytest.mark.parametrize("robot", ["tello", "balls"])
 def test_bits_and_shapes_are_those_of_model(name, robot):
     model = Model(with_balls(floating=False) if robot == "balls" else robot)
-    frame = model.body_names[-1]
-    function = quantity(model, f"{name}:{frame}" if name in FRAMES else name)
+    function = quantity(model, f"{name}:{model.body_names[-1]}" if name in FRAMES else name)
     for batch in ((), (2, 5)):
         arguments = state(model, batch)
         found = function(*arguments[: len(signature(function.py_func).parameters)])
-        expected = FRAMES[name](model, *arguments, frame) if name in FRAMES else METHODS[name](model, *arguments)
+        expected = (METHODS | FRAMES)[name](model, *arguments)
         found, expected = (x if isinstance(x, tuple) else (x,) for x in (found, expected))
         for a, b in zip(found, expected, strict=True):
             assert np.shape(a) == np.shape(b)
