@@ -133,4 +133,4 @@ def test_a_jump_is_planned_and_shown(monkeypatch, tmp_path, capsys):
 
 def test_a_robot_that_cannot_jump_is_told_in_one_line(capsys):
     assert jump.main(["four_bar"]) == 2
-    assert capsys.readouterr().err == "jump.py: four_bar: its base cannot move; expected a robot with a floating base\n"
+    assert capsys.readouterr().err == "ce_gym: four_bar: its base cannot move; expected a robot with a floating base\n"
